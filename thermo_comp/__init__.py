@@ -1,0 +1,40 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Thermal-drift compensation of a three-axis accelerometer, after Golovach (2016).
+
+This page owns the conventions; every other docstring relies on them.
+
+Units
+    SI and degrees Celsius. Temperature differences and rates are in K and K/s. A name carries a
+    unit suffix only where its reader has no docstring (file keys, ROS parameters, command-line
+    flags, columns) or where the unit is foreign (`rate_k_min`).
+Counts
+    Raw accelerometer outputs are signed counts per conversion cycle: an increment, quantized,
+    saturating at the converter's full scale. Where a unit already reports m/s^2, "counts" means
+    m/s^2 and the scale factor is close to 1.
+Signs
+    ``corrected = (measured - bias) / scale``; a residual is ``corrected - true``. The
+    accelerometer measures specific force: at rest, level, z up, it reads +g on z.
+Temperatures
+    ``t = T_board - T_ref`` is the argument of every temperature function. The gradient is
+    ``T_case - T_board``. The case sensor leads, the board sensor lags.
+Regimes
+    Static (S = 0) and dynamic (S = 1), decided by a detector with memory; unknown until the
+    detector has seen enough. The static set applies while it is unknown.
+Frames
+    The output frame is fixed by the sensitivity axes: x along the x sensitivity axis, y in the
+    plane of the x and y sensitivity axes (the misalignment matrix is lower triangular with a
+    unit diagonal).
+Time
+    ``stamp_ns`` integers; a time difference in seconds is always formed from an integer
+    difference, so no result depends on an origin and a stream gives the bits of a batch.
+
+References
+----------
+.. [1] S. V. Golovach, "The results of applying the method of algorithmic temperature drift
+   compensation for three-axis accelerometer", 2016 (in Russian), UDC 531.383.
+
+"""
+
+__version__ = '0.1.0'

@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the exception tree: everything the world can do wrong, said in one line.
+
+A caller's mistake in the numeric core is a plain `ValueError`; the classes here are for what
+comes from outside: files, bags, data that cannot carry a fit. The command line prints
+`str(error)` and nothing else.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class ThermoCompError(Exception):
+    """
+    Any failure that a user can cause and mend; its text is one complete line.
+
+    """
+
+
+class CalibrationError(ThermoCompError):
+    """
+    A calibration that cannot be used, with the file and the key that is wrong.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what was expected.
+    path : str or Path or None, optional
+        The calibration file.
+    key : str or None, optional
+        The dotted path of the offending key, e.g. ``static.x.scale_function``.
+
+    """
+
+    def __init__(
+        self, message: str, path: str | Path | None = None, key: str | None = None
+    ) -> None:
+        self.message = message
+        self.path = None if path is None else str(path)
+        self.key = key
+        super().__init__(': '.join(part for part in (self.path, key, message) if part))
+
+
+class RecordingError(ThermoCompError):
+    """
+    A recording that cannot be read or written, with the file and the topic.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what was expected.
+    path : str or Path or None, optional
+        The bag or table.
+    topic : str or None, optional
+        The topic or column concerned.
+
+    """
+
+    def __init__(
+        self, message: str, path: str | Path | None = None, topic: str | None = None
+    ) -> None:
+        self.message = message
+        self.path = None if path is None else str(path)
+        self.topic = topic
+        super().__init__(': '.join(part for part in (self.path, topic, message) if part))
+
+
+class FitError(ThermoCompError):
+    """
+    Data that cannot carry the fit asked of it; the text says what is missing and what to record.
+
+    """
