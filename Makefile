@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+#
+# make demo   sets up .venv, plays the sample bag over DDS into the node, prints the table
+# make test   sets up .venv, runs the whole test suite
+# make lint   ruff, mypy --strict and the layering test
+# make clean  removes .venv and everything made
+
+PYTHON ?= python3
+VENV ?= .venv
+JOBS ?= 2
+PYTEST_ARGS ?=
+
+# The newest interpreter that the ROS wheels are published for, unless PYTHON is good enough.
+CANDIDATES := $(PYTHON) python3.12 python3.11 python3.10 python3.13
+BIN := $(VENV)/bin
+
+# A sourced ROS workspace would shadow the wheels in the venv.
+unexport PYTHONPATH
+unexport AMENT_PREFIX_PATH
+unexport COLCON_PREFIX_PATH
+unexport LD_LIBRARY_PATH
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+.PHONY: demo test lint clean help
+.DEFAULT_GOAL := help
+
+help:
+	@sed -n 's/^# \(make .*\)/\1/p' Makefile
+
+demo: $(VENV)/.installed
+	$(BIN)/thermo_comp demo --out out
+
+test: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadscope $(PYTEST_ARGS)
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy --strict thermo_comp
+	$(BIN)/python -m pytest test/test_layers.py
+
+clean:
+	rm -rf $(VENV) build install log out site *.egg-info .mypy_cache .ruff_cache .pytest_cache
+
+$(BIN)/python:
+	@found=; \
+	for python in $(CANDIDATES); do \
+	  if command -v $$python >/dev/null 2>&1 \
+	    && $$python -c 'import sys; raise SystemExit(sys.version_info < (3, 10))' 2>/dev/null; \
+	  then found=$$python; break; fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	  echo "thermo_comp: needs Python 3.10 or newer; $(PYTHON) is" \
+	    "$$($(PYTHON) --version 2>&1 || true). Install one, or: make PYTHON=/path/to/python3" >&2; \
+	  exit 1; \
+	fi; \
+	$$found -m venv $(VENV) || { \
+	  echo "thermo_comp: $$found cannot make a venv; on Debian and Ubuntu:" \
+	    "sudo apt install python3-venv" >&2; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=24'
+
+$(VENV)/.installed: setup.py setup.cfg pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros]'
+	@touch $@
+
+$(VENV)/.installed-test: setup.py setup.cfg pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	  -e '.[ros,test,parquet,px4,ardupilot]'
+	@touch $(VENV)/.installed $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed-test
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@

@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+import re
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'thermo_comp'
+ROOT = Path(__file__).resolve().parent
+VERSION = re.search(
+    r"^__version__ = '([^']+)'$", (ROOT / NAME / '__init__.py').read_text(), re.MULTILINE
+).group(1)
+
+# On Ubuntu 24.04 apt already satisfies every floor but those of pydantic, rosbags and mcap.
+INSTALL = [
+    'numpy>=1.26',
+    'pydantic>=2.5',
+    'PyYAML>=6.0',
+    'scipy>=1.11',
+    'typer>=0.9',
+    'rich>=13.7',
+    'rosbags>=0.10',
+    'mcap>=1.1',
+    'zstandard>=0.22',
+    'lz4>=4.0',
+    'matplotlib>=3.6',
+]
+EXTRAS = {
+    'ros': ['ros-jazzy-rclpy[fastrtps]>=7.1,<8', 'ros-jazzy-common-interfaces>=5.3,<6'],
+    'parquet': ['pyarrow>=14'],
+    'px4': ['pyulog>=1.0'],
+    'ardupilot': ['pymavlink>=2.4.40'],
+    'fleet': ['dask>=2024.1', 'distributed>=2024.1'],
+    'test': ['pytest>=7.4', 'pytest-xdist>=3.4', 'hypothesis>=6.98'],
+    'dev': ['ruff>=0.15', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs', 'pre-commit>=3.5'],
+    'docs': ['mkdocs-material>=9.5'],
+}
+
+
+def shared(folder, *patterns):
+    """
+    Pair a folder of the source with its place under share/.
+
+    """
+    files = sorted(
+        str(path.relative_to(ROOT))
+        for pattern in patterns
+        for path in (ROOT / folder).glob(pattern)
+        if path.is_file()
+    )
+    return (f'share/{NAME}/{folder}', files)
+
+
+setup(
+    name=NAME,
+    version=VERSION,
+    description='Thermal-drift compensation of a three-axis accelerometer, as a ROS 2 package.',
+    long_description=(ROOT / 'README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    author='thermo_comp contributors',
+    maintainer='thermo_comp contributors',
+    maintainer_email='maintainers@thermo-comp.example',
+    license='Apache-2.0',
+    keywords=['ROS', 'accelerometer', 'calibration', 'inertial navigation', 'temperature'],
+    python_requires='>=3.10',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed', '**/*.html', '**/*.css', '**/*.yaml', '**/*.json']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        shared('config', '*.yaml', '*.json', '*.xml'),
+        shared('config/columns', '*.yaml'),
+        shared('launch', '*.xml', '*.py'),
+    ],
+    install_requires=INSTALL,
+    extras_require=EXTRAS,
+    tests_require=EXTRAS['test'],
+    entry_points={
+        'console_scripts': [
+            'thermo_comp = thermo_comp.cli.app:main',
+            'thermo_comp_node = thermo_comp.ros.node:main',
+        ],
+    },
+    zip_safe=True,
+)
