@@ -1,0 +1,340 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the thermal state of a unit at any stamp: two thermometers, regime, memory, cross-over.
+
+The compensator, the fit and the report all run this one class, so a regressor means the same
+when it is fitted as when it is applied. It is causal and has no clock: readings go in by stamp,
+a state comes out for a stamp.
+
+Thermal memory: the lag of the board temperature obeys ``dL/dt = (T - L) / tau``. Kept here is
+``m = T - L`` itself; with T linear between two readings (first-order hold) its exact step over
+dt is ``m' = m e + (T' - T) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .regime import DetectorSettings, Regime, RegimeDetector
+from .thermometer import Thermometer
+
+#: A unit that starts in the middle of a ramp has a memory that nobody saw: its sd then [K].
+MEMORY_START_SD = 3.0
+#: A memory is called settled when its start-up uncertainty is below this [K].
+MEMORY_SETTLED_SD = 0.05
+#: While the case sensor is lost the gradient is guessed from the board's rate, this well.
+LOST_GRADIENT_RELATIVE_SD = 0.5
+
+#: Layout of `ThermalTracker.sample`; the memory values follow as pairs (value, variance).
+(
+    BOARD,
+    VAR_BOARD,
+    RATE,
+    GRADIENT,
+    VAR_GRADIENT,
+    WEIGHT,
+    UNKNOWN,
+    MEMORY,
+) = range(8)
+
+
+@dataclass(frozen=True)
+class ThermalConfig:
+    """
+    How the tracker behaves where the unit's calibration has no say.
+
+    Parameters
+    ----------
+    transition_time_s : float
+        Time over which the sets cross over after a switch [s]; 0 = the paper's hard switch.
+    case_timeout_s : float
+        Age at which the case temperature counts as lost [s].
+    board_lag_s : float
+        Time constant of the board behind the case, for the gradient while the case is lost [s].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range.
+
+    """
+
+    transition_time_s: float = 30.0
+    case_timeout_s: float = 30.0
+    board_lag_s: float = 900.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.transition_time_s < math.inf:
+            raise ValueError(
+                f'`transition_time_s` must be zero or more, got {self.transition_time_s}'
+            )
+        for name in ('case_timeout_s', 'board_lag_s'):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalState:
+    """
+    The thermal state at one stamp.
+
+    """
+
+    #: Board temperature [degC], its variance [K^2] and its rate [K/s].
+    board: float
+    var_board: float
+    rate: float
+    #: T_case - T_board [K] and the part of its variance that does not come from the board.
+    gradient: float
+    var_gradient: float
+    #: Weight of the dynamic set, 0..1.
+    weight: float
+    regime: Regime
+    #: -1 cooling, +1 heating, 0 neither.
+    direction: int
+    #: T_board minus its lags [K], and the variance that start-up left in them [K^2].
+    memory: tuple[float, ...]
+    var_memory: tuple[float, ...]
+
+    @property
+    def is_settled(self) -> bool:
+        """
+        Whether the memory has forgotten that its start was not seen.
+
+        """
+        return all(variance < MEMORY_SETTLED_SD**2 for variance in self.var_memory)
+
+
+class ThermalTracker:
+    """
+    Thermal state from stamped readings of the board and the case thermometer.
+
+    Parameters
+    ----------
+    detector : DetectorSettings
+        Thermometers and detector, as the coefficient sets were fitted under.
+    memory_time_constants_s : tuple of float, optional
+        Time constants of the lags of the board temperature [s].
+    config : ThermalConfig, optional
+        Cross-over, time-out and stand-in.
+
+    """
+
+    def __init__(
+        self,
+        detector: DetectorSettings,
+        memory_time_constants_s: tuple[float, ...] = (),
+        config: ThermalConfig | None = None,
+    ) -> None:
+        self.settings = detector
+        self.memory_time_constants_s = memory_time_constants_s
+        self.config = config or ThermalConfig()
+        self.board = Thermometer(detector.board)
+        self.case = Thermometer(detector.case)
+        self.detector = RegimeDetector(detector)
+        self._clear()
+
+    def _clear(self) -> None:
+        #: Stamp of the newest reading that was used, None before the first.
+        self.updated_ns: int | None = None
+        self._memory = [0.0] * len(self.memory_time_constants_s)
+        self._var_memory = [MEMORY_START_SD**2] * len(self.memory_time_constants_s)
+        self._weight = 0.0
+        self._weight_ns = 0
+        self._target = 0.0
+
+    def reset(self) -> None:
+        """
+        Forget everything: time has jumped, or a new recording begins.
+
+        """
+        self.board.reset()
+        self.case.reset()
+        self.detector.reset()
+        self._clear()
+
+    def reconfigure(self, config: ThermalConfig, stamp_ns: int | None) -> None:
+        """
+        Take over another configuration from a stamp on, without a step in the weight.
+
+        """
+        if stamp_ns is not None:
+            self._weight = self.weight_at(stamp_ns)
+            self._weight_ns = stamp_ns
+        self.config = config
+
+    def is_case_live(self, stamp_ns: int) -> bool:
+        """
+        Whether the case temperature is there and fresh enough at a stamp.
+
+        """
+        seen = self.case.stamp_ns
+        return seen is not None and (stamp_ns - seen) * 1e-9 <= self.config.case_timeout_s
+
+    def board_reading(self, stamp_ns: int, celsius: float) -> bool:
+        """
+        Take one reading of the board thermometer.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp.
+        celsius : float
+            The reading [degC].
+
+        Returns
+        -------
+        bool
+            Whether the reading was used; False for one that is not finite, not newer than the
+            last, or an outlier.
+
+        """
+        before_ns = self.board.stamp_ns
+        before = self.board.temperature
+        if not self.board.update(stamp_ns, celsius):
+            return False
+        if before_ns is not None:
+            self._step_memory((stamp_ns - before_ns) * 1e-9, self.board.temperature - before)
+        self._note(stamp_ns)
+        if not self.is_case_live(stamp_ns):
+            self._decide(stamp_ns, None)
+        return True
+
+    def case_reading(self, stamp_ns: int, celsius: float) -> bool:
+        """
+        Take one reading of the case thermometer and decide the regime.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp.
+        celsius : float
+            The reading [degC].
+
+        Returns
+        -------
+        bool
+            Whether the reading was used.
+
+        """
+        if not self.case.update(stamp_ns, celsius):
+            return False
+        self._note(stamp_ns)
+        self._decide(stamp_ns, self.case)
+        return True
+
+    def _note(self, stamp_ns: int) -> None:
+        if self.updated_ns is None or stamp_ns > self.updated_ns:
+            self.updated_ns = stamp_ns
+
+    def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
+        board = self.board if self.board.stamp_ns is not None else None
+        regime = self.detector.update(stamp_ns, case, board)
+        target = 1.0 if regime == Regime.DYNAMIC else 0.0
+        if target != self._target:
+            self._weight = self.weight_at(stamp_ns)
+            self._weight_ns = stamp_ns
+            self._target = target
+
+    def _step_memory(self, dt: float, change: float) -> None:
+        for k, tau in enumerate(self.memory_time_constants_s):
+            e = math.exp(-dt / tau)
+            self._memory[k] = self._memory[k] * e + change * (tau / dt) * (1.0 - e)
+            variance = self._var_memory[k] * e * e
+            if dt > 0.1 * tau:
+                # Nobody saw the way between two readings this far apart.
+                variance += (change * (1.0 - e)) ** 2
+            self._var_memory[k] = variance
+
+    def weight_at(self, stamp_ns: int) -> float:
+        """
+        Weight of the dynamic set at a stamp, moving linearly over the transition time.
+
+        """
+        duration = self.config.transition_time_s
+        if self._weight == self._target or duration == 0.0:
+            return self._target
+        moved = max((stamp_ns - self._weight_ns) * 1e-9, 0.0) / duration
+        if self._target > self._weight:
+            return min(self._weight + moved, self._target)
+        return max(self._weight - moved, self._target)
+
+    def sample(self, stamp_ns: int) -> tuple[float, ...]:
+        """
+        Thermal state at a stamp as a flat tuple, in the layout of `BOARD` .. `MEMORY`.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            The stamp; the board must have been read at least once.
+
+        Returns
+        -------
+        tuple of float
+            Board temperature [degC], its variance [K^2], its rate [K/s], gradient [K], variance
+            of the gradient from the case side [K^2], weight, 1.0 while the regime is unknown,
+            then (memory [K], variance [K^2]) per time constant.
+
+        """
+        board, rate, var_board = self.board.at(stamp_ns)
+        if self.is_case_live(stamp_ns):
+            case, _, var_gradient = self.case.at(stamp_ns)
+            gradient = case - board
+        else:
+            lag = self.config.board_lag_s
+            gradient = lag * rate
+            var_gradient = (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2 + (
+                lag * lag * self.board.var_rate
+            )
+        unknown = 1.0 if self.detector.regime == Regime.UNKNOWN else 0.0
+        state = (board, var_board, rate, gradient, var_gradient, self.weight_at(stamp_ns), unknown)
+        if not self._memory:
+            return state
+        return state + self._memory_at(stamp_ns, board)
+
+    def _memory_at(self, stamp_ns: int, board: float) -> tuple[float, ...]:
+        dt = (stamp_ns - (self.board.stamp_ns or 0)) * 1e-9
+        change = board - self.board.temperature
+        result: tuple[float, ...] = ()
+        for k, tau in enumerate(self.memory_time_constants_s):
+            value, variance = self._memory[k], self._var_memory[k]
+            if dt > 0.0:
+                e = math.exp(-dt / tau)
+                value = value * e + change * (tau / dt) * (1.0 - e)
+                variance = variance * e * e
+            result += (value, variance)
+        return result
+
+    def state_at(self, stamp_ns: int) -> ThermalState:
+        """
+        Thermal state at a stamp, with names.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            The stamp.
+
+        Returns
+        -------
+        ThermalState
+            The state.
+
+        Raises
+        ------
+        ValueError
+            If the board thermometer has not been read yet.
+
+        """
+        if self.board.stamp_ns is None:
+            raise ValueError('`state_at` needs a board temperature first')
+        flat = self.sample(stamp_ns)
+        return ThermalState(
+            *flat[:UNKNOWN],
+            regime=self.detector.regime,
+            direction=self.detector.direction,
+            memory=flat[MEMORY::2],
+            var_memory=flat[MEMORY + 1 :: 2],
+        )
