@@ -74,7 +74,6 @@ setup(
     ],
     install_requires=INSTALL,
     extras_require=EXTRAS,
-    tests_require=EXTRAS['test'],
     entry_points={
         'console_scripts': [
             'thermo_comp = thermo_comp.cli.app:main',

@@ -69,7 +69,7 @@ def cli() -> Cli:
         finished = subprocess.run(
             [sys.executable, '-m', 'thermo_comp', *map(str, args)],
             cwd=cwd,
-            env={**os.environ, 'COLUMNS': '80', **env},
+            env={**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80', **env},
             capture_output=True,
             text=True,
             timeout=300,

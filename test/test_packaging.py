@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The package says one thing in every place where it says it: version, licence, commands, keys.
+
+"""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+import thermo_comp
+
+ROOT = Path(__file__).resolve().parent.parent
+MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own file
+
+# Keys that rosdep/python.yaml of rosdistro resolves on Ubuntu 24.04, and ROS 2 Jazzy packages.
+KNOWN_KEYS = {
+    'rclpy',
+    'builtin_interfaces',
+    'diagnostic_msgs',
+    'geometry_msgs',
+    'rcl_interfaces',
+    'rosgraph_msgs',
+    'sensor_msgs',
+    'std_msgs',
+    'launch_xml',
+    'launch_ros',
+    'python3-numpy',
+    'python3-scipy',
+    'python3-yaml',
+    'python3-matplotlib',
+    'python3-rich',
+    'python3-typer',
+    'python3-rosbags-pip',
+    'python3-hypothesis',
+    'python3-pytest',
+    'python3-pytest-xdist',
+}
+
+
+def setup_literals() -> dict[str, object]:
+    """
+    Return the module-level literals of setup.py without running it.
+
+    """
+    literals: dict[str, object] = {}
+    for node in ast.parse((ROOT / 'setup.py').read_text()).body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            try:
+                literals[node.targets[0].id] = ast.literal_eval(node.value)
+            except ValueError:
+                continue
+    return literals
+
+
+def test_one_version() -> None:
+    assert MANIFEST.findtext('version') == thermo_comp.__version__
+    assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
+    finished = subprocess.run(
+        [sys.executable, 'setup.py', '--version'],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert finished.stdout.split()[-1] == thermo_comp.__version__
+
+
+def test_manifest_is_format_3_with_keys_that_exist() -> None:
+    assert MANIFEST.get('format') == '3'
+    assert MANIFEST.findtext('name') == 'thermo_comp'
+    assert MANIFEST.findtext('export/build_type') == 'ament_python'
+    keys = {
+        node.text
+        for tag in ('depend', 'exec_depend', 'build_depend', 'test_depend')
+        for node in MANIFEST.iter(tag)
+    }
+    assert keys == KNOWN_KEYS
+
+
+def test_licence_is_the_whole_apache_text() -> None:
+    licence = (ROOT / 'LICENSE').read_text()
+    assert 'Version 2.0, January 2004' in licence
+    assert 'END OF TERMS AND CONDITIONS' in licence
+    node = MANIFEST.find('license')
+    assert node is not None
+    assert (node.text, node.get('file')) == ('Apache-2.0', 'LICENSE')
+
+
+def tracked(*patterns: str) -> list[Path]:
+    listing = subprocess.run(
+        ['git', 'ls-files', '-z', '--', *patterns], cwd=ROOT, capture_output=True, check=False
+    )
+    names = [name for name in listing.stdout.decode().split('\0') if name]
+    if listing.returncode or not names:
+        pytest.skip('not a git working tree: an installed or unpacked copy')
+    return [ROOT / name for name in names if (ROOT / name).exists()]
+
+
+def test_every_source_carries_its_licence() -> None:
+    first = '# SPDX-FileCopyrightText: 2026 thermo_comp contributors'
+    second = '# SPDX-License-Identifier: Apache-2.0'
+    for path in tracked('*.py', 'Makefile', '.ci/run'):
+        lines = path.read_text().splitlines()
+        lines = lines[1:] if lines and lines[0].startswith('#!') else lines
+        assert lines[:2] == [first, second], path
+
+
+def test_no_source_is_too_long_to_read() -> None:
+    lengths = {path: len(path.read_text().splitlines()) for path in tracked('*.py')}
+    assert {path.name: n for path, n in lengths.items() if n > 500} == {}
+
+
+def test_dependencies_of_the_manifest_are_those_of_setup() -> None:
+    # What pip must add because rosdep has no (or too old) a package for it; README says so.
+    pip_only = {'pydantic', 'mcap', 'zstandard', 'lz4'}
+    keys = {'pyyaml': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
+    install = setup_literals()['INSTALL']
+    assert isinstance(install, list)
+    readme = (ROOT / 'README.md').read_text()
+    for requirement in install:
+        assert '>=' in requirement, f'{requirement}: no floor'
+        name = requirement.split('>=')[0].lower()
+        if name in pip_only:
+            assert re.search(rf'pip install[^\n]*\b{name}', readme), name
+        else:
+            assert keys.get(name, f'python3-{name}') in KNOWN_KEYS
+
+
+def test_scripts_land_where_ros2_run_looks() -> None:
+    config = configparser.ConfigParser()
+    config.read(ROOT / 'setup.cfg')
+    assert config['develop']['script_dir'] == '$base/lib/thermo_comp'
+    assert config['install']['install_scripts'] == '$base/lib/thermo_comp'
+
+
+def test_share_holds_what_ros_looks_for(tmp_path: Path) -> None:
+    # The way colcon installs a package: setup.py's own install command into a prefix. It is the
+    # data files that are wanted here, so the scripts and the code stay out of it.
+    subprocess.run(
+        [
+            *(sys.executable, 'setup.py', '-q', 'build', '--build-base', tmp_path / 'build'),
+            *('install_data', '--install-dir', tmp_path / 'prefix'),
+        ],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        env={**os.environ, 'PYTHONWARNINGS': 'ignore'},
+    )
+    share = tmp_path / 'prefix' / 'share'
+    assert (share / 'ament_index/resource_index/packages/thermo_comp').is_file()
+    assert (share / 'thermo_comp/package.xml').is_file()
+    for folder in ('config', 'config/columns', 'launch'):
+        kept = {p.name for p in (ROOT / folder).glob('*') if p.suffix in ('.yaml', '.xml')}
+        there = share / 'thermo_comp' / folder
+        assert kept <= {p.name for p in there.glob('*')}, folder

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the one door of the command line: which commands there are and what an exit code means.
+
+Heavy libraries are imported by the commands when they run, so that ``--help`` is quick.
+
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from .. import __version__
+from ..errors import ThermoCompError
+from . import output
+
+# The base of every mistake in a command line; typer gives its children names, but not itself.
+_UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
+
+app = typer.Typer(
+    name='thermo_comp',
+    help='Thermal-drift compensation of a three-axis accelerometer.',
+    no_args_is_help=True,
+    add_completion=True,
+    rich_markup_mode='rich',
+    pretty_exceptions_enable=False,
+    context_settings={'help_option_names': ['-h', '--help']},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f'thermo_comp {__version__}')
+        raise typer.Exit
+
+
+@app.callback()
+def _top(
+    version: Annotated[
+        bool,
+        typer.Option(
+            '--version', help='Print the version.', callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    """
+    Thermal-drift compensation of a three-axis accelerometer.
+
+    """
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """
+    Run one command and leave the process with its exit code.
+
+    0: done. 1: the data or the result is bad. 2: the command line is wrong. A user's mistake is
+    one line on stderr, never a traceback.
+
+    Parameters
+    ----------
+    arguments : list of str or None, optional
+        The command line without the program's name; the process's own by default.
+
+    """
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(arguments: list[str]) -> int:
+    """
+    Run one command and return its exit code.
+
+    Parameters
+    ----------
+    arguments : list of str
+        The command line without the program's name.
+
+    Returns
+    -------
+    int
+        0 done, 1 the data or the result is bad, 2 the command line is wrong.
+
+    """
+    try:
+        code = app(arguments, prog_name='thermo_comp', standalone_mode=False)
+        sys.stdout.flush()
+    except _UsageMistake as mistake:
+        return _usage(mistake)
+    except typer.Abort:
+        return 1
+    except ThermoCompError as failure:
+        output.error(str(failure))
+        return 1
+    except BrokenPipeError:
+        # The reader of a pipe has seen enough (`... | head`); the interpreter must not complain
+        # about it while it shuts down.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as failure:
+        where = f'{failure.filename}: ' if failure.filename else ''
+        output.error(f'{where}{failure.strerror or failure}')
+        return 1
+    return code if isinstance(code, int) else 0
+
+
+def _usage(mistake: Exception) -> int:
+    """
+    Print a mistake in the command line with the next step, return its exit code.
+
+    """
+    message = getattr(mistake, 'format_message', lambda: str(mistake))()
+    context = getattr(mistake, 'ctx', None)
+    command = 'thermo_comp' if context is None else context.command_path
+    if message:  # empty where typer has printed the help for a missing command
+        output.error(f'{message} (see: {command} --help)')
+    code = getattr(mistake, 'exit_code', 2)
+    return code if isinstance(code, int) else 2

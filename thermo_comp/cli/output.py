@@ -1,0 +1,217 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns how the command line speaks: tables, JSON, progress, and one line per error.
+
+Results go to stdout, everything about the run (progress, notes, errors) to stderr, so that a pipe
+carries results only.
+
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+Cell = str | int | float | None
+
+
+class Output:
+    """
+    Where one command prints.
+
+    Parameters
+    ----------
+    as_json : bool, optional
+        Print one JSON object instead of tables and sentences.
+    quiet : bool, optional
+        Print errors only (and the JSON object, if asked for).
+
+    """
+
+    def __init__(self, as_json: bool = False, quiet: bool = False) -> None:
+        self.as_json = as_json
+        self.quiet = quiet
+
+    def line(self, text: str = '') -> None:
+        """
+        Print one sentence of the result.
+
+        """
+        if not (self.as_json or self.quiet):
+            print(text)
+
+    def note(self, text: str) -> None:
+        """
+        Print one sentence about the run, on stderr.
+
+        """
+        if not self.quiet:
+            print(f'thermo_comp: {text}', file=sys.stderr)
+
+    def json(self, data: Mapping[str, Any]) -> None:
+        """
+        Print the result for machines; numbers that JSON does not know become null.
+
+        """
+        if self.as_json:
+            print(json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False))
+
+    def table(
+        self, columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = ''
+    ) -> None:
+        """
+        Print a table: with rules and colour on a terminal, as plain aligned columns in a pipe.
+
+        Parameters
+        ----------
+        columns : sequence of str
+            The headings.
+        rows : sequence of sequence of str, int, float or None
+            The cells; numbers are set flush right, None is a dash.
+        title : str, optional
+            A line above the table.
+
+        """
+        if self.as_json or self.quiet:
+            return
+        cells = [[text(cell) for cell in row] for row in rows]
+        right = [
+            any(isinstance(row[i], (int, float)) for row in rows) for i in range(len(columns))
+        ]
+        if sys.stdout.isatty():
+            from rich import box
+            from rich.console import Console
+            from rich.table import Table
+
+            table = Table(
+                title=title or None, title_justify='left', box=box.SIMPLE_HEAD, pad_edge=False
+            )
+            for heading, is_right in zip(columns, right, strict=True):
+                table.add_column(heading, justify='right' if is_right else 'left')
+            for row in cells:
+                table.add_row(*row)
+            Console(highlight=False, markup=False).print(table)
+            return
+        for text_line in aligned(columns, cells, right, title):
+            print(text_line)
+
+    @contextmanager
+    def progress(self, what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
+        """
+        Show a progress bar on a terminal while the body runs.
+
+        Parameters
+        ----------
+        what : str
+            What is being done.
+        total : float or None, optional
+            The amount of work; None where nobody knows.
+
+        Yields
+        ------
+        callable
+            To be called with the total amount done so far.
+
+        """
+        if self.quiet or not sys.stderr.isatty():
+            yield _ignore
+            return
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TaskProgressColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        with Progress(
+            TextColumn('{task.description}'),
+            BarColumn(),
+            TaskProgressColumn(show_speed=True),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        ) as bar:
+            task = bar.add_task(what, total=total)
+            yield lambda done: bar.update(task, completed=done)
+
+
+def _ignore(_done: float) -> None:
+    return
+
+
+def error(message: str) -> None:
+    """
+    Print the one line that a failed command leaves behind.
+
+    """
+    line = ' '.join(message.split())
+    print(f'thermo_comp: error: {line}', file=sys.stderr)
+
+
+def text(cell: Cell) -> str:
+    """
+    Return a table cell as text: at most four significant digits, a dash for nothing.
+
+    """
+    if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
+        return '-'
+    if isinstance(cell, float):
+        digits = 0 if abs(cell) >= 999.5 else 3 - math.floor(math.log10(abs(cell) or 1.0))
+        return f'{cell:.{min(max(digits, 0), 6)}f}'
+    return str(cell)
+
+
+def aligned(
+    columns: Sequence[str], cells: Sequence[Sequence[str]], right: Sequence[bool], title: str = ''
+) -> Iterator[str]:
+    """
+    Yield the lines of a table as plain text, two blanks between columns.
+
+    """
+    widths = [
+        max(len(column), *(len(row[i]) for row in cells)) if cells else len(column)
+        for i, column in enumerate(columns)
+    ]
+    if title:
+        yield title
+    for row in [columns, *cells]:
+        yield '  '.join(
+            cell.rjust(width) if is_right else cell.ljust(width)
+            for cell, width, is_right in zip(row, widths, right, strict=True)
+        ).rstrip()
+
+
+def plain(value: Any) -> Any:
+    """
+    Return a value in JSON's types: arrays as lists, dataclasses as objects, NaN as null.
+
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(item) for item in value]
+    if isinstance(value, (str, bool, type(None))):
+        return value
+    if isinstance(value, os.PathLike):
+        return str(Path(value))
+    if hasattr(value, 'tolist'):  # numpy arrays and scalars, without importing numpy
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, int):
+        return int(value)
+    return str(value)
