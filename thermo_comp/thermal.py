@@ -332,7 +332,12 @@ class ThermalTracker:
             raise ValueError('`state_at` needs a board temperature first')
         flat = self.sample(stamp_ns)
         return ThermalState(
-            *flat[:UNKNOWN],
+            board=flat[BOARD],
+            var_board=flat[VAR_BOARD],
+            rate=flat[RATE],
+            gradient=flat[GRADIENT],
+            var_gradient=flat[VAR_GRADIENT],
+            weight=flat[WEIGHT],
             regime=self.detector.regime,
             direction=self.detector.direction,
             memory=flat[MEMORY::2],
