@@ -1,0 +1,381 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the chamber's program: air temperature as ramps and soaks, ready-made, random or typed in.
+
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .streams import Stream, generator
+
+_MINUTE = 60.0
+_HOUR = 3600.0
+_STEP = re.compile(
+    r'^(?P<target>[+-]?\d+(?:\.\d*)?|[+-]?\.\d+)'
+    r'(?:\s*@\s*(?P<rate>\d+(?:\.\d*)?|\.\d+))?'
+    r'(?:\s+(?P<soak>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>h|min|s))?$'
+)
+_SECONDS = {'h': _HOUR, 'min': _MINUTE, 's': 1.0}
+
+
+@dataclass(frozen=True)
+class Cyclogram:
+    """
+    Air temperature in the chamber over time: straight lines between points.
+
+    Before the first point the air rests at the first temperature, after the last one at the last.
+
+    Parameters
+    ----------
+    time_s : sequence of float, shape (n,)
+        Times of the points from the start of the program, the first 0, strictly increasing, s.
+    temperature_c : sequence of float, shape (n,)
+        Air temperature at the points, degC.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two points, the lengths differ, a value is not finite, or the
+        times do not start at 0 and increase.
+
+    """
+
+    time_s: tuple[float, ...]
+    temperature_c: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'time_s', tuple(float(t) for t in self.time_s))
+        object.__setattr__(self, 'temperature_c', tuple(float(c) for c in self.temperature_c))
+        if len(self.time_s) != len(self.temperature_c) or len(self.time_s) < 2:
+            raise ValueError(
+                '`time_s` and `temperature_c` must have one length of at least 2, got '
+                f'{len(self.time_s)} and {len(self.temperature_c)}'
+            )
+        if not all(math.isfinite(v) for v in self.time_s + self.temperature_c):
+            raise ValueError('`time_s` and `temperature_c` must be finite')
+        if self.time_s[0] != 0.0 or any(np.diff(self.time_s) <= 0.0):
+            raise ValueError('`time_s` must start at 0 and increase')
+
+    @property
+    def duration_s(self) -> float:
+        """
+        Length of the program, s.
+
+        """
+        return self.time_s[-1]
+
+    @property
+    def rates_k_min(self) -> NDArray[np.float64]:
+        """
+        Rate of each line between points, shape (n - 1,), K/min; 0 in a soak.
+
+        """
+        rates: NDArray[np.float64] = np.diff(self.temperature_c) / np.diff(self.time_s)
+        rates *= _MINUTE
+        return rates
+
+    def at(self, time: ArrayLike) -> NDArray[np.float64]:
+        """
+        Return the programmed air temperature.
+
+        Parameters
+        ----------
+        time : array_like, shape (m,)
+            Seconds from the start of the program.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+            Air temperature, degC.
+
+        """
+        return np.interp(np.asarray(time, dtype=float), self.time_s, self.temperature_c)
+
+    def is_ramp(self, time: ArrayLike) -> NDArray[np.bool_]:
+        """
+        Tell where the program is changing the temperature.
+
+        Parameters
+        ----------
+        time : array_like, shape (m,)
+            Seconds from the start of the program.
+
+        Returns
+        -------
+        ndarray of bool, shape (m,)
+            True from the first instant of a ramp up to, not including, its last.
+
+        """
+        time = np.asarray(time, dtype=float)
+        line = np.searchsorted(self.time_s, time, side='right') - 1
+        is_inside = (line >= 0) & (line < len(self.time_s) - 1)
+        rates = self.rates_k_min[np.clip(line, 0, len(self.time_s) - 2)]
+        result: NDArray[np.bool_] = is_inside & (rates != 0.0)
+        return result
+
+    def cut(self, duration: float) -> Cyclogram:
+        """
+        Return the program up to a time, or drawn out to it by resting at its last temperature.
+
+        Parameters
+        ----------
+        duration : float
+            New length, s.
+
+        Returns
+        -------
+        Cyclogram
+            The program of that length.
+
+        Raises
+        ------
+        ValueError
+            If `duration` is not positive.
+
+        """
+        if not duration > 0.0:
+            raise ValueError(f'`duration` must be positive, got {duration}')
+        n = sum(t < duration for t in self.time_s)
+        return Cyclogram(
+            (*self.time_s[:n], duration), (*self.temperature_c[:n], float(self.at(duration)))
+        )
+
+
+def ramps_and_soaks(start: float, soak: float, steps: Sequence[Sequence[float]]) -> Cyclogram:
+    """
+    Build a program from ramps, each followed by a soak.
+
+    Parameters
+    ----------
+    start : float
+        First temperature, degC.
+    soak : float
+        Rest at the first temperature, minutes; 0 starts with the first ramp.
+    steps : sequence of (target, rate, soak)
+        Target temperature [degC], rate [K/min, its sign is ignored], soak there [minutes].
+
+    Returns
+    -------
+    Cyclogram
+        The program.
+
+    Raises
+    ------
+    ValueError
+        If a rate is not positive or a soak is negative.
+
+    """
+    time, temperature = [0.0], [float(start)]
+
+    def hold(minutes: float) -> None:
+        if not minutes >= 0.0:
+            raise ValueError(f'`soak` must not be negative, got {minutes}')
+        if minutes > 0.0:
+            time.append(time[-1] + minutes * _MINUTE)
+            temperature.append(temperature[-1])
+
+    hold(soak)
+    for target, rate, rest in steps:
+        if not abs(rate) > 0.0:
+            raise ValueError(f'`rate` must be positive, got {rate}')
+        if target != temperature[-1]:
+            time.append(time[-1] + abs(target - temperature[-1]) / abs(rate) * _MINUTE)
+            temperature.append(float(target))
+        hold(rest)
+    return Cyclogram(tuple(time), tuple(temperature))
+
+
+def parse_cyclogram(text: str) -> Cyclogram:
+    """
+    Read a program that a user typed.
+
+    Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target
+    in degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is
+    the starting temperature and takes no rate; a later one without a rate keeps the last rate
+    (1 K/min if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
+
+    Parameters
+    ----------
+    text : str
+        The steps, or the name of a preset.
+
+    Returns
+    -------
+    Cyclogram
+        The program.
+
+    Raises
+    ------
+    ValueError
+        If a step cannot be read, with its number and text, or the program has no duration.
+
+    """
+    if text.strip() in _PRESETS:
+        return cyclogram_preset(text.strip())
+    steps: list[tuple[float, float, float]] = []
+    rate = 1.0
+    for number, raw in enumerate(filter(None, map(str.strip, re.split(r'[,;\n]', text))), 1):
+        match = _STEP.match(raw)
+        if match is None or (number == 1 and match['rate']) or match['rate'] == '0':
+            raise ValueError(
+                f"cyclogram step {number} '{raw}' must read TARGET[@RATE] [SOAK], "
+                "e.g. '35@0.5 90min' (the first one without a rate)"
+            )
+        rate = float(match['rate']) if match['rate'] else rate
+        soak = float(match['soak']) * _SECONDS[match['unit']] / _MINUTE if match['soak'] else 0.0
+        steps.append((float(match['target']), rate, soak))
+    if not steps:
+        raise ValueError('cyclogram is empty')
+    return ramps_and_soaks(steps[0][0], steps[0][2], steps[1:])
+
+
+def cyclogram_preset(name: str) -> Cyclogram:
+    """
+    Return a ready-made program.
+
+    Parameters
+    ----------
+    name : str
+        One of `CYCLOGRAM_NAMES`.
+
+    Returns
+    -------
+    Cyclogram
+        The program.
+
+    Raises
+    ------
+    ValueError
+        If there is no such preset.
+
+    """
+    if name not in _PRESETS:
+        raise ValueError(f'`name` must be one of {", ".join(CYCLOGRAM_NAMES)}, got {name!r}')
+    return _PRESETS[name]()
+
+
+def random_cyclogram(
+    seed: int,
+    duration: float = 8 * _HOUR,
+    *,
+    span: tuple[float, float] = (5.0, 35.0),
+    rates: tuple[float, float] = (0.1, 3.0),
+    soaks: tuple[float, float] = (20.0, 90.0),
+) -> Cyclogram:
+    """
+    Draw a program: ramps between random temperatures at random rates, and random soaks.
+
+    Successive ramps mostly alternate in direction and cover at least a fifth of the span.
+
+    Parameters
+    ----------
+    seed : int
+        Same seed, same program.
+    duration : float, optional
+        Length, s; the last ramp or soak is cut there.
+    span : tuple of float, optional
+        Coldest and hottest air, degC.
+    rates : tuple of float, optional
+        Slowest and fastest ramp, K/min, drawn evenly in the logarithm.
+    soaks : tuple of float, optional
+        Shortest and longest soak, minutes.
+
+    Returns
+    -------
+    Cyclogram
+        The program.
+
+    Raises
+    ------
+    ValueError
+        If `duration` or a rate is not positive, or a pair is not in order.
+
+    """
+    if not duration > 0.0:
+        raise ValueError(f'`duration` must be positive, got {duration}')
+    for label, (low, high) in (('span', span), ('rates', rates), ('soaks', soaks)):
+        if not low < high or (label == 'rates' and low <= 0.0):
+            raise ValueError(f'`{label}` must be an increasing pair, got {(low, high)}')
+    rng = generator(seed, Stream.CYCLOGRAM)
+    start = air = rng.uniform(*span)
+    first_soak = minutes = rng.uniform(*soaks)
+    steps = []
+    while minutes < duration / _MINUTE:
+        target = air
+        while abs(target - air) < 0.2 * (span[1] - span[0]):
+            target = rng.uniform(*span)
+        rate = math.exp(rng.uniform(math.log(rates[0]), math.log(rates[1])))
+        rest = rng.uniform(*soaks)
+        steps.append((target, rate, rest))
+        minutes += abs(target - air) / rate + rest
+        air = target
+    return ramps_and_soaks(start, first_soak, steps).cut(duration)
+
+
+def _paper() -> Cyclogram:
+    # The range and the style of the paper's Fig. 3: up, down and back, with long soaks.
+    return ramps_and_soaks(
+        20.0, 60.0, [(35, 0.5, 90), (20, 0.5, 60), (5, 0.5, 90), (20, 0.5, 60), (35, 0.5, 60)]
+    )
+
+
+def _chamber() -> Cyclogram:
+    # Four hours, one bag of a calibration: the whole range, both directions, two ramp rates.
+    return ramps_and_soaks(20.0, 20.0, [(35, 0.75, 35), (5, 0.6, 45), (20, 0.75, 35), (8, 1, 23)])
+
+
+def _held_out() -> Cyclogram:
+    # Other rates, other soak temperatures and another order than 'paper': what a fit never saw.
+    return ramps_and_soaks(
+        12.0, 40.0, [(31, 0.35, 45), (17, 0.9, 30), (26, 0.6, 50), (7, 0.7, 60), (22, 0.25, 40)]
+    )
+
+
+def _staircase() -> Cyclogram:
+    up = [(c, 1.0, 60.0) for c in range(10, 36, 5)]
+    down = [(c, 1.0, 60.0) for c in range(30, 4, -5)]
+    return ramps_and_soaks(5.0, 60.0, up + down)
+
+
+def _triangle() -> Cyclogram:
+    return ramps_and_soaks(20.0, 10.0, [(35, 0.4, 0), (5, 0.4, 0), (35, 0.4, 0), (5, 0.4, 0)])
+
+
+def _slow() -> Cyclogram:
+    return ramps_and_soaks(20.0, 60.0, [(35, 0.1, 60), (5, 0.2, 60), (20, 0.15, 60)])
+
+
+def _fast() -> Cyclogram:
+    return ramps_and_soaks(20.0, 45.0, [(35, 3, 75), (5, 2, 90), (25, 1.5, 75), (10, 3, 60)])
+
+
+def _demo() -> Cyclogram:
+    # Ninety minutes: short enough for a bag that ships, with both regimes and both directions.
+    return ramps_and_soaks(15.0, 12.0, [(30, 1.0, 22), (8, 1.1, 21)])
+
+
+def _soak() -> Cyclogram:
+    return Cyclogram((0.0, 4 * _HOUR), (20.0, 20.0))
+
+
+_PRESETS: dict[str, Callable[[], Cyclogram]] = {
+    'paper': _paper,
+    'chamber': _chamber,
+    'held-out': _held_out,
+    'staircase': _staircase,
+    'triangle': _triangle,
+    'slow': _slow,
+    'fast': _fast,
+    'demo': _demo,
+    'soak': _soak,
+}
+CYCLOGRAM_NAMES = tuple(_PRESETS)

@@ -1,0 +1,489 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns a run: a unit in a chamber over a program, its recorded columns and the truth behind them.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .attitude import Attitude, Handling
+from .cyclogram import Cyclogram
+from .network import ThermalResponse
+from .streams import Stream, generator
+from .unit import MICRO_G, STANDARD_GRAVITY, UnitModel
+
+START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class ChamberRipple:
+    """
+    What the chamber's own regulation leaves on the air temperature.
+
+    Parameters
+    ----------
+    amplitude : float, optional
+        Half of peak to peak, K.
+    period : float, optional
+        Mean period of the regulation, s.
+    wander : float, optional
+        Random walk of the phase, rad per square root of a period.
+
+    Raises
+    ------
+    ValueError
+        If `amplitude` is negative or `period` is not positive.
+
+    """
+
+    amplitude: float = 0.1
+    period: float = 300.0
+    wander: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.amplitude >= 0.0:
+            raise ValueError(f'`amplitude` must not be negative, got {self.amplitude}')
+        if not self.period > 0.0:
+            raise ValueError(f'`period` must be positive, got {self.period}')
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """
+    What really happened, on the thermal grid and at the accelerometer's cycles.
+
+    Parameters
+    ----------
+    unit : UnitModel
+        The unit, with K, M, bias at the reference.
+    gravity : float
+        Local gravity, m/s^2.
+    nodes : tuple of str
+        Parts, the columns of the temperatures.
+    grid_s : ndarray, shape (m,)
+        Instants of the thermal grid from the start of the run, s.
+    air : ndarray, shape (m,)
+        Air temperature, degC.
+    temperatures, rates : ndarray, shape (m, n_parts)
+        Temperatures of the parts, degC, and their derivatives, K/s.
+    bias_grid, scale_grid : ndarray, shape (m, 3)
+        Bias [counts/cycle] and relative scale on the grid.
+    cycle_s : ndarray, shape (n,)
+        Middles of the accelerometer's cycles from the start of the run, s.
+    position : ndarray of int64, shape (n,)
+        Position at rest of each cycle, -1 while handled.
+    specific_force : ndarray, shape (n, 3)
+        Mean specific force over each cycle in the orthogonal frame, m/s^2.
+
+    """
+
+    unit: UnitModel
+    gravity: float
+    nodes: tuple[str, ...]
+    grid_s: NDArray[np.float64]
+    air: NDArray[np.float64]
+    temperatures: NDArray[np.float64]
+    rates: NDArray[np.float64]
+    bias_grid: NDArray[np.float64]
+    scale_grid: NDArray[np.float64]
+    cycle_s: NDArray[np.float64]
+    position: NDArray[np.int64]
+    specific_force: NDArray[np.float64]
+
+    @property
+    def bias(self) -> NDArray[np.float64]:
+        """
+        Bias of each cycle, shape (n, 3), counts/cycle.
+
+        """
+        return _on_cycles(self.bias_grid, self.grid_s, self.cycle_s)
+
+    @property
+    def scale(self) -> NDArray[np.float64]:
+        """
+        Scale of each cycle relative to the one at the reference temperature, shape (n, 3).
+
+        """
+        return _on_cycles(self.scale_grid, self.grid_s, self.cycle_s)
+
+    def temperature(self, node: str) -> NDArray[np.float64]:
+        """
+        Return the temperature of one part on the thermal grid.
+
+        Parameters
+        ----------
+        node : str
+            Part, or 'air'.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+            Temperature, degC.
+
+        """
+        return self.air if node == 'air' else self.temperatures[:, self.nodes.index(node)]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRun:
+    """
+    What a recorder would have stored, and the truth.
+
+    Parameters
+    ----------
+    accel_stamp_ns : ndarray of int64, shape (n,)
+        End of each conversion cycle.
+    counts : ndarray of int32, shape (n, 3)
+        Output of each cycle, counts.
+    board_stamp_ns, case_stamp_ns : ndarray of int64, shape (m,)
+        Instants of the thermometers' readings.
+    board, case : ndarray, shape (m,)
+        Readings, degC.
+    truth : Truth
+        What really happened.
+
+    """
+
+    accel_stamp_ns: NDArray[np.int64]
+    counts: NDArray[np.int32]
+    board_stamp_ns: NDArray[np.int64]
+    board: NDArray[np.float64]
+    case_stamp_ns: NDArray[np.int64]
+    case: NDArray[np.float64]
+    truth: Truth
+
+    @property
+    def is_saturated(self) -> NDArray[np.bool_]:
+        """
+        Cycles with an axis at its rail, shape (n,).
+
+        """
+        converter = self.truth.unit.converter
+        at_rail = (self.counts <= converter.low) | (self.counts >= converter.high)
+        result: NDArray[np.bool_] = at_rail.any(axis=1)
+        return result
+
+
+def simulate(
+    unit: UnitModel,
+    cyclogram: Cyclogram,
+    up: ArrayLike,
+    *,
+    rate_hz: float = 100.0,
+    temperature_rate_hz: float | None = None,
+    seed: int = 0,
+    start_ns: int = START_NS,
+    gravity: float = STANDARD_GRAVITY,
+    warm: bool = True,
+    ripple: ChamberRipple | None = None,
+    switch_s: Sequence[float] | None = None,
+    handling: Handling | None = None,
+    grid_step: float = 1.0,
+) -> SimulatedRun:
+    """
+    Run a unit through a program.
+
+    Parameters
+    ----------
+    unit : UnitModel
+        The unit, e.g. from `unit_preset`.
+    cyclogram : Cyclogram
+        The chamber's program; its length is the run's.
+    up : array_like, shape (3,) or (p, 3)
+        Direction of the specific force at rest in the orthogonal frame of the accelerometer; for
+        several rows the block is handled from one to the next within the run.
+    rate_hz : float, optional
+        Conversion cycles per second. The elementary charge is sized to the cycle, so K in counts
+        per cycle does not depend on it.
+    temperature_rate_hz : float or None, optional
+        Readings per second of both thermometers; None takes each one's own.
+    seed : int, optional
+        Seed of everything random in this run; the specimen has its own.
+    start_ns : int, optional
+        Stamp of the start of the run, ns.
+    gravity : float, optional
+        Local gravity, m/s^2.
+    warm : bool, optional
+        True starts in thermal equilibrium; False switches the unit on at the start.
+    ripple : ChamberRipple or None, optional
+        Regulation of the chamber; None is a perfect one.
+    switch_s : sequence of float or None, optional
+        Starts of the handling between positions, s from the start; None shares the run evenly.
+    handling : Handling or None, optional
+        How the block is handled; None takes the default.
+    grid_step : float, optional
+        Step of the thermal grid, s; bias and scale are straight between its points.
+
+    Returns
+    -------
+    SimulatedRun
+        Columns and truth.
+
+    Raises
+    ------
+    ValueError
+        If a rate or step is not positive, the program is shorter than a cycle, or `up`,
+        `switch_s`, `gravity` or the thermostat's power do not fit (see `Attitude` and
+        `ThermalResponse`).
+
+    """
+    options = _Options(
+        rate_hz,
+        temperature_rate_hz,
+        seed,
+        start_ns,
+        gravity,
+        warm,
+        ripple,
+        switch_s,
+        handling,
+        grid_step,
+    )
+    chamber = _Chamber(unit, cyclogram, up, options)
+    return next(chamber.blocks(chamber.n_cycles))
+
+
+def simulate_blocks(
+    unit: UnitModel,
+    cyclogram: Cyclogram,
+    up: ArrayLike,
+    *,
+    block_size: int = 65536,
+    rate_hz: float = 100.0,
+    temperature_rate_hz: float | None = None,
+    seed: int = 0,
+    start_ns: int = START_NS,
+    gravity: float = STANDARD_GRAVITY,
+    warm: bool = True,
+    ripple: ChamberRipple | None = None,
+    switch_s: Sequence[float] | None = None,
+    handling: Handling | None = None,
+    grid_step: float = 1.0,
+) -> Iterator[SimulatedRun]:
+    """
+    Run a unit through a program in bounded memory: the bits of `simulate`, block by block.
+
+    Parameters
+    ----------
+    unit, cyclogram, up
+        As in `simulate`.
+    block_size : int, optional
+        Cycles per block; the result does not depend on it.
+    rate_hz, ..., grid_step
+        As in `simulate`.
+
+    Returns
+    -------
+    iterator of SimulatedRun
+        Consecutive stretches of the run. A reading of a thermometer is in the block whose cycles
+        it falls among: after the last stamp of the block before, up to the last of its own; those
+        after the very last cycle are in the last block. Each truth holds the whole thermal grid.
+
+    Raises
+    ------
+    ValueError
+        As in `simulate`, or if `block_size` is below 1.
+
+    """
+    if block_size < 1:
+        raise ValueError(f'`block_size` must be at least 1, got {block_size}')
+    options = _Options(
+        rate_hz,
+        temperature_rate_hz,
+        seed,
+        start_ns,
+        gravity,
+        warm,
+        ripple,
+        switch_s,
+        handling,
+        grid_step,
+    )
+    return _Chamber(unit, cyclogram, up, options).blocks(block_size)
+
+
+def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> NDArray[np.bool_]:
+    """
+    Tell where the board really takes up or gives off heat.
+
+    Parameters
+    ----------
+    run : SimulatedRun
+        The run.
+    threshold_k_min : float, optional
+        True rate of the board's temperature above which the state is dynamic, K/min.
+
+    Returns
+    -------
+    ndarray of bool, shape (m,)
+        On the thermal grid of the run.
+
+    """
+    truth = run.truth
+    rate = truth.rates[:, truth.nodes.index(truth.unit.board.node)]
+    result: NDArray[np.bool_] = np.abs(rate) * 60.0 > threshold_k_min
+    return result
+
+
+@dataclass(frozen=True)
+class _Options:
+    rate_hz: float
+    temperature_rate_hz: float | None
+    seed: int
+    start_ns: int
+    gravity: float
+    warm: bool
+    ripple: ChamberRipple | None
+    switch_s: Sequence[float] | None
+    handling: Handling | None
+    grid_step: float
+
+    def __post_init__(self) -> None:
+        for name in ('rate_hz', 'grid_step'):
+            if not (getattr(self, name) > 0.0 and math.isfinite(getattr(self, name))):
+                raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
+
+
+class _Chamber:
+    """
+    The whole run prepared: thermal truth on its grid, thermometers read; cycles still to come.
+
+    """
+
+    def __init__(
+        self, unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, options: _Options
+    ) -> None:
+        duration = cyclogram.duration_s
+        self.n_cycles = math.floor(duration * options.rate_hz * (1.0 + 1e-12))
+        if self.n_cycles < 1:
+            raise ValueError(f'the program of {duration} s is shorter than one cycle')
+        self._unit, self._options = unit, options
+        handling = options.handling or Handling()
+        n_positions = 1 if np.ndim(up) == 1 else len(np.asarray(up))
+        switch_s = options.switch_s
+        if switch_s is None:
+            switch_s = [duration * k / n_positions for k in range(1, n_positions)]
+        self._attitude = Attitude(up, switch_s, options.gravity, handling)
+
+        knots, air = _knots(cyclogram, options)
+        response = ThermalResponse(
+            unit.network, knots, air, followers=unit.drift.followers, is_warm=options.warm
+        )
+        n_grid = math.ceil(duration / options.grid_step) + 1
+        self._grid: NDArray[np.float64] = np.arange(n_grid, dtype=float) * options.grid_step
+        self._air = np.interp(self._grid, knots, air)
+        states = response.states(self._grid)
+        n_nodes = len(unit.network.nodes)
+        self._temperatures = states[:, :n_nodes]
+        self._rates = response.derivative(states, self._air)[:, :n_nodes]
+        bias_ug, scale = unit.drift.evaluate(unit.network, states, unit.origin)
+        K = np.array(unit.scale_factor)
+        self._bias = np.array(unit.bias_at_reference) + bias_ug * (K * MICRO_G)
+        self._scale = 1.0 + scale
+
+        if options.temperature_rate_hz is not None:
+            unit = unit.with_thermometers(rate_hz=options.temperature_rate_hz)
+        self._board = unit.board.read(
+            response, duration, options.seed, Stream.BOARD_NOISE, Stream.BOARD_OUTLIERS
+        )
+        self._case = unit.case.read(
+            response, duration, options.seed, Stream.CASE_NOISE, Stream.CASE_OUTLIERS
+        )
+
+    def blocks(self, block_size: int) -> Iterator[SimulatedRun]:
+        unit, options = self._unit, self._options
+        seed, rate = options.seed, options.rate_hz
+        K = np.array(unit.scale_factor)
+        to_axes = np.linalg.inv(unit.M)
+        # A mean over one cycle of white noise: density times the root of the cycle rate.
+        noise_sd = np.array(unit.noise_density) * MICRO_G * K * math.sqrt(rate)
+        noise = [generator(seed, Stream.ACCEL_NOISE, i) for i in range(3)]
+        vibration = [generator(seed, Stream.HANDLING, i) for i in range(3)]
+        remainder = unit.converter.start(seed)
+        passed = -1
+        for first in range(0, self.n_cycles, block_size):
+            last = min(first + block_size, self.n_cycles)
+            cycle = np.arange(first, last)
+            stamp_ns = np.rint((cycle + 1.0) * (_NS / rate)).astype(np.int64)
+            truth = self._truth((cycle + 0.5).astype(np.float64) / rate, vibration)
+            # Column by column: the sums of a matrix product may depend on the number of rows.
+            s = sum(truth.specific_force[:, [j]] * to_axes[:, j] for j in range(3))
+            charge = truth.bias + K * truth.scale * s
+            for i in range(3):
+                charge[:, i] += noise_sd[i] * noise[i].standard_normal(len(cycle))
+            counts, remainder = unit.converter.convert(charge, remainder)
+            until = np.iinfo(np.int64).max if last == self.n_cycles else int(stamp_ns[-1])
+            board_ns, board = _between(self._board, passed, until)
+            case_ns, case = _between(self._case, passed, until)
+            passed = until
+            start = options.start_ns
+            yield SimulatedRun(
+                accel_stamp_ns=stamp_ns + start,
+                counts=counts,
+                board_stamp_ns=board_ns + start,
+                board=board,
+                case_stamp_ns=case_ns + start,
+                case=case,
+                truth=truth,
+            )
+
+    def _truth(self, cycle_s: NDArray[np.float64], vibration: list[np.random.Generator]) -> Truth:
+        return Truth(
+            unit=self._unit,
+            gravity=self._options.gravity,
+            nodes=self._unit.network.nodes,
+            grid_s=self._grid,
+            air=self._air,
+            temperatures=self._temperatures,
+            rates=self._rates,
+            bias_grid=self._bias,
+            scale_grid=self._scale,
+            cycle_s=cycle_s,
+            position=self._attitude.position(cycle_s),
+            specific_force=self._attitude.specific_force(cycle_s, vibration),
+        )
+
+
+def _knots(
+    cyclogram: Cyclogram, options: _Options
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    time = np.array(cyclogram.time_s)
+    ripple = options.ripple
+    if ripple is not None and ripple.amplitude > 0.0:
+        # A wandering sine through twelve straight lines per period.
+        step = ripple.period / 12.0
+        fine = np.arange(math.ceil(time[-1] / step)) * step
+        rng = generator(options.seed, Stream.CHAMBER_RIPPLE)
+        walk = rng.standard_normal(len(fine)) * (ripple.wander / math.sqrt(12.0))
+        walk[:1] = 2.0 * math.pi * rng.random(1)
+        wave = ripple.amplitude * np.sin(np.cumsum(walk) + 2.0 * math.pi * fine / ripple.period)
+        time = np.unique(np.concatenate([time, fine]))
+        return time, cyclogram.at(time) + np.interp(time, fine, wave)
+    return time, cyclogram.at(time)
+
+
+def _on_cycles(
+    grid: NDArray[np.float64], grid_s: NDArray[np.float64], cycle_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    # One arithmetic per cycle, whatever the block: not np.interp, which prepares slopes or not.
+    place = cycle_s / grid_s[1]
+    left = np.minimum(place.astype(np.int64), len(grid_s) - 2)
+    share = (place - left)[:, None]
+    result: NDArray[np.float64] = (1.0 - share) * grid[left] + share * grid[left + 1]
+    return result
+
+
+def _between(
+    readings: tuple[NDArray[np.int64], NDArray[np.float64]], after: int, until: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    first, last = np.searchsorted(readings[0], (after, until), side='right')
+    return readings[0][first:last], readings[1][first:last]

@@ -1,0 +1,55 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the random numbers: one independent stream per error source and axis, from one seed.
+
+Switching a source on or off, or asking for other block sizes, leaves every other stream as it was.
+
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Stream(IntEnum):
+    """
+    Error sources; the numbers are part of what a seed means and never change.
+
+    """
+
+    ACCEL_NOISE = 0
+    CONVERTER_PHASE = 1
+    BOARD_NOISE = 2
+    CASE_NOISE = 3
+    BOARD_OUTLIERS = 4
+    CASE_OUTLIERS = 5
+    CHAMBER_RIPPLE = 6
+    HANDLING = 7
+    UNIT = 8
+    POSITIONS = 9
+    CYCLOGRAM = 10
+
+
+def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
+    """
+    Return the generator of one source.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the run, not negative.
+    stream : Stream
+        Error source.
+    axis : int, optional
+        Axis, or another running number within the source.
+
+    Returns
+    -------
+    numpy.random.Generator
+        A fresh generator at the start of its stream.
+
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
