@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the small calibrations and blocks that the tests of the core are built on.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thermo_comp.calibration import (
+    Axes,
+    AxisReference,
+    AxisSet,
+    Calibration,
+    LinearTerm,
+    MemoryTerm,
+    RegimeSet,
+    Unit,
+)
+from thermo_comp.functions import Polynomial
+
+GRAVITY = 9.80665
+SECOND_NS = 1_000_000_000
+
+
+def axis_set(bias=(0.0,), scale=(1.0,), **keys):
+    return AxisSet(Polynomial(tuple(bias)), Polynomial(tuple(scale)), **keys)
+
+
+def regime_set(x=None, y=None, z=None, **keys):
+    ranges = {'temperature_range_c': (5.0, 35.0), 'rate_range_k_min': (-1.0, 1.0), **keys}
+    return RegimeSet(x=x or axis_set(), y=y or axis_set(), z=z or axis_set(), **ranges)
+
+
+def calibration(**keys):
+    """A unit of 300 counts per m/s^2; with no arguments it only scales."""
+    values = {
+        'format_version': 1,
+        'unit': Unit('T-1', 'counts', 32767.0, 0.01),
+        'reference_temperature_c': 20.0,
+        'gravity_m_s2': GRAVITY,
+        'axes': Axes(*[AxisReference(300.0, 0.0)] * 3),
+        'static': regime_set(),
+        'dynamic': regime_set(),
+        'noise_density_m_s2_sqrt_hz': (1e-4, 1e-4, 1e-4),
+        **keys,
+    }
+    return Calibration(**values)
+
+
+def rich_calibration():
+    """Every term at work, on every axis, in both regimes, with a covariance."""
+
+    def one(sign, dynamic):
+        size = 2 if dynamic else 1
+        bias = (0.0, *(sign * 0.3 / k for k in range(1, size + 1)))
+        scale = (1.0, *(sign * 7e-5 / k for k in range(1, size + 1)))
+        n = len(bias) + len(scale) - 2 + 2 * 5
+        rows = tuple(tuple(1e-8 if i == j else 1e-10 for j in range(i + 1)) for i in range(n))
+        return axis_set(
+            bias,
+            scale,
+            delta=sign * 0.2 * size,
+            gradient=LinearTerm(0.5 * sign, 2e-5),
+            rate=LinearTerm(3.0, 1e-3 * sign),
+            memory=MemoryTerm((0.1, -0.05), (1e-6, 2e-6 * sign)),
+            residual_sd_m_s2=1e-5 * size,
+            covariance=rows,
+        )
+
+    return calibration(
+        axes=Axes(AxisReference(300.0, 5.0), AxisReference(-295.0, -3.0), AxisReference(310, 1)),
+        static=regime_set(one(1, False), one(-1, False), one(1, False)),
+        dynamic=regime_set(one(-1, True), one(1, True), one(-1, True)),
+        misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (-2e-3, 3e-4, 1.0)),
+        misalignment_sd=(1e-6, 1e-6, 2e-6),
+        memory_time_constants_s=(600.0, 2400.0),
+    )
+
+
+@dataclass
+class Columns:
+    """Columns in file order, as a recording gives them."""
+
+    accel_stamp_ns: np.ndarray
+    accel: np.ndarray
+    board_stamp_ns: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+    board: np.ndarray = field(default_factory=lambda: np.empty(0))
+    board_after: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+    case_stamp_ns: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+    case: np.ndarray = field(default_factory=lambda: np.empty(0))
+    case_after: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+
+
+def columns_from_events(events):
+    """
+    Columns from (kind, stamp_ns, value) in file order; kind is 'accel', 'board' or 'case'.
+
+    """
+    accel = [(s, v) for kind, s, v in events if kind == 'accel']
+    readings = {'board': ([], [], []), 'case': ([], [], [])}
+    n_accel = 0
+    for kind, stamp, value in events:
+        if kind == 'accel':
+            n_accel += 1
+        else:
+            for column, item in zip(readings[kind], (stamp, value, n_accel), strict=True):
+                column.append(item)
+    board, case = readings['board'], readings['case']
+    return Columns(
+        np.array([s for s, _ in accel], dtype=np.int64),
+        np.array([v for _, v in accel], dtype=float).reshape(-1, 3),
+        np.array(board[0], dtype=np.int64),
+        np.array(board[1], dtype=float),
+        np.array(board[2], dtype=np.int64),
+        np.array(case[0], dtype=np.int64),
+        np.array(case[1], dtype=float),
+        np.array(case[2], dtype=np.int64),
+    )

@@ -1,0 +1,392 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the batch form of the compensator: whole columns at once, with the stream's bits.
+
+The thermal side runs reading by reading through the same tracker; only what it gives at the
+segments' ends is gathered, evaluated for all segments together and applied to all samples with
+the operations of `Compensator.process` in their order.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from .compensator import Compensator
+
+Floats = npt.NDArray[np.float64]
+Stamps = npt.NDArray[np.int64]
+
+#: Longest time over which bias and scale are taken as linear in time.
+SEGMENT_NS = 1_000_000_000
+#: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
+TIME_JUMP_NS = 1_000_000_000
+#: Samples corrected at a time, so that the columns in work stay in the cache.
+_CHUNK = 16384
+
+
+class AccelBlock(Protocol):
+    """
+    Columns of a run of messages in file order.
+
+    `board_after[k]` and `case_after[k]` say how many of the block's samples come before reading k.
+
+    """
+
+    @property
+    def accel_stamp_ns(self) -> Stamps:
+        """
+        Stamps of the samples, shape (n,).
+
+        """
+
+    @property
+    def accel(self) -> Floats:
+        """
+        Samples in the calibration's input unit, shape (n, 3).
+
+        """
+
+    @property
+    def board_stamp_ns(self) -> Stamps:
+        """
+        Stamps of the board readings, shape (m,).
+
+        """
+
+    @property
+    def board(self) -> Floats:
+        """
+        Board readings [degC], shape (m,).
+
+        """
+
+    @property
+    def board_after(self) -> Stamps:
+        """
+        Samples before each board reading, shape (m,).
+
+        """
+
+    @property
+    def case_stamp_ns(self) -> Stamps:
+        """
+        Stamps of the case readings, shape (k,).
+
+        """
+
+    @property
+    def case(self) -> Floats:
+        """
+        Case readings [degC], shape (k,).
+
+        """
+
+    @property
+    def case_after(self) -> Stamps:
+        """
+        Samples before each case reading, shape (k,).
+
+        """
+
+
+@dataclass(frozen=True)
+class CompensatedBlock:
+    """
+    The published samples of a block.
+
+    """
+
+    #: Which samples of the block these are, shape (n,).
+    index: npt.NDArray[np.int64]
+    stamp_ns: Stamps
+    #: [m/s^2], shape (n, 3).
+    specific_force: Floats
+    #: Row-major 3x3 [m^2/s^4], shape (n, 9).
+    covariance: Floats
+
+
+@dataclass(slots=True)
+class _Segments:
+    """
+    The segments of a block: where each begins and ends, and the thermal states at both ends.
+
+    """
+
+    start_ns: list[int]
+    first: list[int]
+    after: list[int]
+    states: list[tuple[float, ...]]
+    end_states: list[tuple[float, ...]]
+
+
+def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
+    """
+    Correct a block of samples; see `Compensator.process_block`.
+
+    """
+    stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
+    before = np.maximum.accumulate(np.concatenate(([compensator.last_ns], stamps)))[:-1]
+    in_order = stamps > before
+    if np.any(stamps <= before - TIME_JUMP_NS):
+        return _one_by_one(compensator, block)
+    compensator.counters.n_out_of_order += int(len(stamps) - np.count_nonzero(in_order))
+    if in_order.all():
+        index = np.arange(len(stamps), dtype=np.int64)
+        samples = np.asarray(block.accel, dtype=np.float64)
+    else:
+        index = np.flatnonzero(in_order)
+        stamps = stamps[index]
+        samples = np.asarray(block.accel, dtype=np.float64)[index]
+    segments = _run_thermal_side(compensator, block, stamps, in_order)
+    if len(stamps):
+        compensator.last_ns = int(stamps[-1])
+    return _apply(compensator, segments, index, stamps, samples)
+
+
+def _one_by_one(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
+    """
+    Process a block in which time jumps: rare, so the stream's own code serves.
+
+    """
+    events = [
+        (int(after), 0, int(s), float(v))
+        for after, s, v in zip(block.board_after, block.board_stamp_ns, block.board, strict=True)
+    ]
+    events += [
+        (int(after), 1, int(s), float(v))
+        for after, s, v in zip(block.case_after, block.case_stamp_ns, block.case, strict=True)
+    ]
+    events.sort(key=lambda event: event[0])
+    push = (compensator.push_board, compensator.push_case)
+    index, rows = [], []
+    k = 0
+    stamps = block.accel_stamp_ns.tolist()
+    for i, (stamp_ns, sample) in enumerate(zip(stamps, block.accel.tolist(), strict=True)):
+        while k < len(events) and events[k][0] <= i:
+            push[events[k][1]](events[k][2], events[k][3])
+            k += 1
+        row = compensator.process(stamp_ns, *sample)
+        if row is not None:
+            index.append(i)
+            rows.append(row)
+    for _, kind, stamp_ns, celsius in events[k:]:
+        push[kind](stamp_ns, celsius)
+    where = np.array(index, dtype=np.int64)
+    table = np.array(rows).reshape(-1, 9)
+    return CompensatedBlock(
+        where,
+        np.asarray(block.accel_stamp_ns)[where],
+        table[:, :3],
+        table[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]],
+    )
+
+
+def _run_thermal_side(
+    compensator: Compensator,
+    block: AccelBlock,
+    stamps: Stamps,
+    in_order: npt.NDArray[np.bool_],
+) -> _Segments:
+    segments = _Segments([], [], [], [], [])
+    n_samples = len(stamps)
+    # A reading takes effect at the first sample that is not before it and that comes after it.
+    kept_before = np.concatenate(([0], np.cumsum(in_order)))
+    pending = compensator.take_pending()
+    reading_ns = [np.array([entry[0] for entry in pending], dtype=np.int64)]
+    kinds = [np.array([entry[1] for entry in pending], dtype=np.int64)]
+    orders = [np.array([entry[2] for entry in pending], dtype=np.int64)]
+    values = [np.array([entry[3] for entry in pending])]
+    after = [np.zeros(len(pending), dtype=np.int64)]
+    for kind, (s, v, a) in enumerate(
+        (
+            (block.board_stamp_ns, block.board, block.board_after),
+            (block.case_stamp_ns, block.case, block.case_after),
+        )
+    ):
+        reading_ns.append(np.asarray(s, dtype=np.int64))
+        kinds.append(np.full(len(s), kind))
+        # Behind whatever was pushed before: only the order within one sensor and stamp counts.
+        orders.append(np.arange(len(s)) + (1 << 60))
+        values.append(np.asarray(v, dtype=np.float64))
+        after.append(kept_before[np.asarray(a, dtype=np.int64)])
+    reading_stamps = np.concatenate(reading_ns)
+    kind_column = np.concatenate(kinds)
+    value_column = np.concatenate(values)
+    effect = np.maximum(
+        np.searchsorted(stamps, reading_stamps, side='left'), np.concatenate(after)
+    )
+    order = np.lexsort((np.concatenate(orders), kind_column, reading_stamps, effect))
+    events = zip(
+        effect[order].tolist(),
+        reading_stamps[order].tolist(),
+        kind_column[order].tolist(),
+        value_column[order].tolist(),
+        strict=True,
+    )
+    position = 0
+    for at, stamp_ns, kind, celsius in events:
+        if at > position:
+            _add_segments(compensator, segments, stamps, position, min(at, n_samples))
+            position = at
+        if at >= n_samples:
+            (compensator.push_board, compensator.push_case)[kind](stamp_ns, celsius)
+        else:
+            compensator.apply_reading(stamp_ns, kind, celsius)
+    if position < n_samples:
+        _add_segments(compensator, segments, stamps, position, n_samples)
+    return segments
+
+
+def _add_segments(
+    compensator: Compensator, segments: _Segments, stamps: Stamps, first: int, after: int
+) -> None:
+    """
+    Add the segments of samples first..after, over which no reading takes effect.
+
+    """
+    tracker = compensator.tracker
+    board_ns, updated_ns = tracker.board.stamp_ns, tracker.updated_ns
+    if board_ns is None or updated_ns is None:
+        compensator.counters.n_no_temperature += after - first
+        return
+    if int(stamps[after - 1]) - board_ns > compensator.timeout_ns:
+        fresh = int(
+            np.searchsorted(stamps[first:after], board_ns + compensator.timeout_ns, 'right')
+        )
+        compensator.counters.n_stale += after - first - fresh
+        after = first + fresh
+    while first < after:
+        start_ns = updated_ns + (int(stamps[first]) - updated_ns) // SEGMENT_NS * SEGMENT_NS
+        end_ns = start_ns + SEGMENT_NS
+        if int(stamps[after - 1]) < end_ns:
+            stop = after
+        else:
+            stop = first + int(np.searchsorted(stamps[first:after], end_ns, 'left'))
+        segments.start_ns.append(start_ns)
+        segments.first.append(first)
+        segments.after.append(stop)
+        segments.states.append(tracker.sample(start_ns))
+        segments.end_states.append(tracker.sample(end_ns))
+        first = stop
+
+
+def _apply(
+    compensator: Compensator,
+    segments: _Segments,
+    index: npt.NDArray[np.int64],
+    stamps: Stamps,
+    samples: Floats,
+) -> CompensatedBlock:
+    if not segments.start_ns:
+        return CompensatedBlock(index[:0], stamps[:0], np.empty((0, 3)), np.empty((0, 9)))
+    starts = tuple(np.array(segments.states).T.copy())
+    ends = tuple(np.array(segments.end_states).T.copy())
+    at_start = compensator.correction.bias_scale(starts)
+    at_end = compensator.correction.bias_scale(ends)
+    columns: list[npt.NDArray[Any]] = [np.array(segments.start_ns, dtype=np.int64)]
+    for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
+        columns += [bias, bias_end - bias, scale, scale_end - scale]
+    for axis in compensator.correction.variance(ends):
+        columns += axis
+    first = np.array(segments.first)
+    counts = np.array(segments.after) - first
+    n = int(counts.sum())
+    # The columns stand one after the other in memory: each is written in one run.
+    force = np.empty((3, n)).T
+    covariance = np.empty((9, n)).T
+    keep = np.ones(n, dtype=bool)
+    source = _covered(first, counts, len(stamps))
+    ends_at = np.cumsum(counts)
+    low = 0
+    begin = 0
+    while begin < n:
+        # Whole segments, about a cache's worth of them.
+        high = max(int(np.searchsorted(ends_at, begin + _CHUNK, 'right')), low + 1)
+        end = int(ends_at[high - 1])
+        rows = source[begin:end] if source is not None else slice(begin, end)
+        with np.errstate(invalid='ignore', over='ignore'):
+            # What is not finite is corrected like the rest and then left out.
+            _correct(
+                compensator,
+                [column[low:high] for column in columns],
+                counts[low:high],
+                stamps[rows],
+                samples[rows],
+                force[begin:end],
+                covariance[begin:end],
+                keep[begin:end],
+            )
+        low, begin = high, end
+    if source is not None:
+        index, stamps = index[source], stamps[source]
+    if not keep.all():
+        index, stamps = index[keep], stamps[keep]
+        force, covariance = force[keep], covariance[keep]
+    compensator.counters.n_out += len(index)
+    return CompensatedBlock(index, stamps, force, covariance)
+
+
+def _covered(
+    first: npt.NDArray[np.int64], counts: npt.NDArray[np.int64], n_samples: int
+) -> npt.NDArray[np.int64] | None:
+    """
+    Find the samples that lie in a segment; None when all do.
+
+    """
+    if int(counts.sum()) == n_samples:
+        return None
+    return np.concatenate([np.arange(f, f + c) for f, c in zip(first, counts, strict=True)])
+
+
+def _correct(
+    compensator: Compensator,
+    columns: list[npt.NDArray[Any]],
+    counts: npt.NDArray[np.int64],
+    stamps: Stamps,
+    samples: Floats,
+    force: Floats,
+    covariance: Floats,
+    keep: npt.NDArray[np.bool_],
+) -> None:
+    full_scale = compensator.calibration.unit.full_scale
+    spread = [np.repeat(column, counts) for column in columns]
+    dt = (stamps - spread[0]) * 1e-9
+    good = np.ones(len(stamps), dtype=bool)
+    axes = []
+    for i in range(3):
+        raw = samples[:, i]
+        good &= (-full_scale < raw) & (raw < full_scale)
+        bias, bias_slope, scale, scale_slope = spread[1 + 4 * i : 5 + 4 * i]
+        axes.append((raw - (bias + bias_slope * dt)) / (scale + scale_slope * dt))
+    if not good.all():
+        finite = np.isfinite(samples).all(axis=1)
+        compensator.counters.n_saturated += int(np.count_nonzero(~good & finite))
+        compensator.counters.n_not_finite += int(np.count_nonzero(~finite))
+        keep &= good
+    x, y, z = axes
+    vx, vy, vz = (
+        a + value * (b + value * c)
+        for value, (a, b, c) in zip(
+            axes, (spread[13:16], spread[16:19], spread[19:22]), strict=True
+        )
+    )
+    yx, zx, zy, var_yx, var_zx, var_zy = compensator.misalignment
+    xx = x * x
+    cxy = yx * vx
+    cxz = zx * vx
+    force[:, 0] = x
+    force[:, 1] = yx * x + y
+    force[:, 2] = zx * x + zy * y + z
+    covariance[:, 0] = vx
+    covariance[:, 1] = covariance[:, 3] = cxy
+    covariance[:, 2] = covariance[:, 6] = cxz
+    covariance[:, 4] = yx * cxy + vy + xx * var_yx
+    covariance[:, 5] = covariance[:, 7] = yx * cxz + zy * vy
+    covariance[:, 8] = zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy

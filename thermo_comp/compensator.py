@@ -1,0 +1,500 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns (counts, temperatures) -> (specific force, covariance, regime, status), streaming and batch.
+
+Between two thermal events the bias and the scale of each axis move linearly in time. An event is
+a temperature reading or, while none comes, the end of a one-second segment; there the correction
+is evaluated in full (at the segment's start and end), so a sample costs a few operations, follows
+the temperature without a staircase, and a batch needs the full evaluation once per segment.
+
+A reading takes effect at the first sample whose stamp is not before its own and that comes after
+it; so the result depends on stamps and order of arrival, not on when the code happened to run,
+and a node that got everything in order publishes the bits that the offline replay writes.
+
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass, replace
+
+from . import thermal
+from .batch import SEGMENT_NS, TIME_JUMP_NS, AccelBlock, CompensatedBlock, process_block
+from .calibration import Calibration
+from .correction import Correction
+from .regime import Regime
+from .thermal import ThermalConfig, ThermalTracker
+
+#: The board temperature is called stale beyond this many of its usual intervals.
+STALE_INTERVALS = 5.0
+
+#: Readings that wait for samples: more than this means that their clock is not the samples'.
+PENDING_LIMIT = 4096
+
+#: Later than any stamp, earlier than any stamp.
+_NEVER_NS = 1 << 62
+_EVER_NS = -(1 << 62)
+
+#: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
+Corrected = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class CompensatorConfig:
+    """
+    What the user sets beside the calibration.
+
+    Parameters
+    ----------
+    transition_time_s : float
+        Time over which the sets cross over after a switch [s]; 0 = the paper's hard switch.
+    temperature_timeout_s : float
+        Age of the board temperature at which nothing is published any more [s].
+    case_timeout_s : float
+        Age of the case temperature at which the regime falls back to the board sensor [s].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range.
+
+    """
+
+    transition_time_s: float = 30.0
+    temperature_timeout_s: float = 60.0
+    case_timeout_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.temperature_timeout_s < math.inf:
+            raise ValueError(
+                f'`temperature_timeout_s` must be positive, got {self.temperature_timeout_s}'
+            )
+        ThermalConfig(self.transition_time_s, self.case_timeout_s)
+
+
+@dataclass(slots=True)
+class Counters:
+    """
+    What came in and why some of it did not go out.
+
+    """
+
+    n_out: int = 0
+    n_not_finite: int = 0
+    n_saturated: int = 0
+    n_out_of_order: int = 0
+    n_no_temperature: int = 0
+    n_stale: int = 0
+    n_board: int = 0
+    n_board_rejected: int = 0
+    n_case: int = 0
+    n_case_rejected: int = 0
+    n_time_jumps: int = 0
+
+    @property
+    def n_dropped(self) -> int:
+        """
+        Samples that came in and did not go out.
+
+        """
+        return (
+            self.n_not_finite
+            + self.n_saturated
+            + self.n_out_of_order
+            + self.n_no_temperature
+            + self.n_stale
+        )
+
+    @property
+    def n_in(self) -> int:
+        """
+        Samples that came in.
+
+        """
+        return self.n_out + self.n_dropped
+
+
+@dataclass(frozen=True, slots=True)
+class CompensatorStatus:
+    """
+    Snapshot for diagnostics.
+
+    """
+
+    counters: Counters
+    stamp_ns: int | None
+    #: None until there is a board temperature.
+    state: thermal.ThermalState | None
+    #: Ages of the last used readings at the last sample [s]; infinite when there was none.
+    board_age_s: float
+    case_age_s: float
+    is_board_stale: bool
+    is_board_lost: bool
+    is_case_lost: bool
+    #: How far outside the calibrated ranges, in half ranges; 0 inside.
+    relative_excess: float
+    #: Board temperature beyond the calibrated range [K], signed; rate beyond [K/min].
+    temperature_excess_k: float
+    rate_excess_k_min: float
+
+
+class Compensator:
+    """
+    Corrects one unit's samples, one by one.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The unit.
+    config : CompensatorConfig, optional
+        The user's settings.
+
+    """
+
+    def __init__(self, calibration: Calibration, config: CompensatorConfig | None = None) -> None:
+        self.config = config or CompensatorConfig()
+        self.counters = Counters()
+        self._pending: list[tuple[int, int, int, float]] = []
+        self._n_pushed = 0
+        self._flags: list[tuple[int, bool]] = []
+        self._use(calibration)
+        self.tracker = ThermalTracker(
+            calibration.detector, calibration.memory_time_constants_s, self._thermal_config()
+        )
+        self.last_ns = _EVER_NS
+        self._event_ns = _EVER_NS
+
+    def _use(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.correction = Correction(calibration)
+        self._full_scale = calibration.unit.full_scale
+        M = calibration.misalignment
+        sd = calibration.misalignment_sd
+        self.misalignment = (M[1][0], M[2][0], M[2][1], *(value * value for value in sd))
+
+    def _thermal_config(self) -> ThermalConfig:
+        return ThermalConfig(
+            self.config.transition_time_s,
+            self.config.case_timeout_s,
+            self.calibration.board_lag_s,
+        )
+
+    def push_board(self, stamp_ns: int, celsius: float) -> None:
+        """
+        Queue a board temperature [degC]; it takes effect at the first sample not before it.
+
+        """
+        self._push(stamp_ns, 0, celsius)
+
+    def push_case(self, stamp_ns: int, celsius: float) -> None:
+        """
+        Queue a case temperature [degC]; it takes effect at the first sample not before it.
+
+        """
+        self._push(stamp_ns, 1, celsius)
+
+    def _push(self, stamp_ns: int, kind: int, celsius: float) -> None:
+        if len(self._pending) >= PENDING_LIMIT:
+            self._count_rejected(kind)
+            return
+        # Ties: the board first, so that the detector decides with the newest of both.
+        heapq.heappush(self._pending, (stamp_ns, kind, self._n_pushed, celsius))
+        self._n_pushed += 1
+        self._event_ns = min(self._event_ns, stamp_ns)
+
+    def process(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
+        """
+        Correct one sample.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp.
+        x, y, z : float
+            The raw sample, in the calibration's input unit.
+
+        Returns
+        -------
+        tuple of 9 floats or None
+            Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4];
+            None where nothing must be published, with the reason counted in `counters`.
+
+        """
+        if not self.last_ns < stamp_ns < self._event_ns and not self._advance(stamp_ns):
+            return None
+        self.last_ns = stamp_ns
+        full_scale = self._full_scale
+        if not (
+            -full_scale < x < full_scale
+            and -full_scale < y < full_scale
+            and -full_scale < z < full_scale
+        ):
+            self._count_bad(x, y, z)
+            return None
+        (
+            (start_ns, bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1),
+            (ax, lx, qx, ay, ly, qy, az, lz, qz),
+            (yx, zx, zy, var_yx, var_zx, var_zy),
+        ) = self._segment
+        dt = (stamp_ns - start_ns) * 1e-9
+        x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
+        y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
+        z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)
+        vx = ax + x * (lx + x * qx)
+        vy = ay + y * (ly + y * qy)
+        vz = az + z * (lz + z * qz)
+        xx = x * x
+        cxy = yx * vx
+        cxz = zx * vx
+        self.counters.n_out += 1
+        return (
+            x,
+            yx * x + y,
+            zx * x + zy * y + z,
+            vx,
+            cxy,
+            cxz,
+            yx * cxy + vy + xx * var_yx,
+            yx * cxz + zy * vy,
+            zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy,
+        )
+
+    def _count_bad(self, x: float, y: float, z: float) -> None:
+        if math.isfinite(x) and math.isfinite(y) and math.isfinite(z):
+            self.counters.n_saturated += 1
+        else:
+            self.counters.n_not_finite += 1
+
+    def _advance(self, stamp_ns: int) -> bool:
+        """
+        Bring the thermal state and the segment to a stamp; False where no sample may go out.
+
+        """
+        if not self._admit(stamp_ns):
+            return False
+        while self._pending and self._pending[0][0] <= stamp_ns:
+            reading_ns, kind, _, celsius = heapq.heappop(self._pending)
+            self.apply_reading(reading_ns, kind, celsius)
+        return self._enter_segment(stamp_ns)
+
+    def _admit(self, stamp_ns: int) -> bool:
+        if stamp_ns > self.last_ns:
+            return True
+        if stamp_ns > self.last_ns - TIME_JUMP_NS:
+            self.counters.n_out_of_order += 1
+            return False
+        # Readings of the old time that no sample reached belong to the time that is gone.
+        self._pending = [entry for entry in self._pending if entry[0] <= stamp_ns]
+        heapq.heapify(self._pending)
+        self.tracker.reset()
+        self.counters.n_time_jumps += 1
+        return True
+
+    def apply_reading(self, stamp_ns: int, kind: int, celsius: float) -> None:
+        """
+        Let a reading take effect now: kind 0 is the board, 1 the case.
+
+        """
+        counters = self.counters
+        if kind == 0:
+            if self.tracker.board_reading(stamp_ns, celsius):
+                counters.n_board += 1
+            else:
+                self._count_rejected(kind)
+        elif self.tracker.case_reading(stamp_ns, celsius):
+            counters.n_case += 1
+            if self.tracker.detector.regime != Regime.UNKNOWN:
+                self._flags.append((stamp_ns, self.tracker.detector.regime == Regime.DYNAMIC))
+        else:
+            self._count_rejected(kind)
+
+    def _count_rejected(self, kind: int) -> None:
+        if kind == 0:
+            self.counters.n_board_rejected += 1
+        else:
+            self.counters.n_case_rejected += 1
+
+    def _enter_segment(self, stamp_ns: int) -> bool:
+        tracker = self.tracker
+        board_ns = tracker.board.stamp_ns
+        updated_ns = tracker.updated_ns
+        next_ns = self._pending[0][0] if self._pending else _NEVER_NS
+        if board_ns is None or updated_ns is None:
+            self.counters.n_no_temperature += 1
+            # Every sample comes back here until there is a temperature, and is counted here.
+            self._event_ns = _EVER_NS
+            self.last_ns = stamp_ns
+            return False
+        if stamp_ns - board_ns > self.timeout_ns:
+            self.counters.n_stale += 1
+            self._event_ns = _EVER_NS
+            self.last_ns = stamp_ns
+            return False
+        # Segments count from the last reading, wherever the first sample in one may lie.
+        start_ns = updated_ns + (stamp_ns - updated_ns) // SEGMENT_NS * SEGMENT_NS
+        self._segment = (*self._evaluate(start_ns), self.misalignment)
+        deadline_ns = board_ns + self.timeout_ns + 1
+        self._event_ns = min(next_ns, start_ns + SEGMENT_NS, deadline_ns)
+        return True
+
+    def _evaluate(self, start_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        start = self.tracker.sample(start_ns)
+        end = self.tracker.sample(start_ns + SEGMENT_NS)
+        linear: list[float] = [start_ns]
+        for (bias, scale), (bias_end, scale_end) in zip(
+            self.correction.bias_scale(start), self.correction.bias_scale(end), strict=True
+        ):
+            linear += (bias, bias_end - bias, scale, scale_end - scale)
+        variance = self.correction.variance(end)
+        return tuple(linear), tuple(value for axis in variance for value in axis)
+
+    def take_flags(self) -> list[tuple[int, bool]]:
+        """
+        Take the regime flags that became due: (stamp of the case reading, S).
+
+        """
+        flags, self._flags = self._flags, []
+        return flags
+
+    @property
+    def timeout_ns(self) -> int:
+        """
+        Age of the board temperature beyond which nothing is published.
+
+        """
+        return int(self.config.temperature_timeout_s * 1e9)
+
+    def process_block(self, block: AccelBlock) -> CompensatedBlock:
+        """
+        Correct a block of samples with the bits that `process` gives one by one.
+
+        Parameters
+        ----------
+        block : AccelBlock
+            Columns in file order, e.g. a `recording.Block`.
+
+        Returns
+        -------
+        CompensatedBlock
+            The published samples; flags wait in `take_flags`, counts in `counters`.
+
+        """
+        result = process_block(self, block)
+        self._event_ns = _EVER_NS
+        return result
+
+    def take_pending(self) -> list[tuple[int, int, int, float]]:
+        """
+        Take the readings that no sample has reached: (stamp, kind, order, degC).
+
+        """
+        pending, self._pending = self._pending, []
+        return pending
+
+    def flush(self, stamp_ns: int) -> None:
+        """
+        Let queued readings up to a stamp take effect without a sample (no samples are coming).
+
+        """
+        while self._pending and self._pending[0][0] <= stamp_ns:
+            reading_ns, kind, _, celsius = heapq.heappop(self._pending)
+            self.apply_reading(reading_ns, kind, celsius)
+        self._event_ns = _EVER_NS
+
+    def swap(self, calibration: Calibration) -> None:
+        """
+        Take over another calibration between two samples.
+
+        The thermometers, the regime and the memory go on where the new calibration reads them in
+        the same way; a calibration with another detector or other time constants starts them anew.
+
+        """
+        same = (
+            calibration.detector == self.calibration.detector
+            and calibration.memory_time_constants_s == self.calibration.memory_time_constants_s
+        )
+        self._use(calibration)
+        if same:
+            self.tracker.reconfigure(self._thermal_config(), self._now())
+        else:
+            self.tracker = self._restarted(calibration)
+        self._event_ns = _EVER_NS
+
+    def _restarted(self, calibration: Calibration) -> ThermalTracker:
+        """
+        Make a tracker that starts from the temperatures just seen, so that no sample is lost.
+
+        """
+        tracker = ThermalTracker(
+            calibration.detector, calibration.memory_time_constants_s, self._thermal_config()
+        )
+        old = self.tracker
+        if old.board.stamp_ns is not None:
+            tracker.board_reading(old.board.stamp_ns, old.board.temperature)
+        if old.case.stamp_ns is not None:
+            tracker.case_reading(old.case.stamp_ns, old.case.temperature)
+        return tracker
+
+    def reconfigure(self, config: CompensatorConfig) -> None:
+        """
+        Take over other settings between two samples.
+
+        """
+        self.config = config
+        self.tracker.reconfigure(self._thermal_config(), self._now())
+        self._event_ns = _EVER_NS
+
+    def _now(self) -> int | None:
+        return self.last_ns if self.last_ns != _EVER_NS else None
+
+    def reset(self) -> None:
+        """
+        Forget temperatures, regime and queue; counters stay.
+
+        """
+        self.tracker.reset()
+        self._pending.clear()
+        self._flags.clear()
+        self.last_ns = _EVER_NS
+        self._event_ns = _EVER_NS
+
+    @property
+    def status(self) -> CompensatorStatus:
+        """
+        Snapshot of what is going on, at the last sample's stamp.
+
+        """
+        tracker = self.tracker
+        stamp_ns = self._now()
+        if stamp_ns is None:
+            stamp_ns = tracker.updated_ns
+        counters = replace(self.counters)
+        board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
+        if stamp_ns is None or board_ns is None:
+            return CompensatorStatus(
+                counters, stamp_ns, None, math.inf, math.inf, True, True, True, 0.0, 0.0, 0.0
+            )
+        board_age = (stamp_ns - board_ns) * 1e-9
+        stale_after = STALE_INTERVALS * max(tracker.board.interval_s, 0.1)
+        state = tracker.sample(stamp_ns)
+        regime_set = (
+            self.correction.dynamic
+            if tracker.detector.regime == Regime.DYNAMIC
+            else self.correction.static
+        )
+        _, excess = regime_set.regressors(state)
+        return CompensatorStatus(
+            counters,
+            stamp_ns,
+            tracker.state_at(stamp_ns),
+            board_age,
+            math.inf if case_ns is None else (stamp_ns - case_ns) * 1e-9,
+            board_age > stale_after,
+            board_age > self.config.temperature_timeout_s,
+            not tracker.is_case_live(stamp_ns),
+            regime_set.relative_excess(excess),
+            excess.temperature,
+            excess.rate * 60.0,
+        )
