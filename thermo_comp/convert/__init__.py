@@ -1,0 +1,19 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the way from other people's logs to bags: tables with a column map, PX4, ArduPilot.
+
+"""
+
+from .columnar import table_log
+from .columns import ColumnMap, load_column_map
+from .log import ConversionReport, ForeignLog, write_log
+
+__all__ = [
+    'ColumnMap',
+    'ConversionReport',
+    'ForeignLog',
+    'load_column_map',
+    'table_log',
+    'write_log',
+]

@@ -1,0 +1,238 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the column map: which column of a table is what, in which unit, and how it becomes a message.
+
+A map is a small YAML file beside the log; config/columns/ has examples.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from ..errors import RecordingError
+from .table import Column
+
+STANDARD_GRAVITY = 9.80665
+_STAMP_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra='forbid', frozen=True, strict=True)
+
+
+class Format(_Section):
+    """
+    How the text is laid out; found out where it is not said.
+
+    """
+
+    delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
+    header: bool | None = None
+
+    @property
+    def character(self) -> str | None:
+        """
+        The delimiter as one character.
+
+        """
+        names = {'tab': '\t', 'blank': ' '}
+        return None if self.delimiter is None else names.get(self.delimiter, self.delimiter)
+
+
+class Stamp(_Section):
+    """
+    A column of time stamps, or a fixed rate.
+
+    The start is not 0 by default, because ROS takes a zero stamp for "no time yet".
+
+    """
+
+    column: Column | None = None
+    unit: Literal['s', 'ms', 'us', 'ns'] | None = None
+    rate_hz: Positive | None = None
+    start_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 1.0
+
+    @model_validator(mode='after')
+    def _one_way(self) -> Stamp:
+        if (self.column is None) == (self.rate_hz is None):
+            raise ValueError('give either `column` and `unit`, or `rate_hz`')
+        if self.column is not None and self.unit is None:
+            raise ValueError('`unit` of the stamp column must be s, ms, us or ns')
+        return self
+
+    @property
+    def exponent(self) -> int:
+        """
+        Power of ten from the unit to nanoseconds.
+
+        """
+        return _STAMP_EXPONENTS[self.unit or 'ns']
+
+
+class Accel(_Section):
+    """
+    The accelerometer's three columns.
+
+    `output` is what becomes of them: ``counts`` (geometry_msgs/Vector3Stamped) or ``imu``
+    (sensor_msgs/Imu, m/s^2). `clip` are the readings, in the table's unit, at and beyond which
+    the sensor saturates.
+
+    """
+
+    columns: tuple[Column, Column, Column]
+    unit: Literal['counts', 'm/s^2', 'g', 'mg']
+    output: Literal['counts', 'imu']
+    counts_per_g: Positive | None = None
+    clip: tuple[Finite, Finite] | None = None
+
+    @model_validator(mode='after')
+    def _units_fit(self) -> Accel:
+        if self.unit == 'counts' and self.output == 'imu' and self.counts_per_g is None:
+            raise ValueError('counts become an Imu only with `counts_per_g`')
+        if self.unit != 'counts' and self.output == 'counts':
+            raise ValueError(f'{self.unit} cannot become counts: output must be imu')
+        if self.clip is not None and not self.clip[0] < self.clip[1]:
+            raise ValueError('`clip` must be [lowest, highest]')
+        return self
+
+    @property
+    def factor(self) -> float:
+        """
+        What a reading is multiplied by to become the message's value.
+
+        """
+        if self.output == 'counts':
+            return 1.0
+        per_g = {'m/s^2': STANDARD_GRAVITY, 'g': 1.0, 'mg': 1000.0}
+        return STANDARD_GRAVITY / per_g.get(self.unit, self.counts_per_g or 1.0)
+
+
+class Gyro(_Section):
+    """
+    The gyroscope's three columns; they travel in the Imu message.
+
+    """
+
+    columns: tuple[Column, Column, Column]
+    unit: Literal['rad/s', 'deg/s']
+
+
+class Thermometer(_Section):
+    """
+    One temperature column; unit raw: ``degC = reading * degc_per_count + degc_at_zero``.
+
+    Slow sensors hold their last value between readings of their own. `publish` says which rows
+    become messages: ``change`` (the value differs from the last one, or `heartbeat_s` is over),
+    ``period`` (every `period_s`) or ``all``.
+
+    """
+
+    column: Column
+    unit: Literal['degC', 'K', 'degF', 'raw'] = 'degC'
+    degc_per_count: Finite | None = None
+    degc_at_zero: Finite | None = None
+    publish: Literal['change', 'period', 'all'] = 'change'
+    heartbeat_s: Positive = 10.0
+    period_s: Positive | None = None
+
+    @model_validator(mode='after')
+    def _complete(self) -> Thermometer:
+        if (self.unit == 'raw') != (self.degc_per_count is not None):
+            raise ValueError('unit raw needs `degc_per_count`, the other units forbid it')
+        if (self.unit == 'raw') != (self.degc_at_zero is not None):
+            raise ValueError('unit raw needs `degc_at_zero`, the other units forbid it')
+        if (self.publish == 'period') != (self.period_s is not None):
+            raise ValueError('publish: period needs `period_s`, the other ways forbid it')
+        return self
+
+    @property
+    def linear(self) -> tuple[float, float]:
+        """
+        Slope and offset from the table's reading to degC.
+
+        """
+        if self.unit == 'raw':
+            return self.degc_per_count or 0.0, self.degc_at_zero or 0.0
+        return {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}[self.unit]
+
+
+class ColumnMap(_Section):
+    """
+    The whole map.
+
+    """
+
+    stamp: Stamp
+    accel: Accel
+    board: Thermometer | None = None
+    case: Thermometer | None = None
+    gyro: Gyro | None = None
+    format: Format = Format()
+    frame_id: str = 'imu_link'
+    serial: Annotated[str, Field(min_length=1)] | None = None
+
+    @model_validator(mode='after')
+    def _gyro_needs_imu(self) -> ColumnMap:
+        if self.gyro is not None and self.accel.output == 'counts':
+            raise ValueError('a gyro travels in an Imu message: accel output must be imu')
+        return self
+
+
+def load_column_map(path: str | Path) -> ColumnMap:
+    """
+    Read and validate a column map.
+
+    Parameters
+    ----------
+    path : str or Path
+        The YAML file.
+
+    Returns
+    -------
+    ColumnMap
+        The map.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, or a key is unknown, missing or wrong; names the key.
+
+    """
+    try:
+        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except OSError as failure:
+        raise RecordingError(failure.strerror or str(failure), path=path) from failure
+    except UnicodeDecodeError as failure:
+        raise RecordingError('a column map is YAML text in UTF-8', path=path) from failure
+    except yaml.YAMLError as failure:
+        reason = ' '.join(str(failure).split())
+        raise RecordingError(f'not valid YAML ({reason})', path=path) from failure
+    if not isinstance(data, dict):
+        raise RecordingError('a column map is a mapping of keys (see config/columns)', path=path)
+    try:
+        # Strict types: a list may stand for a tuple, nothing else is converted.
+        return ColumnMap.model_validate(_tuples(data))
+    except ValidationError as failure:
+        first = failure.errors()[0]
+        key = '.'.join(str(part) for part in first['loc'] if part not in ('str', 'int'))
+        message = first['msg'].removeprefix('Value error, ')
+        if first['type'] == 'extra_forbidden':
+            message = 'unknown key'
+        raise RecordingError(message, path=path, topic=key or None) from failure
+
+
+def _tuples(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    return value

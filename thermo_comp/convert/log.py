@@ -1,0 +1,404 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the way from any foreign log to a bag: checks, thinning, and the account of every row.
+
+A reader of a format makes a `ForeignLog`; `write_log` does the rest, the same for all formats.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..errors import RecordingError
+from ..recording import BagWriter, ImuColumns, Topics
+from .table import NO_STAMP
+from .units import (
+    Array,
+    BoolArray,
+    IntArray,
+    Stillness,
+    believed_unit,
+    contradiction,
+    find_stillness,
+)
+
+# No sensor on a circuit board is read outside this range; kelvins and raw counts are.
+_PLAUSIBLE_CELSIUS = (-90.0, 200.0)
+# Messages are written in runs of this many rows: bounded memory in the writer.
+_RUN_ROWS = 100_000
+_EXAMPLES = 5
+
+
+@dataclass(frozen=True)
+class Readings:
+    """
+    One thermometer's readings.
+
+    Parameters
+    ----------
+    stamp_ns : ndarray of int64, shape (n,)
+        Stamps, in file order.
+    celsius : ndarray, shape (n,)
+        Temperatures.
+
+    """
+
+    stamp_ns: IntArray
+    celsius: Array
+
+
+@dataclass(frozen=True)
+class ForeignLog:
+    """
+    What a log of any format holds, in file order.
+
+    Parameters
+    ----------
+    path : str
+        The log.
+    input : {'counts', 'imu'}
+        What the accelerometer's messages become.
+    unit : {'counts', 'm/s^2', 'g', 'mg'}
+        The unit that the log states.
+    factor : float
+        From that unit to the message's.
+    stamp_ns : ndarray of int64, shape (n,)
+        Stamps of the rows; `NO_STAMP` of `table` where there is none.
+    accel : ndarray, shape (n, 3)
+        Readings in the stated unit; NaN where a cell is no number.
+    gyro : ndarray, shape (n, 3), or None
+        Angular rate [rad/s].
+    board, case : Readings or None
+        The two thermometers.
+    line : ndarray of int64, shape (n,)
+        Where each row stands in the file.
+    counts_per_g : float or None
+        The sensitivity that the log states.
+    clip : (float, float) or None
+        Readings at and beyond which the sensor saturates, in the stated unit.
+    frame_id, serial : str
+        For the messages and for the bag.
+    n_short : int
+        Rows that were left out because they are too short.
+    metadata : dict of {str: str}
+        What the bag shall say about its origin.
+
+    """
+
+    path: str
+    input: Literal['counts', 'imu']
+    unit: Literal['counts', 'm/s^2', 'g', 'mg']
+    factor: float
+    stamp_ns: IntArray
+    accel: Array
+    gyro: Array | None
+    board: Readings | None
+    case: Readings | None
+    line: IntArray
+    counts_per_g: float | None = None
+    clip: tuple[float, float] | None = None
+    frame_id: str = 'imu_link'
+    serial: str = ''
+    n_short: int = 0
+    metadata: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """
+    Something that some rows have in common.
+
+    Parameters
+    ----------
+    count : int
+        How many rows.
+    lines : tuple of int
+        Where the first few stand in the file.
+
+    """
+
+    count: int
+    lines: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ConversionReport:
+    """
+    What came in, what went out, and what was seen on the way.
+
+    Parameters
+    ----------
+    source, output : str
+        The log and the bag.
+    rows : int
+        Rows of the log.
+    accel_messages, board_messages, case_messages : int
+        Messages in the bag.
+    input : {'counts', 'imu'}
+        What the accelerometer's messages are.
+    rate_hz, duration_s : float
+        Median rate and length of the log.
+    short_rows, non_numeric, backwards, repeated, clipped : Finding
+        Rows left out because they are too short or hold no numbers; rows kept whose time goes
+        back, stands still, or whose reading is clipped.
+    unit, believed : str
+        The unit stated, and what the readings at rest speak for.
+    stillness : Stillness
+        Where the log rests and what it reads there.
+    start_ns : int
+        First stamp.
+
+    """
+
+    source: str
+    output: str
+    rows: int
+    accel_messages: int
+    board_messages: int
+    case_messages: int
+    input: str
+    rate_hz: float
+    duration_s: float
+    short_rows: Finding
+    non_numeric: Finding
+    backwards: Finding
+    repeated: Finding
+    clipped: Finding
+    unit: str
+    believed: str
+    stillness: Stillness
+    start_ns: int
+
+
+def thin(
+    readings: Readings, publish: str, heartbeat_s: float, period_s: float | None = None
+) -> Readings:
+    """
+    Keep the readings that say something new.
+
+    Parameters
+    ----------
+    readings : Readings
+        All of them; those that are not finite are left out.
+    publish : {'change', 'period', 'all'}
+        On a change (or after `heartbeat_s` without one), every `period_s`, or all.
+    heartbeat_s : float
+        Longest silence of an unchanged value [s].
+    period_s : float or None, optional
+        For ``period`` [s].
+
+    Returns
+    -------
+    Readings
+        The kept ones.
+
+    """
+    finite = np.isfinite(readings.celsius)
+    stamp_ns, celsius = readings.stamp_ns[finite], readings.celsius[finite]
+    if publish == 'all' or not len(stamp_ns):
+        return Readings(stamp_ns, celsius)
+    every_ns = round((heartbeat_s if publish == 'change' else period_s or 0.0) * 1e9)
+    on_change = publish == 'change'
+    kept: list[int] = []
+    last_ns, last = 0, float('nan')
+    for i, (now_ns, value) in enumerate(zip(stamp_ns.tolist(), celsius.tolist(), strict=True)):
+        # A stamp before the last one is a restart of the log's clock, and worth a message.
+        silent = not kept or now_ns - last_ns >= every_ns or now_ns < last_ns
+        if silent or (on_change and value != last):
+            kept.append(i)
+            last_ns, last = now_ns, value
+    return Readings(stamp_ns[kept], celsius[kept])
+
+
+def write_log(
+    log: ForeignLog,
+    output: str | Path,
+    force: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> ConversionReport:
+    """
+    Check a log and write it as a bag.
+
+    Parameters
+    ----------
+    log : ForeignLog
+        The log.
+    output : str or Path
+        The bag; ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
+    force : bool, optional
+        Overwrite a bag that is there.
+    progress : callable, optional
+        Called with the fraction of rows written.
+
+    Returns
+    -------
+    ConversionReport
+        The account.
+
+    Raises
+    ------
+    RecordingError
+        If no row is usable, a stated unit contradicts the readings, or the bag cannot be written.
+
+    """
+    usable = _usable(log)
+    stamp_ns, accel, line = log.stamp_ns[usable], log.accel[usable], log.line[usable]
+    if not len(stamp_ns):
+        raise RecordingError(
+            f'none of its {len(usable)} rows holds numbers in the accelerometer and stamp columns',
+            path=log.path,
+        )
+    newest = np.maximum.accumulate(stamp_ns)
+    rises = np.concatenate(([True], stamp_ns[1:] > newest[:-1]))
+    back = np.concatenate(([False], stamp_ns[1:] < stamp_ns[:-1]))
+    repeat = np.concatenate(([False], stamp_ns[1:] == stamp_ns[:-1]))
+    clipped = np.zeros(len(accel), dtype=np.bool_)
+    if log.clip is not None:
+        clipped = ((accel <= log.clip[0]) | (accel >= log.clip[1])).any(axis=1)
+    stillness = find_stillness(stamp_ns[rises], accel[rises])
+    _refuse_wrong_units(log, stillness)
+
+    _write(log, Path(output), force, usable, newest, progress)
+    steps = np.diff(stamp_ns[rises])
+    return ConversionReport(
+        source=log.path,
+        output=str(output),
+        rows=len(log.stamp_ns) + log.n_short,
+        accel_messages=len(stamp_ns),
+        board_messages=0 if log.board is None else len(log.board.stamp_ns),
+        case_messages=0 if log.case is None else len(log.case.stamp_ns),
+        input=log.input,
+        rate_hz=1e9 / float(np.median(steps)) if len(steps) else float('nan'),
+        duration_s=float(newest[-1] - stamp_ns[0]) * 1e-9,
+        short_rows=Finding(log.n_short, ()),
+        non_numeric=_finding(~usable, log.line),
+        backwards=_finding(back, line),
+        repeated=_finding(repeat, line),
+        clipped=_finding(clipped, line),
+        unit=log.unit,
+        believed=believed_unit(stillness.magnitude)[1]
+        if np.isfinite(stillness.magnitude)
+        else 'it never rests, so its unit was not checked',
+        stillness=stillness,
+        start_ns=int(stamp_ns[0]),
+    )
+
+
+def _usable(log: ForeignLog) -> BoolArray:
+    usable: BoolArray = (log.stamp_ns != NO_STAMP) & np.isfinite(log.accel).all(axis=1)
+    if log.gyro is not None:
+        usable &= np.isfinite(log.gyro).all(axis=1)
+    return usable
+
+
+def _finding(rows: BoolArray, line: IntArray) -> Finding:
+    found = np.flatnonzero(rows)
+    return Finding(len(found), tuple(line[found[:_EXAMPLES]].tolist()))
+
+
+def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
+    reason = contradiction(log.unit, stillness.magnitude, log.counts_per_g)
+    if reason is not None:
+        raise RecordingError(
+            f'the accelerometer is stated in {log.unit}, but {reason}', path=log.path
+        )
+    low, high = _PLAUSIBLE_CELSIUS
+    for name, readings in (('board', log.board), ('case', log.case)):
+        if readings is None or not len(readings.celsius):
+            continue
+        typical = float(np.nanmedian(readings.celsius))
+        if not low <= typical <= high:
+            guess = ': that looks like kelvins' if 180.0 < typical < 480.0 else ''
+            raise RecordingError(
+                f'the {name} temperature is {typical:.4g} degC in the median{guess}', path=log.path
+            )
+
+
+def _write(
+    log: ForeignLog,
+    output: Path,
+    force: bool,
+    usable: BoolArray,
+    newest: IntArray,
+    progress: Callable[[float], None] | None,
+) -> None:
+    """
+    Write the messages; a stamp that goes back keeps its place in the bag through its log time.
+
+    """
+    topics = Topics()
+    stamp_ns = log.stamp_ns[usable]
+    values = log.accel[usable] * log.factor
+    gyro = None if log.gyro is None else log.gyro[usable]
+    log_of = {'board': _log_times(log.board), 'case': _log_times(log.case)}
+    written = {'board': 0, 'case': 0}
+    with BagWriter(output, metadata=log.metadata, overwrite=force) as writer:
+        for first in range(0, len(stamp_ns), _RUN_ROWS):
+            last = min(first + _RUN_ROWS, len(stamp_ns))
+            is_end = last == len(stamp_ns)
+            for name, readings in (('board', log.board), ('case', log.case)):
+                if readings is None:
+                    continue
+                until = (
+                    len(readings.stamp_ns)
+                    if is_end
+                    else int(np.searchsorted(log_of[name], newest[last - 1], side='right'))
+                )
+                run = slice(written[name], until)
+                written[name] = until
+                writer.write_temperature(
+                    getattr(topics, name),
+                    readings.stamp_ns[run],
+                    readings.celsius[run],
+                    log_ns=log_of[name][run],
+                    frame_id=log.frame_id,
+                )
+            rows = slice(first, last)
+            if log.input == 'counts':
+                writer.write_counts(
+                    topics.counts, stamp_ns[rows], values[rows], log.frame_id, log_ns=newest[rows]
+                )
+            else:
+                n = last - first
+                writer.write_imu(
+                    topics.imu,
+                    stamp_ns[rows],
+                    values[rows],
+                    np.zeros((n, 9)),
+                    log.frame_id,
+                    imu=_imu_columns(n, None if gyro is None else gyro[rows]),
+                    log_ns=newest[rows],
+                )
+            writer.flush()
+            if progress is not None:
+                progress(last / len(stamp_ns))
+
+
+def _log_times(readings: Readings | None) -> IntArray:
+    if readings is None:
+        return np.empty(0, dtype=np.int64)
+    return np.maximum.accumulate(readings.stamp_ns)
+
+
+def _imu_columns(n: int, gyro: Array | None) -> ImuColumns:
+    """
+    Return the rest of an Imu message: what the log has not is marked with -1, REP 145.
+
+    """
+    absent = np.zeros((n, 9))
+    absent[:, 0] = -1.0
+    return ImuColumns(
+        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
+        orientation_covariance=absent,
+        angular_velocity=np.zeros((n, 3)) if gyro is None else gyro,
+        # All zeros: the rate is there, its covariance is not known.
+        angular_velocity_covariance=absent if gyro is None else np.zeros((n, 9)),
+        linear_acceleration_covariance=np.zeros((n, 9)),
+    )

@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns Parquet tables, behind the extra ``parquet``.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import RecordingError
+from .table import NO_STAMP, Array, Column, IntArray, Table, place
+
+
+def read_parquet(
+    path: Path, columns: Sequence[Column], stamp: Column | None, stamp_exponent: int
+) -> Table:
+    """
+    Read some columns of a Parquet file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : sequence of str or int
+        Headings, or numbers counted from 0.
+    stamp : str or int or None
+        The column of time stamps; a column of Parquet's own timestamp type states its unit
+        itself.
+    stamp_exponent : int
+        Power of ten from the stamp's unit to nanoseconds.
+
+    Returns
+    -------
+    Table
+        The columns; `Table.line` is the row number from 1.
+
+    Raises
+    ------
+    RecordingError
+        If pyarrow is not installed, the file is no Parquet file, is empty, or lacks a column.
+
+    """
+    try:
+        from pyarrow import ArrowException
+        from pyarrow import parquet as pq
+    except ImportError as failure:
+        raise RecordingError(
+            "a Parquet file needs pyarrow: pip install 'thermo_comp[parquet]'", path=path
+        ) from failure
+    try:
+        headings = list(pq.read_schema(path).names)
+        names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
+        places = {name: place(path, name, headings, len(headings)) for name in names}
+        table = pq.read_table(path, columns=[headings[i] for i in sorted(set(places.values()))])
+    except (ArrowException, OSError) as failure:
+        reason = ' '.join(str(failure).split())
+        raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
+    if not table.num_rows:
+        raise RecordingError('the table is empty', path=path)
+    return Table(
+        path=str(path),
+        line=np.arange(1, table.num_rows + 1, dtype=np.int64),
+        values={
+            name: _floats(path, headings[places[name]], table.column(headings[places[name]]))
+            for name in columns
+        },
+        stamp_ns=None
+        if stamp is None
+        else _stamps(
+            path,
+            headings[places[stamp]],
+            table.column(headings[places[stamp]]),
+            stamp_exponent,
+        ),
+        n_short=0,
+    )
+
+
+def _floats(path: Path, name: str, column: Any) -> Array:
+    import pyarrow as pa
+
+    try:
+        values = column.cast(pa.float64(), safe=False).to_numpy()
+    except (pa.ArrowException, ValueError) as failure:
+        raise RecordingError(f'column {name!r} holds {column.type}', path=path) from failure
+    return np.asarray(values, dtype=np.float64)
+
+
+def _stamps(path: Path, name: str, column: Any, exponent: int) -> IntArray:
+    import pyarrow as pa
+
+    known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)
+    if pa.types.is_timestamp(column.type):
+        whole = column.cast(pa.timestamp('ns')).cast(pa.int64())
+        exponent = 0
+    elif pa.types.is_integer(column.type):
+        whole = column.cast(pa.int64())
+    else:
+        values = _floats(path, name, column)
+        known &= np.isfinite(values)
+        stamps = np.full(len(values), NO_STAMP, dtype=np.int64)
+        stamps[known] = np.rint(values[known] * 10.0**exponent).astype(np.int64)
+        return stamps
+    integers = np.asarray(whole.fill_null(0).to_numpy(), dtype=np.int64)
+    return np.where(known, integers * 10**exponent, NO_STAMP)
