@@ -1,0 +1,41 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns bags: recordings to columns and columns to recordings, streaming, in bounded memory.
+
+The only package that knows `rosbags` and `mcap`.
+
+"""
+
+from __future__ import annotations
+
+from .columns import (
+    ROLES,
+    Block,
+    ImuColumns,
+    Input,
+    RawMessages,
+    Recording,
+    RecordingInfo,
+    Role,
+    Topics,
+)
+from .reader import RecordingReader, inspect_recording, open_recording, read_recording
+from .writer import BagWriter
+
+__all__ = [
+    'ROLES',
+    'BagWriter',
+    'Block',
+    'ImuColumns',
+    'Input',
+    'RawMessages',
+    'Recording',
+    'RecordingInfo',
+    'RecordingReader',
+    'Role',
+    'Topics',
+    'inspect_recording',
+    'open_recording',
+    'read_recording',
+]

@@ -1,0 +1,359 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the MCAP file being written: chunks with their message indexes, and the summary at the end.
+
+The bulk (message records, message indexes) is numpy bytes; the few other records go through the
+`mcap` library's record classes.
+
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from numpy.typing import NDArray
+
+from .. import __version__
+from .columns import Ints
+from .definitions import Definition, offered_qos
+from .rosbag2_metadata import FileSummary, TopicSummary, dump_yaml, information
+from .wire import Bytes
+
+MAGIC = b'\x89MCAP0\r\n'
+#: Name of the metadata record that holds the writer's key-value pairs.
+METADATA_NAME = 'thermo_comp'
+
+_INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
+
+
+class McapFile:
+    """
+    One MCAP file from its first byte to its footer.
+
+    Parameters
+    ----------
+    path : Path
+        Created; it must not exist.
+    compression : {'none', 'lz4', 'zstd'}
+    level : int or None
+    chunk_bytes : int
+    metadata : mapping of str to str
+        Written at the front, so that even a torn file has it.
+
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        compression: Literal['none', 'lz4', 'zstd'],
+        level: int | None,
+        chunk_bytes: int,
+        metadata: Mapping[str, str],
+    ) -> None:
+        self._name = path.name
+        self._compression = '' if compression == 'none' else compression
+        self._compress = _compressor(compression, level)
+        self._chunk_bytes = chunk_bytes
+        self._schemas: dict[str, Schema] = {}
+        self._channels: dict[str, Channel] = {}
+        self._topics: dict[str, tuple[str, str]] = {}
+        self._counts: dict[int, int] = {}
+        self._chunks: list[ChunkIndex] = []
+        self._metadata_index: list[MetadataIndex] = []
+        self._tail = _nothing()
+        self._start_ns: int | None = None
+        self._end_ns = 0
+        self._at = 0
+        self._stream = path.open('xb', buffering=0)
+        self._put(MAGIC)
+        self._put_record(Header('ros2', f'thermo_comp {__version__}'))
+        if metadata:
+            self._put_metadata(METADATA_NAME, metadata)
+
+    def channel(self, topic: str, kind: str, definition: Definition) -> int | None:
+        """
+        The number of a topic's channel, made where it is new.
+
+        Parameters
+        ----------
+        topic : str
+        kind : str
+            Message type.
+        definition : Definition
+
+        Returns
+        -------
+        int or None
+            None where the topic has another type already.
+
+        """
+        if topic in self._channels:
+            same = self._topics[topic][0] == kind
+            return self._channels[topic].id if same else None
+        if kind not in self._schemas:
+            schema = Schema(
+                id=len(self._schemas) + 1,
+                data=definition.text.encode(),
+                encoding=definition.encoding,
+                name=kind,
+            )
+            self._schemas[kind] = schema
+            self._put_record(schema)
+        channel = Channel(
+            id=len(self._channels) + 1,
+            topic=topic,
+            message_encoding='cdr',
+            schema_id=self._schemas[kind].id,
+            metadata={
+                'offered_qos_profiles': dump_yaml([offered_qos(kind)]).strip(),
+                'topic_type_hash': definition.type_hash,
+            },
+        )
+        self._channels[topic] = channel
+        self._topics[topic] = (kind, definition.type_hash)
+        self._counts[channel.id] = 0
+        self._put_record(channel)
+        return channel.id
+
+    def append(self, data: Bytes, channel: NDArray[np.uint16], log_ns: Ints, size: Ints) -> None:
+        """
+        Add message records; whole chunks are written, the rest waits for more.
+
+        Parameters
+        ----------
+        data : ndarray of uint8
+            The records behind each other.
+        channel : ndarray of uint16, shape (n,)
+        log_ns : ndarray of int64, shape (n,)
+        size : ndarray of int64, shape (n,)
+
+        """
+        data = np.concatenate([self._tail[0], data])
+        channel = np.concatenate([self._tail[1], channel])
+        log_ns = np.concatenate([self._tail[2], log_ns])
+        size = np.concatenate([self._tail[3], size])
+        ends = np.cumsum(size)
+        row = begin = 0
+        while True:
+            last = int(np.searchsorted(ends, begin + self._chunk_bytes))
+            if last >= len(ends):
+                break
+            end = int(ends[last])
+            rows = slice(row, last + 1)
+            self._put_chunk(data[begin:end], channel[rows], log_ns[rows], size[rows])
+            row, begin = last + 1, end
+        self._tail = (data[begin:].copy(), channel[row:], log_ns[row:], size[row:])
+
+    def finish(self, custom: Mapping[str, str]) -> FileSummary:
+        """
+        Write the last chunk, the summary and the footer; flush all to disk and close.
+
+        Parameters
+        ----------
+        custom : mapping of str to str
+            The key-value pairs for rosbag2's own metadata record.
+
+        Returns
+        -------
+        FileSummary
+
+        """
+        if len(self._tail[1]):
+            self._put_chunk(*self._tail)
+            self._tail = _nothing()
+        summary = self._summary()
+        text = dump_yaml(information(summary, custom)).strip()
+        self._put_metadata('rosbag2', {'serialized_metadata': text})
+        self._put_record(DataEnd(data_section_crc=0))
+        self._put_summary()
+        os.fsync(self._stream.fileno())
+        self.close()
+        return summary
+
+    def close(self) -> None:
+        """
+        Close the file as it is.
+
+        """
+        self._stream.close()
+
+    def _put(self, data: bytes | memoryview) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[self._stream.write(view) :]
+        self._at += len(data)
+
+    def _put_record(self, record: McapRecord) -> None:
+        builder = RecordBuilder()
+        record.write(builder)
+        self._put(_taken(builder))
+
+    def _put_metadata(self, name: str, content: Mapping[str, str]) -> None:
+        begin = self._at
+        self._put_record(Metadata(name, dict(content)))
+        self._metadata_index.append(MetadataIndex(begin, self._at - begin, name))
+
+    def _put_chunk(
+        self, data: Bytes, channel: NDArray[np.uint16], log_ns: Ints, size: Ints
+    ) -> None:
+        start, end = int(np.min(log_ns)), int(np.max(log_ns))
+        self._start_ns = start if self._start_ns is None else min(self._start_ns, start)
+        self._end_ns = max(self._end_ns, end)
+        packed = self._compress(data)
+        name = self._compression.encode()
+        begin = self._at
+        self._put(
+            struct.pack(
+                f'<BQQQQII{len(name)}sQ',
+                Opcode.CHUNK,
+                40 + len(name) + len(packed),
+                start,
+                end,
+                len(data),
+                zlib.crc32(data),
+                len(name),
+                name,
+                len(packed),
+            )
+        )
+        self._put(packed)
+        chunk_length = self._at - begin
+        offsets: dict[int, int] = {}
+        rows = np.empty(len(log_ns), _INDEX_ROW)
+        rows['log'] = log_ns
+        rows['offset'] = np.cumsum(size) - size
+        for number in np.unique(channel).tolist():
+            own = rows[channel == number]
+            self._counts[number] += len(own)
+            offsets[number] = self._at
+            self._put(
+                struct.pack('<BQHI', Opcode.MESSAGE_INDEX, 6 + own.nbytes, number, own.nbytes)
+                + own.tobytes()
+            )
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=chunk_length,
+                chunk_start_offset=begin,
+                compression=self._compression,
+                compressed_size=len(packed),
+                message_end_time=end,
+                message_index_length=self._at - begin - chunk_length,
+                message_index_offsets=offsets,
+                message_start_time=start,
+                uncompressed_size=len(data),
+            )
+        )
+
+    def _summary(self) -> FileSummary:
+        return FileSummary(
+            name=self._name,
+            start_ns=self._start_ns or 0,
+            end_ns=self._end_ns,
+            topics=tuple(
+                TopicSummary(topic, *self._topics[topic], self._counts[channel.id])
+                for topic, channel in self._channels.items()
+            ),
+        )
+
+    def _put_summary(self) -> None:
+        summary_start = self._at
+        statistics = Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=self._end_ns,
+            message_start_time=self._start_ns or 0,
+            metadata_count=len(self._metadata_index),
+            schema_count=len(self._schemas),
+        )
+        groups: list[tuple[Opcode, list[McapRecord]]] = [
+            (Opcode.SCHEMA, list(self._schemas.values())),
+            (Opcode.CHANNEL, list(self._channels.values())),
+            (Opcode.STATISTICS, [statistics]),
+            (Opcode.CHUNK_INDEX, list(self._chunks)),
+            (Opcode.METADATA_INDEX, list(self._metadata_index)),
+        ]
+        builder = RecordBuilder()
+        offsets: list[SummaryOffset] = []
+        for opcode, records in groups:
+            group_start = builder.count
+            for record in records:
+                record.write(builder)
+            if records:
+                offsets.append(
+                    SummaryOffset(
+                        group_length=builder.count - group_start,
+                        group_opcode=opcode,
+                        group_start=summary_start + group_start,
+                    )
+                )
+        offset_start = summary_start + builder.count
+        for offset in offsets:
+            offset.write(builder)
+        body = _taken(builder)
+        footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 20, summary_start, offset_start)
+        self._put(body)
+        self._put_record(
+            Footer(
+                summary_start=summary_start,
+                summary_offset_start=offset_start,
+                summary_crc=zlib.crc32(footer_head, zlib.crc32(body)),
+            )
+        )
+        self._put(MAGIC)
+
+
+_Waiting = tuple[Bytes, NDArray[np.uint16], Ints, Ints]
+
+
+def _nothing() -> _Waiting:
+    return (
+        np.empty(0, np.uint8),
+        np.empty(0, np.uint16),
+        np.empty(0, np.int64),
+        np.empty(0, np.int64),
+    )
+
+
+def _taken(builder: RecordBuilder) -> bytes:
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
+
+
+def _compressor(
+    compression: Literal['none', 'lz4', 'zstd'], level: int | None
+) -> Callable[[Bytes], bytes | memoryview]:
+    if compression == 'zstd':
+        compressor = zstandard.ZstdCompressor(level=1 if level is None else level)
+        return lambda data: compressor.compress(data.data)
+    if compression == 'lz4':
+        return lambda data: bytes(
+            lz4.frame.compress(data, compression_level=0 if level is None else level)
+        )
+    return lambda data: data.data

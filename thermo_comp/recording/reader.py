@@ -1,0 +1,252 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the door to recordings: open a bag of any storage, say what it holds, read it as columns.
+
+Reading order
+    The order of a ROS player: log time, and for equal log times the place in the file. The split
+    files of one bag follow each other as its metadata.yaml lists them.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol
+
+from ..errors import RecordingError
+from .assemble import Part, assemble, join_blocks
+from .columns import ROLES, Block, Input, Recording, RecordingInfo, Role, Topics
+from .foreign import ForeignSource
+from .topics import select_topics
+
+
+class Source(Protocol):
+    """
+    One opened storage.
+
+    """
+
+    storage: str
+    topics: Mapping[str, tuple[str, int]]
+    definitions: Mapping[str, tuple[str, str]]
+    start_ns: int
+    end_ns: int
+    truncated: str | None
+    metadata: Mapping[str, str]
+
+    def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
+        """
+        Decoded messages of the chosen topics in reading order.
+
+        """
+        ...
+
+    def close(self) -> None:
+        """
+        Close the files.
+
+        """
+        ...
+
+
+class RecordingReader:
+    """
+    An open bag; use it as a context manager.
+
+    Attributes
+    ----------
+    info : RecordingInfo
+    definitions : mapping of str to (str, str)
+        Encoding and text of each message type's definition, where the bag carries it.
+
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        source: Source,
+        topics: Topics,
+        input: Input,  # noqa: A002 - the parameter's public name
+        require: Collection[Role],
+    ) -> None:
+        selection = select_topics(path, source.topics, topics, input, require)
+        self._source = source
+        self._selection = dict(selection.topics)
+        self.definitions = source.definitions
+        self.info = RecordingInfo(
+            path=path,
+            storage=source.storage,
+            topics=dict(source.topics),
+            start_ns=source.start_ns,
+            end_ns=source.end_ns,
+            truncated=source.truncated,
+            metadata=dict(source.metadata),
+            input=selection.input,
+        )
+
+    @property
+    def topics(self) -> Mapping[Role, str]:
+        """
+        The bag's own name of each topic that is read.
+
+        """
+        return dict(self._selection)
+
+    def blocks(self, *, raw: bool = False) -> Iterator[Block]:
+        """
+        Read the bag from its beginning in bounded memory.
+
+        Parameters
+        ----------
+        raw : bool, optional
+            Keep the serialized messages in `Block.raw`.
+
+        Yields
+        ------
+        Block
+            In reading order; of limited size.
+
+        Raises
+        ------
+        RecordingError
+            Damaged data.
+
+        """
+        names = {role: (name, self.info.topics[name][0]) for role, name in self._selection.items()}
+        parts = self._source.parts(self._selection, raw=raw)
+        yield from assemble(parts, is_imu=self.info.input == 'imu', names=names)
+
+    def close(self) -> None:
+        """
+        Close the files.
+
+        """
+        self._source.close()
+
+    def __enter__(self) -> RecordingReader:
+        """
+        Give the open reader.
+
+        """
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """
+        Close the files.
+
+        """
+        self.close()
+
+
+def open_recording(
+    path: str | Path,
+    topics: Topics | None = None,
+    input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    *,
+    require: Collection[Role] = ROLES,
+) -> RecordingReader:
+    """
+    Open a bag for reading block by block.
+
+    Parameters
+    ----------
+    path : str or Path
+        A rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
+    topics : Topics, optional
+        Names of the inputs.
+    input : {'auto', 'counts', 'imu'}, optional
+        Which accelerometer topic is read; ``auto`` prefers the counts.
+    require : collection of {'accel', 'board', 'case'}, optional
+        Roles whose absence is an error; the others' columns are just empty.
+
+    Returns
+    -------
+    RecordingReader
+
+    Raises
+    ------
+    RecordingError
+        Missing file, not a bag, empty bag, missing or ambiguous topic, wrong message type,
+        damaged file.
+
+    """
+    path = Path(path)
+    source = _open_source(path)
+    try:
+        return RecordingReader(path, source, topics or Topics(), input, require)
+    except BaseException:
+        source.close()
+        raise
+
+
+def read_recording(
+    path: str | Path,
+    topics: Topics | None = None,
+    input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    *,
+    require: Collection[Role] = ROLES,
+) -> Recording:
+    """
+    Read a whole bag into memory.
+
+    Parameters
+    ----------
+    path, topics, input, require
+        As for `open_recording`.
+
+    Returns
+    -------
+    Recording
+
+    Raises
+    ------
+    RecordingError
+        As for `open_recording`, and damaged data.
+
+    """
+    with open_recording(path, topics, input, require=require) as reader:
+        return Recording(reader.info, join_blocks(reader.blocks(), reader.info.input == 'imu'))
+
+
+def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
+    """
+    Say what a bag holds without reading its messages.
+
+    Parameters
+    ----------
+    path : str or Path
+    topics : Topics, optional
+        Names of the inputs, to tell `RecordingInfo.input`.
+
+    Returns
+    -------
+    RecordingInfo
+
+    Raises
+    ------
+    RecordingError
+        Missing file, not a bag, damaged file.
+
+    """
+    path = Path(path)
+    with open_recording(path, topics, require=()) as reader:
+        return reader.info
+
+
+def _open_source(path: Path) -> Source:
+    if not path.exists():
+        raise RecordingError('no such file or directory', path)
+    if path.is_dir():
+        if not (path / 'metadata.yaml').is_file():
+            raise RecordingError('not a bag: the directory has no metadata.yaml', path)
+    elif path.suffix not in {'.mcap', '.db3', '.bag'}:
+        raise RecordingError('not a bag: expected a directory, .mcap, .db3 or .bag', path)
+    return ForeignSource(path)

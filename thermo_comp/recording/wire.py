@@ -1,0 +1,308 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the serialized layout of stamped messages: many messages to columns in a few array passes.
+
+All three input types are a std_msgs/Header followed by nothing but float64 numbers. In CDR::
+
+    0   encapsulation: 00, endianness (0 big, 1 little), options
+    4   stamp: int32 seconds, uint32 nanoseconds
+    12  uint32 length of frame_id with its final NUL, then its characters
+    4 + align8(12 + length)   the float64 numbers
+
+and in ROS 1 a sequence number stands in place of the encapsulation, the string has no NUL and
+nothing is aligned. Only `frame_id` makes the size vary, so two gathers per message (the fixed
+head, then the numbers) read any mixture of lengths.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RecordingError
+from .columns import Floats, ImuColumns, Ints
+from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED
+
+Bytes = NDArray[np.uint8]
+Encoding = Literal['cdr', 'ros1']
+
+#: How many float64 numbers follow the header of each type.
+N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
+
+HEAD_BYTES = 16
+_MAX_PADDING = 7
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped:
+    """
+    Decoded messages of one topic.
+
+    Attributes
+    ----------
+    stamp_ns : ndarray of int64, shape (n,)
+    numbers : ndarray, shape (n, k)
+    frame_start, frame_size : ndarray of int64, shape (n,)
+        Where the characters of `frame_id` stand in the buffer.
+
+    """
+
+    stamp_ns: Ints
+    numbers: Floats
+    frame_start: Ints
+    frame_size: Ints
+
+
+def gather(buffer: Bytes, at: Ints, n_bytes: int) -> NDArray[Any]:
+    """
+    Copy `n_bytes` from each position of a buffer.
+
+    Parameters
+    ----------
+    buffer : ndarray of uint8, contiguous
+    at : ndarray of int64, shape (n,)
+        Positions, each at least `n_bytes` before the buffer's end.
+    n_bytes : int
+
+    Returns
+    -------
+    ndarray of void, shape (n,)
+
+    """
+    kind = np.dtype((np.void, n_bytes))
+    if len(at) == 0:
+        return np.empty(0, kind)
+    everywhere: NDArray[Any] = np.ndarray(
+        (buffer.size - n_bytes + 1,), kind, buffer.data, strides=(1,)
+    )
+    return everywhere[at]
+
+
+def field(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
+    """
+    One number out of each gathered row.
+
+    Parameters
+    ----------
+    rows : ndarray of void, shape (n,)
+    offset : int
+        Where the number stands in the row [bytes].
+    kind : str
+        Its numpy type.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        A view.
+
+    """
+    view: NDArray[Any] = np.ndarray(
+        (len(rows),), kind, rows.data, offset=offset, strides=(rows.itemsize,)
+    )
+    return view
+
+
+def decode_stamped(
+    buffer: Bytes,
+    start: Ints,
+    size: Ints,
+    kind: str,
+    encoding: Encoding,
+    n_wanted: int | None = None,
+) -> Stamped:
+    """
+    Decode messages that are a header and float64 numbers.
+
+    Parameters
+    ----------
+    buffer : ndarray of uint8, contiguous
+    start, size : ndarray of int64, shape (n,)
+        Where each serialized message stands; all within the buffer.
+    kind : str
+        A key of `N_NUMBERS`.
+    encoding : {'cdr', 'ros1'}
+    n_wanted : int, optional
+        Take only so many leading numbers.
+
+    Returns
+    -------
+    Stamped
+
+    Raises
+    ------
+    RecordingError
+        Bytes that are no message of that type.
+
+    """
+    n_numbers = N_NUMBERS[kind]
+    if len(start) and int(np.min(size)) < HEAD_BYTES + 8 * n_numbers:
+        raise _misfit(kind)
+    head = gather(buffer, start, HEAD_BYTES)
+    orders = _byte_orders(head) if encoding == 'cdr' else ['<']
+    if len(orders) == 1:
+        return _decode(buffer, start, size, head, orders[0], n_numbers, encoding, n_wanted)
+    little = field(head, 1, 'u1') == 1
+    halves = [
+        (
+            rows,
+            _decode(
+                buffer, start[rows], size[rows], head[rows], order, n_numbers, encoding, n_wanted
+            ),
+        )
+        for rows, order in ((np.flatnonzero(little), '<'), (np.flatnonzero(~little), '>'))
+    ]
+    joined = Stamped(
+        np.empty(len(start), np.int64),
+        np.empty((len(start), halves[0][1].numbers.shape[1])),
+        np.empty(len(start), np.int64),
+        np.empty(len(start), np.int64),
+    )
+    for rows, half in halves:
+        joined.stamp_ns[rows] = half.stamp_ns
+        joined.numbers[rows] = half.numbers
+        joined.frame_start[rows] = half.frame_start
+        joined.frame_size[rows] = half.frame_size
+    return joined
+
+
+def _byte_orders(head: NDArray[Any]) -> list[str]:
+    first = field(head, 0, '>u2')
+    if not len(first):
+        return ['<']
+    low, high = int(first.min()), int(first.max())
+    if high > 1:
+        raise RecordingError(
+            f'serialized with representation {high:#06x}, only plain CDR (0 or 1) is read'
+        )
+    return ['<' if high else '>'] if low == high else ['<', '>']
+
+
+def _decode(
+    buffer: Bytes,
+    start: Ints,
+    size: Ints,
+    head: NDArray[Any],
+    order: str,
+    n_numbers: int,
+    encoding: Encoding,
+    n_wanted: int | None,
+) -> Stamped:
+    seconds = field(head, 4, f'{order}i4' if encoding == 'cdr' else '<u4')
+    stamp_ns = seconds.astype(np.int64)
+    stamp_ns *= _NS
+    stamp_ns += field(head, 8, f'{order}u4')
+    frame_size = field(head, 12, f'{order}u4').astype(np.int64)
+    body = frame_size + HEAD_BYTES
+    if encoding == 'cdr':
+        body += 3  # (12 + length + 7) // 8 * 8, counted from after the encapsulation
+        body &= -8
+        body += 4
+    rest = size - body
+    if len(rest) and not (
+        int(np.min(rest)) >= 8 * n_numbers and int(np.max(rest)) <= 8 * n_numbers + _MAX_PADDING
+    ):
+        raise _misfit('a header and its numbers')
+    body += start
+    n_taken = n_numbers if n_wanted is None else n_wanted
+    numbers = gather(buffer, body, 8 * n_taken).view(f'{order}f8').reshape(len(start), n_taken)
+    return Stamped(
+        stamp_ns, numbers.astype(np.float64, copy=False), start + HEAD_BYTES, frame_size
+    )
+
+
+def _misfit(kind: str) -> RecordingError:
+    return RecordingError(f'damaged message: its size does not fit {kind}')
+
+
+def frame_runs(buffer: Bytes, messages: Stamped) -> list[tuple[int, str]]:
+    """
+    Where `frame_id` changes along the messages.
+
+    Parameters
+    ----------
+    buffer : ndarray of uint8
+    messages : Stamped
+
+    Returns
+    -------
+    list of (int, str)
+        First row of each run and its `frame_id`; empty where there are no messages.
+
+    """
+    start, size = messages.frame_start, messages.frame_size
+    if not len(start):
+        return []
+    first_size = int(size[0])
+    if first_size == 0 and not size.any():
+        return [(0, '')]
+    if (size == first_size).all():
+        texts = gather(buffer, start, first_size)
+        if _all_equal(texts):
+            return [(0, _text(texts[0].tobytes()))]
+        rows: list[bytes] = [row.tobytes() for row in texts]
+    else:
+        rows = [
+            buffer[at : at + length].tobytes()
+            for at, length in zip(start.tolist(), size.tolist(), strict=True)
+        ]
+    runs: list[tuple[int, str]] = []
+    before: bytes | None = None
+    for row, characters in enumerate(rows):
+        if characters != before:
+            text = _text(characters)
+            if not runs or runs[-1][1] != text:
+                runs.append((row, text))
+            before = characters
+    return runs
+
+
+def _all_equal(texts: NDArray[Any]) -> bool:
+    """
+    Whether all rows have the bytes of the first one, compared word by word.
+
+    """
+    offset = 0
+    while offset < texts.itemsize:
+        width = next(w for w in (8, 4, 2, 1) if offset + w <= texts.itemsize)
+        words = field(texts, offset, f'u{width}')
+        if (words != words[0]).any():
+            return False
+        offset += width
+    return True
+
+
+def _text(characters: bytes) -> str:
+    return characters.rstrip(b'\0').decode('utf-8', 'replace')
+
+
+def imu_columns(numbers: Floats) -> ImuColumns:
+    """
+    Name the numbers of sensor_msgs/Imu.
+
+    Parameters
+    ----------
+    numbers : ndarray, shape (n, 37)
+
+    Returns
+    -------
+    ImuColumns
+        Views.
+
+    """
+    return ImuColumns(
+        orientation=numbers[:, 0:4],
+        orientation_covariance=numbers[:, 4:13],
+        angular_velocity=numbers[:, 13:16],
+        angular_velocity_covariance=numbers[:, 16:25],
+        linear_acceleration_covariance=numbers[:, 28:37],
+    )
+
+
+#: Where the linear acceleration stands among the numbers of sensor_msgs/Imu.
+IMU_ACCELERATION = slice(25, 28)

@@ -1,0 +1,446 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the way out: columns to a rosbag2 directory or a bare MCAP file that other tools open.
+
+Nothing stands under the target's name until `BagWriter.close` has succeeded; an output that was
+there before stays if writing fails.
+
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import RecordingError
+from .atomic import partial_sibling, publish, sync_directory
+from .columns import ImuColumns, RawMessages
+from .definitions import Definition, known_definition
+from .encode import (
+    Records,
+    as_numbers,
+    as_times,
+    bool_records,
+    imu_numbers,
+    merge_records,
+    raw_records,
+    stamped_records,
+)
+from .mcap_out import McapFile
+from .rosbag2_metadata import dump_metadata
+from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
+
+Compression = Literal['none', 'lz4', 'zstd']
+
+_AUTO_FLUSH_BYTES = 1 << 26
+_LAST_SECOND = 2**31
+_BAG_FILES = {'.mcap', '.db3', '.yaml', '.zstd'}
+
+
+class BagWriter:
+    """
+    Write a bag; use it as a context manager.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
+    compression : {'zstd', 'lz4', 'none'}, optional
+    level : int, optional
+        Of the compression; the default favours speed.
+    metadata : mapping of str to str, optional
+        Key-value pairs kept in the bag; `RecordingInfo.metadata` gives them back.
+    overwrite : bool, optional
+        Replace an output that is there already.
+    chunk_bytes : int, optional
+        Size of a chunk before compression.
+
+    Raises
+    ------
+    RecordingError
+        The output exists, is no bag that may be replaced, or cannot be created.
+    ValueError
+        An unknown compression.
+
+    Notes
+    -----
+    Messages are buffered until `flush`, which merges all topics in log-time order; 64 MiB of them
+    are flushed unasked. So one group of calls whose time spans overlap and a `flush` make a file
+    in log-time order, whatever order the calls had.
+
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        compression: Compression = 'zstd',
+        level: int | None = None,
+        metadata: Mapping[str, str] | None = None,
+        overwrite: bool = False,
+        chunk_bytes: int = 1 << 20,
+    ) -> None:
+        if compression not in {'zstd', 'lz4', 'none'}:
+            raise ValueError(f'`compression` must be zstd, lz4 or none, got {compression!r}')
+        self._path = Path(path)
+        self._is_file = self._path.suffix == '.mcap'
+        self._metadata = dict(metadata or {})
+        self._batches: list[Records] = []
+        self._n_buffered_bytes = 0
+        self._file: McapFile | None = None
+        _check_target(self._path, self._is_file, overwrite)
+        self._partial = partial_sibling(self._path)
+        with self._translated():
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            if not self._is_file:
+                self._partial.mkdir()
+            self._file = McapFile(
+                self._partial if self._is_file else self._partial / f'{self._path.name}_0.mcap',
+                compression,
+                level,
+                chunk_bytes,
+                self._metadata,
+            )
+
+    def write_counts(
+        self,
+        topic: str,
+        stamp_ns: ArrayLike,
+        xyz: ArrayLike,
+        frame_id: str = '',
+        log_ns: ArrayLike | None = None,
+    ) -> None:
+        """
+        Write geometry_msgs/Vector3Stamped.
+
+        Parameters
+        ----------
+        topic : str
+        stamp_ns : array_like of int, shape (n,)
+        xyz : array_like, shape (n, 3)
+        frame_id : str, optional
+        log_ns : array_like of int, shape (n,), optional
+            Log times; the stamps by default.
+
+        Raises
+        ------
+        ValueError
+            Shapes that do not fit, times that no ROS stamp can hold.
+        RecordingError
+            The disk is full or the like.
+
+        """
+        self._write_stamped(topic, VECTOR3_STAMPED, stamp_ns, log_ns, frame_id, xyz, 3, 'xyz')
+
+    def write_temperature(
+        self,
+        topic: str,
+        stamp_ns: ArrayLike,
+        celsius: ArrayLike,
+        log_ns: ArrayLike | None = None,
+        frame_id: str = '',
+        variance: ArrayLike = 0.0,
+    ) -> None:
+        """
+        Write sensor_msgs/Temperature.
+
+        Parameters
+        ----------
+        topic : str
+        stamp_ns : array_like of int, shape (n,)
+        celsius : array_like, shape (n,)
+        log_ns : array_like of int, shape (n,), optional
+        frame_id : str, optional
+        variance : array_like, shape (n,) or scalar, optional
+            K^2; 0 means unknown.
+
+        Raises
+        ------
+        ValueError
+            As for `write_counts`.
+        RecordingError
+            As for `write_counts`.
+
+        """
+        stamps = _as_stamps(stamp_ns)
+        column = np.asarray(celsius, np.float64)
+        if column.shape != stamps.shape:
+            raise ValueError(f'`celsius` must have {len(stamps)} values, got {column.shape}')
+        numbers = np.column_stack([column, np.broadcast_to(np.asarray(variance), column.shape)])
+        self._write_stamped(topic, TEMPERATURE, stamps, log_ns, frame_id, numbers, 2, 'celsius')
+
+    def write_imu(
+        self,
+        topic: str,
+        stamp_ns: ArrayLike,
+        linear_acceleration: ArrayLike,
+        linear_acceleration_covariance: ArrayLike,
+        frame_id: str = '',
+        imu: ImuColumns | None = None,
+        log_ns: ArrayLike | None = None,
+    ) -> None:
+        """
+        Write sensor_msgs/Imu.
+
+        Parameters
+        ----------
+        topic : str
+        stamp_ns : array_like of int, shape (n,)
+        linear_acceleration : array_like, shape (n, 3)
+            m/s^2.
+        linear_acceleration_covariance : array_like, shape (n, 9) or (9,)
+        frame_id : str, optional
+        imu : ImuColumns, optional
+            Orientation and angular velocity with their covariances. Without it neither is
+            claimed: identity orientation, zero rate, and -1 as first element of each covariance.
+        log_ns : array_like of int, shape (n,), optional
+
+        Raises
+        ------
+        ValueError
+            As for `write_counts`.
+        RecordingError
+            As for `write_counts`.
+
+        """
+        stamps = _as_stamps(stamp_ns)
+        n = len(stamps)
+        numbers = imu_numbers(
+            n,
+            as_numbers('linear_acceleration', linear_acceleration, n, 3),
+            as_numbers('linear_acceleration_covariance', linear_acceleration_covariance, n, 9),
+            imu,
+        )
+        self._write_stamped(topic, IMU, stamps, log_ns, frame_id, numbers, 37, 'imu')
+
+    def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
+        """
+        Write std_msgs/Bool.
+
+        Parameters
+        ----------
+        topic : str
+        log_ns : array_like of int, shape (n,)
+        values : array_like of bool, shape (n,)
+
+        Raises
+        ------
+        ValueError
+            As for `write_counts`.
+        RecordingError
+            As for `write_counts`.
+
+        """
+        times = as_times('log_ns', log_ns)
+        flags = np.atleast_1d(np.asarray(values, np.bool_))
+        if flags.shape != times.shape:
+            raise ValueError(f'`values` must have {len(times)} values, got {flags.shape}')
+        self._add(bool_records(self._channel(topic, BOOL), times, flags))
+
+    def write_raw(
+        self,
+        topic: str,
+        type: str,  # noqa: A002 - the parameter's public name
+        log_ns: ArrayLike,
+        messages: Sequence[bytes] | RawMessages,
+        definition: tuple[str, str] | None = None,
+    ) -> None:
+        """
+        Write messages that are serialized (CDR) already.
+
+        Parameters
+        ----------
+        topic : str
+        type : str
+            E.g. ``diagnostic_msgs/msg/DiagnosticArray``.
+        log_ns : array_like of int, shape (n,)
+        messages : sequence of bytes, or RawMessages
+        definition : (str, str), optional
+            Encoding (``ros2msg``, ``ros2idl``) and text of the type's definition, as
+            `RecordingReader.definitions` gives it; by default that of ROS 2 Jazzy.
+
+        Raises
+        ------
+        ValueError
+            Lengths that do not fit.
+        RecordingError
+            A type whose definition is not known; the disk is full or the like.
+
+        """
+        if isinstance(messages, RawMessages):
+            data, ends = messages.data, messages.ends
+        else:
+            data = np.frombuffer(b''.join(messages), np.uint8)
+            ends = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
+        times = as_times('log_ns', log_ns, len(ends))
+        channel = self._channel(topic, type, definition)
+        self._add(raw_records(channel, times, data, ends))
+
+    def flush(self) -> None:
+        """
+        Merge what is buffered in log-time order and hand it to the file.
+
+        Raises
+        ------
+        RecordingError
+            The disk is full or the like.
+
+        """
+        if self._batches:
+            batches, self._batches, self._n_buffered_bytes = self._batches, [], 0
+            with self._translated():
+                self._open_file().append(*merge_records(batches))
+
+    def close(self) -> None:
+        """
+        Finish the bag and give it its name.
+
+        Raises
+        ------
+        RecordingError
+            The disk is full or the like; nothing of this output is left then.
+
+        """
+        if self._file is None:
+            return
+        self.flush()
+        with self._translated():
+            summary = self._open_file().finish(self._metadata)
+            if not self._is_file:
+                text = dump_metadata(summary, self._metadata)
+                _write_text(self._partial / 'metadata.yaml', text)
+                sync_directory(self._partial)
+            publish(self._partial, self._path)
+        self._file = None
+
+    def abort(self) -> None:
+        """
+        Drop the unfinished output; what stood under its name before stays.
+
+        """
+        file, self._file = self._file, None
+        if file is not None:
+            with suppress(OSError):
+                file.close()
+        with suppress(OSError):
+            if self._partial.is_dir():
+                shutil.rmtree(self._partial)
+            else:
+                self._partial.unlink(missing_ok=True)
+
+    def __enter__(self) -> BagWriter:
+        """
+        Give the open writer.
+
+        """
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """
+        Finish the bag, or drop it where the block raised.
+
+        """
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+    def _write_stamped(
+        self,
+        topic: str,
+        kind: str,
+        stamp_ns: ArrayLike,
+        log_ns: ArrayLike | None,
+        frame_id: str,
+        numbers: ArrayLike,
+        width: int,
+        name: str,
+    ) -> None:
+        stamps = _as_stamps(stamp_ns)
+        times = stamps if log_ns is None else as_times('log_ns', log_ns, len(stamps))
+        columns = as_numbers(name, numbers, len(stamps), width)
+        self._add(stamped_records(self._channel(topic, kind), stamps, times, frame_id, columns))
+
+    def _channel(self, topic: str, kind: str, definition: tuple[str, str] | None = None) -> int:
+        name = '/' + topic.strip('/')
+        if definition is None:
+            try:
+                known = known_definition(kind)
+            except RecordingError as error:
+                raise RecordingError(error.message, self._path, name) from error
+        else:
+            known = Definition(*definition, '')
+        with self._translated():
+            channel = self._open_file().channel(name, kind, known)
+        if channel is None:
+            raise RecordingError(
+                f'already written with another type than {kind}', self._path, name
+            )
+        return channel
+
+    def _add(self, records: Records) -> None:
+        if len(records.log_ns):
+            self._batches.append(records)
+            self._n_buffered_bytes += int(records.size.sum())
+            if self._n_buffered_bytes > _AUTO_FLUSH_BYTES:
+                self.flush()
+
+    def _open_file(self) -> McapFile:
+        if self._file is None:
+            raise RecordingError('the bag is closed', self._path)
+        return self._file
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self.abort()
+            raise RecordingError(
+                f'cannot be written: {error.strerror or error}', self._path
+            ) from error
+
+
+def _as_stamps(stamp_ns: ArrayLike) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    stamps = as_times('stamp_ns', stamp_ns)
+    if len(stamps) and int(np.max(stamps)) >= _LAST_SECOND * 1_000_000_000:
+        raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))}')
+    return stamps
+
+
+def _check_target(path: Path, is_file: bool, overwrite: bool) -> None:
+    if not path.exists():
+        return
+    if not overwrite:
+        raise RecordingError('exists already; say so if it is to be overwritten', path)
+    if is_file == path.is_dir():
+        raise RecordingError(
+            f'is a {"directory" if path.is_dir() else "file"} and is not replaced', path
+        )
+    if path.is_dir():
+        strange = [entry.name for entry in path.iterdir() if entry.suffix not in _BAG_FILES]
+        if strange:
+            raise RecordingError(
+                f'is not replaced: it holds {sorted(strange)[0]}, which belongs to no bag', path
+            )
+
+
+def _write_text(path: Path, text: str) -> None:
+    with path.open('w', encoding='utf-8') as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
