@@ -37,7 +37,7 @@ def regime_set(x=None, y=None, z=None, **keys):
 
 
 def calibration(**keys):
-    """A unit of 300 counts per m/s^2; with no arguments it only scales."""
+    """Make a unit of 300 counts per m/s^2; with no arguments it only scales."""
     values = {
         'format_version': 1,
         'unit': Unit('T-1', 'counts', 32767.0, 0.01),
@@ -53,7 +53,7 @@ def calibration(**keys):
 
 
 def rich_calibration():
-    """Every term at work, on every axis, in both regimes, with a covariance."""
+    """Put every term to work, on every axis, in both regimes, with a covariance."""
 
     def one(sign, dynamic):
         size = 2 if dynamic else 1

@@ -40,6 +40,12 @@ class _Loader(_BASE):  # type: ignore[valid-type, misc]
 
     """
 
+    #: Only what JSON knows: an explicit !!binary, !!set or !!timestamp is undefined here.
+    yaml_constructors = {  # noqa: RUF012
+        tag: constructor
+        for tag, constructor in _BASE.yaml_constructors.items()
+        if tag is None or tag.rpartition(':')[2] in ('null', 'str', 'seq')
+    }
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
 
@@ -282,6 +288,7 @@ def _parse_yaml(content: bytes, path: str | Path | None) -> Any:
 def _check_events(text: str, path: str | Path | None) -> None:
     depth = 0
     documents = 0
+    event: Any
     for event in yaml.parse(text, Loader=_BASE):
         if isinstance(event, yaml.AliasEvent):
             raise CalibrationError(

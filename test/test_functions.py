@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Temperature functions against hand numbers, scipy and their own derivatives.
+
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline as ReferenceSpline
+
+from thermo_comp.functions import CubicSpline, Exponential, Polynomial, hold
+
+KNOTS = (-15.0, -6.0, 0.0, 4.0, 15.0)
+FUNCTIONS = [
+    Polynomial((1.0,)),
+    Polynomial((0.0, 2e-3, -3e-5, 4e-7, 1e-9)),
+    CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9)),
+    Exponential(-0.5, (0.2, 0.3), (12.0, -7.0)),
+]
+temperatures = st.floats(-15.0, 15.0)
+
+
+def test_polynomial_by_hand():
+    # 1 + 2*3 + 0.5*9 + 0.25*27: a4 t^4 is the fourth term of eq (10), not a4 t.
+    assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
+
+
+def test_exponential_by_hand():
+    function = Exponential(-2.0, (2.0,), (10.0,))
+    assert function.value(0.0) == 0.0
+    assert function.value(10.0) == pytest.approx(2.0 * (np.e - 1.0), rel=1e-15)
+
+
+def test_spline_equals_scipy():
+    values = (1.5, 0.4, 0.0, -0.2, 0.9)
+    ours = CubicSpline(KNOTS, values)
+    reference = ReferenceSpline(KNOTS, values, bc_type='natural')
+    t = np.linspace(-15.0, 15.0, 301)
+    # Two solutions of one linear system: only rounding apart.
+    np.testing.assert_allclose(ours.value(t), reference(t), atol=1e-13)
+    np.testing.assert_allclose(ours.slope(t), reference(t, 1), atol=1e-13)
+
+
+def test_spline_holds_its_ends():
+    spline = CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9))
+    assert spline.value(-100.0) == spline.value(-15.0)
+    assert spline.value(100.0) == pytest.approx(0.9, abs=1e-15)
+
+
+@pytest.mark.parametrize('function', FUNCTIONS)
+def test_array_gives_the_bits_of_floats(function):
+    t = np.concatenate((np.linspace(-16.0, 16.0, 1001), KNOTS))
+    for method in (function.value, function.slope):
+        assert method(t).tolist() == [method(x) for x in t.tolist()]
+    columns = function.basis(t)
+    rows = [function.basis(x) for x in t.tolist()]
+    assert [list(row) for row in zip(*columns, strict=True)] == rows or function.n_free == 0
+
+
+@pytest.mark.parametrize('function', FUNCTIONS)
+@given(t=temperatures)
+def test_slope_is_the_derivative(function, t):
+    step = 1e-4
+    t = min(max(t, -15.0 + step), 15.0 - step)
+    # Central difference: third derivative * step^2 / 6 of functions of order 1 over 10 K.
+    expected = (function.value(t + step) - function.value(t - step)) / (2.0 * step)
+    assert function.slope(t) == pytest.approx(expected, abs=1e-8)
+
+
+@pytest.mark.parametrize('function', FUNCTIONS)
+@given(t=temperatures, data=st.data())
+def test_value_is_linear_in_the_free_coefficients(function, t, data):
+    change = data.draw(st.tuples(*[st.floats(-1.0, 1.0)] * function.n_free))
+    other = function.with_free(
+        tuple(a + b for a, b in zip(function.free_coefficients, change, strict=True))
+    )
+    expected = function.value(t) + sum(
+        b * d for b, d in zip(function.basis(t), change, strict=True)
+    )
+    # Powers up to 15^4 times coefficients of order 1.
+    assert other.value(t) == pytest.approx(expected, rel=1e-12, abs=1e-9)
+    assert other.value(0.0) == pytest.approx(function.value(0.0), abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ('build', 'message'),
+    [
+        (lambda: Polynomial(()), 'at least the value'),
+        (lambda: Polynomial((0.0, float('nan'))), '`coefficients` must be finite'),
+        (lambda: CubicSpline((0.0, 1.0), (0.0, 1.0)), 'at least 3 knots'),
+        (lambda: CubicSpline((-1.0, 0.0, 1.0), (0.0, 1.0)), 'one number per knot'),
+        (lambda: CubicSpline((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)), 'must rise'),
+        (lambda: CubicSpline((1.0, 2.0, 3.0), (0.0, 0.0, 1.0)), 'must contain 0'),
+        (lambda: Exponential(0.0, (), ()), 'at least one number'),
+        (lambda: Exponential(0.0, (1.0,), (1.0, 2.0)), 'one number per amplitude'),
+        (lambda: Exponential(0.0, (1.0,), (0.0,)), 'at least 1 K'),
+        (lambda: Exponential(float('inf'), (1.0,), (9.0,)), '`constant` must be finite'),
+    ],
+)
+def test_refusals(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def test_hold():
+    assert [hold(x, -1.0, 2.0) for x in (-3.0, 0.5, 4.0)] == [-1.0, 0.5, 2.0]
+    assert hold(np.array([-3.0, 0.5, 4.0]), -1.0, 2.0).tolist() == [-1.0, 0.5, 2.0]
