@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the thermal history of a bag: the causal thermal state, on a uniform grid.
+
+The thermal tracker that the compensator runs is run here over the bag's readings, so that every
+regressor means in the fit what it means online.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..regime import DetectorSettings
+from ..thermal import (
+    BOARD,
+    GRADIENT,
+    RATE,
+    UNKNOWN,
+    VAR_BOARD,
+    WEIGHT,
+    ThermalConfig,
+    ThermalTracker,
+)
+from .reduction import ReducedBag
+
+Array = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+_GRID_COLUMNS = (BOARD, VAR_BOARD, RATE, GRADIENT, WEIGHT, UNKNOWN)
+
+
+@dataclass(frozen=True)
+class ThermalHistory:
+    """
+    Thermal state of one bag.
+
+    Parameters
+    ----------
+    start_s : float
+        Time of the first grid point since the bag's first sample [s].
+    step_s : float
+        Grid step [s].
+    board, var_board, rate, gradient, weight : ndarray, shape (n,)
+        Board temperature, its variance and rate, ``T_case - T_board``, weight of the dynamic set.
+    is_unknown : ndarray of bool, shape (n,)
+        Whether the regime was still unknown.
+
+    """
+
+    start_s: float
+    step_s: float
+    board: Array
+    var_board: Array
+    rate: Array
+    gradient: Array
+    weight: Array
+    is_unknown: BoolArray
+
+    @property
+    def time(self) -> Array:
+        """
+        Times of the grid points since the bag's first sample, shape (n,).
+
+        """
+        return np.asarray(self.start_s + self.step_s * np.arange(len(self.board)))
+
+
+def thermal_history(
+    bag: ReducedBag, detector: DetectorSettings, step_s: float, config: ThermalConfig
+) -> ThermalHistory:
+    """
+    Run the thermal tracker over a bag's readings.
+
+    Parameters
+    ----------
+    bag : ReducedBag
+        The bag, with board readings.
+    detector : DetectorSettings
+        Settings of thermometers and detector.
+    step_s : float
+        Grid step [s].
+    config : ThermalConfig
+        Cross-over and time-outs.
+
+    Returns
+    -------
+    ThermalHistory
+        From the first board reading to the last sample.
+
+    """
+    tracker = ThermalTracker(detector, (), config)
+    stamps = np.concatenate((bag.board.stamp_ns, bag.case.stamp_ns))
+    values = np.concatenate((bag.board.value, bag.case.value))
+    is_case = np.concatenate(
+        (np.zeros(len(bag.board.value), bool), np.ones(len(bag.case.value), bool))
+    )
+    order = np.argsort(stamps, kind='stable')
+    stamps, values, is_case = stamps[order], values[order], is_case[order]
+    step_ns = round(step_s * 1e9)
+    begin = max(int(bag.board.stamp_ns[0]), bag.start_ns)
+    grid = np.arange(begin, max(bag.end_ns, begin) + step_ns, step_ns)
+    # Readings up to and including a grid stamp come first, as they do online.
+    due = np.searchsorted(stamps, grid, side='right')
+    rows = np.empty((len(grid), len(_GRID_COLUMNS)))
+    reading = 0
+    stamp_list, value_list, case_list = stamps.tolist(), values.tolist(), is_case.tolist()
+    for i, (stamp, stop) in enumerate(zip(grid.tolist(), due.tolist(), strict=True)):
+        while reading < stop:
+            take = tracker.case_reading if case_list[reading] else tracker.board_reading
+            take(stamp_list[reading], value_list[reading])
+            reading += 1
+        state = tracker.sample(stamp)
+        rows[i] = [state[column] for column in _GRID_COLUMNS]
+    return ThermalHistory(
+        start_s=(begin - bag.start_ns) * 1e-9,
+        step_s=step_s,
+        board=rows[:, 0],
+        var_board=rows[:, 1],
+        rate=rows[:, 2],
+        gradient=rows[:, 3],
+        weight=rows[:, 4],
+        is_unknown=rows[:, 5] > 0.5,
+    )

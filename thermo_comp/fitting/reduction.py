@@ -1,0 +1,246 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
+
+One pass over the blocks, in bounded memory: samples become cells of about half a second (see
+`stillness`), the cells of a still interval become windows of some ten seconds. Within a window
+every thermal regressor is linear in time to far below the noise, so the window's mean is a
+sufficient statistic; its noise is what the regression finds, because a charge-balancing
+converter makes means better than the scatter of its samples says.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .sources import FitSource
+from .stillness import CellAccumulator, Cells, still_intervals
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+# Faster readings are averaged to this interval: no thermometer of this kind is that fast, and the
+# thermometers' recursion runs in Python.
+_SHORTEST_READING_INTERVAL_S = 0.2
+
+
+@dataclass(frozen=True)
+class Readings:
+    """
+    One thermometer's readings over a bag.
+
+    Parameters
+    ----------
+    stamp_ns : ndarray of int64, shape (n,)
+        Rising stamps.
+    value : ndarray, shape (n,)
+        Temperatures.
+    n_read : int
+        Readings in the bag, before averaging.
+
+    """
+
+    stamp_ns: IntArray
+    value: Array
+    n_read: int
+
+
+@dataclass(frozen=True)
+class StillInterval:
+    """
+    One interval without motion: one position.
+
+    Parameters
+    ----------
+    bag : int
+        Number of the bag in the order given.
+    start_ns, end_ns : int
+        Stamps of its first and last cell's middle.
+    time : ndarray, shape (n,)
+        Window times since the bag's first sample [s].
+    count : ndarray, shape (n,)
+        Samples per window.
+    mean : ndarray, shape (n, 3)
+        Window means of the raw samples.
+    sample_sd : ndarray, shape (3,)
+        Scatter of single samples.
+
+    """
+
+    bag: int
+    start_ns: int
+    end_ns: int
+    time: Array
+    count: Array
+    mean: Array
+    sample_sd: Array
+
+
+@dataclass(frozen=True)
+class ReducedBag:
+    """
+    What the fit keeps of one bag.
+
+    Parameters
+    ----------
+    source : FitSource
+        Where it came from.
+    start_ns, end_ns : int
+        First and last stamp of the samples used.
+    intervals : tuple of StillInterval
+        Still intervals in order.
+    board, case : Readings
+        Temperature readings.
+    n_samples, n_dropped, n_saturated : int
+        Samples read; not finite or out of order; at the full scale.
+    n_cells, n_still_cells : int
+        Length of the bag, and of its still intervals, in cells.
+    cycle_s : float
+        Typical interval between samples.
+    is_integer : bool
+        Whether all samples were whole numbers.
+
+    """
+
+    source: FitSource
+    start_ns: int
+    end_ns: int
+    intervals: tuple[StillInterval, ...]
+    board: Readings
+    case: Readings
+    n_samples: int
+    n_dropped: int
+    n_saturated: int
+    n_cells: int
+    n_still_cells: int
+    cycle_s: float
+    is_integer: bool
+
+
+def reduce_source(
+    source: FitSource,
+    bag: int,
+    *,
+    window_s: float,
+    cell_s: float,
+    min_still_s: float,
+    full_scale: float | None,
+) -> ReducedBag:
+    """
+    Stream one source and keep its sufficient statistics.
+
+    Parameters
+    ----------
+    source : FitSource
+        The bag.
+    bag : int
+        Its number.
+    window_s, cell_s : float
+        Length of a window and of a cell.
+    min_still_s : float
+        Shortest still interval.
+    full_scale : float or None
+        Magnitude of a saturated sample.
+
+    Returns
+    -------
+    ReducedBag
+        The reduced bag.
+
+    """
+    cells = CellAccumulator(cell_s, full_scale)
+    board, case = _ReadingCollector(), _ReadingCollector()
+    n_samples = 0
+    for block in source.blocks():
+        cells.add(block.accel_stamp_ns, block.accel)
+        board.add(block.board_stamp_ns, block.board)
+        case.add(block.case_stamp_ns, block.case)
+        n_samples += len(block.accel_stamp_ns)
+    found = cells.finish()
+    ranges = still_intervals(found, min_still_s)
+    return ReducedBag(
+        source=source,
+        start_ns=found.start_ns,
+        end_ns=found.start_ns + (round(found.time[-1] * 1e9) if len(found.time) else 0),
+        intervals=tuple(_windows(found, bag, lower, upper, window_s) for lower, upper in ranges),
+        board=board.finish(),
+        case=case.finish(),
+        n_samples=n_samples,
+        n_dropped=found.n_dropped,
+        n_saturated=found.n_saturated,
+        n_cells=len(found.count),
+        n_still_cells=sum(upper - lower for lower, upper in ranges),
+        cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
+        is_integer=found.is_integer,
+    )
+
+
+def _windows(cells: Cells, bag: int, lower: int, upper: int, window_s: float) -> StillInterval:
+    per_window = max(1, round(window_s / cells.cell_s))
+    n_windows = max(1, round((upper - lower) / per_window))
+    first = lower + np.round(np.arange(n_windows) * (upper - lower) / n_windows).astype(np.int64)
+    rows = slice(lower, upper)
+    offsets = first - lower
+    count = cells.count[rows].astype(np.float64)
+    total = np.add.reduceat(count, offsets)
+    mean = np.add.reduceat(cells.mean[rows] * count[:, None], offsets, axis=0) / total[:, None]
+    return StillInterval(
+        bag=bag,
+        start_ns=cells.start_ns + round(cells.time[lower] * 1e9),
+        end_ns=cells.start_ns + round(cells.time[upper - 1] * 1e9),
+        time=np.add.reduceat(cells.time[rows] * count, offsets) / total,
+        count=total,
+        mean=mean,
+        sample_sd=np.sqrt(np.median(cells.variance[rows], axis=0)),
+    )
+
+
+class _ReadingCollector:
+    """
+    Gathers one thermometer's readings: finite, in rising order, averaged when very fast.
+
+    """
+
+    def __init__(self) -> None:
+        self._stamps: list[IntArray] = []
+        self._values: list[Array] = []
+        self._last_ns: int | None = None
+        self._n_read = 0
+
+    def add(self, stamp_ns: IntArray, value: Array) -> None:
+        if not len(stamp_ns):
+            return
+        stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
+        value = np.asarray(value, dtype=np.float64)
+        self._n_read += len(stamp_ns)
+        before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
+        use = np.isfinite(value)
+        use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
+        stamp_ns, value = stamp_ns[use], value[use]
+        if not len(stamp_ns):
+            return
+        self._last_ns = int(stamp_ns[-1])
+        span_s = (stamp_ns[-1] - stamp_ns[0]) * 1e-9
+        size = int(_SHORTEST_READING_INTERVAL_S * (len(stamp_ns) - 1) / span_s) if span_s else 1
+        if size > 1:
+            n = len(stamp_ns) // size * size
+            if n:
+                first = stamp_ns[0]
+                middle = np.mean((stamp_ns[:n] - first).reshape(-1, size), axis=1)
+                stamp_ns = first + middle.astype(np.int64)
+                value = np.mean(value[:n].reshape(-1, size), axis=1)
+        self._stamps.append(stamp_ns)
+        self._values.append(value)
+
+    def finish(self) -> Readings:
+        empty = np.zeros(0, dtype=np.int64)
+        return Readings(
+            np.concatenate(self._stamps) if self._stamps else empty,
+            np.concatenate(self._values) if self._values else np.zeros(0),
+            self._n_read,
+        )

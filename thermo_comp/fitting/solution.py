@@ -1,0 +1,188 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the state of the regression: everything it estimates, and the prediction made from it.
+
+Measurement model of window w of position p, axis i::
+
+    N = columns_bias(w) . bias_i + g (A u_p)_i columns_scale(w) . scale_i + noise,  A = M^-1
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .lags import Memory
+from .model import ModelSpec
+from .table import WindowTable
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """
+    Estimates of one model.
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model.
+    gravity : float
+        Local gravity.
+    bias : ndarray, shape (3, n_columns('bias'))
+        Bias parameters per axis, in input units.
+    scale : ndarray, shape (3, n_columns('scale'))
+        Scale parameters per axis; the first is K.
+    skew : ndarray, shape (3,)
+        A[1, 0], A[2, 0], A[2, 1] of ``A = M^-1``.
+    up : ndarray, shape (n_positions, 3)
+        Unit vectors of the specific force.
+    time_constants_s : ndarray, shape (n_lags,)
+        Time constants of the lags.
+    start_memory : ndarray, shape (n_bags, n_lags)
+        Memory at each bag's start [K].
+    noise_sd : ndarray, shape (2, 3)
+        Residual sd of a window of typical length, per regime and axis, in input units.
+
+    """
+
+    spec: ModelSpec
+    gravity: float
+    bias: Array
+    scale: Array
+    skew: Array
+    up: Array
+    time_constants_s: Array
+    start_memory: Array
+    noise_sd: Array
+
+    @property
+    def inverse_misalignment(self) -> Array:
+        """
+        A: from the frame to the sensitivity axes, lower triangular with a unit diagonal.
+
+        """
+        matrix = np.eye(3)
+        matrix[1, 0], matrix[2, 0], matrix[2, 1] = self.skew
+        return matrix
+
+    @property
+    def misalignment(self) -> Array:
+        """
+        M, from the sensitivity axes to the frame.
+
+        """
+        a, b, c = self.skew
+        matrix = np.eye(3)
+        matrix[1, 0], matrix[2, 1] = -a, -c
+        matrix[2, 0] = a * c - b
+        return matrix
+
+
+@dataclass(frozen=True)
+class Regressors:
+    """
+    The columns of a model over a table, at given time constants.
+
+    Parameters
+    ----------
+    bias, scale : ndarray, shape (n, n_columns)
+        Columns, with the start memories in.
+    live : ndarray, shape (n,)
+        Weight of the thermal terms.
+    slope, decay : ndarray, shape (n, n_lags)
+        Derivatives of the memory by ``ln tau`` and by the start memory.
+
+    """
+
+    bias: Array
+    scale: Array
+    live: Array
+    slope: Array
+    decay: Array
+
+
+def regressors(
+    table: WindowTable,
+    spec: ModelSpec,
+    time_constants_s: Array,
+    start_memory: Array,
+    memory: Memory | None = None,
+) -> Regressors:
+    """
+    Evaluate a model's columns over a table.
+
+    Parameters
+    ----------
+    table : WindowTable
+        The windows.
+    spec : ModelSpec
+        The model.
+    time_constants_s : ndarray, shape (n_lags,)
+        Time constants [s].
+    start_memory : ndarray, shape (n_bags, n_lags)
+        Memory at each bag's start [K].
+    memory : Memory or None, optional
+        The memory at these time constants, when it is already known.
+
+    Returns
+    -------
+    Regressors
+        The columns.
+
+    """
+    if memory is None:
+        memory = table.memory(time_constants_s)
+    start = start_memory[table.bag]
+    value = memory.value + start * memory.decay
+    return Regressors(
+        bias=spec.columns(table, value, 'bias'),
+        scale=spec.columns(table, value, 'scale'),
+        live=spec.live_weight(table),
+        slope=memory.slope + start * memory.decay_slope,
+        decay=memory.decay,
+    )
+
+
+def predict(table: WindowTable, solution: Solution, columns: Regressors) -> Array:
+    """
+    Predict the window means.
+
+    Parameters
+    ----------
+    table : WindowTable
+        The windows.
+    solution : Solution
+        The estimates.
+    columns : Regressors
+        The model's columns over the table.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        In input units.
+
+    """
+    force = solution.gravity * solution.up @ solution.inverse_misalignment.T
+    return np.asarray(
+        columns.bias @ solution.bias.T + force[table.position] * (columns.scale @ solution.scale.T)
+    )
+
+
+def correct(table: WindowTable, solution: Solution, columns: Regressors) -> Array:
+    """
+    Correct the window means, as the compensator would.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Specific force.
+
+    """
+    along = (table.mean - columns.bias @ solution.bias.T) / (columns.scale @ solution.scale.T)
+    return np.asarray(along @ solution.misalignment.T)

@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what the fit reads: blocks of accelerometer samples and temperature readings, by source.
+
+The fit lives below the recording layer, so it says here what it needs and lets bags, tables and
+simulated runs provide it.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+class SourceBlock(Protocol):
+    """
+    A run of messages; `recording.Block` is one.
+
+    """
+
+    @property
+    def accel_stamp_ns(self) -> IntArray:
+        """
+        Stamps of the samples, shape (n,).
+
+        """
+
+    @property
+    def accel(self) -> Array:
+        """
+        Counts, or m/s^2, shape (n, 3).
+
+        """
+
+    @property
+    def board_stamp_ns(self) -> IntArray:
+        """
+        Stamps of the board readings, shape (m,).
+
+        """
+
+    @property
+    def board(self) -> Array:
+        """
+        Board temperature, shape (m,).
+
+        """
+
+    @property
+    def case_stamp_ns(self) -> IntArray:
+        """
+        Stamps of the case readings, shape (k,).
+
+        """
+
+    @property
+    def case(self) -> Array:
+        """
+        Case temperature, shape (k,).
+
+        """
+
+
+@dataclass(frozen=True)
+class ArrayBlock:
+    """
+    A block made of arrays at hand: a simulated run, or a whole recording in memory.
+
+    Parameters
+    ----------
+    accel_stamp_ns : ndarray of int64, shape (n,)
+        Stamps of the samples.
+    accel : ndarray, shape (n, 3)
+        Counts, or m/s^2.
+    board_stamp_ns, case_stamp_ns : ndarray of int64, shape (m,) and (k,)
+        Stamps of the temperature readings.
+    board, case : ndarray, shape (m,) and (k,)
+        Temperatures.
+
+    """
+
+    accel_stamp_ns: IntArray
+    accel: Array
+    board_stamp_ns: IntArray
+    board: Array
+    case_stamp_ns: IntArray
+    case: Array
+
+
+@dataclass(frozen=True)
+class FitSource:
+    """
+    One bag (or what stands for one), to be streamed in file order.
+
+    Parameters
+    ----------
+    name : str
+        What messages and provenance call it.
+    blocks : callable
+        Gives a fresh iterable of blocks; called once per pass.
+    sha256 : str or None, optional
+        Hash of the content, for the provenance.
+    serial : str or None, optional
+        Unit serial found in the source's metadata.
+
+    """
+
+    name: str
+    blocks: Callable[[], Iterable[SourceBlock]]
+    sha256: str | None = None
+    serial: str | None = None

@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the first guess: constant bias, scale, misalignment and attitudes from position means.
+
+The mean of each position lies on an ellipsoid. It is fitted without temperature, first by its
+best box, then by least squares on ``|f| - g``; the full regression starts from there.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from ..errors import FitError
+from .model import ModelSpec
+from .solution import Solution
+from .table import WindowTable
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ConstantCalibration:
+    """
+    The nine parameters of a triad at one temperature.
+
+    Parameters
+    ----------
+    bias, scale : ndarray, shape (3,)
+        Input units; input units per m/s^2.
+    misalignment : ndarray, shape (3, 3)
+        M, lower triangular with a unit diagonal.
+
+    """
+
+    bias: Array
+    scale: Array
+    misalignment: Array
+
+    def force(self, measured: Array) -> Array:
+        """
+        Specific force of measured vectors, shape (n, 3).
+
+        """
+        return np.asarray(((measured - self.bias) / self.scale) @ self.misalignment.T)
+
+
+def constant_calibration(
+    means: Array, gravity: float, with_misalignment: bool
+) -> ConstantCalibration:
+    """
+    Fit bias, scale and, if asked, misalignment to position means.
+
+    Parameters
+    ----------
+    means : ndarray, shape (n, 3)
+        Mean raw vector of each position.
+    gravity : float
+        Local gravity.
+    with_misalignment : bool
+        Whether M is estimated; otherwise it is the identity.
+
+    Returns
+    -------
+    ConstantCalibration
+        The least squares of ``|f| - g``.
+
+    Raises
+    ------
+    FitError
+        If the positions lie on no ellipsoid.
+
+    """
+    bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
+    half = 0.5 * (means.max(axis=0) - means.min(axis=0))
+    if not np.all(half > 0.0):
+        raise FitError('an axis reads the same in all positions: it is dead or was never turned')
+    tried = []
+    for spread in (1.0, 1.3):
+        scale = np.full(3, float(np.max(half)) * spread / gravity)
+        scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
+        tried.append(_refine(means, gravity, bias, scale, with_misalignment))
+    calibration, rms = min(tried, key=lambda found: found[1])
+    if not np.all(calibration.scale > 0.0) or not rms < 0.2 * gravity:
+        raise FitError('the positions lie on no ellipsoid: is every one of them at rest?')
+    return calibration
+
+
+def _refine(
+    means: Array, gravity: float, bias: Array, scale: Array, with_misalignment: bool
+) -> tuple[ConstantCalibration, float]:
+    unit = scale * gravity
+
+    def unpack(parameters: Array) -> ConstantCalibration:
+        matrix = np.eye(3)
+        if with_misalignment:
+            matrix[1, 0], matrix[2, 0], matrix[2, 1] = parameters[6:]
+        return ConstantCalibration(
+            bias + parameters[:3] * unit, scale * np.exp(parameters[3:6]), matrix
+        )
+
+    def residual(parameters: Array) -> Array:
+        return np.asarray(np.linalg.norm(unpack(parameters).force(means), axis=1) / gravity - 1.0)
+
+    found = least_squares(
+        residual,
+        np.zeros(9 if with_misalignment else 6),
+        loss='soft_l1',
+        f_scale=0.01,
+        x_scale=0.1,
+    )
+    return unpack(found.x), gravity * float(np.sqrt(np.mean(residual(found.x) ** 2)))
+
+
+def starting_solution(
+    table: WindowTable,
+    spec: ModelSpec,
+    gravity: float,
+    constant: ConstantCalibration,
+    time_constants_s: Array,
+) -> Solution:
+    """
+    Turn the constant calibration into a start of the full regression.
+
+    Parameters
+    ----------
+    table : WindowTable
+        The windows.
+    spec : ModelSpec
+        The model.
+    gravity : float
+        Local gravity.
+    constant : ConstantCalibration
+        The first guess.
+    time_constants_s : ndarray, shape (n_lags,)
+        First guess of the lags [s].
+
+    Returns
+    -------
+    Solution
+        All temperature coefficients zero.
+
+    """
+    bias = np.zeros((3, spec.n_columns('bias')))
+    scale = np.zeros((3, spec.n_columns('scale')))
+    bias[:, 0] = constant.bias
+    scale[:, 0] = constant.scale
+    force = constant.force(position_means(table))
+    inverse = np.linalg.inv(constant.misalignment)
+    return Solution(
+        spec=spec,
+        gravity=gravity,
+        bias=bias,
+        scale=scale,
+        skew=np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
+        up=force / np.linalg.norm(force, axis=1, keepdims=True),
+        time_constants_s=np.asarray(time_constants_s, dtype=np.float64),
+        start_memory=np.zeros((len(table.histories), spec.n_lags)),
+        noise_sd=np.tile(1e-4 * gravity * constant.scale, (2, 1)),
+    )
+
+
+def position_means(table: WindowTable) -> Array:
+    """
+    Mean raw vector of each position, shape (n_positions, 3); a position has rows.
+
+    """
+    first = np.searchsorted(table.position, np.arange(table.n_positions))
+    total = np.add.reduceat(table.count, first)
+    weighted = np.add.reduceat(table.mean * table.count[:, None], first, axis=0)
+    return np.asarray(weighted / total[:, None])

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns still intervals: raw samples -> short cells (count, mean, variance) -> where nothing moved.
+
+Cells of about half a second are accumulated while the samples stream by; a bag of any length
+costs some 50 bytes per cell. Two tests, both relative to the bag's own quiet level: the variance
+inside a cell (vibration, handling) and the step between neighbouring cells (a turn, a knock that
+left another attitude). A step starts a new interval, because a shift of one microradian is
+already one micro-g.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+# A cell's variance, of n >= 32 samples, exceeds 4 times its mean by chance with probability
+# below 1e-12; vibration worth cutting out is far above.
+_VARIANCE_RATIO = 4.0
+# Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
+_STEP_SDS = 8.0
+
+
+@dataclass(frozen=True)
+class Cells:
+    """
+    Sufficient statistics of short runs of samples.
+
+    Parameters
+    ----------
+    start_ns : int
+        Stamp that cell times count from.
+    time : ndarray, shape (n,)
+        Mean time of the cell's samples since `start_ns` [s].
+    count : ndarray of int64, shape (n,)
+        Samples in the cell.
+    mean, variance : ndarray, shape (n, 3)
+        Mean and variance of the samples.
+    index : ndarray of int64, shape (n,)
+        Number of the cell on the bag's time grid; neighbours differ by 1.
+    cell_s : float
+        Length of a cell [s].
+    n_dropped : int
+        Samples left out because a component was not finite or the stamp did not rise.
+    n_saturated : int
+        Samples at the full scale.
+    is_integer : bool
+        Whether all samples are whole numbers (counts).
+
+    """
+
+    start_ns: int
+    time: Array
+    count: IntArray
+    mean: Array
+    variance: Array
+    index: IntArray
+    cell_s: float
+    n_dropped: int
+    n_saturated: int
+    is_integer: bool
+
+
+class CellAccumulator:
+    """
+    Reduces samples to cells while they stream by.
+
+    Parameters
+    ----------
+    cell_s : float
+        Shortest length of a cell [s]; cells are longer where it would hold fewer than 32 samples.
+    full_scale : float or None
+        Magnitude at which a sample is saturated.
+
+    """
+
+    _MIN_SAMPLES = 32
+
+    def __init__(self, cell_s: float, full_scale: float | None) -> None:
+        self._asked_cell_s = cell_s
+        self._full_scale = full_scale
+        self._cell_ns = 0
+        self._start_ns = 0
+        self._last_ns: int | None = None
+        self._shift = np.zeros(3)
+        self._ids: list[IntArray] = []
+        self._sums: list[Array] = []
+        self._n_dropped = 0
+        self._n_saturated = 0
+        self._is_integer = True
+        self._open = np.zeros((0, 8))
+        self._open_id = -1
+
+    def add(self, stamp_ns: IntArray, samples: Array) -> None:
+        """
+        Take the next samples in file order.
+
+        Parameters
+        ----------
+        stamp_ns : ndarray of int64, shape (n,)
+            Stamps.
+        samples : ndarray, shape (n, 3)
+            Samples.
+
+        """
+        stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
+        samples = np.asarray(samples, dtype=np.float64)
+        if not len(stamp_ns):
+            return
+        use = np.isfinite(samples).all(axis=1)
+        before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
+        use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
+        if self._full_scale is not None:
+            saturated = use & (np.abs(samples) >= self._full_scale).any(axis=1)
+            self._n_saturated += int(saturated.sum())
+            use &= ~saturated
+            self._n_dropped -= int(saturated.sum())
+        self._n_dropped += int((~use).sum())
+        stamp_ns, samples = stamp_ns[use], samples[use]
+        if not len(stamp_ns):
+            return
+        if self._last_ns is None:
+            self._begin(stamp_ns, samples)
+        self._last_ns = int(stamp_ns[-1])
+        if self._is_integer:
+            self._is_integer = bool((samples == np.rint(samples)).all())
+        self._accumulate(stamp_ns, samples)
+
+    def finish(self) -> Cells:
+        """
+        Close the last cell and return all of them.
+
+        Returns
+        -------
+        Cells
+            The bag's cells.
+
+        """
+        if self._open_id >= 0:
+            self._ids.append(np.array([self._open_id]))
+            self._sums.append(self._open)
+        self._open_id = -1
+        index = np.concatenate(self._ids) if self._ids else np.zeros(0, dtype=np.int64)
+        sums = np.concatenate(self._sums) if self._sums else np.zeros((0, 8))
+        count = sums[:, 0]
+        mean = sums[:, 2:5] / count[:, None]
+        spread = np.maximum(sums[:, 5:8] - count[:, None] * mean**2, 0.0)
+        return Cells(
+            start_ns=self._start_ns,
+            time=sums[:, 1] / count + index * (self._cell_ns * 1e-9),
+            count=count.astype(np.int64),
+            mean=mean + self._shift,
+            variance=spread / np.maximum(count[:, None] - 1.0, 1.0),
+            index=index,
+            cell_s=self._cell_ns * 1e-9,
+            n_dropped=self._n_dropped,
+            n_saturated=self._n_saturated,
+            is_integer=self._is_integer,
+        )
+
+    def _begin(self, stamp_ns: IntArray, samples: Array) -> None:
+        step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
+        self._cell_ns = int(max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0))
+        self._start_ns = int(stamp_ns[0])
+        self._shift = samples[0].copy()
+
+    def _accumulate(self, stamp_ns: IntArray, samples: Array) -> None:
+        since = stamp_ns - self._start_ns
+        ids = since // self._cell_ns
+        first = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
+        columns = np.empty((len(since), 8))
+        columns[:, 0] = 1.0
+        columns[:, 1] = (since - ids * self._cell_ns) * 1e-9
+        columns[:, 2:5] = samples - self._shift
+        columns[:, 5:8] = columns[:, 2:5] ** 2
+        sums = np.add.reduceat(columns, first, axis=0)
+        ids = ids[first]
+        if self._open_id >= 0:
+            if ids[0] == self._open_id:
+                sums[0] += self._open[0]
+            else:
+                self._ids.append(np.array([self._open_id]))
+                self._sums.append(self._open)
+        self._open_id = int(ids[-1])
+        self._open = sums[-1:].copy()
+        if len(ids) > 1:
+            self._ids.append(ids[:-1])
+            self._sums.append(sums[:-1].copy())
+
+
+def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
+    """
+    Find the runs of cells in which nothing moved.
+
+    Parameters
+    ----------
+    cells : Cells
+        The bag's cells.
+    min_still_s : float
+        Shortest interval worth using [s].
+
+    Returns
+    -------
+    list of (int, int)
+        Half-open ranges of cell numbers, in order.
+
+    """
+    n = len(cells.count)
+    if not n:
+        return []
+    full = cells.count >= max(2.0, 0.5 * float(np.median(cells.count)))
+    quiet = full & _is_quiet(cells, full)
+    broken = ~_is_joined(cells, quiet)
+    # A cell beside a moving one, or on either side of a step, holds the edge of the motion.
+    moved = ~quiet
+    near = moved.copy()
+    near[1:] |= moved[:-1] | broken
+    near[:-1] |= moved[1:] | broken
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], (~near).astype(np.int8), [0]))))
+    min_cells = max(1, int(np.ceil(min_still_s / cells.cell_s - 1e-9)))
+    return [
+        (int(start), int(stop))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True)
+        if stop - start >= min_cells
+    ]
+
+
+def _is_quiet(cells: Cells, full: BoolArray) -> BoolArray:
+    """
+    Compare each cell's variance with the quietest tenth of the bag.
+
+    """
+    floor = 0.25 if cells.is_integer else 0.0
+    level = np.quantile(cells.variance[full], 0.1, axis=0)
+    # A tenth-percentile of a chi-square variance lies a little below its mean; 1.3 covers it
+    # for cells of 32 samples.
+    limit = _VARIANCE_RATIO * np.maximum(1.3 * level, floor)
+    return np.asarray((cells.variance <= limit).all(axis=1))
+
+
+def _is_joined(cells: Cells, quiet: BoolArray) -> BoolArray:
+    """
+    Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step in the mean.
+
+    """
+    step = np.diff(cells.mean, axis=0)
+    both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
+    if not both.any():
+        return np.zeros(len(step), dtype=bool)
+    spread = 1.4826 * np.median(np.abs(step[both]), axis=0)
+    noise = np.sqrt(2.0 * np.median(cells.variance[quiet] / cells.count[quiet, None], axis=0))
+    limit = _STEP_SDS * np.maximum(spread, noise)
+    joined: BoolArray = both & (np.abs(step) <= limit).all(axis=1)
+    return joined

@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the window table: all windows of all positions with their thermal regressors.
+
+This is the whole data set as the regression sees it; from here on no samples are needed.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .history import ThermalHistory
+from .lags import Memory, memory_regressors
+from .reduction import ReducedBag
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+_NUMBERS = ('position', 'bag', 'section')
+_MEANS = ('time', 'mean', 't', 'gradient', 'rate', 'weight')
+_COLUMNS = (*_NUMBERS, 'count', *_MEANS)
+
+
+@dataclass(frozen=True)
+class WindowTable:
+    """
+    Windows, sorted by position.
+
+    Parameters
+    ----------
+    position, bag, section : ndarray of int64, shape (n,)
+        Number of the position, of the bag, and of the run of one regime within the bag.
+    time : ndarray, shape (n,)
+        Time since the bag's first sample [s].
+    count : ndarray, shape (n,)
+        Samples in the window.
+    mean : ndarray, shape (n, 3)
+        Mean of the raw samples.
+    t, gradient, rate, weight : ndarray, shape (n,)
+        ``T_board - T_ref``, ``T_case - T_board``, ``dT_board/dt``, weight of the dynamic set.
+    histories : tuple of ThermalHistory
+        One per bag, for the lags.
+
+    """
+
+    position: IntArray
+    bag: IntArray
+    section: IntArray
+    time: Array
+    count: Array
+    mean: Array
+    t: Array
+    gradient: Array
+    rate: Array
+    weight: Array
+    histories: tuple[ThermalHistory, ...]
+
+    @property
+    def n_positions(self) -> int:
+        """
+        Number of positions.
+
+        """
+        return int(self.position[-1]) + 1 if len(self.position) else 0
+
+    @property
+    def is_dynamic(self) -> BoolArray:
+        """
+        Whether the dynamic set prevails, shape (n,).
+
+        """
+        return np.asarray(self.weight > 0.5)
+
+    def position_slices(self) -> list[slice]:
+        """
+        Rows of each position.
+
+        """
+        edges = np.searchsorted(self.position, np.arange(self.n_positions + 1)).tolist()
+        return [slice(start, stop) for start, stop in pairwise(edges)]
+
+    def memory(self, time_constants_s: Array) -> Memory:
+        """
+        Memory regressors at the windows.
+
+        Parameters
+        ----------
+        time_constants_s : ndarray, shape (k,)
+            Time constants [s].
+
+        Returns
+        -------
+        Memory
+            With one row per window.
+
+        """
+        n, k = len(self.time), len(time_constants_s)
+        result = Memory(*(np.zeros((n, k)) for _ in range(4)))
+        if not k:
+            return result
+        for bag, history in enumerate(self.histories):
+            rows = np.flatnonzero(self.bag == bag)
+            if not len(rows):
+                continue
+            grid = memory_regressors(history.board, history.step_s, time_constants_s)
+            at = grid.at(self.time[rows], history.time)
+            result.value[rows] = at.value
+            result.slope[rows] = at.slope
+            result.decay[rows] = at.decay
+            result.decay_slope[rows] = at.decay_slope
+        return result
+
+    def select(self, rows: BoolArray) -> WindowTable:
+        """
+        Keep some windows; positions keep their numbers.
+
+        """
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+
+    def coarsened(self, window_s: float) -> WindowTable:
+        """
+        Merge neighbouring windows of one position and section into longer ones.
+
+        Parameters
+        ----------
+        window_s : float
+            Length of the merged windows [s].
+
+        Returns
+        -------
+        WindowTable
+            Count-weighted means.
+
+        """
+        if not len(self.time):
+            return self
+        slot = np.floor(self.time / window_s).astype(np.int64)
+        keys = np.column_stack((self.position, self.section, slot))
+        first = np.flatnonzero(np.concatenate(([True], (np.diff(keys, axis=0) != 0).any(axis=1))))
+        total = np.add.reduceat(self.count, first)
+
+        def mean(column: Array) -> Array:
+            weights = self.count if column.ndim == 1 else self.count[:, None]
+            shape = total if column.ndim == 1 else total[:, None]
+            return np.asarray(np.add.reduceat(column * weights, first, axis=0) / shape)
+
+        merged: dict[str, Any] = {name: getattr(self, name)[first] for name in _NUMBERS}
+        merged |= {name: mean(getattr(self, name)) for name in _MEANS}
+        return replace(self, count=total, **merged)
+
+
+def window_table(
+    bags: Sequence[ReducedBag], histories: Sequence[ThermalHistory], reference_temperature: float
+) -> WindowTable:
+    """
+    Join the windows of all bags with their thermal state.
+
+    Windows before the board's first reading, or while its estimate is still settling, are left
+    out.
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        The bags.
+    histories : sequence of ThermalHistory
+        Their thermal histories.
+    reference_temperature : float
+        T_ref [degC].
+
+    Returns
+    -------
+    WindowTable
+        The table; a position none of whose windows is usable has no rows.
+
+    """
+    columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in _COLUMNS}
+    position = 0
+    for bag, (reduced, history) in enumerate(zip(bags, histories, strict=True)):
+        grid = history.time
+        settled = history.var_board <= 4.0 * np.median(history.var_board)
+        begin = float(grid[int(np.argmax(settled))])
+        runs = np.concatenate(([0], np.cumsum(np.diff(history.weight > 0.5) != 0)))
+        for interval in reduced.intervals:
+            use = interval.time >= begin
+            if not use.any():
+                continue
+            time = interval.time[use]
+            columns['time'].append(time)
+            columns['count'].append(interval.count[use])
+            columns['mean'].append(interval.mean[use])
+            columns['t'].append(np.interp(time, grid, history.board) - reference_temperature)
+            for name in ('gradient', 'rate', 'weight'):
+                columns[name].append(np.interp(time, grid, getattr(history, name)))
+            nearest = np.clip(np.searchsorted(grid, time), 0, len(grid) - 1)
+            columns['section'].append(runs[nearest])
+            columns['position'].append(np.full(len(time), position))
+            columns['bag'].append(np.full(len(time), bag))
+            position += 1
+    empty: dict[str, npt.NDArray[Any]] = dict.fromkeys(_NUMBERS, np.zeros(0, dtype=np.int64))
+    empty['mean'] = np.zeros((0, 3))
+    joined = {
+        name: np.concatenate(parts) if parts else empty.get(name, np.zeros(0))
+        for name, parts in columns.items()
+    }
+    return WindowTable(**joined, histories=tuple(histories))

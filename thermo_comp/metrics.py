@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns residual statistics: the few numbers that tests, the fit and the report all quote.
+
+A residual is ``corrected - true``. Of a position of unknown attitude only the norm is known to
+be true, so the residual that every bag gives is ``|f| - g``; where the truth is simulated the
+vector residual is judged too.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+#: One micro-g: a unit of accelerometer errors, from the conventional 9.80665 m/s^2.
+MICRO_G = 9.80665e-6
+
+
+@dataclass(frozen=True)
+class ResidualStatistics:
+    """
+    What is said of a set of residuals.
+
+    Parameters
+    ----------
+    n : int
+        How many residuals were finite and counted.
+    mean, rms, peak : float
+        Mean, root of the mean square and largest magnitude, in the residual's unit; NaN when
+        there are none.
+
+    """
+
+    n: int
+    mean: float
+    rms: float
+    peak: float
+
+    def scaled(self, factor: float) -> ResidualStatistics:
+        """
+        Return the statistics in another unit.
+
+        """
+        return ResidualStatistics(
+            self.n, self.mean * factor, self.rms * factor, self.peak * abs(factor)
+        )
+
+    @property
+    def micro_g(self) -> ResidualStatistics:
+        """
+        The statistics of residuals in m/s^2, expressed in micro-g.
+
+        """
+        return self.scaled(1.0 / MICRO_G)
+
+
+def residual_statistics(residual: Array) -> ResidualStatistics:
+    """
+    Summarise residuals; those that are not finite are left out.
+
+    Parameters
+    ----------
+    residual : array_like, shape (n,) or (n, 3)
+        Scalar residuals, or vectors, of which the norm is summarised (the mean is then the
+        length of the mean vector).
+
+    Returns
+    -------
+    ResidualStatistics
+        In the unit of `residual`.
+
+    """
+    values = np.asarray(residual, dtype=np.float64)
+    if values.ndim == 2:
+        values = values[np.isfinite(values).all(axis=1)]
+        size = np.linalg.norm(values, axis=1)
+        mean = float(np.linalg.norm(values.mean(axis=0))) if len(values) else np.nan
+    else:
+        values = values[np.isfinite(values)]
+        size = np.abs(values)
+        mean = float(values.mean()) if len(values) else np.nan
+    if not len(values):
+        return ResidualStatistics(0, np.nan, np.nan, np.nan)
+    return ResidualStatistics(
+        len(values), mean, float(np.sqrt(np.mean(size**2))), float(np.max(size))
+    )
+
+
+def norm_residual(specific_force: Array, gravity: float) -> Array:
+    """
+    Form ``|f| - g``, the residual that needs no attitude.
+
+    Parameters
+    ----------
+    specific_force : array_like, shape (..., 3)
+        Corrected specific force.
+    gravity : float
+        Local gravity.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Norm residual.
+
+    """
+    force = np.asarray(specific_force, dtype=np.float64)
+    return np.asarray(np.sqrt(np.einsum('...i,...i->...', force, force)) - gravity)
+
+
+def statistics_by_regime(residual: Array, is_dynamic: BoolArray) -> dict[str, ResidualStatistics]:
+    """
+    Summarise residuals over the static sections, the dynamic ones and all together.
+
+    Parameters
+    ----------
+    residual : array_like, shape (n,) or (n, 3)
+        Residuals.
+    is_dynamic : array_like of bool, shape (n,)
+        Which of them fall on a dynamic section.
+
+    Returns
+    -------
+    dict
+        Keys ``static``, ``dynamic`` and ``all``.
+
+    """
+    values = np.asarray(residual, dtype=np.float64)
+    dynamic = np.asarray(is_dynamic, dtype=bool)
+    return {
+        'static': residual_statistics(values[~dynamic]),
+        'dynamic': residual_statistics(values[dynamic]),
+        'all': residual_statistics(values),
+    }
