@@ -25,18 +25,12 @@ from .cyclogram import (
     random_cyclogram,
 )
 from .drift import CreepEffect, DifferenceEffect, DriftModel, PartEffect
-from .network import AIR, Link, ThermalNetwork, ThermalResponse, Thermostat
+from .network import AIR, Link, ThermalNetwork, Thermostat
 from .presets import UNIT_NAMES, unit_preset
-from .run import (
-    START_NS,
-    ChamberRipple,
-    SimulatedRun,
-    Truth,
-    ideal_regime,
-    simulate,
-    simulate_blocks,
-)
+from .response import ThermalResponse
+from .run import START_NS, ChamberRipple, simulate, simulate_blocks
 from .thermometers import ThermometerModel
+from .truth import SimulatedRun, Truth, ideal_regime
 from .unit import MICRO_G, STANDARD_GRAVITY, UnitModel
 
 __all__ = [

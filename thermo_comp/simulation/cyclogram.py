@@ -79,8 +79,8 @@ class Cyclogram:
         Rate of each line between points, shape (n - 1,), K/min; 0 in a soak.
 
         """
-        rates: NDArray[np.float64] = np.diff(self.temperature_c) / np.diff(self.time_s)
-        rates *= _MINUTE
+        minutes = np.diff(np.array(self.time_s)) / _MINUTE
+        rates: NDArray[np.float64] = np.diff(np.array(self.temperature_c)) / minutes
         return rates
 
     def at(self, time: ArrayLike) -> NDArray[np.float64]:
@@ -98,7 +98,10 @@ class Cyclogram:
             Air temperature, degC.
 
         """
-        return np.interp(np.asarray(time, dtype=float), self.time_s, self.temperature_c)
+        air: NDArray[np.float64] = np.interp(
+            np.asarray(time, dtype=float), self.time_s, self.temperature_c
+        )
+        return air
 
     def is_ramp(self, time: ArrayLike) -> NDArray[np.bool_]:
         """

@@ -74,39 +74,36 @@ def _thermostatted(seed: int) -> UnitModel:
         capacity={
             'case': draw.near(1500.0),
             'board': draw.near(110.0),
-            'cover': draw.near(60.0),
+            'cover': draw.near(65.0),
             'reference': draw.near(12.0),
-            'integrator': draw.near(8.0),
+            'integrator': draw.near(25.0),
             'oven': draw.near(200.0),
             'head': draw.near(400.0),
         },
         links=draw.links(
             (AIR, 'case', 5.0),
             ('case', 'board', 0.40),
-            ('board', 'cover', 0.20),
+            ('board', 'cover', 0.16),
             ('cover', 'reference', 0.04),
             ('board', 'reference', 0.03),
-            ('board', 'integrator', 0.06),
+            ('board', 'integrator', 0.03),
             ('case', 'oven', 0.15),
             ('board', 'oven', 0.02),
             ('oven', 'head', 1.5),
         ),
         power={'board': 0.8, 'reference': 0.02, 'head': 0.3},
-        thermostat=Thermostat('oven', 55.0, 8.0, 0.02, 600.0, 15.0),
+        thermostat=Thermostat('oven', 55.0, 8.0, 0.02, 1800.0, 25.0),
     )
     drift = DriftModel(
         parts=(
             # The reference current sets the scale of all axes; its curvature is a bandgap's.
             PartEffect(
-                'reference', scale=draw.axes(28.0, 0.15), scale_curvature=draw.axes(0.05, 0.5)
+                'reference', scale=draw.axes(40.0, 0.15), scale_curvature=draw.axes(0.02, 0.5)
             ),
-            # Leakage and charge injection of each axis' own integrator.
-            PartEffect(
-                'integrator',
-                scale=draw.normal(3.0),
-                bias=draw.signed(4.0, 10.0),
-                bias_curvature=draw.normal(0.03),
-            ),
+            # Dielectric absorption and charge injection of each axis' own, potted integrator;
+            # the leakage of its switches, which bends upwards, sits on the board itself.
+            PartEffect('integrator', scale=draw.normal(3.0), bias=draw.signed(6.0, 14.0)),
+            PartEffect('board', bias=draw.normal(1.0), bias_curvature=draw.normal(0.03)),
             PartEffect('head', scale=draw.axes(80.0, 0.1), bias=draw.signed(0.3, 5.0)),
         ),
         differences=(
@@ -137,17 +134,22 @@ def _bare_quartz(seed: int) -> UnitModel:
         capacity={
             'case': draw.near(900.0),
             'board': draw.near(150.0),
+            'cover': draw.near(45.0),
             'reference': draw.near(10.0),
             'head': draw.near(120.0),
-            'magnet': draw.near(20.0),
-            'pendulum': draw.near(2.0),
+            'magnet': draw.near(25.0),
+            'mount': draw.near(50.0),
+            'pendulum': draw.near(3.0),
         },
         links=draw.links(
             (AIR, 'case', 4.0),
             ('case', 'board', 0.50),
-            ('board', 'reference', 0.05),
-            ('board', 'head', 1.0),
-            ('head', 'magnet', 0.10),
+            ('board', 'cover', 0.12),
+            ('cover', 'reference', 0.04),
+            ('board', 'reference', 0.02),
+            ('board', 'head', 4.0),
+            ('head', 'magnet', 0.80),
+            ('head', 'mount', 0.06),
             ('head', 'pendulum', 0.01),
             ('magnet', 'pendulum', 0.01),
         ),
@@ -156,12 +158,20 @@ def _bare_quartz(seed: int) -> UnitModel:
     drift = DriftModel(
         parts=(
             PartEffect(
-                'magnet', scale=draw.axes(77.5, 0.01), scale_curvature=draw.axes(0.31, 0.03)
+                'magnet', scale=draw.axes(48.0, 0.01), scale_curvature=draw.axes(0.31, 0.02)
             ),
-            PartEffect('reference', bias=draw.normal(0.3)),
-            PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.01)),
+            PartEffect('reference', scale=draw.axes(29.5, 0.01)),
+            PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
         ),
-        differences=(DifferenceEffect('head', 'pendulum', bias=draw.normal(3.0)),),
+        differences=(
+            # The shunt that offsets the magnet's own tempco, and the coil on the pendulum, are
+            # not at one temperature in a ramp: parts that balance in still air do not then.
+            DifferenceEffect(
+                'head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)
+            ),
+            # Stress through the joint to the mounting ring, which is heavy and poorly coupled.
+            DifferenceEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
+        ),
         creeps=(CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),),
     )
     K, bias = draw.constants(11.0, 2000.0)
@@ -207,7 +217,7 @@ def _mems(seed: int) -> UnitModel:
             ),
         ),
         differences=(DifferenceEffect('board', 'package', bias=draw.normal(300.0)),),
-        creeps=(CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(10.0)),),
+        creeps=(CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),),
     )
     K, bias = draw.constants(16.0, 20000.0, spread=0.02)
     return UnitModel(

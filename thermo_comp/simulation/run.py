@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a run: a unit in a chamber over a program, its recorded columns and the truth behind them.
+Owns a run: a unit in a chamber over a program, whole or block by block.
 
 """
 
@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from .attitude import Attitude, Handling
 from .cyclogram import Cyclogram
-from .network import ThermalResponse
+from .response import ThermalResponse
 from .streams import Stream, generator
+from .truth import SimulatedRun, Truth
 from .unit import MICRO_G, STANDARD_GRAVITY, UnitModel
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
@@ -54,123 +55,6 @@ class ChamberRipple:
             raise ValueError(f'`amplitude` must not be negative, got {self.amplitude}')
         if not self.period > 0.0:
             raise ValueError(f'`period` must be positive, got {self.period}')
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """
-    What really happened, on the thermal grid and at the accelerometer's cycles.
-
-    Parameters
-    ----------
-    unit : UnitModel
-        The unit, with K, M, bias at the reference.
-    gravity : float
-        Local gravity, m/s^2.
-    nodes : tuple of str
-        Parts, the columns of the temperatures.
-    grid_s : ndarray, shape (m,)
-        Instants of the thermal grid from the start of the run, s.
-    air : ndarray, shape (m,)
-        Air temperature, degC.
-    temperatures, rates : ndarray, shape (m, n_parts)
-        Temperatures of the parts, degC, and their derivatives, K/s.
-    bias_grid, scale_grid : ndarray, shape (m, 3)
-        Bias [counts/cycle] and relative scale on the grid.
-    cycle_s : ndarray, shape (n,)
-        Middles of the accelerometer's cycles from the start of the run, s.
-    position : ndarray of int64, shape (n,)
-        Position at rest of each cycle, -1 while handled.
-    specific_force : ndarray, shape (n, 3)
-        Mean specific force over each cycle in the orthogonal frame, m/s^2.
-
-    """
-
-    unit: UnitModel
-    gravity: float
-    nodes: tuple[str, ...]
-    grid_s: NDArray[np.float64]
-    air: NDArray[np.float64]
-    temperatures: NDArray[np.float64]
-    rates: NDArray[np.float64]
-    bias_grid: NDArray[np.float64]
-    scale_grid: NDArray[np.float64]
-    cycle_s: NDArray[np.float64]
-    position: NDArray[np.int64]
-    specific_force: NDArray[np.float64]
-
-    @property
-    def bias(self) -> NDArray[np.float64]:
-        """
-        Bias of each cycle, shape (n, 3), counts/cycle.
-
-        """
-        return _on_cycles(self.bias_grid, self.grid_s, self.cycle_s)
-
-    @property
-    def scale(self) -> NDArray[np.float64]:
-        """
-        Scale of each cycle relative to the one at the reference temperature, shape (n, 3).
-
-        """
-        return _on_cycles(self.scale_grid, self.grid_s, self.cycle_s)
-
-    def temperature(self, node: str) -> NDArray[np.float64]:
-        """
-        Return the temperature of one part on the thermal grid.
-
-        Parameters
-        ----------
-        node : str
-            Part, or 'air'.
-
-        Returns
-        -------
-        ndarray, shape (m,)
-            Temperature, degC.
-
-        """
-        return self.air if node == 'air' else self.temperatures[:, self.nodes.index(node)]
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatedRun:
-    """
-    What a recorder would have stored, and the truth.
-
-    Parameters
-    ----------
-    accel_stamp_ns : ndarray of int64, shape (n,)
-        End of each conversion cycle.
-    counts : ndarray of int32, shape (n, 3)
-        Output of each cycle, counts.
-    board_stamp_ns, case_stamp_ns : ndarray of int64, shape (m,)
-        Instants of the thermometers' readings.
-    board, case : ndarray, shape (m,)
-        Readings, degC.
-    truth : Truth
-        What really happened.
-
-    """
-
-    accel_stamp_ns: NDArray[np.int64]
-    counts: NDArray[np.int32]
-    board_stamp_ns: NDArray[np.int64]
-    board: NDArray[np.float64]
-    case_stamp_ns: NDArray[np.int64]
-    case: NDArray[np.float64]
-    truth: Truth
-
-    @property
-    def is_saturated(self) -> NDArray[np.bool_]:
-        """
-        Cycles with an axis at its rail, shape (n,).
-
-        """
-        converter = self.truth.unit.converter
-        at_rail = (self.counts <= converter.low) | (self.counts >= converter.high)
-        result: NDArray[np.bool_] = at_rail.any(axis=1)
-        return result
 
 
 def simulate(
@@ -278,7 +162,9 @@ def simulate_blocks(
         As in `simulate`.
     block_size : int, optional
         Cycles per block; the result does not depend on it.
-    rate_hz, ..., grid_step
+    rate_hz, temperature_rate_hz, seed, start_ns, gravity, warm
+        As in `simulate`.
+    ripple, switch_s, handling, grid_step
         As in `simulate`.
 
     Returns
@@ -309,29 +195,6 @@ def simulate_blocks(
         grid_step,
     )
     return _Chamber(unit, cyclogram, up, options).blocks(block_size)
-
-
-def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> NDArray[np.bool_]:
-    """
-    Tell where the board really takes up or gives off heat.
-
-    Parameters
-    ----------
-    run : SimulatedRun
-        The run.
-    threshold_k_min : float, optional
-        True rate of the board's temperature above which the state is dynamic, K/min.
-
-    Returns
-    -------
-    ndarray of bool, shape (m,)
-        On the thermal grid of the run.
-
-    """
-    truth = run.truth
-    rate = truth.rates[:, truth.nodes.index(truth.unit.board.node)]
-    result: NDArray[np.bool_] = np.abs(rate) * 60.0 > threshold_k_min
-    return result
 
 
 @dataclass(frozen=True)
@@ -469,17 +332,6 @@ def _knots(
         time = np.unique(np.concatenate([time, fine]))
         return time, cyclogram.at(time) + np.interp(time, fine, wave)
     return time, cyclogram.at(time)
-
-
-def _on_cycles(
-    grid: NDArray[np.float64], grid_s: NDArray[np.float64], cycle_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    # One arithmetic per cycle, whatever the block: not np.interp, which prepares slopes or not.
-    place = cycle_s / grid_s[1]
-    left = np.minimum(place.astype(np.int64), len(grid_s) - 2)
-    share = (place - left)[:, None]
-    result: NDArray[np.float64] = (1.0 - share) * grid[left] + share * grid[left + 1]
-    return result
 
 
 def _between(

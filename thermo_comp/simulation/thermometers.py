@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .network import ThermalResponse
+from .response import ThermalResponse
 from .streams import Stream, generator
 
 _NS = 1_000_000_000
