@@ -31,6 +31,8 @@ LAYERS = {
     'calibration_file': 2,
     'correction': 2,
     'thermal': 2,
+    'status': 2,
+    'batch': 2,
     'compensator': 2,
     'exchange': 2,
     'fitting': 2,

@@ -288,24 +288,23 @@ def _parse_yaml(content: bytes, path: str | Path | None) -> Any:
 def _check_events(text: str, path: str | Path | None) -> None:
     depth = 0
     documents = 0
-    event: Any
     for event in yaml.parse(text, Loader=_BASE):
         if isinstance(event, yaml.AliasEvent):
-            raise CalibrationError(
-                f'YAML aliases are not accepted (line {event.start_mark.line + 1})', path
-            )
+            raise CalibrationError(f'YAML aliases are not accepted ({_line(event)})', path)
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > DEPTH_LIMIT:
-                raise CalibrationError(
-                    f'nested deeper than {DEPTH_LIMIT} (line {event.start_mark.line + 1})', path
-                )
+                raise CalibrationError(f'nested deeper than {DEPTH_LIMIT} ({_line(event)})', path)
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         elif isinstance(event, yaml.DocumentStartEvent):
             documents += 1
             if documents > 1:
                 raise CalibrationError('expected one YAML document, found more', path)
+
+
+def _line(event: Any) -> str:
+    return f'line {event.start_mark.line + 1}'
 
 
 def _first_problem(error: ValidationError) -> tuple[str, str | None]:

@@ -1,0 +1,410 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The compensator against hand numbers, Monte Carlo, and itself: stream = batch, chunked = whole.
+
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders import (
+    GRAVITY,
+    SECOND_NS,
+    Columns,
+    axis_set,
+    calibration,
+    columns_from_events,
+    regime_set,
+    rich_calibration,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermo_comp.calibration import Axes, AxisReference, LinearTerm
+from thermo_comp.compensator import Compensator, CompensatorConfig
+
+UNIQUE = [0, 1, 2, 4, 5, 8]
+
+
+def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0):
+    for second in range(start_s, until_s):
+        compensator.push_board(second * SECOND_NS, celsius)
+        compensator.push_case(second * SECOND_NS, celsius if case is None else case)
+
+
+def stream(compensator, events):
+    """Run events one by one; return the rows and the positions of the published samples."""
+    rows, index = [], []
+    position = 0
+    for kind, stamp, value in events:
+        if kind == 'accel':
+            row = compensator.process(stamp, *map(float, value))
+            if row is not None:
+                rows.append(row)
+                index.append(position)
+            position += 1
+        elif kind == 'board':
+            compensator.push_board(stamp, value)
+        else:
+            compensator.push_case(stamp, value)
+    return np.array(rows).reshape(-1, 9), index
+
+
+def assert_same(block, rows, index):
+    assert block.index.tolist() == index
+    np.testing.assert_array_equal(block.specific_force, rows[:, :3])
+    np.testing.assert_array_equal(block.covariance[:, UNIQUE], rows[:, 3:])
+    matrices = block.covariance.reshape(-1, 3, 3)
+    np.testing.assert_array_equal(matrices, matrices.transpose(0, 2, 1))
+
+
+def test_signed_counts_and_the_printed_equations():
+    # A channel of 300 counts per m/s^2 with an offset of 12 counts sees +g and -g.
+    offset, K = 12.0, 300.0
+    plus = K * GRAVITY + offset
+    minus = -K * GRAVITY + offset
+    # method.md: offset = half sum, centred count = half difference, for signed counts.
+    assert (plus + minus) / 2.0 == pytest.approx(offset)
+    assert (plus - minus) / 2.0 == pytest.approx(K * GRAVITY)
+    # As printed (eqs 3 and 4) the two are exchanged: the "offset" would be the whole signal.
+    assert (plus - minus) / 2.0 != pytest.approx(offset)
+    compensator = Compensator(calibration(axes=Axes(*[AxisReference(K, offset)] * 3)))
+    warm(compensator)
+    assert compensator.process(1, plus, minus, offset)[:3] == pytest.approx(
+        (GRAVITY, -GRAVITY, 0.0), abs=1e-12
+    )
+
+
+def test_every_term_by_hand():
+    # Static set at t = 10 K, T_case = T_board (no gradient), steady (no rate): eq of section 4.
+    one = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0, gradient=LinearTerm(9.0, 9.0))
+    unit = calibration(
+        axes=Axes(*[AxisReference(300.0, 7.0)] * 3),
+        static=regime_set(one, one, one, gradient_range_k=(-0.05, 0.05)),
+        misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (2e-3, -3e-3, 1.0)),
+    )
+    compensator = Compensator(unit)
+    warm(compensator, 30.0, until_s=200)
+    x, y, z = compensator.process(200 * SECOND_NS, 1000.0, -500.0, 3000.0)[:3]
+    bias = 7.0 + 2.0 + 0.5 * 10.0 + 0.01 * 100.0
+    scale = 300.0 * (1.0 + 1e-4 * 10.0)
+    a, b, c = ((n - bias) / scale for n in (1000.0, -500.0, 3000.0))
+    # Constant temperature: the thermometer is exact, only rounding remains.
+    assert (x, y, z) == pytest.approx((a, 1e-3 * a + b, 2e-3 * a - 3e-3 * b + c), abs=1e-12)
+
+
+def test_gradient_has_the_sign_of_the_ramp():
+    one = axis_set(gradient=LinearTerm(bias=30.0))
+    unit = calibration(static=regime_set(one, one, one), dynamic=regime_set(one, one, one))
+    for sign in (1.0, -1.0):
+        compensator = Compensator(unit)
+        warm(compensator, 20.0, 20.0 + sign * 2.0, until_s=300)
+        x = compensator.process(300 * SECOND_NS, 0.0, 0.0, 0.0)[0]
+        assert x == pytest.approx(-sign * 30.0 * 2.0 / 300.0, rel=1e-6)
+
+
+sample_value = st.one_of(
+    st.floats(-33000.0, 33000.0), st.sampled_from([math.nan, math.inf, 32767.0, -32768.0])
+)
+
+
+@st.composite
+def event_lists(draw):
+    """Any order of messages: late, doubled, going back, not finite, saturated, in two clocks."""
+    events = []
+    stamp = draw(st.integers(0, 2**60))
+    for _ in range(draw(st.integers(1, 60))):
+        kind = draw(st.sampled_from(['accel', 'accel', 'accel', 'board', 'case']))
+        stamp += draw(
+            st.sampled_from([0, 1, 2_500_000, 400_000_000, 3 * SECOND_NS, 50 * SECOND_NS])
+        )
+        stamp -= draw(st.sampled_from([0, 0, 0, 0, 0, 5_000_000, 400 * SECOND_NS]))
+        stamp = max(stamp, 0)
+        if kind == 'accel':
+            value = tuple(draw(sample_value) for _ in range(3))
+            if draw(st.booleans()):
+                value = (100.0, -200.0, 2900.0)
+            events.append((kind, stamp, value))
+        else:
+            late = draw(st.sampled_from([0, 0, 0, -SECOND_NS, 2 * SECOND_NS]))
+            celsius = draw(st.one_of(st.floats(-60.0, 90.0), st.sampled_from([math.nan, 20.0])))
+            events.append((kind, max(stamp + late, 0), celsius))
+    return events
+
+
+@given(event_lists(), st.integers(1, 30), st.sampled_from([0.0, 5.0]))
+@settings(max_examples=300, deadline=None)
+def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, transition_s):
+    config = CompensatorConfig(transition_time_s=transition_s, case_timeout_s=2.0)
+    streamed = Compensator(rich_calibration(), config)
+    whole = Compensator(rich_calibration(), config)
+    cut = Compensator(rich_calibration(), config)
+    rows, index = stream(streamed, events)
+    assert_same(whole.process_block(columns_from_events(events)), rows, index)
+    pieces = [
+        cut.process_block(columns_from_events(events[k : k + chunk]))
+        for k in range(0, len(events), chunk)
+    ]
+    np.testing.assert_array_equal(
+        np.concatenate([piece.specific_force for piece in pieces]), rows[:, :3]
+    )
+    np.testing.assert_array_equal(
+        np.concatenate([piece.covariance for piece in pieces])[:, UNIQUE], rows[:, 3:]
+    )
+    assert streamed.counters == whole.counters == cut.counters
+    assert streamed.take_flags() == whole.take_flags() == cut.take_flags()
+
+
+@given(event_lists())
+@settings(max_examples=200, deadline=None)
+def test_whatever_comes_in_what_goes_out_is_sound(events):
+    compensator = Compensator(rich_calibration(), CompensatorConfig(case_timeout_s=2.0))
+    block = compensator.process_block(columns_from_events(events))
+    assert np.isfinite(block.specific_force).all()
+    matrices = block.covariance.reshape(-1, 3, 3)
+    assert np.isfinite(matrices).all()
+    if len(matrices):
+        assert np.linalg.eigvalsh(matrices).min() > 0.0
+    counters = compensator.counters
+    assert counters.n_in == sum(kind == 'accel' for kind, _, _ in events)
+    assert counters.n_out == len(block.index)
+    backward = np.diff(block.stamp_ns) <= 0
+    assert np.count_nonzero(backward) <= counters.n_time_jumps
+
+
+def test_long_run_batch_equals_stream(rng):
+    events = []
+    for k in range(60_000):
+        stamp = 1_790_000_000 * SECOND_NS + k * 40_000_000
+        if k % 25 == 0:
+            # A soak, so that the regime is known, then a slow wave of +-14 K.
+            case = 20.0 + 14.0 * math.sin(max(k / 25.0 - 1000.0, 0.0) / 300.0)
+            events.append(('board', stamp, case - 2.0 + 0.005 * rng.standard_normal()))
+            events.append(('case', stamp, case + 0.005 * rng.standard_normal()))
+        events.append(('accel', stamp, (rng.normal(0, 900), rng.normal(0, 900), 2900.0)))
+    streamed, whole = Compensator(rich_calibration()), Compensator(rich_calibration())
+    rows, index = stream(streamed, events)
+    assert_same(whole.process_block(columns_from_events(events)), rows, index)
+    assert len(rows) == 60_000
+    assert {value for _, value in whole.take_flags()} == {True, False}
+
+
+def test_axes_are_treated_alike():
+    one = axis_set((0.0, 0.3), (1.0, 8e-5), delta=1.0)
+    two = axis_set((0.0, -0.1), (1.0, 5e-5))
+    three = axis_set((0.0, 0.7, 0.01), (1.0, -5e-5))
+
+    def run(order, sample):
+        sets = [(one, two, three)[i] for i in order]
+        compensator = Compensator(calibration(static=regime_set(*sets)))
+        warm(compensator, 27.0, until_s=60)
+        return compensator.process(60 * SECOND_NS, *(sample[i] for i in order))[:3]
+
+    sample = (500.0, -1200.0, 2500.0)
+    plain = run((0, 1, 2), sample)
+    assert run((2, 0, 1), sample) == (plain[2], plain[0], plain[1])
+
+
+def test_beyond_the_range_the_edge_holds_and_the_covariance_grows():
+    one = axis_set((0.0, 0.5), (1.0, 1e-4), residual_sd_m_s2=1e-5)
+    two = axis_set((0.0, 0.6), (1.0, 1e-4), residual_sd_m_s2=1e-5)
+    unit = calibration(static=regime_set(one, one, one), dynamic=regime_set(two, two, two))
+
+    def at(celsius):
+        compensator = Compensator(unit)
+        warm(compensator, celsius, until_s=400)
+        return compensator.process(400 * SECOND_NS, 10.0, 20.0, 3000.0), compensator.status
+
+    edge, inside = at(35.0)
+    out, outside = at(41.0)
+    assert inside.temperature_excess_k == pytest.approx(0.0, abs=1e-9)
+    assert outside.temperature_excess_k == pytest.approx(6.0, abs=1e-6)
+    assert outside.relative_excess == pytest.approx(6.0 / 15.0, rel=1e-6)
+    assert out[:3] == pytest.approx(edge[:3], abs=1e-9)
+    # At the least the slope at the edge times the excess: 0.5 counts/K * 6 K / 300 counts.
+    assert math.sqrt(out[3]) > 0.5 * 6.0 / 300.0
+    assert out[3] > 100.0 * edge[3]
+
+
+def test_unknown_regime_is_paid_for_in_the_covariance():
+    unit = calibration(dynamic=regime_set(axis_set(delta=3.0)))
+    compensator = Compensator(unit)
+    warm(compensator, until_s=1)
+    early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 0.0)
+    warm(compensator, until_s=1500, start_s=1)
+    late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 0.0)
+    noise = 1e-4**2 / 0.01
+    # The sets disagree by 3 counts = 0.01 m/s^2 on x, by nothing on y.
+    assert early[3] == pytest.approx(noise + 0.01**2, rel=1e-6)
+    assert early[6] == pytest.approx(noise, rel=1e-6)
+    assert late[3] == pytest.approx(noise, rel=1e-6)
+
+
+def test_nothing_goes_out_before_a_temperature_or_long_after_one():
+    compensator = Compensator(calibration(), CompensatorConfig(temperature_timeout_s=20.0))
+    assert compensator.process(1, 0.0, 0.0, 0.0) is None
+    compensator.push_board(2, 20.0)
+    assert compensator.process(3, 0.0, 0.0, 0.0) is not None
+    assert compensator.process(2 + 20 * SECOND_NS, 0.0, 0.0, 0.0) is not None
+    assert compensator.status.is_board_stale
+    assert compensator.process(3 + 20 * SECOND_NS, 0.0, 0.0, 0.0) is None
+    assert compensator.status.is_board_lost
+    compensator.push_board(30 * SECOND_NS, 20.0)
+    assert compensator.process(30 * SECOND_NS, 0.0, 0.0, 0.0) is not None
+    counters = compensator.counters
+    assert (counters.n_out, counters.n_no_temperature, counters.n_stale) == (3, 1, 1)
+
+
+def test_bad_samples_are_dropped_and_counted():
+    compensator = Compensator(calibration())
+    warm(compensator)
+    bad = [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 32767.0), (-32768.0, 0, 0)]
+    for k, sample in enumerate(bad):
+        assert compensator.process(k + 1, *map(float, sample)) is None
+    assert compensator.process(4, 0.0, 0.0, 0.0) is None  # the stamp of the last one again
+    counters = compensator.counters
+    assert (counters.n_not_finite, counters.n_saturated, counters.n_out_of_order) == (2, 2, 1)
+    assert counters.n_in == 5
+
+
+def test_time_that_jumps_back_starts_anew():
+    compensator = Compensator(calibration())
+    for lap in range(2):
+        warm(compensator, until_s=1500)
+        assert compensator.process(1500 * SECOND_NS, 0.0, 0.0, 0.0) is not None
+        assert compensator.counters.n_time_jumps == lap
+        flags = compensator.take_flags()
+        assert flags
+        assert not any(value for _, value in flags)
+        compensator.push_board(0, 20.0)
+        assert compensator.process(0, 0.0, 0.0, 0.0) is not None
+
+
+def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
+    compensator = Compensator(calibration())
+    for k in range(10_000):
+        compensator.push_board(10**18 + k, 20.0)
+    assert len(compensator.take_pending()) == 4096
+    assert compensator.counters.n_board_rejected == 10_000 - 4096
+
+
+def test_switch_makes_no_step():
+    # The sets differ by 5 counts = 17 mg; over 30 s at 100 Hz that is 5.7 ug a sample.
+    unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
+    compensator = Compensator(unit)
+    outputs = []
+    for k in range(200_000):
+        stamp = k * 10_000_000
+        if k % 100 == 0:
+            ramp = max(k / 100.0 - 1200.0, 0.0) / 60.0
+            compensator.push_board(stamp, 20.0 + 0.3 * ramp)
+            compensator.push_case(stamp, 20.0 + ramp)
+        outputs.append(compensator.process(stamp, 0.0, 0.0, 0.0)[0])
+    steps = np.abs(np.diff(outputs))
+    assert outputs[0] == 0.0
+    assert outputs[-1] == pytest.approx(-5.0 / 300.0)
+    assert steps.max() <= 5.0 / 300.0 / 3000.0 * 1.001
+
+
+def test_swap_takes_effect_between_two_samples():
+    compensator = Compensator(calibration())
+    warm(compensator, until_s=5)
+    before = compensator.process(5 * SECOND_NS, 300.0, 0.0, 0.0)
+    compensator.swap(calibration(axes=Axes(*[AxisReference(150.0, 0.0)] * 3)))
+    after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 0.0)
+    assert (before[0], after[0]) == (1.0, 2.0)
+
+
+def test_swap_to_another_detector_loses_no_sample():
+    compensator = Compensator(calibration())
+    warm(compensator, until_s=5)
+    assert compensator.process(5 * SECOND_NS, 300.0, 0.0, 0.0) is not None
+    compensator.swap(rich_calibration())
+    row = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 0.0)
+    assert row is not None
+    assert not compensator.status.state.is_settled
+
+
+def test_flush_lets_the_regime_go_on_without_samples():
+    compensator = Compensator(calibration())
+    warm(compensator, until_s=1500)
+    compensator.flush(1500 * SECOND_NS)
+    flags = compensator.take_flags()
+    assert flags[-1] == (1499 * SECOND_NS, False)
+
+
+def test_covariance_is_the_scatter_of_calibrations_drawn_from_it(rng):
+    # Bias level, Fs slope, scale level and Fc slope drawn from their covariance; the published
+    # variance must be the scatter of what the drawn calibrations publish.
+    sd = np.array([0.02, 0.002, 0.0, 0.0, 2e-5, 1e-6, 0.0, 0.0])
+    correlation = np.eye(8)
+    correlation[0, 1] = correlation[1, 0] = -0.6
+    correlation[0, 4] = correlation[4, 0] = 0.5
+    covariance = correlation * np.outer(sd, sd)
+    rows = tuple(tuple(covariance[i, : i + 1].tolist()) for i in range(8))
+
+    def unit(d):
+        one = axis_set((0.0, 0.3 + d[1]), (1.0, 7e-5 + d[5]), delta=d[0], covariance=rows)
+        return calibration(
+            axes=Axes(*[AxisReference(300.0 * (1.0 + d[4]), 0.0)] * 3),
+            static=regime_set(one, one, one),
+            dynamic=regime_set(one, one, one),
+        )
+
+    def publish(d):
+        compensator = Compensator(unit(d))
+        warm(compensator, 32.0, until_s=120)
+        return compensator.process(120 * SECOND_NS, -2000.0, 100.0, 2950.0)
+
+    n = 400
+    draws = rng.multivariate_normal(np.zeros(8), covariance, size=n)
+    scatter = np.var([publish(d)[:3] for d in draws.tolist()], axis=0)
+    nominal = publish([0.0] * 8)
+    noise = 1e-4**2 / 0.01
+    thermometer = (0.3 / 300.0) ** 2 * 0.005**2
+    for axis, at in enumerate((3, 6, 8)):
+        predicted = nominal[at] - noise
+        # A variance from n draws has a relative sd of sqrt(2/n) = 7 %: 4 sigma.
+        assert scatter[axis] == pytest.approx(
+            predicted, rel=4 * math.sqrt(2.0 / n), abs=thermometer
+        )
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'temperature_timeout_s': 0.0}, '`temperature_timeout_s` must be positive'),
+        ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or more'),
+        ({'case_timeout_s': math.inf}, '`case_timeout_s` must be positive'),
+    ],
+)
+def test_config_refusals(values, message):
+    with pytest.raises(ValueError, match=message):
+        CompensatorConfig(**values)
+
+
+def test_empty_block():
+    block = Compensator(calibration()).process_block(
+        Columns(np.empty(0, np.int64), np.empty((0, 3)))
+    )
+    assert block.specific_force.shape == (0, 3)
+    assert block.covariance.shape == (0, 9)
+
+
+def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
+    unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
+    compensator = Compensator(unit, CompensatorConfig(transition_time_s=100.0))
+    warm(compensator, 20.0, until_s=1200)
+    for k in range(1200, 1400):
+        compensator.push_board(k * SECOND_NS, 20.0)
+        compensator.push_case(k * SECOND_NS, 20.0 + (k - 1200) / 30.0)
+    stamp = 1200 * SECOND_NS
+    while compensator.process(stamp, 0.0, 0.0, 0.0)[0] > -2.0 / 300.0:
+        stamp += SECOND_NS // 10
+    before = compensator.process(stamp + 1, 0.0, 0.0, 0.0)[0]
+    compensator.reconfigure(replace(compensator.config, transition_time_s=50.0))
+    after = compensator.process(stamp + 2, 0.0, 0.0, 0.0)[0]
+    assert after == pytest.approx(before, abs=1e-9)

@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The thermal tracker: memory against its closed form, cross-over, lost sensors, restart.
+
+"""
+
+import math
+
+import numpy as np
+import pytest
+from builders import SECOND_NS
+
+from thermo_comp.regime import DetectorSettings, Regime
+from thermo_comp.thermal import LOST_GRADIENT_RELATIVE_SD, ThermalConfig, ThermalTracker
+
+TAU_S = 900.0
+
+
+def feed(tracker, board, case=None, *, start_s=0, step_s=1):
+    for k, celsius in enumerate(board):
+        stamp_ns = (start_s + k * step_s) * SECOND_NS
+        tracker.board_reading(stamp_ns, float(celsius))
+        if case is not None:
+            tracker.case_reading(stamp_ns, float(case[k]))
+
+
+@pytest.mark.parametrize('step_s', [1, 10])
+def test_memory_of_a_ramp_is_the_closed_form(step_s):
+    # After a soak, a ramp of rate r: m = T - L = r tau (1 - exp(-t / tau)).
+    tracker = ThermalTracker(DetectorSettings(), (TAU_S,))
+    soak_s, ramp_s, rate = 6000, 1800, 0.5 / 60.0
+    t = np.arange(0, soak_s + ramp_s + 1, step_s)
+    feed(tracker, 20.0 + rate * np.maximum(t - soak_s, 0.0), step_s=step_s)
+    state = tracker.state_at(int(t[-1]) * SECOND_NS)
+    expected = rate * TAU_S * (1.0 - math.exp(-ramp_s / TAU_S))
+    # The thermometer needs some readings to bend into the ramp: m remembers at most that lag,
+    # tens of mK, of a value of 6.5 K.
+    assert state.memory[0] == pytest.approx(expected, abs=0.05)
+    assert state.is_settled
+
+
+def test_memory_start_is_unknown_and_settles():
+    tracker = ThermalTracker(DetectorSettings(), (TAU_S,))
+    feed(tracker, np.full(10, 20.0))
+    assert not tracker.state_at(10 * SECOND_NS).is_settled
+    feed(tracker, np.full(5000, 20.0), start_s=10)
+    state = tracker.state_at(5010 * SECOND_NS)
+    # 3 K of doubt after 5010 s: 3 exp(-5.6) = 11 mK.
+    assert math.sqrt(state.var_memory[0]) == pytest.approx(3.0 * math.exp(-5010 / TAU_S), rel=1e-3)
+    assert state.is_settled
+
+
+def test_state_does_not_depend_on_when_it_is_asked_for():
+    one = ThermalTracker(DetectorSettings(), (TAU_S,))
+    other = ThermalTracker(DetectorSettings(), (TAU_S,))
+    t = np.arange(0, 3000)
+    board = 20.0 + 0.005 * t
+    feed(one, board, board + 1.0)
+    for k, celsius in enumerate(board.tolist()):
+        other.board_reading(k * SECOND_NS, celsius)
+        other.case_reading(k * SECOND_NS, celsius + 1.0)
+        other.sample(k * SECOND_NS + 123)
+        other.state_at(k * SECOND_NS + 456_000_000)
+    at = 3000 * SECOND_NS
+    assert one.sample(at) == other.sample(at)
+
+
+def test_results_do_not_depend_on_the_origin_of_time():
+    epoch_ns = 1_790_000_000 * SECOND_NS
+    one = ThermalTracker(DetectorSettings(), (TAU_S,))
+    other = ThermalTracker(DetectorSettings(), (TAU_S,))
+    board = 20.0 + 0.01 * np.arange(500)
+    feed(one, board, board + 2.0)
+    feed(other, board, board + 2.0, start_s=1_790_000_000)
+    assert one.sample(500 * SECOND_NS) == other.sample(epoch_ns + 500 * SECOND_NS)
+
+
+def ramp(tracker):
+    """Feed a soak and then a ramp; return the weight at every second of the ramp."""
+    soak = np.full(1200, 20.0)
+    feed(tracker, soak, soak)
+    assert tracker.detector.regime == Regime.STATIC
+    weights = []
+    for k in range(1, 600):
+        case = 20.0 + k / 60.0
+        stamp_ns = (1199 + k) * SECOND_NS
+        tracker.board_reading(stamp_ns, 20.0 + (k / 60.0) * 0.2)
+        tracker.case_reading(stamp_ns, case)
+        weights.append(tracker.weight_at(stamp_ns))
+    assert tracker.detector.regime == Regime.DYNAMIC
+    return np.array(weights)
+
+
+def test_cross_over_moves_linearly_over_the_transition_time():
+    tracker = ThermalTracker(DetectorSettings(), (), ThermalConfig(transition_time_s=20.0))
+    weights = ramp(tracker)
+    steps = np.diff(weights)
+    moving = steps[steps > 0.0]
+    assert len(moving) == 20
+    np.testing.assert_allclose(moving, 1.0 / 20.0, atol=1e-9)
+    assert weights[-1] == 1.0
+
+
+def test_no_transition_time_is_the_hard_switch_of_the_paper():
+    tracker = ThermalTracker(DetectorSettings(), (), ThermalConfig(transition_time_s=0.0))
+    assert set(ramp(tracker).tolist()) == {0.0, 1.0}
+
+
+def test_lost_case_is_replaced_by_the_boards_rate():
+    config = ThermalConfig(case_timeout_s=10.0, board_lag_s=600.0)
+    tracker = ThermalTracker(DetectorSettings(), (), config)
+    t = np.arange(0, 1000)
+    board = 20.0 + 0.01 * t
+    feed(tracker, board, board + 6.0)
+    assert tracker.state_at(999 * SECOND_NS).gradient == pytest.approx(6.0, abs=0.05)
+    feed(tracker, 20.0 + 0.01 * np.arange(1000, 1100), start_s=1000)
+    state = tracker.state_at(1099 * SECOND_NS)
+    # lag times rate, the closed form of a first-order lag in a ramp.
+    assert state.gradient == pytest.approx(600.0 * 0.01, abs=0.1)
+    assert math.sqrt(state.var_gradient) >= LOST_GRADIENT_RELATIVE_SD * 5.9
+
+
+def test_reset_is_a_new_tracker():
+    tracker = ThermalTracker(DetectorSettings(), (TAU_S,))
+    fresh = ThermalTracker(DetectorSettings(), (TAU_S,))
+    board = 20.0 + 0.01 * np.arange(500)
+    feed(tracker, board, board + 2.0)
+    tracker.reset()
+    feed(tracker, board, board + 2.0)
+    feed(fresh, board, board + 2.0)
+    assert tracker.sample(500 * SECOND_NS) == fresh.sample(500 * SECOND_NS)
+
+
+def test_state_before_any_board_temperature_is_refused():
+    with pytest.raises(ValueError, match='needs a board temperature'):
+        ThermalTracker(DetectorSettings()).state_at(0)
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or more'),
+        ({'transition_time_s': math.nan}, '`transition_time_s`'),
+        ({'case_timeout_s': 0.0}, '`case_timeout_s` must be positive'),
+        ({'board_lag_s': -5.0}, '`board_lag_s` must be positive'),
+    ],
+)
+def test_config_refusals(values, message):
+    with pytest.raises(ValueError, match=message):
+        ThermalConfig(**values)
