@@ -17,7 +17,7 @@ import typer
 
 from .. import __version__
 from ..errors import ThermoCompError
-from . import output
+from . import convert, info, output, replay, simulate
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
@@ -52,6 +52,12 @@ def _top(
     Thermal-drift compensation of a three-axis accelerometer.
 
     """
+
+
+app.command()(replay.replay)
+app.command()(info.info)
+app.command()(convert.convert)
+app.command()(simulate.simulate)
 
 
 def main(arguments: list[str] | None = None) -> None:

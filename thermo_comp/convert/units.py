@@ -91,7 +91,7 @@ def find_stillness(stamp_ns: IntArray, accel: Array) -> Stillness:
     # The quiet level is the lower quartile: a log may be handled for most of its time. A sensor
     # whose noise is below its own step shows none: then a step is the level.
     steps = np.abs(np.diff(accel, axis=0))
-    quantum = float(steps[steps > 0.0].min(initial=np.inf))
+    quantum = float(np.min(steps[steps > 0.0], initial=np.inf))
     level = max(float(np.quantile(sd, 0.25)), quantum if np.isfinite(quantum) else 0.0)
     is_quiet = sd <= _MOVING_RATIO * level
     return Stillness(

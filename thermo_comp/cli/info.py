@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp info``: what is in a bag or a calibration, and whether it is fit for a fit.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from . import options
+from .output import Cell, Output
+
+
+def info(
+    path: Annotated[Path, typer.Argument(help='Bag or calibration file.', metavar='BAG|YAML')],
+    counts_topic: options.CountsTopic = 'accel/counts',
+    imu_topic: options.ImuTopic = 'imu/uncompensated',
+    board_topic: options.BoardTopic = 'temperature/board',
+    case_topic: options.CaseTopic = 'temperature/case',
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Say what is in a bag or a calibration.
+
+    Of a bag: topics, rate, temperature span and ramps, gaps, and whether
+    it is fit for a fit. Of a calibration: unit, ranges, sets, residuals.
+
+    Example:
+      thermo_comp info chamber.mcap
+
+    """
+    out = Output(as_json, quiet)
+    if path.suffix in ('.yaml', '.yml'):
+        _calibration(out, path)
+    else:
+        _bag(out, path, (counts_topic, imu_topic, board_topic, case_topic))
+
+
+def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
+    from ..survey import survey_recording
+
+    with out.progress(f'reading {path.name}', total=1.0) as done:
+        survey = survey_recording(path, options.topics_of(*topics), done)
+    found = survey.info
+    out.line(f'{path}: {found.storage}, {found.n_messages} messages')
+    for key, value in found.metadata.items():
+        if key in ('serial', 'converted_from', 'corrected_from', 'simulated_by'):
+            out.line(f'  {key.replace("_", " ")}: {value}')
+    out.table(
+        ('topic', 'type', 'messages'),
+        [(name, kind, count) for name, (kind, count) in sorted(found.topics.items())],
+    )
+    if survey.n:
+        out.line(
+            f'{survey.n} samples of {found.input}, {survey.rate_hz:.4g} Hz, '
+            f'{survey.duration_s:.1f} s; {survey.n_still} still intervals, {survey.still_s:.1f} s'
+        )
+    rows: list[tuple[Cell, ...]] = [
+        (
+            name,
+            sensor.rate_hz,
+            sensor.lowest,
+            sensor.highest,
+            sensor.steepest_heating_k_min,
+            sensor.steepest_cooling_k_min,
+        )
+        for name, sensor in (('board', survey.board), ('case', survey.case))
+        if sensor is not None
+    ]
+    if rows:
+        out.table(('sensor', 'Hz', 'min degC', 'max degC', 'max K/min', 'min K/min'), rows)
+    for finding in survey.findings:
+        out.line(f'- {finding}')
+    if not survey.findings:
+        out.line('fit for a fit, together with other positions')
+    out.json(
+        {
+            'path': path,
+            'storage': found.storage,
+            'truncated': found.truncated,
+            'metadata': found.metadata,
+            'topics': {
+                name: {'type': kind, 'messages': count}
+                for name, (kind, count) in found.topics.items()
+            },
+            'input': found.input,
+            'samples': survey.n,
+            'rate_hz': survey.rate_hz,
+            'duration_s': survey.duration_s,
+            'still_intervals': survey.n_still,
+            'still_s': survey.still_s,
+            'board': survey.board,
+            'case': survey.case,
+            'findings': survey.findings,
+        }
+    )
+
+
+def _calibration(out: Output, path: Path) -> None:
+    from ..calibration_file import load_calibration
+    from ..metrics import MICRO_G
+
+    calibration = load_calibration(path)
+    unit, provenance = calibration.unit, calibration.provenance
+    out.line(f'{path}: unit {unit.serial}, {unit.input} up to {unit.full_scale:g}')
+    out.line(
+        f'  fitted {provenance.created or "at an unknown time"} by thermo_comp '
+        f'{provenance.tool_version or "?"} from {len(provenance.sources)} bags, '
+        f'model {provenance.model or "?"}'
+    )
+    out.line(
+        f'  local gravity {calibration.gravity_m_s2:.6g} m/s^2, '
+        f'reference {calibration.reference_temperature_c:g} degC'
+    )
+    out.table(
+        ('axis', 'scale factor', 'bias', 'bias ug'),
+        [
+            (
+                name,
+                f'{axis.scale_factor:.8g}',
+                f'{axis.bias:.6g}',
+                axis.bias / axis.scale_factor / MICRO_G,
+            )
+            for name, axis in zip(
+                'xyz',
+                (calibration.axes.x, calibration.axes.y, calibration.axes.z),
+                strict=True,
+            )
+        ],
+    )
+    out.table(
+        ('set', 'degC', 'K/min', 'bias(t)', 'scale(t)'),
+        [
+            (
+                name,
+                '{:.1f} .. {:.1f}'.format(*regime_set.temperature_range_c),
+                '{:.2f} .. {:.2f}'.format(*regime_set.rate_range_k_min),
+                regime_set.x.bias_function.kind,
+                regime_set.x.scale_function.kind,
+            )
+            for name, regime_set in zip(
+                ('static', 'dynamic'), calibration.regime_sets(), strict=True
+            )
+        ],
+    )
+    if provenance.residuals:
+        out.table(
+            ('section', 'windows', 'raw ug RMS', 'ug RMS', 'ug max'),
+            [
+                (
+                    row.section,
+                    row.n_windows,
+                    row.raw_rms_m_s2 / MICRO_G,
+                    row.rms_m_s2 / MICRO_G,
+                    row.max_m_s2 / MICRO_G,
+                )
+                for row in provenance.residuals
+            ],
+        )
+    for note in provenance.notes:
+        out.line(f'- {note}')
+    out.json({'path': path, 'calibration': calibration})

@@ -1,0 +1,98 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the options that several commands share, each with one meaning everywhere.
+
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..errors import ThermoCompError
+
+if TYPE_CHECKING:
+    from ..recording import Topics
+
+
+class InputChoice(str, Enum):
+    """
+    What the accelerometer's messages are.
+
+    """
+
+    auto = 'auto'
+    counts = 'counts'
+    imu = 'imu'
+
+
+Json = Annotated[bool, typer.Option('--json', help='Print the result as one JSON object.')]
+Quiet = Annotated[bool, typer.Option('--quiet', '-q', help='Print nothing but errors.')]
+Force = Annotated[bool, typer.Option('--force', '-f', help='Overwrite the output.')]
+CalibrationFile = Annotated[
+    Path, typer.Option('--calibration', '-c', help='Calibration of the unit (YAML).')
+]
+Bag = Annotated[
+    Path, typer.Argument(help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
+]
+CountsTopic = Annotated[str, typer.Option(help='Topic of the counts.', show_default=True)]
+ImuTopic = Annotated[str, typer.Option(help='Topic of the uncompensated Imu.')]
+BoardTopic = Annotated[str, typer.Option(help='Topic of the board temperature.')]
+CaseTopic = Annotated[str, typer.Option(help='Topic of the case temperature.')]
+InputOption = Annotated[InputChoice, typer.Option('--input', help='What is read from the bag.')]
+Gravity = Annotated[
+    float | None, typer.Option('--gravity', help='Local gravity in m/s^2.', metavar='G')
+]
+Latitude = Annotated[
+    float | None, typer.Option('--latitude', help='Latitude in degrees, with --height.')
+]
+Height = Annotated[float | None, typer.Option('--height', help='Height above the ellipsoid in m.')]
+Serial = Annotated[
+    str | None,
+    typer.Option(
+        '--serial', help="Serial of the unit, instead of the bag's; '' accepts any calibration."
+    ),
+]
+
+
+def topics_of(counts: str, imu: str, board: str, case: str) -> Topics:
+    """
+    Collect the topic options.
+
+    """
+    from ..recording import Topics
+
+    return Topics(counts, imu, board, case)
+
+
+def refuse_existing(output: Path, force: bool) -> None:
+    """
+    Refuse to overwrite an output before any work is done.
+
+    Parameters
+    ----------
+    output : Path
+        The file or directory to be written.
+    force : bool
+        The user's word.
+
+    Raises
+    ------
+    ThermoCompError
+        If it exists and `force` is not given.
+
+    """
+    if output.exists() and not force:
+        raise ThermoCompError(f'{output}: exists already; --force overwrites it')
+
+
+def usage(message: str, **context: Any) -> typer.BadParameter:
+    """
+    Return a mistake in the command line, to be raised: exit code 2.
+
+    """
+    return typer.BadParameter(message, **context)

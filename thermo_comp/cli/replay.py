@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp replay``: a whole bag through the compensator, offline.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from . import options
+from .output import Output
+
+if TYPE_CHECKING:
+    from ..replay import ReplayResult
+
+
+def replay(
+    bag: options.Bag,
+    calibration: options.CalibrationFile,
+    output: Annotated[
+        Path, typer.Option('--output', '-o', help='Bag to write; *.mcap makes a bare file.')
+    ],
+    keep_inputs: Annotated[
+        bool, typer.Option('--keep-inputs', help='Copy the input messages beside the output.')
+    ] = False,
+    serial: options.Serial = None,
+    frame_id: Annotated[
+        str, typer.Option(help="Frame of the output; empty keeps the input's.")
+    ] = '',
+    transition_time: Annotated[
+        float | None, typer.Option(help='As the parameter of the node [s].', min=0.0)
+    ] = None,
+    temperature_timeout: Annotated[
+        float | None, typer.Option(help='As the parameter of the node [s].')
+    ] = None,
+    case_timeout: Annotated[
+        float | None, typer.Option(help='As the parameter of the node [s].')
+    ] = None,
+    input_: options.InputOption = options.InputChoice.auto,
+    counts_topic: options.CountsTopic = 'accel/counts',
+    imu_topic: options.ImuTopic = 'imu/uncompensated',
+    board_topic: options.BoardTopic = 'temperature/board',
+    case_topic: options.CaseTopic = 'temperature/case',
+    force: options.Force = False,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Correct a whole bag offline, with the values of the live node.
+
+    Writes imu/data_raw (sensor_msgs/Imu) and regime/dynamic
+    (std_msgs/Bool); the log time of each message is its stamp.
+
+    Example:
+      thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
+
+    """
+    from ..calibration_file import load_calibration
+    from ..replay import replay as run
+    from ..status import CompensatorConfig
+
+    out = Output(as_json, quiet)
+    given = {
+        'transition_time_s': transition_time,
+        'temperature_timeout_s': temperature_timeout,
+        'case_timeout_s': case_timeout,
+    }
+    try:
+        config = CompensatorConfig(**{k: v for k, v in given.items() if v is not None})
+    except ValueError as mistake:
+        raise options.usage(str(mistake)) from mistake
+    options.refuse_existing(output, force)
+    with out.progress('replaying', total=1.0) as done:
+        result = run(
+            bag,
+            load_calibration(calibration),
+            output,
+            config=config,
+            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            input=input_.value,
+            serial=serial,
+            frame_id=frame_id,
+            keep_inputs=keep_inputs,
+            overwrite=force,
+            progress=done,
+        )
+    _say(out, result)
+
+
+def _say(out: Output, result: ReplayResult) -> None:
+    counters = result.counters
+    if result.info.truncated:
+        out.note(f'{result.info.path}: {result.info.truncated}')
+    dropped = {
+        name.removeprefix('n_').replace('_', ' '): n
+        for name, n in asdict(counters).items()
+        if name in ('n_not_finite', 'n_saturated', 'n_out_of_order', 'n_no_temperature', 'n_stale')
+        and n
+    }
+    out.line(f'{result.output}: {counters.n_out} of {counters.n_in} samples corrected')
+    for reason, n in dropped.items():
+        out.line(f'  left out, {reason}: {n}')
+    start_ns = result.info.start_ns
+    out.line(f'  regime flags: {result.n_flags}, switches: {max(len(result.switches) - 1, 0)}')
+    for stamp_ns, is_dynamic in result.switches:
+        name = 'dynamic' if is_dynamic else 'static'
+        out.line(f'    {(stamp_ns - start_ns) * 1e-9:10.1f} s  {name}')
+    out.json(
+        {
+            'output': result.output,
+            'samples_in': counters.n_in,
+            'samples_out': counters.n_out,
+            'counters': asdict(counters),
+            'flags': result.n_flags,
+            'switches': [
+                {'stamp_ns': stamp_ns, 'dynamic': is_dynamic}
+                for stamp_ns, is_dynamic in result.switches
+            ],
+            'truncated': result.info.truncated,
+        }
+    )

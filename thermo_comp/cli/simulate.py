@@ -1,0 +1,183 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp simulate``: bags of a thermal test with known truth.
+
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from . import options
+from .output import Output
+
+if TYPE_CHECKING:
+    from ..simulation import Cyclogram, SimulatedRun, UnitModel
+
+_BLOCK = 65536
+
+
+def simulate(
+    output: Annotated[
+        Path,
+        typer.Option(
+            '--output', '-o', help='Bag to write; with several positions a directory of them.'
+        ),
+    ],
+    unit: Annotated[
+        str, typer.Option(help='Kind of unit: thermostatted, bare-quartz or mems.')
+    ] = 'thermostatted',
+    unit_seed: Annotated[int, typer.Option(help='Which specimen of that kind.', min=0)] = 1,
+    profile: Annotated[
+        str,
+        typer.Option(help="Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'."),
+    ] = 'chamber',
+    positions: Annotated[
+        int, typer.Option(help='Number of positions, one bag each.', min=1, max=999)
+    ] = 1,
+    position_seed: Annotated[int, typer.Option(help='Which set of positions.', min=0)] = 0,
+    rate_hz: Annotated[float, typer.Option(help='Conversion cycles per second.', min=0.1)] = 100.0,
+    temperature_rate_hz: Annotated[
+        float | None, typer.Option(help="Temperature readings per second, else the sensors' own.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help='Seed of the noise.', min=0)] = 0,
+    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = 9.80665,
+    cold_start: Annotated[
+        bool, typer.Option('--cold-start', help='Switch the unit on when the recording starts.')
+    ] = False,
+    level: Annotated[int, typer.Option(help='zstd level, 1 fast to 19 small.', min=1, max=19)] = 3,
+    force: options.Force = False,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Make bags of a thermal test whose truth is known.
+
+    The unit is simulated from its physics (heat flow, parts with
+    temperature coefficients, noise, converter); the truth stands in each
+    bag's metadata.
+
+    Example:
+      thermo_comp simulate --profile chamber --positions 12 -o bags/sim
+
+    """
+    from .. import simulation
+
+    out = Output(as_json, quiet)
+    try:
+        cyclogram = (
+            simulation.cyclogram_preset(profile)
+            if profile in simulation.CYCLOGRAM_NAMES
+            else simulation.parse_cyclogram(profile)
+        )
+        specimen = simulation.unit_preset(unit, unit_seed)
+    except ValueError as mistake:
+        raise options.usage(str(mistake)) from mistake
+    options.refuse_existing(output, force)
+    ups = simulation.positions(positions, position_seed)
+    names = (
+        [output] if positions == 1 else [output / f'{i:02d}.mcap' for i in range(1, positions + 1)]
+    )
+    written: list[dict[str, Any]] = []
+    with out.progress('simulating', total=positions) as done:
+        for i, (name, up) in enumerate(zip(names, ups, strict=True)):
+            facts = {
+                'unit': unit,
+                'unit_seed': unit_seed,
+                'profile': profile,
+                'position': i + 1,
+                'positions': positions,
+                'position_seed': position_seed,
+                'seed': seed + i,
+                'rate_hz': rate_hz,
+                'gravity': gravity,
+                'up': up.tolist(),
+            }
+            runs = simulation.simulate_blocks(
+                specimen,
+                cyclogram,
+                up,
+                block_size=_BLOCK,
+                rate_hz=rate_hz,
+                temperature_rate_hz=temperature_rate_hz,
+                seed=seed + i,
+                gravity=gravity,
+                warm=not cold_start,
+            )
+            count = _write(
+                name, runs, specimen, facts, level, force, _part(done, i, cyclogram, rate_hz)
+            )
+            written.append({'bag': str(name), **count})
+    out.table(
+        ('bag', 'counts', 'board', 'case'),
+        [(row['bag'], row['counts'], row['board'], row['case']) for row in written],
+    )
+    out.json({'serial': specimen.serial, 'duration_s': cyclogram.duration_s, 'bags': written})
+
+
+def _part(
+    done: Callable[[float], None], before: int, cyclogram: Cyclogram, rate_hz: float
+) -> Callable[[int], None]:
+    total = cyclogram.duration_s * rate_hz
+    return lambda n: done(before + n / total)
+
+
+def _write(
+    path: Path,
+    runs: Any,
+    unit: UnitModel,
+    facts: dict[str, Any],
+    level: int,
+    force: bool,
+    tell: Callable[[int], None],
+) -> dict[str, int]:
+    """
+    Write one run; the recording starts with the first temperatures, as a recorder would.
+
+    """
+    from .. import __version__
+    from ..recording import BagWriter, Topics
+
+    topics = Topics()
+    truth = {
+        **facts,
+        'scale_factor': list(unit.scale_factor),
+        'bias_at_reference': list(unit.bias_at_reference),
+        'misalignment': [list(row) for row in unit.M],
+    }
+    metadata = {
+        'serial': unit.serial,
+        'simulated_by': f'thermo_comp {__version__}',
+        'truth': json.dumps(truth),
+    }
+    count = {'counts': 0, 'board': 0, 'case': 0}
+    start_ns: int | None = None
+    with BagWriter(path, metadata=metadata, level=level, overwrite=force) as writer:
+        for run in runs:
+            if start_ns is None:
+                start_ns = _first_stamp(run)
+            keep = run.accel_stamp_ns >= start_ns
+            # Temperatures first: of equal stamps the reading comes before the sample.
+            writer.write_temperature(topics.board, run.board_stamp_ns, run.board)
+            writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
+            writer.write_counts(
+                topics.counts, run.accel_stamp_ns[keep], run.counts[keep], 'imu_link'
+            )
+            writer.flush()
+            count['counts'] += int(keep.sum())
+            count['board'] += len(run.board)
+            count['case'] += len(run.case)
+            tell(count['counts'])
+    return count
+
+
+def _first_stamp(run: SimulatedRun) -> int:
+    if not len(run.board_stamp_ns) or not len(run.case_stamp_ns):
+        return 0
+    return int(max(run.board_stamp_ns[0], run.case_stamp_ns[0]))

@@ -1,0 +1,304 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the look at a recording before a fit: how long, how fast, how warm, how still, how whole.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from .fitting.stillness import CellAccumulator, still_intervals
+from .recording import RecordingInfo, Topics, open_recording
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+# What a fit asks of one unit's bags together; below the first it refuses.
+HARD_SPAN_K, ADVISED_SPAN_K = 10.0, 25.0
+# Rate of the board over two minutes that counts as a ramp: well above a soak's slow drift.
+_RAMP_K_MIN = 0.1
+_RAMP_WINDOW_S = 120.0
+_CELL_S, _MIN_STILL_S = 0.5, 3.0
+# A pause of this many usual intervals is a gap.
+_GAP_INTERVALS = 5.0
+
+
+@dataclass(frozen=True)
+class ThermometerSurvey:
+    """
+    One thermometer's readings in a few numbers.
+
+    Parameters
+    ----------
+    n : int
+        Readings.
+    rate_hz : float
+        Median rate.
+    lowest, highest : float
+        Extremes.
+    steepest_heating_k_min, steepest_cooling_k_min : float
+        Largest mean rates over two minutes [K/min].
+    quantum : float
+        Smallest step between neighbouring readings that differ.
+
+    """
+
+    n: int
+    rate_hz: float
+    lowest: float
+    highest: float
+    steepest_heating_k_min: float
+    steepest_cooling_k_min: float
+    quantum: float
+
+    @property
+    def span(self) -> float:
+        """
+        Highest minus lowest.
+
+        """
+        return self.highest - self.lowest
+
+
+@dataclass(frozen=True)
+class Survey:
+    """
+    What a recording holds, as far as a fit is concerned.
+
+    Parameters
+    ----------
+    info : RecordingInfo
+        Topics and storage.
+    n : int
+        Accelerometer samples.
+    rate_hz, duration_s : float
+        Median rate and length.
+    n_gaps : int
+        Pauses of more than five usual intervals.
+    longest_gap_s : float
+        The longest of them, 0 when there is none.
+    n_backwards : int
+        Samples whose stamp does not rise.
+    n_not_finite : int
+        Samples that are no numbers.
+    n_still : int
+        Still intervals of at least 3 s.
+    still_s : float
+        Their length together.
+    board, case : ThermometerSurvey or None
+        The thermometers.
+
+    """
+
+    info: RecordingInfo
+    n: int
+    rate_hz: float
+    duration_s: float
+    n_gaps: int
+    longest_gap_s: float
+    n_backwards: int
+    n_not_finite: int
+    n_still: int
+    still_s: float
+    board: ThermometerSurvey | None
+    case: ThermometerSurvey | None
+
+    @property
+    def findings(self) -> list[str]:
+        """
+        What stands between this recording and a fit, each with the next step.
+
+        """
+        found = []
+        if self.info.truncated:
+            found.append(f'cut off: {self.info.truncated}')
+        if self.n == 0:
+            found.append('no accelerometer samples: record accel/counts or imu/uncompensated')
+        if self.board is None:
+            found.append('no board temperature: a thermal fit needs temperature/board')
+        else:
+            found += self._thermal_findings(self.board)
+        if self.case is None:
+            found.append('no case temperature: the regime will follow the slower board sensor')
+        if self.n and not self.n_still:
+            found.append('it never rests for 3 s: the fit works on positions at rest')
+        if self.n_backwards:
+            found.append(f'{self.n_backwards} stamps do not rise: those samples are left out')
+        if self.n_gaps:
+            found.append(f'{self.n_gaps} gaps, the longest {self.longest_gap_s:.3g} s')
+        return found
+
+    @staticmethod
+    def _thermal_findings(board: ThermometerSurvey) -> list[str]:
+        found = []
+        if board.span < HARD_SPAN_K:
+            found.append(
+                f'board temperature spans {board.span:.1f} K: a fit needs {HARD_SPAN_K:g}, '
+                f'better {ADVISED_SPAN_K:g}'
+            )
+        elif board.span < ADVISED_SPAN_K:
+            found.append(
+                f'board temperature spans {board.span:.1f} K: {ADVISED_SPAN_K:g} are advised'
+            )
+        for name, rate in (
+            ('heating', board.steepest_heating_k_min),
+            ('cooling', -board.steepest_cooling_k_min),
+        ):
+            if rate < _RAMP_K_MIN:
+                found.append(f'no {name} ramp: the dynamic set would not know {name}')
+        return found
+
+
+def survey_recording(
+    path: str | Path,
+    topics: Topics | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Survey:
+    """
+    Read a recording once, in bounded memory, and describe it.
+
+    Parameters
+    ----------
+    path : str or Path
+        The recording.
+    topics : Topics or None, optional
+        Names of the inputs.
+    progress : callable or None, optional
+        Called with the fraction read.
+
+    Returns
+    -------
+    Survey
+        The description.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+
+    """
+    with open_recording(path, topics, require=()) as reader:
+        info = reader.info
+        name = reader.topics.get('accel')
+        total = info.topics[name][1] if name else 0
+        cells = CellAccumulator(_CELL_S, None)
+        stamps = _Stamps()
+        n_not_finite = 0
+        board, case = _Readings(), _Readings()
+        for block in reader.blocks():
+            stamps.add(block.accel_stamp_ns)
+            n_not_finite += int((~np.isfinite(block.accel).all(axis=1)).sum())
+            cells.add(block.accel_stamp_ns, block.accel)
+            board.add(block.board_stamp_ns, block.board)
+            case.add(block.case_stamp_ns, block.case)
+            if progress is not None and total:
+                progress(stamps.n / total)
+    still: list[tuple[int, int]] = []
+    still_s = 0.0
+    if stamps.n > 1:
+        reduced = cells.finish()
+        still = still_intervals(reduced, _MIN_STILL_S)
+        still_s = sum((upper - lower) * reduced.cell_s for lower, upper in still)
+    return Survey(
+        info=info,
+        n=stamps.n,
+        rate_hz=1e9 / stamps.step_ns if stamps.step_ns else float('nan'),
+        duration_s=stamps.duration_s,
+        n_gaps=stamps.n_gaps,
+        longest_gap_s=stamps.longest_gap_s,
+        n_backwards=stamps.n_backwards,
+        n_not_finite=n_not_finite,
+        n_still=len(still),
+        still_s=still_s,
+        board=board.survey(),
+        case=case.survey(),
+    )
+
+
+class _Stamps:
+    """
+    Counts gaps and disorder while the stamps stream by.
+
+    """
+
+    def __init__(self) -> None:
+        self.n = 0
+        self.n_backwards = 0
+        self.n_gaps = 0
+        self.longest_gap_s = 0.0
+        self.step_ns = 0.0
+        self._first_ns: int | None = None
+        self._last_ns = 0
+
+    def add(self, stamp_ns: IntArray) -> None:
+        if not len(stamp_ns):
+            return
+        if self._first_ns is None:
+            self._first_ns = self._last_ns = int(stamp_ns[0])
+            self.n = 1
+            stamp_ns = stamp_ns[1:]
+        steps = np.diff(np.concatenate(([self._last_ns], stamp_ns)))
+        self.n += len(stamp_ns)
+        if not len(steps):
+            return
+        self._last_ns = int(stamp_ns[-1])
+        rising = steps[steps > 0]
+        self.n_backwards += len(steps) - len(rising)
+        if not self.step_ns and len(rising):
+            self.step_ns = float(np.median(rising))
+        gaps = rising[rising > _GAP_INTERVALS * self.step_ns]
+        self.n_gaps += len(gaps)
+        self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
+
+    @property
+    def duration_s(self) -> float:
+        return 0.0 if self._first_ns is None else (self._last_ns - self._first_ns) * 1e-9
+
+
+class _Readings:
+    """
+    Gathers one thermometer; a thermal test has few readings beside its samples.
+
+    """
+
+    def __init__(self) -> None:
+        self._stamp_ns: list[IntArray] = []
+        self._celsius: list[Array] = []
+
+    def add(self, stamp_ns: IntArray, celsius: Array) -> None:
+        self._stamp_ns.append(stamp_ns)
+        self._celsius.append(celsius)
+
+    def survey(self) -> ThermometerSurvey | None:
+        stamp_ns = np.concatenate(self._stamp_ns) if self._stamp_ns else np.empty(0, np.int64)
+        celsius = np.concatenate(self._celsius) if self._celsius else np.empty(0)
+        use = np.isfinite(celsius)
+        stamp_ns, celsius = stamp_ns[use], celsius[use]
+        if not len(celsius):
+            return None
+        # Rates from means over two minutes, so that a quantum is not a ramp.
+        time = (stamp_ns - stamp_ns[0]) * 1e-9
+        bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
+        _, place = np.unique(bins, return_inverse=True)
+        count = np.bincount(place)
+        mean_time = np.bincount(place, time) / count
+        mean = np.bincount(place, celsius) / count
+        rates = np.diff(mean) / np.maximum(np.diff(mean_time), 1e-9) * 60.0
+        steps = np.abs(np.diff(celsius))
+        intervals = np.diff(stamp_ns)
+        return ThermometerSurvey(
+            n=len(celsius),
+            rate_hz=1e9 / float(np.median(intervals)) if len(intervals) else float('nan'),
+            lowest=float(np.min(celsius)),
+            highest=float(np.max(celsius)),
+            steepest_heating_k_min=max(0.0, float(np.max(rates, initial=0.0))),
+            steepest_cooling_k_min=min(0.0, float(np.min(rates, initial=0.0))),
+            quantum=float(np.min(steps[steps > 0.0], initial=np.inf)),
+        )
