@@ -355,38 +355,67 @@ def _correct(
     covariance: Floats,
     keep: npt.NDArray[np.bool_],
 ) -> None:
-    full_scale = compensator.calibration.unit.full_scale
-    spread = [np.repeat(column, counts) for column in columns]
-    dt = (stamps - spread[0]) * 1e-9
-    good = np.ones(len(stamps), dtype=bool)
-    axes = []
-    for i in range(3):
-        raw = samples[:, i]
-        good &= (-full_scale < raw) & (raw < full_scale)
-        bias, bias_slope, scale, scale_slope = spread[1 + 4 * i : 5 + 4 * i]
-        axes.append((raw - (bias + bias_slope * dt)) / (scale + scale_slope * dt))
-    if not good.all():
-        finite = np.isfinite(samples).all(axis=1)
-        compensator.counters.n_saturated += int(np.count_nonzero(~good & finite))
-        compensator.counters.n_not_finite += int(np.count_nonzero(~finite))
-        keep &= good
-    x, y, z = axes
+    if counts[0] * len(counts) == len(stamps) and (counts == counts[0]).all():
+        # Segments of one length stand as the rows of a table: their columns spread for nothing.
+        shape: tuple[int, ...] = (len(counts), int(counts[0]))
+        spread = [column[:, None] for column in columns]
+    else:
+        shape = (len(stamps),)
+        spread = [np.repeat(column, counts) for column in columns]
+    dt = (stamps.reshape(shape) - spread[0]) * 1e-9
+    _mark_bad(compensator, samples, keep)
+    x, y, z = (
+        _divide(samples[:, i].reshape(shape), spread[1 + 4 * i : 5 + 4 * i], dt) for i in range(3)
+    )
     vx, vy, vz = (
-        a + value * (b + value * c)
-        for value, (a, b, c) in zip(
-            axes, (spread[13:16], spread[16:19], spread[19:22]), strict=True
-        )
+        _variance(value, *spread[at : at + 3])
+        for value, at in zip((x, y, z), (13, 16, 19), strict=True)
     )
     yx, zx, zy, var_yx, var_zx, var_zy = compensator.misalignment
     xx = x * x
     cxy = yx * vx
     cxz = zx * vx
-    force[:, 0] = x
-    force[:, 1] = yx * x + y
-    force[:, 2] = zx * x + zy * y + z
-    covariance[:, 0] = vx
-    covariance[:, 1] = covariance[:, 3] = cxy
-    covariance[:, 2] = covariance[:, 6] = cxz
-    covariance[:, 4] = yx * cxy + vy + xx * var_yx
-    covariance[:, 5] = covariance[:, 7] = yx * cxz + zy * vy
-    covariance[:, 8] = zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy
+    out = [column.reshape(shape) for column in (*force.T, *covariance.T)]
+    out[0][...] = x
+    np.add(yx * x, y, out=out[1])
+    np.add(zx * x + zy * y, z, out=out[2])
+    out[3][...] = vx
+    out[4][...] = cxy
+    out[6][...] = cxy
+    out[5][...] = cxz
+    out[9][...] = cxz
+    np.add(yx * cxy + vy, xx * var_yx, out=out[7])
+    np.add(yx * cxz, zy * vy, out=out[8])
+    out[10][...] = out[8]
+    np.add(zx * cxz + zy * zy * vy + vz + xx * var_zx, y * y * var_zy, out=out[11])
+
+
+def _mark_bad(compensator: Compensator, samples: Floats, keep: npt.NDArray[np.bool_]) -> None:
+    full_scale = compensator.calibration.unit.full_scale
+    # One look at the extremes settles the usual case; a NaN fails both comparisons.
+    if -full_scale < np.min(samples) and np.max(samples) < full_scale:
+        return
+    good = ((-full_scale < samples) & (samples < full_scale)).all(axis=1)
+    finite = np.isfinite(samples).all(axis=1)
+    compensator.counters.n_saturated += int(np.count_nonzero(~good & finite))
+    compensator.counters.n_not_finite += int(np.count_nonzero(~finite))
+    keep &= good
+
+
+def _divide(raw: Floats, line: list[npt.NDArray[Any]], dt: Floats) -> Floats:
+    bias, bias_slope, scale, scale_slope = line
+    value: Floats = bias_slope * dt
+    value += bias
+    np.subtract(raw, value, out=value)
+    divisor = scale_slope * dt
+    divisor += scale
+    value /= divisor
+    return value
+
+
+def _variance(x: Floats, a: Floats, b: Floats, c: Floats) -> Floats:
+    value = x * c
+    value += b
+    value *= x
+    value += a
+    return value
