@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the field check of a calibration: while the platform stands still, |f| must be gravity.
+
+A calibration that has aged, or a unit that was exchanged, shows as a residual larger than its
+own uncertainty. Samples are gathered in windows of one second; a window counts as still when its
+scatter is that of the sensor and its mean that of the window before.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+#: Length of a window.
+WINDOW_NS = 1_000_000_000
+#: Fewer samples than this make no window.
+SMALLEST_WINDOW = 10
+#: A still window scatters by at most this many times the noise of its samples...
+SCATTER_FACTOR = 3.0
+#: ... and its mean differs from the last one's by at most this [m/s^2]: half a milli-g.
+LARGEST_CHANGE = 5e-3
+#: Still windows averaged into one residual, the older with falling weight.
+MEMORY_WINDOWS = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class GravityResidual:
+    """
+    What the still windows say.
+
+    """
+
+    #: |f| - g [m/s^2], averaged over the recent still windows.
+    residual: float
+    #: Its standard deviation [m/s^2]: what calibration and noise leave uncertain.
+    residual_sd: float
+    #: Still windows that went into it.
+    n_windows: int
+    #: Whether the last window was still.
+    is_still: bool
+
+    @property
+    def sigmas(self) -> float:
+        """
+        Size of the residual in its own standard deviations.
+
+        """
+        return abs(self.residual) / self.residual_sd
+
+
+class GravityMonitor:
+    """
+    Compare |f| with gravity over still windows.
+
+    Parameters
+    ----------
+    gravity : float
+        Local gravity where the platform stands [m/s^2].
+
+    Raises
+    ------
+    ValueError
+        If `gravity` is not positive.
+
+    """
+
+    def __init__(self, gravity: float) -> None:
+        if not 0.0 < gravity < math.inf:
+            raise ValueError(f'`gravity` must be positive, got {gravity}')
+        self.gravity = gravity
+        self._window_ns: int | None = None
+        self._clear_window()
+        self._last_mean: tuple[float, float, float] | None = None
+        self._residual = 0.0
+        self._variance = 0.0
+        self._weight = 0.0
+        self._n_windows = 0
+        self._is_still = False
+
+    def _clear_window(self) -> None:
+        self._n = 0
+        self._sum = [0.0, 0.0, 0.0]
+        self._squares = 0.0
+        self._origin = (0.0, 0.0, 0.0)
+
+    def add(
+        self,
+        stamp_ns: int,
+        force: tuple[float, float, float],
+        covariance: tuple[float, float, float, float, float, float],
+        noise_variance: float,
+    ) -> None:
+        """
+        Take one corrected sample.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp.
+        force : tuple of 3 floats
+            Specific force [m/s^2].
+        covariance : tuple of 6 floats
+            xx, xy, xz, yy, yz, zz of the sample [m^2/s^4].
+        noise_variance : float
+            The part of the trace of the covariance that is noise of one sample [m^2/s^4].
+
+        """
+        start = self._window_ns
+        if start is None or not 0 <= stamp_ns - start < WINDOW_NS:
+            self._window_ns = stamp_ns
+            self._clear_window()
+            self._origin = force
+        total = self._sum
+        dx, dy, dz = (value - o for value, o in zip(force, self._origin, strict=True))
+        total[0] += dx
+        total[1] += dy
+        total[2] += dz
+        self._squares += dx * dx + dy * dy + dz * dz
+        self._n += 1
+        if self._n >= SMALLEST_WINDOW and stamp_ns - (start or stamp_ns) >= 0.98 * WINDOW_NS:
+            self._close(covariance, noise_variance)
+            self._window_ns = None
+
+    def _close(
+        self,
+        covariance: tuple[float, float, float, float, float, float],
+        noise_variance: float,
+    ) -> None:
+        n = self._n
+        shift = [value / n for value in self._sum]
+        mean = tuple(o + s for o, s in zip(self._origin, shift, strict=True))
+        scatter = (self._squares - n * sum(s * s for s in shift)) / (n - 1)
+        last, self._last_mean = self._last_mean, (mean[0], mean[1], mean[2])
+        self._is_still = (
+            scatter <= SCATTER_FACTOR**2 * noise_variance
+            and last is not None
+            and max(abs(a - b) for a, b in zip(mean, last, strict=True)) <= LARGEST_CHANGE
+        )
+        if not self._is_still:
+            return
+        size = math.sqrt(sum(value * value for value in mean))
+        ux, uy, uz = (value / size for value in mean)
+        xx, xy, xz, yy, yz, zz = covariance
+        along = (
+            ux * ux * xx
+            + uy * uy * yy
+            + uz * uz * zz
+            + 2.0 * (ux * uy * xy + ux * uz * xz + uy * uz * yz)
+        )
+        # The calibration's error is common to the samples of a window, their noise averages out.
+        noise = noise_variance / 3.0
+        variance = max(along - noise, 0.0) + noise / n
+        decay = 1.0 - 1.0 / MEMORY_WINDOWS
+        self._weight = self._weight * decay + 1.0
+        gain = 1.0 / self._weight
+        self._residual += gain * (size - self.gravity - self._residual)
+        self._variance += gain * (variance - self._variance)
+        self._n_windows += 1
+
+    @property
+    def result(self) -> GravityResidual | None:
+        """
+        The residual so far; None before the first still window.
+
+        """
+        if not self._n_windows:
+            return None
+        return GravityResidual(
+            self._residual, math.sqrt(self._variance), self._n_windows, self._is_still
+        )
