@@ -110,7 +110,7 @@ class GravityMonitor:
         """
         start = self._window_ns
         if start is None or not 0 <= stamp_ns - start < WINDOW_NS:
-            self._window_ns = stamp_ns
+            self._window_ns = start = stamp_ns
             self._clear_window()
             self._origin = force
         total = self._sum
@@ -120,7 +120,7 @@ class GravityMonitor:
         total[2] += dz
         self._squares += dx * dx + dy * dy + dz * dz
         self._n += 1
-        if self._n >= SMALLEST_WINDOW and stamp_ns - (start or stamp_ns) >= 0.98 * WINDOW_NS:
+        if self._n >= SMALLEST_WINDOW and stamp_ns - start >= 0.98 * WINDOW_NS:
             self._close(covariance, noise_variance)
             self._window_ns = None
 
