@@ -79,7 +79,7 @@ def learn_thermometer(
         variance = max(float(square.mean()) / 6.0 - quantum**2 / 12.0, (0.1 * quantum) ** 2)
         noise = float(np.sqrt(variance))
     else:
-        noise = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0)
+        noise = float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
     return replace(base, noise_sd_c=max(noise, _SMALLEST_NOISE), quantum_c=quantum)
 
 
