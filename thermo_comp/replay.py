@@ -39,8 +39,6 @@ from .status import CompensatorConfig, Counters
 OUTPUT_TOPIC = 'imu/data_raw'
 REGIME_TOPIC = 'regime/dynamic'
 
-_INPUT_OF_UNIT: dict[str, Input] = {'counts': 'counts', 'm/s^2': 'imu'}
-
 
 @dataclass(frozen=True)
 class CorrectedBlock:
@@ -116,12 +114,34 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
             f'the recording {info.path} is of {expected}',
             key='unit.serial',
         )
-    if info.input is not None and _INPUT_OF_UNIT[calibration.unit.input] != info.input:
+    if info.input == 'imu' and calibration.unit.input != 'm/s^2':
         raise CalibrationError(
             f'this calibration takes {calibration.unit.input}, '
-            f'the recording {info.path} holds {info.input}',
+            f'the recording {info.path} holds sensor_msgs/Imu in m/s^2',
             key='unit.input',
         )
+
+
+def input_for(calibration: Calibration, asked: Input) -> Input:
+    """
+    Choose what is read from a recording for a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    asked : {'auto', 'counts', 'imu'}
+        The user's word.
+
+    Returns
+    -------
+    {'counts', 'imu'}
+        For ``auto``, counts for a calibration in counts and Imu for one in m/s^2.
+
+    """
+    if asked != 'auto':
+        return asked
+    return 'counts' if calibration.unit.input == 'counts' else 'imu'
 
 
 def corrected_blocks(
@@ -203,10 +223,9 @@ def replay(
         If the calibration is for another unit.
 
     """
-    if input == 'auto':
-        input = _INPUT_OF_UNIT[calibration.unit.input]  # noqa: A001
     compensator = Compensator(calibration, config)
-    with open_recording(path, topics, input, require=('accel', 'board')) as reader:
+    wanted = input_for(calibration, input)
+    with open_recording(path, topics, wanted, require=('accel', 'board')) as reader:
         check_unit(calibration, reader.info, serial)
         metadata = {
             'serial': calibration.unit.serial,

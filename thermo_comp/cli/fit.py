@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp fit``: bags of a thermal test to a calibration, once per unit.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from . import options
+from .output import Output
+
+if TYPE_CHECKING:
+    from ..fitting import FitResult
+
+
+def fit(
+    bags: Annotated[
+        list[Path], typer.Argument(help='Bags of one unit: its positions.', metavar='BAG...')
+    ],
+    output: Annotated[Path, typer.Option('--output', '-o', help='Calibration to write (YAML).')],
+    gravity: options.Gravity = None,
+    latitude: options.Latitude = None,
+    height: options.Height = None,
+    model: Annotated[
+        str, typer.Option(help='auto, golovach (the paper), quadratic (one set), or a candidate.')
+    ] = 'auto',
+    report: Annotated[
+        Path | None, typer.Option(help='Certificate to write (HTML).', metavar='HTML')
+    ] = None,
+    serial: Annotated[str | None, typer.Option(help="Serial, instead of the bags'.")] = None,
+    full_scale: Annotated[
+        float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
+    ] = None,
+    reference_temperature: Annotated[
+        float, typer.Option(help='Reference temperature [degC].')
+    ] = 20.0,
+    min_still: Annotated[float, typer.Option(help='Shortest still interval used [s].')] = 3.0,
+    allow: Annotated[
+        list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
+    ] = None,
+    input_: options.InputOption = options.InputChoice.auto,
+    counts_topic: options.CountsTopic = 'accel/counts',
+    imu_topic: options.ImuTopic = 'imu/uncompensated',
+    board_topic: options.BoardTopic = 'temperature/board',
+    case_topic: options.CaseTopic = 'temperature/case',
+    force: options.Force = False,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Fit a calibration to bags of a thermal test.
+
+    The unit rests in several unknown positions while the chamber goes
+    through its program: six faces give bias and scale, nine or more well
+    spread positions the misalignment, too. Local gravity is yours to give.
+
+    Example:
+      thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
+
+    """
+    from ..calibration_file import save_calibration
+    from ..fit_sources import fit_sources
+    from ..fitting import FitOptions, resolve_gravity
+    from ..fitting import fit as run
+
+    out = Output(as_json, quiet)
+    if gravity is None and (latitude is None or height is None):
+        raise options.usage('give --gravity, or --latitude and --height')
+    for path in (output, report):
+        if path is not None:
+            options.refuse_existing(path, force)
+    topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
+    sources, kind = fit_sources(bags, topics, input_.value)
+    try:
+        settings = FitOptions(
+            gravity=resolve_gravity(gravity, latitude, height),
+            model=model,
+            serial=serial,
+            input='counts' if kind == 'counts' else 'm/s^2',
+            full_scale=full_scale,
+            reference_temperature=reference_temperature,
+            min_still_s=min_still,
+            allow=tuple(allow or ()),
+        )
+    except ValueError as mistake:
+        raise options.usage(str(mistake)) from mistake
+    with out.progress('fitting', total=1.0) as done:
+        result = run(sources, settings, lambda _stage, part: done(part))
+    save_calibration(result.calibration, output)
+    _say(out, result, output)
+
+
+def _say(out: Output, result: FitResult, output: Path) -> None:
+    calibration = result.calibration
+    out.table(
+        ('section', 'windows', 'raw ug', 'one set ug', 'fitted ug', 'max ug'),
+        [
+            (
+                row.section,
+                row.fitted.n,
+                row.raw.micro_g.rms,
+                row.one_set.micro_g.rms,
+                row.fitted.micro_g.rms,
+                row.fitted.micro_g.peak,
+            )
+            for row in result.residuals
+            if row.fitted.n
+        ],
+        title='|f| - g at rest, RMS',
+    )
+    out.line(
+        f'{output}: unit {calibration.unit.serial}, {calibration.provenance.model}, '
+        f'{len(result.positions)} positions'
+    )
+    out.json(
+        {
+            'output': output,
+            'serial': calibration.unit.serial,
+            'model': calibration.provenance.model,
+            'gravity': calibration.gravity_m_s2,
+            'residuals': result.residuals,
+            'positions': result.positions,
+        }
+    )
