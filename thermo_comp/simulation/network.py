@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 AIR = 'air'
+_HELD = 1e-6  # change with the air's below which a part counts as held, K/K
 
 
 @dataclass(frozen=True)
@@ -249,13 +250,27 @@ class ThermalNetwork:
         Returns
         -------
         float
-            ``(T_behind - T_node) / (dT/dt)``, s, self-heating apart.
+            Delay of the straight line that the part ends up on, s.
+
+        Raises
+        ------
+        ValueError
+            If the thermostat holds one of the parts.
 
         """
         A, b, _ = self.system()
-        lag = np.linalg.solve(A, np.linalg.solve(A, b))
-        lead = 0.0 if behind == AIR else lag[self.nodes.index(behind)]
-        return float(lag[self.nodes.index(node)] - lead)
+        gain = np.linalg.solve(A, -b)
+        shortfall = np.linalg.solve(A, -gain)
+
+        def delay(name: str) -> float:
+            if name == AIR:
+                return 0.0
+            i = self.nodes.index(name)
+            if abs(gain[i]) < _HELD:
+                raise ValueError(f'the thermostat holds {name!r}: it does not follow a ramp')
+            return float(shortfall[i] / gain[i])
+
+        return delay(node) - delay(behind)
 
     def stretched(self, factor: float, keep: tuple[str, ...] = ()) -> ThermalNetwork:
         """

@@ -92,7 +92,7 @@ def _thermostatted(seed: int) -> UnitModel:
             ('oven', 'head', 1.5),
         ),
         power={'board': 0.8, 'reference': 0.02, 'head': 0.3},
-        thermostat=Thermostat('oven', 55.0, 8.0, 0.02, 1800.0, 25.0),
+        thermostat=Thermostat('oven', 55.0, 20.0, 0.08, 1800.0, 25.0),
     )
     drift = DriftModel(
         parts=(
@@ -149,7 +149,8 @@ def _bare_quartz(seed: int) -> UnitModel:
             ('board', 'reference', 0.02),
             ('board', 'head', 4.0),
             ('head', 'magnet', 0.80),
-            ('head', 'mount', 0.06),
+            ('head', 'mount', 0.05),
+            ('case', 'mount', 0.01),
             ('head', 'pendulum', 0.01),
             ('magnet', 'pendulum', 0.01),
         ),
@@ -169,7 +170,7 @@ def _bare_quartz(seed: int) -> UnitModel:
             DifferenceEffect(
                 'head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)
             ),
-            # Stress through the joint to the mounting ring, which is heavy and poorly coupled.
+            # Stress through the joint to the mounting ring, heavy and slow, bolted to the case.
             DifferenceEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
         ),
         creeps=(CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),),

@@ -1,0 +1,230 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The thermal network against hand-solved cases, an integrator and its own heat balance.
+
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from thermo_comp.simulation import (
+    AIR,
+    UNIT_NAMES,
+    Link,
+    ThermalNetwork,
+    ThermalResponse,
+    Thermostat,
+    cyclogram_preset,
+    unit_preset,
+)
+
+# Solved in closed form, so only rounding remains; temperatures are tens of degrees.
+ROUNDING = 1e-9
+
+
+def test_one_part_follows_a_ramp_as_the_textbook_says() -> None:
+    """
+    A first-order lag in a ramp: ``T = r (t - tau (1 - exp(-t / tau)))``.
+
+    """
+    tau, rate = 900.0, 0.5 / 60.0
+    network = ThermalNetwork({'case': 900.0}, (Link(AIR, 'case', 1.0),))
+    response = ThermalResponse(network, [0.0, 3600.0], [20.0, 20.0 + rate * 3600.0])
+    time = np.linspace(0.0, 3600.0, 61)
+    expected = 20.0 + rate * (time - tau * (1.0 - np.exp(-time / tau)))
+    np.testing.assert_allclose(response.temperatures(time)[:, 0], expected, atol=ROUNDING)
+
+
+def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
+    """
+    Air - case - board with back-loading: eigenvalues from the quadratic formula, lags from the
+    heat balance of an endless ramp, amplitudes from the start at rest.
+
+    """
+    c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
+    network = ThermalNetwork(
+        {'case': c0, 'board': c1}, (Link(AIR, 'case', g0), Link('case', 'board', g1))
+    )
+    trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
+    root = math.sqrt(trace * trace - 4.0 * determinant)
+    modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
+    # In a ramp the path to the air feeds both capacities, the inner path the board's.
+    lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
+    shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
+    amplitude = np.linalg.solve(shapes, lag)
+    time = np.linspace(0.0, 5400.0, 91)
+    decaying = np.exp(np.outer(time, modes)) * amplitude
+    expected = rate * (time[:, None] - lag + decaying @ shapes.T)
+
+    response = ThermalResponse(network, [0.0, 5400.0], [0.0, rate * 5400.0])
+    np.testing.assert_allclose(response.temperatures(time), expected, atol=ROUNDING)
+    assert network.ramp_lag('board') == pytest.approx(lag[1])
+    assert network.ramp_lag('board', behind='case') == pytest.approx(c1 / g1)
+
+
+@pytest.mark.parametrize('name', UNIT_NAMES)
+@pytest.mark.parametrize('is_warm', [True, False])
+def test_presets_agree_with_a_numerical_integrator(name: str, is_warm: bool) -> None:
+    unit = unit_preset(name, 3)
+    program = cyclogram_preset('demo')
+    response = ThermalResponse(
+        unit.network, program.time_s, program.temperature_c, is_warm=is_warm
+    )
+    A, b, p = unit.network.system()
+    time = np.linspace(0.0, program.duration_s, 200)
+    states = response.states(time)
+    solved = solve_ivp(
+        lambda t, x: A @ x + b * program.at(t) + p,
+        (0.0, program.duration_s),
+        states[0],
+        method='LSODA',
+        t_eval=time,
+        rtol=1e-10,
+        atol=1e-10,
+        max_step=60.0,
+    )
+    # The integrator steps over the corners of the program; that is its error, not ours.
+    np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
+
+
+def test_rate_is_the_slope_of_the_temperature() -> None:
+    unit = unit_preset('bare-quartz', 0)
+    program = cyclogram_preset('paper')
+    response = ThermalResponse(unit.network, program.time_s, program.temperature_c)
+    time = np.array([5000.0, 9000.0, 20000.0])
+    slope = (response.states(time + 0.5) - response.states(time - 0.5)) / 1.0
+    rates = response.derivative(response.states(time), program.at(time))
+    # Central difference over 1 s against time constants of 30 s and more at 1e-2 K/s.
+    np.testing.assert_allclose(rates, slope, atol=1e-6)
+
+
+def test_followers_relax_towards_their_part() -> None:
+    """
+    A follower of a part that warms by a step lags it by its own exponential.
+
+    """
+    network = ThermalNetwork({'case': 1.0}, (Link(AIR, 'case', 1.0),))
+    response = ThermalResponse(
+        network, [0.0, 1e-6, 50000.0], [0.0, 10.0, 10.0], followers=(('case', 7200.0),)
+    )
+    followed = response.states(np.array([7200.0]))[0, 1]
+    # The case itself takes 1 s, 1.4e-4 of the follower's time constant.
+    assert followed == pytest.approx(10.0 * (1.0 - math.exp(-1.0)), abs=1e-3)
+
+
+def test_still_state_obeys_the_heat_balance() -> None:
+    """
+    With everything settled all power leaves through the air's path and nothing changes.
+
+    """
+    unit = unit_preset('bare-quartz', 5)
+    warm = unit.network.equilibrium(12.0)
+    to_air = next(link for link in unit.network.links if AIR in (link.a, link.b))
+    case = warm[unit.network.nodes.index('case')]
+    assert to_air.conductance * (case - 12.0) == pytest.approx(sum(unit.network.power.values()))
+    response = ThermalResponse(unit.network, [0.0, 3600.0], [12.0, 12.0])
+    np.testing.assert_allclose(
+        response.temperatures([0.0, 1800.0, 3600.0]), np.tile(warm, (3, 1)), atol=ROUNDING
+    )
+    board = unit.network.nodes.index('board')
+    assert unit.network.equilibrium(unit.network.air_for('board', 20.0))[board] == pytest.approx(
+        20.0
+    )
+
+
+def test_thermostat_holds_its_part_and_spends_what_leaks() -> None:
+    unit = unit_preset('thermostatted', 2)
+    network = unit.network
+    heat = network.thermostat
+    assert heat is not None
+    oven, head = network.nodes.index('oven'), network.nodes.index('head')
+    for air in (5.0, 20.0, 35.0):
+        still = network.equilibrium(air)
+        assert still[oven] == pytest.approx(heat.set_point)
+        leak = sum(
+            link.conductance * (heat.set_point - still[network.nodes.index(other)])
+            for link in network.links
+            for here, other in ((link.a, link.b), (link.b, link.a))
+            if here == 'oven'
+        )
+        assert network.heater_power(air) == pytest.approx(leak)
+    program = cyclogram_preset('fast')
+    response = ThermalResponse(network, program.time_s, program.temperature_c)
+    grid = np.arange(0.0, program.duration_s, 30.0)
+    # 30 K outside, 3 K/min: an oven of this class keeps the head to better than 0.2 K.
+    assert np.ptp(response.temperatures(grid)[:, head]) < 0.2
+
+
+@pytest.mark.parametrize('air', [5.0, 35.0])
+def test_cold_start_stays_within_the_heater_and_settles(air: float) -> None:
+    network = unit_preset('thermostatted', 0).network
+    heat = network.thermostat
+    assert heat is not None
+    response = ThermalResponse(network, [0.0, 40000.0], [air, air], is_warm=False)
+    np.testing.assert_allclose(response.temperatures([0.0])[0], air, atol=ROUNDING)
+    watts = response.heater_power(np.arange(0.0, 40000.0, 20.0))
+    assert watts.min() > -1e-9
+    assert watts.max() < heat.max_power
+    # 11 h are 22 times the slowest time constant, the soft start's half hour: exp(-22) of 50 K.
+    np.testing.assert_allclose(
+        response.temperatures([40000.0])[0], network.equilibrium(air), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize('name', UNIT_NAMES)
+@pytest.mark.parametrize('case', [180.0, 900.0, 1200.0])
+def test_lags_can_be_set(name: str, case: float) -> None:
+    """
+    A ramp starts the case off with ``r / case``, and the board trails it by `board` in the end.
+
+    """
+    unit = unit_preset(name, 1).with_lags(case=case, board=720.0)
+    duration, slope = 90000.0, 0.004 / 60.0
+    end = 5.0 + slope * duration
+    response = ThermalResponse(unit.network, [0.0, duration], [5.0, end])
+    A, b, _ = unit.network.system()
+    states = response.states([0.0, duration])
+    leading, trailing = (unit.network.nodes.index(node) for node in ('case', 'board'))
+    second = A @ response.derivative(states, np.array([5.0, 5.0]))[0] + b * slope
+    assert second[leading] == pytest.approx(slope / case, rel=1e-6)
+    # 25 h are over 20 times the slowest time constant here; the oven takes its share of the gain.
+    gain = unit.network.equilibrium(1.0) - unit.network.equilibrium(0.0)
+    short = unit.network.equilibrium(end) - response.temperatures([duration])[0]
+    delay = short[[leading, trailing]] / (slope * gain[[leading, trailing]])
+    assert delay[1] - delay[0] == pytest.approx(720.0, rel=1e-6)
+
+
+def test_network_refuses_what_is_not_one() -> None:
+    link = (Link(AIR, 'case', 1.0),)
+    with pytest.raises(ValueError, match='`capacity` of case must be positive, got 0'):
+        ThermalNetwork({'case': 0.0}, link)
+    with pytest.raises(ValueError, match="part 'oven' has no `capacity`"):
+        ThermalNetwork({'case': 1.0}, link, power={'oven': 1.0})
+    with pytest.raises(ValueError, match='`conductance` must be positive, got -1'):
+        ThermalNetwork({'case': 1.0}, (Link(AIR, 'case', -1.0),))
+    with pytest.raises(ValueError, match="part 'board' has no heat path to the air"):
+        ThermalNetwork({'case': 1.0, 'board': 1.0}, link)
+
+
+def test_response_refuses_what_it_cannot_solve() -> None:
+    network = unit_preset('thermostatted', 0).network
+    with pytest.raises(ValueError, match=r'air of 5\.\.90 degC needs -.* W of a thermostat'):
+        ThermalResponse(network, [0.0, 60.0], [5.0, 90.0])
+    # A chain of equal one-way parts has one eigenvector only; so has a critically damped heater.
+    heat = Thermostat('case', 50.0, 1.0, 1.0, 1.0, 100.0)
+    twin = ThermalNetwork({'case': 1.0}, (Link(AIR, 'case', 1.0),), thermostat=heat)
+    with pytest.raises(ValueError, match='modes that cannot be told apart'):
+        ThermalResponse(twin, [0.0, 60.0], [20.0, 20.0])
+    with pytest.raises(ValueError, match="the thermostat holds 'oven'"):
+        network.ramp_lag('oven')
+    unit = unit_preset('mems', 0)
+    with pytest.raises(ValueError, match='`case` must be positive, got -1'):
+        unit.with_lags(case=-1.0)
+    with pytest.raises(ValueError, match='`board` must be positive, got 0'):
+        unit.with_lags(board=0.0)
