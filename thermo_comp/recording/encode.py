@@ -84,44 +84,81 @@ def stamped_records(
     channel: int, stamp_ns: Ints, log_ns: Ints, frame_id: str, numbers: Floats
 ) -> Records:
     """
-    Records of messages that are a header and float64 numbers.
+    Make records of messages that are a header and float64 numbers.
 
     Parameters
     ----------
     channel : int
+        Number of the channel.
     stamp_ns, log_ns : ndarray of int64, shape (n,)
+        Header stamps and log times.
     frame_id : str
+        Of all of them.
     numbers : ndarray, shape (n, k)
+        What follows the header.
 
     Returns
     -------
     Records
 
     """
-    characters = frame_id.encode() + b'\0'
-    body = 31 + 4 + (12 + len(characters) + 7) // 8 * 8
-    size = body + 8 * numbers.shape[1]
+    payload = _stamped_layout(frame_id, numbers.shape[1])
+    size = RECORD_HEAD.itemsize + payload.itemsize
     rows: NDArray[Any] = np.zeros(
-        len(stamp_ns),
-        layout(
-            size,
-            head=(RECORD_HEAD, 0),
-            order=('u1', 32),
-            sec=('<i4', 35),
-            nanosec=('<u4', 39),
-            length=('<u4', 43),
-            frame=(np.dtype((np.void, len(characters))), 47),
-            numbers=(('<f8', (numbers.shape[1],)), body),
-        ),
+        len(stamp_ns), layout(size, head=(RECORD_HEAD, 0), payload=(payload, RECORD_HEAD.itemsize))
     )
     _fill_head(rows['head'], channel, log_ns, size)
+    _fill_stamped(rows['payload'], stamp_ns, frame_id, numbers)
+    return _uniform(channel, log_ns, rows)
+
+
+def stamped_payloads(stamp_ns: Ints, frame_id: str, numbers: Floats) -> Bytes:
+    """
+    Serialize messages that are a header and float64 numbers.
+
+    Parameters
+    ----------
+    stamp_ns : ndarray of int64, shape (n,)
+        Header stamps.
+    frame_id : str
+        Of all of them.
+    numbers : ndarray, shape (n, k)
+        What follows the header.
+
+    Returns
+    -------
+    ndarray of uint8, shape (n, size)
+        CDR, little-endian.
+
+    """
+    payload = _stamped_layout(frame_id, numbers.shape[1])
+    rows: NDArray[Any] = np.zeros(len(stamp_ns), payload)
+    _fill_stamped(rows, stamp_ns, frame_id, numbers)
+    return rows.view(np.uint8).reshape(len(stamp_ns), payload.itemsize)
+
+
+def _stamped_layout(frame_id: str, n_numbers: int) -> np.dtype[Any]:
+    length = len(frame_id.encode()) + 1
+    body = 4 + (12 + length + 7) // 8 * 8
+    return layout(
+        body + 8 * n_numbers,
+        order=('u1', 1),
+        sec=('<i4', 4),
+        nanosec=('<u4', 8),
+        length=('<u4', 12),
+        frame=(np.dtype((np.void, length)), 16),
+        numbers=(('<f8', (n_numbers,)), body),
+    )
+
+
+def _fill_stamped(rows: NDArray[Any], stamp_ns: Ints, frame_id: str, numbers: Floats) -> None:
+    characters = frame_id.encode() + b'\0'
     rows['order'] = 1
     rows['sec'] = stamp_ns // _NS
     rows['nanosec'] = stamp_ns % _NS
     rows['length'] = len(characters)
     rows['frame'] = np.void(characters)
     rows['numbers'] = numbers
-    return _uniform(channel, log_ns, rows)
 
 
 def bool_records(channel: int, log_ns: Ints, values: NDArray[np.bool_]) -> Records:

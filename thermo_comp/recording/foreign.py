@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RecordingError
-from .assemble import Part, Rows
-from .columns import ROLES, Role
-from .topics import TEMPERATURE
-from .wire import Encoding, decode_stamped, frame_runs
+from .assemble import Part
+from .columns import Role
+from .decode import Decoder, Feed
+from .wire import Encoding
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -38,6 +38,8 @@ class ForeignSource:
     ----------
     path : Path
         A rosbag2 directory, a bare storage file, or a ROS 1 ``.bag``.
+    note : str or None, optional
+        What is missing beside it.
 
     Raises
     ------
@@ -46,13 +48,12 @@ class ForeignSource:
 
     """
 
-    truncated: str | None = None
-
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, note: str | None = None) -> None:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
 
         self.path = path
+        self.truncated = note
         self._encoding: Encoding = 'ros1' if path.suffix == '.bag' else 'cdr'
         with _translated(path):
             self._reader: Any = Reader1(path) if self._encoding == 'ros1' else Reader2(path)
@@ -106,14 +107,15 @@ class ForeignSource:
         chosen = [c for c in self._connections if c.topic in roles]
         if not chosen:
             return
-        batch = _Batch(self.path, self._encoding, raw)
+        feeds = {roles[c.topic]: Feed(c.topic, c.msgtype, self._encoding) for c in chosen}
+        batch = _Batch(Decoder(feeds, {}, raw), feeds)
         with _translated(self.path):
             for connection, log_ns, data in self._reader.messages(connections=chosen):
-                batch.add(roles[connection.topic], connection, log_ns, data)
+                batch.add(roles[connection.topic], log_ns, data)
                 if batch.is_full:
                     yield batch.take()
-        if batch.n_messages:
-            yield batch.take()
+            if batch.n_messages:
+                yield batch.take()
 
     def close(self) -> None:
         """
@@ -126,62 +128,55 @@ class ForeignSource:
 
 
 class _Batch:
-    def __init__(self, path: Path, encoding: Encoding, raw: bool) -> None:
-        self._path = path
-        self._encoding = encoding
-        self._raw = raw
+    """
+    Messages collected one by one, to be decoded together.
+
+    """
+
+    def __init__(self, decoder: Decoder, feeds: dict[Role, Feed]) -> None:
+        self._decoder = decoder
+        self._feeds = feeds
         self._next_rank = 0
-        self._types: dict[Role, tuple[str, str]] = {}
         self._clear()
 
     def _clear(self) -> None:
         self.n_messages = 0
         self._n_bytes = 0
-        self._data: dict[Role, list[bytes]] = {role: [] for role in ROLES}
-        self._log_ns: dict[Role, list[int]] = {role: [] for role in ROLES}
-        self._rank: dict[Role, list[int]] = {role: [] for role in ROLES}
+        self._data: dict[Role, list[bytes]] = {role: [] for role in self._feeds}
+        self._times: dict[Role, list[tuple[int, int]]] = {role: [] for role in self._feeds}
 
     @property
     def is_full(self) -> bool:
+        """
+        Whether it is time to decode.
+
+        """
         return self.n_messages >= _BATCH_MESSAGES or self._n_bytes >= _BATCH_BYTES
 
-    def add(self, role: Role, connection: Connection, log_ns: int, data: bytes) -> None:
-        self._types[role] = (connection.topic, connection.msgtype)
+    def add(self, role: Role, log_ns: int, data: bytes) -> None:
+        """
+        Add one message.
+
+        """
         self._data[role].append(data)
-        self._log_ns[role].append(log_ns)
-        self._rank[role].append(self._next_rank)
+        self._times[role].append((log_ns, self._next_rank))
         self._next_rank += 1
         self.n_messages += 1
         self._n_bytes += len(data)
 
     def take(self) -> Part:
+        """
+        Decode what is there and begin anew.
+
+        """
         part: Part = {}
-        for role in ROLES:
-            if not self._data[role]:
-                continue
-            topic, kind = self._types[role]
-            buffer = np.frombuffer(b''.join(self._data[role]), np.uint8)
-            size = np.fromiter(map(len, self._data[role]), np.int64, len(self._data[role]))
-            ends = np.cumsum(size)
-            try:
-                messages = decode_stamped(
-                    buffer,
-                    ends - size,
-                    size,
-                    kind,
-                    self._encoding,
-                    1 if kind == TEMPERATURE else None,
-                )
-            except RecordingError as error:
-                raise RecordingError(error.message, self._path, topic) from error
-            part[role] = Rows(
-                np.array(self._rank[role], np.int64),
-                messages.stamp_ns,
-                np.array(self._log_ns[role], np.int64),
-                messages.numbers,
-                frame_runs(buffer, messages) if role == 'accel' else [(0, '')],
-                (buffer, ends) if self._raw else None,
-            )
+        for role, feed in self._feeds.items():
+            if self._data[role]:
+                data = np.frombuffer(b''.join(self._data[role]), np.uint8)
+                size = np.fromiter(map(len, self._data[role]), np.int64, len(self._data[role]))
+                log_ns, rank = np.array(self._times[role], np.int64).T
+                start = np.cumsum(size) - size
+                part[role] = self._decoder.rows(feed, role, data, start, size, log_ns, rank)
         self._clear()
         return part
 
@@ -203,8 +198,8 @@ def _translated(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except RecordingError:
-        raise
+    except RecordingError as error:
+        raise RecordingError(error.message, path, error.topic) from error
     except Exception as error:  # a damaged bag surfaces there as nearly any exception type
         text = ' '.join(str(error).split()) or type(error).__name__
         raise RecordingError(f'the bag cannot be read: {text}', path) from error

@@ -20,6 +20,8 @@ from ..errors import RecordingError
 from .assemble import Part, assemble, join_blocks
 from .columns import ROLES, Block, Input, Recording, RecordingInfo, Role, Topics
 from .foreign import ForeignSource
+from .mcap_source import McapSource
+from .rosbag2_metadata import read_metadata
 from .topics import select_topics
 
 
@@ -245,8 +247,37 @@ def _open_source(path: Path) -> Source:
     if not path.exists():
         raise RecordingError('no such file or directory', path)
     if path.is_dir():
-        if not (path / 'metadata.yaml').is_file():
-            raise RecordingError('not a bag: the directory has no metadata.yaml', path)
-    elif path.suffix not in {'.mcap', '.db3', '.bag'}:
-        raise RecordingError('not a bag: expected a directory, .mcap, .db3 or .bag', path)
-    return ForeignSource(path)
+        return _open_directory(path)
+    if not path.is_file():
+        raise RecordingError('not a bag: neither a file nor a directory', path)
+    if path.suffix == '.mcap':
+        return McapSource([path])
+    if path.suffix in {'.db3', '.bag'}:
+        return ForeignSource(path)
+    raise RecordingError('not a bag: expected a directory, .mcap, .db3 or .bag', path)
+
+
+def _open_directory(path: Path) -> Source:
+    description = read_metadata(path)
+    if description is not None:
+        if description.storage == 'mcap' and not description.is_compressed:
+            return McapSource(description.files, description.custom)
+        return ForeignSource(path)
+    for suffix in ('.mcap', '.db3'):
+        files = sorted((file for file in path.iterdir() if file.suffix == suffix), key=_number)
+        if files:
+            note = 'metadata.yaml is missing, the recording was not finished'
+            if suffix == '.mcap':
+                return McapSource(files, note=note)
+            if len(files) == 1:
+                return ForeignSource(files[0], note)
+    raise RecordingError('not a bag: the directory has no metadata.yaml', path)
+
+
+def _number(file: Path) -> tuple[int, str]:
+    """
+    Sort key of the files of a split bag: the number at the end of the name.
+
+    """
+    digits = file.stem.rpartition('_')[2]
+    return (int(digits) if digits.isascii() and digits.isdigit() else 0, file.name)

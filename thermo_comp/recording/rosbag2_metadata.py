@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns rosbag2's metadata.yaml: written as ROS 2 Jazzy does it (version 9).
+Owns rosbag2's metadata.yaml: written as ROS 2 Jazzy does it (version 9), any version read.
 
 """
 
@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path, PurePath
 from typing import Any
 
 import yaml
 
+from ..errors import RecordingError
 from .definitions import offered_qos
 
 _VERSION = 9
+_MAX_BYTES = 1 << 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,3 +123,84 @@ def dump_yaml(content: Any) -> str:
     """
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=10_000)
     return text
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """
+    What the reader needs of a metadata.yaml.
+
+    Attributes
+    ----------
+    storage : str
+        E.g. ``mcap``.
+    files : tuple of Path
+        In their order, each directly in the bag's directory.
+    is_compressed : bool
+        By rosbag2 itself, file by file or message by message.
+    custom : dict of str to str
+
+    """
+
+    storage: str
+    files: tuple[Path, ...]
+    is_compressed: bool
+    custom: dict[str, str]
+
+
+def read_metadata(directory: Path) -> Description | None:
+    """
+    Read the metadata.yaml of a bag.
+
+    Parameters
+    ----------
+    directory : Path
+        The bag.
+
+    Returns
+    -------
+    Description or None
+        None where the file is missing or empty: the recorder was killed.
+
+    Raises
+    ------
+    RecordingError
+        A file that is no metadata of a bag, or names files that are not there.
+
+    """
+    path = directory / 'metadata.yaml'
+    try:
+        with path.open('rb') as file:
+            text = file.read(_MAX_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RecordingError(f'cannot be read: {error.strerror}', path) from error
+    if not text.strip():
+        return None
+    if len(text) > _MAX_BYTES:
+        raise RecordingError('too large for the metadata of a bag', path)
+    try:
+        content = yaml.safe_load(text)['rosbag2_bagfile_information']
+        files = tuple(directory / PurePath(str(name)).name for name in _names(content))
+        description = Description(
+            storage=str(content['storage_identifier']),
+            files=files,
+            is_compressed=str(content.get('compression_mode') or 'none').lower() != 'none',
+            custom={str(k): str(v) for k, v in (content.get('custom_data') or {}).items()},
+        )
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise RecordingError('not valid YAML', path) from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise RecordingError('not the metadata of a rosbag2 bag', path) from error
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise RecordingError(f'the file {missing[0]} of the bag is missing', directory)
+    return description
+
+
+def _names(content: Any) -> list[Any]:
+    names = content['relative_file_paths']
+    if not isinstance(names, list) or not names:
+        raise TypeError('no files')
+    return names

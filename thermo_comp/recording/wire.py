@@ -102,6 +102,8 @@ def field(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
         A view.
 
     """
+    if len(rows) == 0:
+        return np.empty(0, kind)
     view: NDArray[Any] = np.ndarray(
         (len(rows),), kind, rows.data, offset=offset, strides=(rows.itemsize,)
     )

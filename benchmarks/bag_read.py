@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the measurement of reading: bag to columns, ours against rosbags and mcap in one run.
+
+All read the same counts and temperatures (400 Hz and 2 x 10 Hz) from the same files. `rosbags`
+reads and deserializes each message; `mcap` reads each message and does not decode it at all.
+Rates are counts messages per second of wall time, best of the repeats; what matters are ratios.
+
+    python benchmarks/bag_read.py --samples 1000000
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from thermo_comp.recording import BagWriter, open_recording, read_recording
+
+START_NS = 1_700_000_000_000_000_000
+RATE_HZ = 400
+TEMPERATURE_HZ = 10
+CHUNK_BYTES = 1 << 20
+COMPRESSIONS = ('none', 'lz4', 'zstd')
+
+
+def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
+    """
+    Write n counts messages and their temperatures.
+
+    """
+    rng = np.random.default_rng(1)
+    block = 1 << 17
+    with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes) as bag:
+        for begin in range(0, n, block):
+            index = np.arange(begin, min(begin + block, n))
+            stamp_ns = START_NS + index * (1_000_000_000 // RATE_HZ)
+            xyz = np.round(rng.normal(0.0, 8.0, (len(index), 3)) + [200.0, -3000.0, 28000.0])
+            bag.write_counts('accel/counts', stamp_ns, xyz, 'accel_link')
+            slow = stamp_ns[index % (RATE_HZ // TEMPERATURE_HZ) == 0]
+            celsius = 20.0 + 15.0 * np.sin((slow - START_NS) * 1e-9 / 600.0)
+            bag.write_temperature('temperature/board', slow, np.round(celsius / 0.005) * 0.005)
+            bag.write_temperature('temperature/case', slow, celsius + 0.3)
+            bag.flush()
+
+
+def read_ours_whole(path: Path) -> int:
+    """
+    The whole bag into memory.
+
+    """
+    return len(read_recording(path).columns)
+
+
+def read_ours_blocks(path: Path) -> int:
+    """
+    Block by block, as the compensator does it.
+
+    """
+    with open_recording(path) as reader:
+        return sum(len(block) for block in reader.blocks())
+
+
+def read_rosbags(path: Path) -> int:
+    """
+    Every message of the three topics, deserialized, its numbers kept.
+
+    """
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    n = 0
+    with Reader(path) as reader:
+        for connection, _, data in reader.messages():
+            message = typestore.deserialize_cdr(data, connection.msgtype)
+            n += hasattr(message, 'vector')
+    return n
+
+
+def read_mcap(path: Path) -> int:
+    """
+    Every message, its bytes not decoded.
+
+    """
+    from mcap.reader import make_reader
+
+    n = 0
+    with path.open('rb') as file:
+        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            n += channel.topic == '/accel/counts' and len(message.data) > 0
+    return n
+
+
+def rate(read: Callable[[Path], int], path: Path, n: int, repeats: int) -> float:
+    """
+    Messages per second, best of some repeats.
+
+    """
+    best = float('inf')
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        found = read(path)
+        best = min(best, time.perf_counter() - begin)
+        assert found == n, f'{found} messages read, {n} written'
+    return n / best
+
+
+def measure(
+    folder: Path, n: int, n_peers: int, repeats: int, chunk_bytes: int
+) -> Iterator[dict[str, float | str]]:
+    """
+    One row of results per compression.
+
+    """
+    for compression in COMPRESSIONS:
+        ours, peers = folder / f'{compression}.mcap', folder / f'{compression}_peers.mcap'
+        write_bag(ours, n, compression, chunk_bytes)
+        write_bag(peers, n_peers, compression, chunk_bytes)
+        row: dict[str, float | str] = {
+            'compression': compression,
+            'bytes_per_message': ours.stat().st_size / n,
+            'rosbags': rate(read_rosbags, peers, n_peers, repeats),
+            'mcap': rate(read_mcap, peers, n_peers, repeats),
+            'blocks': rate(read_ours_blocks, ours, n, repeats),
+            'whole': rate(read_ours_whole, ours, n, repeats),
+        }
+        yield row
+        ours.unlink()
+        peers.unlink()
+
+
+def main() -> None:
+    """
+    Measure and print.
+
+    """
+    parser = argparse.ArgumentParser(description='Reading a bag to columns against its peers.')
+    parser.add_argument('--samples', type=int, default=2_000_000, help='counts messages for ours')
+    parser.add_argument('--peer-samples', type=int, default=200_000, help='and for the peers')
+    parser.add_argument('--repeats', type=int, default=3)
+    parser.add_argument('--chunk-bytes', type=int, default=CHUNK_BYTES)
+    parser.add_argument('--json', action='store_true', help='machine-readable')
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        rows = list(
+            measure(
+                Path(folder),
+                options.samples,
+                options.peer_samples,
+                options.repeats,
+                options.chunk_bytes,
+            )
+        )
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    machine = f'{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}'
+    machine += f', numpy {np.__version__}'
+    if options.json:
+        json.dump({'machine': machine, 'peak_mb': peak_mb, 'rows': rows}, sys.stdout, indent=1)
+        print()
+        return
+    print(f'{machine}; {options.samples} samples, chunks of {options.chunk_bytes} bytes')
+    print('compression  B/msg  rosbags M/s  mcap M/s  blocks M/s  whole M/s   blocks/rosbags')
+    for row in rows:
+        rates = [float(row[key]) for key in ('rosbags', 'mcap', 'blocks', 'whole')]
+        print(
+            f'{row["compression"]:11}  {float(row["bytes_per_message"]):5.1f}'
+            f'  {rates[0] / 1e6:11.3f}  {rates[1] / 1e6:8.3f}  {rates[2] / 1e6:10.2f}'
+            f'  {rates[3] / 1e6:9.2f}   {rates[2] / rates[0]:10.1f} x'
+        )
+
+
+if __name__ == '__main__':
+    main()

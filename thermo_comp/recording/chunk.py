@@ -1,0 +1,230 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns one stretch of an MCAP file with messages: read it, decompress it, find its messages.
+
+A chunk of ordinary size is taken as a whole. Large chunks, torn chunks and messages outside any
+chunk are read window by window; a window holds whole records only, and the piece of a record at
+its end opens the next one.
+
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import mcap_records as mcap
+from .mcap_records import ChunkSpan, DamagedError
+from .unpack import Region, Stream, open_stream, unpack
+from .walk import ENDS_EARLY, OTHER_RECORD, ZERO_OPCODE, Messages, OnRecord, locate, walk
+from .wire import Bytes
+
+#: Chunks up to this size are taken as a whole, larger ones as a stream.
+MAX_CHUNK_BYTES = 1 << 26
+WINDOW_BYTES = 1 << 22
+#: Enough of a chunk's record to hold its head.
+HEAD_BYTES = 160
+
+_PIECE_BYTES = 1 << 16
+#: A chunk that claims to grow by more than this is not believed.
+_MAX_GROWTH = 1024
+_LOOSE = frozenset({mcap.MESSAGE, mcap.SCHEMA, mcap.CHANNEL})
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSpan:
+    """
+    A stretch of a file whose records are read window by window.
+
+    Attributes
+    ----------
+    position : int
+        Its first byte in the file.
+    end : int
+        Where it ends at the latest.
+    is_chunk : bool
+        A chunk, or else records outside any chunk.
+    is_torn : bool
+        Whether the end is missing: then what is whole is read, and the rest is no error.
+
+    """
+
+    position: int
+    end: int
+    is_chunk: bool
+    is_torn: bool = False
+
+
+def load_chunk(handle: int, span: ChunkSpan, on_record: OnRecord) -> tuple[Bytes, Messages]:
+    """
+    Read a whole chunk.
+
+    Parameters
+    ----------
+    handle : int
+        The file's descriptor.
+    span : ChunkSpan
+        Where the chunk stands.
+    on_record : callable of (int, bytes)
+        Is given opcode and content of every record that is no message.
+
+    Returns
+    -------
+    data : ndarray of uint8
+        The decompressed chunk.
+    messages : Messages
+        Its messages.
+
+    Raises
+    ------
+    DamagedError
+        Damage anywhere in the chunk, with its place in the file.
+
+    """
+    record = os.pread(handle, span.length + span.index_length, span.position)
+    try:
+        if len(record) != span.length + span.index_length:
+            raise DamagedError('the file ends inside it')
+        found, data_at, checksum = mcap.parse_chunk_head(record[:HEAD_BYTES], span.position)
+        if found.length != span.length or found.size != span.size:
+            raise DamagedError('its size is not what the index of the file says')
+        packed = np.frombuffer(record, np.uint8, span.length - data_at, data_at)
+        data = unpack(found.compression, packed, span.size, checksum)
+        index = memoryview(record)[span.length :]
+        return data, locate(data, index, on_record)
+    except DamagedError as error:
+        raise DamagedError(f'chunk at byte {span.position}: {error}') from error
+
+
+class Windows:
+    """
+    The records of a stretch, in bounded memory.
+
+    Parameters
+    ----------
+    handle : int
+        The file's descriptor.
+    span : StreamSpan
+        The stretch.
+    on_record : callable of (int, bytes)
+        Is given opcode and content of every record that is no message.
+
+    Attributes
+    ----------
+    n_whole : int
+        Bytes of the records that were gone through so far.
+
+    """
+
+    def __init__(self, handle: int, span: StreamSpan, on_record: OnRecord) -> None:
+        self._handle = handle
+        self._span = span
+        self._on_record = on_record
+        self.n_whole = 0
+
+    def __iter__(self) -> Iterator[tuple[Bytes, Messages]]:
+        """
+        Yield bytes and the messages in them, at least one each time.
+
+        Raises
+        ------
+        DamagedError
+            Damage, unless the stretch is torn.
+
+        """
+        try:
+            yield from self._windows()
+        except DamagedError as error:
+            raise DamagedError(f'at byte {self._span.position}: {error}') from error
+
+    def _windows(self) -> Iterator[tuple[Bytes, Messages]]:
+        stream, size, checksum = self._open()
+        only = None if self._span.is_chunk else _LOOSE
+        is_torn = self._span.is_torn
+        rest, wanted, n_read, found_sum = b'', WINDOW_BYTES, 0, 0
+        is_end = False
+        while not is_end:
+            piece, is_end = _fill(stream, wanted - len(rest), is_torn)
+            n_read += len(piece)
+            if size is not None and n_read > size and not is_torn:
+                raise DamagedError(f'more than the {size} bytes that it claims')
+            if checksum and not is_torn:
+                found_sum = zlib.crc32(piece, found_sum)
+            data = np.frombuffer(rest + piece, np.uint8)
+            messages, end, reason = walk(data, self._on_record, only)
+            self.n_whole += end
+            if is_torn and reason == ZERO_OPCODE:
+                messages = _without_last(messages)
+            if len(messages.at):
+                yield data, messages
+            if reason == OTHER_RECORD:
+                return
+            if reason and (is_end or reason != ENDS_EARLY):
+                if is_torn:
+                    return
+                raise DamagedError(reason)
+            rest = data[end:].tobytes()
+            wanted = _needed(rest)
+        if is_torn:
+            return
+        if size is not None and n_read != size:
+            raise DamagedError(f'{n_read} bytes after decompression, expected {size}')
+        if found_sum != checksum:
+            raise DamagedError('the checksum does not fit the content')
+
+    def _open(self) -> tuple[Stream, int | None, int]:
+        span = self._span
+        if not span.is_chunk:
+            return Region(self._handle, span.position, span.end), None, 0
+        head = os.pread(self._handle, HEAD_BYTES, span.position)
+        chunk, data_at, checksum = mcap.parse_chunk_head(head, span.position)
+        limit = chunk.compressed_size * _MAX_GROWTH + MAX_CHUNK_BYTES
+        if chunk.size > limit and not span.is_torn:
+            raise DamagedError(f'{chunk.compressed_size} bytes claim to hold {chunk.size}')
+        region = Region(self._handle, span.position + data_at, span.end)
+        return open_stream(chunk.compression, region), chunk.size, checksum
+
+
+def _fill(stream: Stream, n_bytes: int, is_torn: bool) -> tuple[bytes, bool]:
+    pieces: list[bytes] = []
+    left = n_bytes
+    while left > 0:
+        try:
+            piece = stream.read(min(left, _PIECE_BYTES))
+        except DamagedError:
+            if not is_torn:
+                raise
+            piece = b''
+        if not piece:
+            return b''.join(pieces), True
+        pieces.append(piece)
+        left -= len(piece)
+    return b''.join(pieces), False
+
+
+def _needed(rest: bytes) -> int:
+    """
+    Bytes of a window that holds the record at its front.
+
+    """
+    if len(rest) < mcap.PREFIX_BYTES:
+        return WINDOW_BYTES
+    length = int.from_bytes(rest[1 : mcap.PREFIX_BYTES], 'little')
+    if length > MAX_CHUNK_BYTES:
+        raise DamagedError(f'a record of {length} bytes')
+    return max(WINDOW_BYTES, mcap.PREFIX_BYTES + length)
+
+
+def _without_last(messages: Messages) -> Messages:
+    """
+    Drop the message before a stretch of zeros: its own end may be zeros too.
+
+    """
+    return Messages(
+        messages.at[:-1], messages.size[:-1], messages.channel[:-1], messages.log_ns[:-1]
+    )

@@ -1,0 +1,270 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the fast path: the MCAP files of a bag to parts, chunk by chunk, in bounded memory.
+
+Reading order within a file is log time and, for equal log times, the place in the file: what a
+ROS player gives. It needs the time spans in the heads of the chunks to be true, which is checked.
+A file with messages outside chunks, or with chunks above 64 MiB, has no such index of times: it
+is read in the order of the file, each ordinary chunk sorted by log time.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from ..errors import RecordingError
+from .assemble import Part
+from .chunk import Windows, load_chunk
+from .columns import Role
+from .decode import Decoder, Feed
+from .mcap_records import ChunkSpan, DamagedError
+from .survey import Survey
+from .sweep import in_log_order
+from .walk import Messages
+from .wire import Bytes, Encoding
+
+_N_LOADERS = 2
+_N_AHEAD = 3
+_AHEAD_BYTES = 1 << 26
+#: Places of one chunk are below this, so a chunk's number times it plus a place is unique.
+_PLACES = 1 << 32
+
+
+class McapSource:
+    """
+    The MCAP files of one bag.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        In the order in which they follow each other.
+    metadata : mapping of str to str, optional
+        Key-value pairs that stand beside the files.
+    note : str or None, optional
+        What is missing beside the files.
+
+    Raises
+    ------
+    RecordingError
+        A file that is no MCAP file or damaged.
+
+    """
+
+    storage = 'mcap'
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        metadata: Mapping[str, str] | None = None,
+        note: str | None = None,
+    ) -> None:
+        self._surveys: list[Survey] = []
+        try:
+            for file in files:
+                self._surveys.append(Survey(file))
+        except BaseException:
+            self.close()
+            raise
+        surveys = self._surveys
+        counts: Counter[str] = Counter()
+        types: dict[str, list[str]] = {}
+        for survey in surveys:
+            for number, channel in survey.channels.items():
+                counts[channel.topic] += survey.counts[number]
+                known = types.setdefault(channel.topic, [])
+                if channel.type not in known:
+                    known.append(channel.type)
+        self.topics: Mapping[str, tuple[str, int]] = {
+            topic: (' | '.join(known), counts[topic]) for topic, known in types.items()
+        }
+        self.definitions: Mapping[str, tuple[str, str]] = {
+            schema.name: (schema.encoding, schema.text)
+            for survey in surveys
+            for schema in survey.schemas.values()
+            if schema.text
+        }
+        self.start_ns = min((s.start_ns for s in surveys if s.start_ns is not None), default=0)
+        self.end_ns = max((s.end_ns for s in surveys if s.end_ns is not None), default=0)
+        self.metadata: Mapping[str, str] = {
+            key: value
+            for pairs in (metadata or {}, *(survey.metadata for survey in surveys))
+            for key, value in pairs.items()
+        }
+        notes = [note] if note else []
+        for survey in surveys:
+            if survey.truncated is not None:
+                name = f'{survey.path.name}: ' if len(surveys) > 1 else ''
+                notes.append(name + survey.truncated)
+        self.truncated: str | None = '; '.join(notes) or None
+
+    def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
+        """
+        Read the chosen topics.
+
+        Parameters
+        ----------
+        selection : dict of role to str
+            Topic per role.
+        raw : bool
+            Keep the serialized messages too.
+
+        Yields
+        ------
+        Part
+            With ranks that go on from part to part.
+
+        Raises
+        ------
+        RecordingError
+            Damaged data.
+
+        """
+        n_ranks = 0
+        for survey in self._surveys:
+            try:
+                for part in _read(survey, selection, raw):
+                    last = n_ranks
+                    for rows in part.values():
+                        rows.rank = rows.rank + n_ranks
+                        last = max(last, int(rows.rank[-1]) + 1)
+                    n_ranks = last
+                    yield part
+            except DamagedError as error:
+                raise RecordingError(f'damaged: {error}', survey.path) from error
+            except RecordingError as error:
+                raise RecordingError(error.message, survey.path, error.topic) from error
+            except OSError as error:
+                raise RecordingError(f'cannot be read: {error.strerror}', survey.path) from error
+
+    def close(self) -> None:
+        """
+        Close the files.
+
+        """
+        for survey in self._surveys:
+            survey.close()
+        self._surveys = []
+
+
+def _read(survey: Survey, selection: dict[Role, str], raw: bool) -> Iterator[Part]:
+    decoder = _decoder(survey, selection, raw)
+    if decoder is None:
+        return
+    chunks = [span for span in survey.spans if isinstance(span, ChunkSpan)]
+    if len(chunks) < len(survey.spans):
+        yield from _in_file_order(survey, decoder)
+        return
+    order = sorted(range(len(chunks)), key=lambda row: (chunks[row].start_ns, row))
+    is_overlapping = any(
+        chunks[later].start_ns <= chunks[earlier].end_ns or later < earlier
+        for earlier, later in zip(order, order[1:], strict=False)
+    )
+    loaded = _loaded(survey.handle, [chunks[row] for row in order])
+    if is_overlapping:
+        yield from in_log_order(_placed(loaded, decoder, chunks, order))
+    else:
+        for span, data, messages in loaded:
+            _check_times(span, messages)
+            part = decoder.part(data, messages, None)
+            if part:
+                yield part
+
+
+def _decoder(survey: Survey, selection: dict[Role, str], raw: bool) -> Decoder | None:
+    roles_by_topic = {topic: role for role, topic in selection.items()}
+    roles: dict[int, Role] = {}
+    feeds: dict[Role, Feed] = {}
+    for number, channel in survey.channels.items():
+        role = roles_by_topic.get(channel.topic)
+        if role is None:
+            continue
+        if channel.encoding not in {'cdr', 'ros1'}:
+            raise RecordingError(
+                f'its messages are encoded as {channel.encoding!r}, expected cdr',
+                topic=channel.topic,
+            )
+        feed = Feed(channel.topic, channel.type, cast(Encoding, channel.encoding))
+        if feeds.setdefault(role, feed) != feed:
+            raise RecordingError('its messages have several encodings', topic=channel.topic)
+        roles[number] = role
+    return Decoder(feeds, roles, raw) if roles else None
+
+
+def _in_file_order(survey: Survey, decoder: Decoder) -> Iterator[Part]:
+    for span in survey.spans:
+        if isinstance(span, ChunkSpan):
+            data, messages = load_chunk(survey.handle, span, _ignore)
+            part = decoder.part(data, messages, None)
+            if part:
+                yield part
+            continue
+        for data, messages in Windows(survey.handle, span, _ignore):
+            part = decoder.part(data, messages, 0)
+            if part:
+                yield part
+
+
+def _placed(
+    loaded: Iterator[tuple[ChunkSpan, Bytes, Messages]],
+    decoder: Decoder,
+    chunks: list[ChunkSpan],
+    order: list[int],
+) -> Iterator[tuple[Part, int | None]]:
+    following = [*(chunks[row].start_ns for row in order[1:]), None]
+    for (span, data, messages), row, next_ns in zip(loaded, order, following, strict=True):
+        _check_times(span, messages)
+        yield decoder.part(data, messages, row * _PLACES), next_ns
+
+
+def _check_times(span: ChunkSpan, messages: Messages) -> None:
+    if len(messages.log_ns) and not (
+        span.start_ns <= int(np.min(messages.log_ns))
+        and int(np.max(messages.log_ns)) <= span.end_ns
+    ):
+        raise DamagedError(
+            f'chunk at byte {span.position}: its messages are outside the time span it claims'
+        )
+
+
+def _loaded(
+    handle: int, spans: Sequence[ChunkSpan]
+) -> Iterator[tuple[ChunkSpan, Bytes, Messages]]:
+    """
+    Read and decompress ahead in threads; what they do needs no interpreter lock.
+
+    """
+    waiting: deque[tuple[ChunkSpan, Future[tuple[Bytes, Messages]]]] = deque()
+    n_ahead = 0
+    following = iter(spans)
+    upcoming = next(following, None)
+    pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
+    try:
+        while waiting or upcoming is not None:
+            while upcoming is not None and (
+                not waiting
+                or (len(waiting) < _N_AHEAD and n_ahead + upcoming.size <= _AHEAD_BYTES)
+            ):
+                waiting.append((upcoming, pool.submit(load_chunk, handle, upcoming, _ignore)))
+                n_ahead += upcoming.size
+                upcoming = next(following, None)
+            span, future = waiting.popleft()
+            n_ahead -= span.size
+            data, messages = future.result()
+            yield span, data, messages
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _ignore(opcode: int, content: bytes) -> None:
+    """
+    Pass over a record; the survey has read those that matter.
+
+    """

@@ -1,0 +1,258 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns finding the records in decompressed MCAP bytes: with an index as a hint, or one by one.
+
+The index is never trusted. What it points at must be message records that, together with the
+few other records between them, tile the chunk without gap or overlap; where they do not, the
+records are walked from the first to the last, a run of equally long ones at a time.
+
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .columns import Ints
+from .mcap_records import MESSAGE, MESSAGE_INDEX, PREFIX_BYTES, DamagedError
+from .wire import Bytes, field, gather
+
+#: Bytes of a message record before its serialized message.
+MESSAGE_HEAD_BYTES = 31
+_INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
+_PREFIX = struct.Struct('<BQ')
+_INDEX_HEAD = struct.Struct('<BQHI')
+#: So many equal lengths in a row make it worth while to compare many at once.
+_REGULAR = 4
+
+#: Why a walk stopped, besides damage that is said in other words.
+ENDS_EARLY = 'a record ends too early'
+OTHER_RECORD = 'a record of another kind'
+ZERO_OPCODE = 'a record has the opcode 0'
+
+OnRecord = Callable[[int, bytes], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """
+    The message records of some bytes, by place.
+
+    Attributes
+    ----------
+    at : ndarray of int64, shape (n,)
+        Of each record's opcode.
+    size : ndarray of int64, shape (n,)
+        Of each serialized message [bytes]; it begins `MESSAGE_HEAD_BYTES` after `at`.
+    channel : ndarray of uint16, shape (n,)
+    log_ns : ndarray of int64, shape (n,)
+
+    """
+
+    at: Ints
+    size: Ints
+    channel: NDArray[np.uint16]
+    log_ns: Ints
+
+
+def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
+    """
+    Find all messages of a whole chunk.
+
+    Parameters
+    ----------
+    data : ndarray of uint8
+        The decompressed chunk.
+    index : memoryview
+        The message index records behind it; may be empty or wrong.
+    on_record : callable of (int, bytes)
+        Is given opcode and content of every record that is no message.
+
+    Returns
+    -------
+    Messages
+        In the order of their places.
+
+    Raises
+    ------
+    DamagedError
+        Bytes that are no sequence of records.
+
+    """
+    hinted = _indexed(index, len(data))
+    if hinted is not None:
+        messages = _checked(data, hinted, on_record)
+        if messages is not None:
+            return messages
+    messages, end, reason = walk(data, on_record)
+    if end != len(data):
+        raise DamagedError(reason)
+    return messages
+
+
+def _indexed(index: memoryview, size: int) -> Ints | None:
+    """
+    Offsets of all messages by the index records; None where these are not usable.
+
+    """
+    columns: list[Ints] = []
+    at = 0
+    while at + _INDEX_HEAD.size <= len(index):
+        opcode, content, _, length = _INDEX_HEAD.unpack_from(index, at)
+        at += _INDEX_HEAD.size
+        if opcode != MESSAGE_INDEX:
+            raise DamagedError('what follows it is not its message index')
+        if content != length + 6 or length % _INDEX_ROW.itemsize:
+            return None
+        if at + length > len(index):
+            return None
+        n_rows = length // _INDEX_ROW.itemsize
+        rows = np.frombuffer(index, _INDEX_ROW, n_rows, at)
+        columns.append(rows['offset'].astype(np.int64))
+        at += length
+    if not columns or at != len(index):
+        return None
+    offsets = np.sort(np.concatenate(columns), kind='stable')
+    if not len(offsets) or offsets[0] < 0 or offsets[-1] > size - MESSAGE_HEAD_BYTES:
+        return None
+    return offsets
+
+
+def _checked(data: Bytes, at: Ints, on_record: OnRecord) -> Messages | None:
+    """
+    The messages at these places if they tile the data together with what is between them.
+
+    """
+    head = gather(data, at, MESSAGE_HEAD_BYTES)
+    size = field(head, 1, '<i8') - (MESSAGE_HEAD_BYTES - PREFIX_BYTES)
+    if (field(head, 0, 'u1') != MESSAGE).any() or int(np.min(size)) < 0:
+        return None
+    limit = len(data) - MESSAGE_HEAD_BYTES
+    if int(np.max(size)) > limit:
+        return None
+    ends = at + size
+    ends += MESSAGE_HEAD_BYTES
+    if int(np.min(at[1:] - ends[:-1], initial=0)) < 0 or int(ends[-1]) > len(data):
+        return None
+    breaks = np.flatnonzero(at[1:] != ends[:-1])
+    gaps = [(0, int(at[0])), (int(ends[-1]), len(data))]
+    gaps[1:1] = zip(ends[breaks].tolist(), at[breaks + 1].tolist(), strict=True)
+    found: list[tuple[int, bytes]] = []
+    for begin, end in gaps:
+        if begin == end:
+            continue
+        extra, stop, _ = walk(data[begin:end], lambda *record: found.append(record))
+        if len(extra.at) or stop != end - begin:
+            return None
+    for record in found:
+        on_record(*record)
+    return _messages(at, size, head)
+
+
+def _messages(at: Ints, size: Ints, head: NDArray[np.void]) -> Messages:
+    log_ns = field(head, 15, '<i8').astype(np.int64)
+    if len(log_ns) and int(np.min(log_ns)) < 0:
+        raise DamagedError('a message has a log time beyond the year 2262')
+    return Messages(at, size, field(head, 9, '<u2'), log_ns)
+
+
+def walk(
+    data: Bytes, on_record: OnRecord, only: frozenset[int] | None = None
+) -> tuple[Messages, int, str]:
+    """
+    Go from record to record as far as they are whole.
+
+    Parameters
+    ----------
+    data : ndarray of uint8
+        The bytes.
+    on_record : callable of (int, bytes)
+        Is given opcode and content of every record that is no message.
+    only : frozenset of int, optional
+        Stop before a record with another opcode.
+
+    Returns
+    -------
+    messages : Messages
+    end : int
+        Where the first record begins that is not whole or not valid; the length of `data` where
+        all are.
+    reason : str
+        What is wrong with that record.
+
+    Raises
+    ------
+    DamagedError
+        A message with an impossible time.
+
+    """
+    view = data.data
+    runs: list[Ints] = []
+    at, length_before, n_equal = 0, -1, 0
+    singles: list[int] = []
+    reason = ''
+    while at < len(data):
+        if at + PREFIX_BYTES > len(data):
+            reason = ENDS_EARLY
+            break
+        opcode, length = _PREFIX.unpack_from(view, at)
+        step = PREFIX_BYTES + length
+        reason = _fault(opcode, length, at + step > len(data))
+        if only is not None and opcode not in only:
+            reason = OTHER_RECORD
+        if reason:
+            break
+        n_equal = n_equal + 1 if length == length_before else 0
+        length_before = length
+        if opcode == MESSAGE:
+            n_run = _run(data, at, length) if n_equal >= _REGULAR else 1
+            if n_run > 1:
+                runs.append(np.array(singles, np.int64))
+                singles = []
+                runs.append(at + step * np.arange(n_run))
+            else:
+                singles.append(at)
+            at += step * n_run
+        else:
+            begin = at + PREFIX_BYTES
+            on_record(opcode, bytes(view[begin : begin + length]))
+            at += step
+    runs.append(np.array(singles, np.int64))
+    places = np.concatenate(runs)
+    head = gather(data, places, MESSAGE_HEAD_BYTES)
+    size = field(head, 1, '<i8') - (MESSAGE_HEAD_BYTES - PREFIX_BYTES)
+    return _messages(places, size, head), at, reason
+
+
+def _fault(opcode: int, length: int, is_beyond: bool) -> str:
+    if opcode == 0:
+        return ZERO_OPCODE
+    if opcode == MESSAGE and length < MESSAGE_HEAD_BYTES - PREFIX_BYTES:
+        return f'a message record has {length} bytes'
+    return ENDS_EARLY if is_beyond else ''
+
+
+def _run(data: Bytes, at: int, length: int) -> int:
+    """
+    How many message records of one length follow each other from here on.
+
+    """
+    step = PREFIX_BYTES + length
+    n_possible = (len(data) - at) // step
+    n_same, n_next = 1, 16
+    while n_same < n_possible:
+        n_next = min(n_next, n_possible - n_same)
+        begin = at + n_same * step
+        opcodes: Bytes = np.ndarray((n_next,), np.uint8, data.data, begin, (step,))
+        lengths: NDArray[np.uint64] = np.ndarray((n_next,), '<u8', data.data, begin + 1, (step,))
+        different = np.flatnonzero((opcodes != MESSAGE) | (lengths != length))
+        if len(different):
+            return n_same + int(different[0])
+        n_same += n_next
+        n_next *= 4
+    return n_same
