@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from .streams import Stream, generator
 
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Edges of the cube: one per pair of axes first, then their opposites, then the other diagonals.
+# Edges of the cube: one per pair of axes and adding up to nothing, their opposites, the rest.
 _EDGES = [
-    *[(1, 1, 0), (0, 1, 1), (1, 0, 1), (-1, -1, 0), (0, -1, -1), (-1, 0, -1)],
-    *[(1, -1, 0), (0, 1, -1), (-1, 0, 1), (-1, 1, 0), (0, -1, 1), (1, 0, -1)],
+    *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
+    *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
 ]
 # Corners: three diagonals with their opposites first.
 _CORNERS = [
@@ -32,14 +32,15 @@ def positions(n: int, seed: int = 0, *, spread_deg: float = 3.0) -> NDArray[np.f
     """
     Return attitudes of a calibration test as the direction of the specific force.
 
-    The six faces of a cube come first, then its edges (from 9 positions on, every pair of axes is
-    seen together, which the misalignment needs), then its corners; beyond 26 an even spiral over
-    the sphere. Each is turned by a small random angle, since nobody levels the block.
+    Six are the faces of a cube, nine the corners of a three-capped prism, twelve those of an
+    icosahedron: the sets that tell bias, scale and misalignment apart best for their number. Other
+    sets take the faces of a cube, then its edges, then its corners; beyond 26, an even spiral over
+    the sphere. Each position is turned by a small random angle, since nobody levels the block.
 
     Parameters
     ----------
     n : int
-        Number of positions; 6, 9, 12, 18, 24 and 26 are the balanced sets.
+        Number of positions; 6, 9, 12, 18, 24 and 26 are balanced sets.
     seed : int, optional
         Seed of the small turns.
     spread_deg : float, optional
@@ -60,21 +61,43 @@ def positions(n: int, seed: int = 0, *, spread_deg: float = 3.0) -> NDArray[np.f
         raise ValueError(f'`n` must be at least 1, got {n}')
     if not spread_deg >= 0.0:
         raise ValueError(f'`spread_deg` must not be negative, got {spread_deg}')
-    if n <= 26:
+    if n == 9:
+        up = _capped_prism()
+    elif n == 12:
+        up = _icosahedron()
+    elif n <= 26:
         up = np.array((_FACES + _EDGES + _CORNERS)[:n], dtype=float)
     else:
-        k = np.arange(n)
-        z = 1.0 - (2.0 * k + 1.0) / n
-        turn = math.pi * (3.0 - math.sqrt(5.0)) * k
-        up = np.stack([np.sqrt(1.0 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
-        up = up.T
+        up = _spiral(n)
     up /= np.linalg.norm(up, axis=1, keepdims=True)
-    # One stream per position: the first six of 18 are the six of 6.
     for row in range(n):
         push = generator(seed, Stream.POSITIONS, row).standard_normal(3)
         up[row] += math.radians(spread_deg) * np.cross(push, up[row])
     result: NDArray[np.float64] = up / np.linalg.norm(up, axis=1, keepdims=True)
     return result
+
+
+def _capped_prism() -> NDArray[np.float64]:
+    # Three on the equator, six 44 degrees above and below between them.
+    third = np.arange(3) * 2.0 * math.pi / 3.0
+    ring = np.stack([np.cos(third), np.sin(third)], axis=1)
+    height, radius = 0.7, math.sqrt(1.0 - 0.7**2)
+    levels = ((-1.0, 0.0), (radius, height), (radius, -height))
+    return np.concatenate([np.insert(size * ring, 2, z, axis=1) for size, z in levels])
+
+
+def _icosahedron() -> NDArray[np.float64]:
+    golden = (1.0 + math.sqrt(5.0)) / 2.0
+    quad = np.array([(0.0, a, b * golden) for a in (1.0, -1.0) for b in (1.0, -1.0)])
+    return np.concatenate([np.roll(quad, turn, axis=1) for turn in range(3)])
+
+
+def _spiral(n: int) -> NDArray[np.float64]:
+    k = np.arange(n)
+    z = 1.0 - (2.0 * k + 1.0) / n
+    turn = math.pi * (3.0 - math.sqrt(5.0)) * k
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
 @dataclass(frozen=True)

@@ -228,7 +228,7 @@ def parse_cyclogram(text: str) -> Cyclogram:
     rate = 1.0
     for number, raw in enumerate(filter(None, map(str.strip, re.split(r'[,;\n]', text))), 1):
         match = _STEP.match(raw)
-        if match is None or (number == 1 and match['rate']) or match['rate'] == '0':
+        if match is None or _is_rate_wrong(number, match['rate']):
             raise ValueError(
                 f"cyclogram step {number} '{raw}' must read TARGET[@RATE] [SOAK], "
                 "e.g. '35@0.5 90min' (the first one without a rate)"
@@ -239,6 +239,10 @@ def parse_cyclogram(text: str) -> Cyclogram:
     if not steps:
         raise ValueError('cyclogram is empty')
     return ramps_and_soaks(steps[0][0], steps[0][2], steps[1:])
+
+
+def _is_rate_wrong(number: int, rate: str | None) -> bool:
+    return rate is not None and (number == 1 or float(rate) == 0.0)
 
 
 def cyclogram_preset(name: str) -> Cyclogram:

@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The chamber's program: presets, the user's own list, random programs.
+
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermo_comp.simulation import (
+    CYCLOGRAM_NAMES,
+    Cyclogram,
+    cyclogram_preset,
+    parse_cyclogram,
+    ramps_and_soaks,
+    random_cyclogram,
+)
+
+
+@pytest.mark.parametrize('name', [name for name in CYCLOGRAM_NAMES if name != 'soak'])
+def test_presets_heat_and_cool_within_the_papers_range(name: str) -> None:
+    program = cyclogram_preset(name)
+    air = np.array(program.temperature_c)
+    assert air.min() >= 5.0
+    assert air.max() <= 35.0
+    assert air.max() - air.min() >= 20.0
+    assert program.rates_k_min.max() > 0.0 > program.rates_k_min.min()
+
+
+def test_paper_covers_its_range_in_ramps_and_soaks() -> None:
+    program = cyclogram_preset('paper')
+    assert min(program.temperature_c) == 5.0
+    assert max(program.temperature_c) == 35.0
+    ramps = program.rates_k_min[program.rates_k_min != 0.0]
+    np.testing.assert_allclose(np.abs(ramps), 0.5)
+
+
+def test_presets_span_the_ramp_rates_a_detector_meets() -> None:
+    rates = np.abs(np.concatenate([cyclogram_preset(n).rates_k_min for n in CYCLOGRAM_NAMES]))
+    assert rates[rates > 0.0].min() == pytest.approx(0.1)
+    assert rates.max() == pytest.approx(3.0)
+
+
+def test_a_typed_program_is_read_as_written() -> None:
+    program = parse_cyclogram('20 30min, 35@0.5 1h; -5.5@1.5\n-5.5 90s, 20')
+    np.testing.assert_allclose(program.temperature_c, [20, 20, 35, 35, -5.5, -5.5, 20])
+    np.testing.assert_allclose(
+        np.diff(program.time_s), [1800, 30 * 60, 3600, 40.5 / 1.5 * 60, 90, 25.5 / 1.5 * 60]
+    )
+    assert parse_cyclogram('paper') == cyclogram_preset('paper')
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('20, 35@', "step 2 '35@' must read TARGET"),
+        ('20@1, 30', "step 1 '20@1' must read"),
+        ('20, 30@0 5min', "step 2 '30@0 5min' must read"),
+        ('20, 30@0.00 5min', r"step 2 '30@0\.00 5min' must read"),
+        ('20, 30 5', "step 2 '30 5' must read"),
+        ('nan', "step 1 'nan' must read"),
+        (' ,\n', 'cyclogram is empty'),
+        ('20', 'one length of at least 2'),
+    ],
+)
+def test_a_typed_program_that_cannot_be_read_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_cyclogram(text)
+
+
+def test_air_is_straight_between_points_and_rests_outside() -> None:
+    program = Cyclogram((0.0, 600.0, 1200.0), (20.0, 25.0, 25.0))
+    np.testing.assert_allclose(program.at([-1.0, 300.0, 900.0, 5000.0]), [20.0, 22.5, 25.0, 25.0])
+    np.testing.assert_array_equal(
+        program.is_ramp([-1.0, 0.0, 599.0, 600.0, 1300.0]), [False, True, True, False, False]
+    )
+
+
+def test_cut_shortens_in_mid_ramp_and_draws_out_by_resting() -> None:
+    program = Cyclogram((0.0, 600.0), (20.0, 30.0))
+    assert program.cut(300.0) == Cyclogram((0.0, 300.0), (20.0, 25.0))
+    assert program.cut(900.0) == Cyclogram((0.0, 600.0, 900.0), (20.0, 30.0, 30.0))
+    assert program.cut(600.0) == program
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_random_programs_keep_their_limits(seed: int) -> None:
+    program = random_cyclogram(seed, 6 * 3600.0, rates=(0.2, 2.0))
+    assert program.duration_s == 6 * 3600.0
+    assert program == random_cyclogram(seed, 6 * 3600.0, rates=(0.2, 2.0))
+    assert program != random_cyclogram(seed + 1, 6 * 3600.0, rates=(0.2, 2.0))
+    ramps = np.abs(program.rates_k_min[program.rates_k_min != 0.0])
+    assert np.all((ramps > 0.2 - 1e-9) & (ramps < 2.0 + 1e-9))
+    assert 5.0 <= min(program.temperature_c) < max(program.temperature_c) <= 35.0
+
+
+def test_program_refuses_what_is_not_one() -> None:
+    with pytest.raises(ValueError, match='one length of at least 2, got 2 and 1'):
+        Cyclogram((0.0, 1.0), (20.0,))
+    with pytest.raises(ValueError, match='must be finite'):
+        Cyclogram((0.0, 1.0), (20.0, float('nan')))
+    with pytest.raises(ValueError, match='`time_s` must start at 0 and increase'):
+        Cyclogram((0.0, 2.0, 2.0), (20.0, 21.0, 22.0))
+    with pytest.raises(ValueError, match='`rate` must be positive, got 0'):
+        ramps_and_soaks(20.0, 0.0, [(30.0, 0.0, 10.0)])
+    with pytest.raises(ValueError, match='`soak` must not be negative, got -1'):
+        ramps_and_soaks(20.0, -1.0, [(30.0, 1.0, 10.0)])
+    with pytest.raises(ValueError, match=r"`name` must be one of paper, .*, got 'oven'"):
+        cyclogram_preset('oven')
+    with pytest.raises(ValueError, match='`duration` must be positive, got 0'):
+        cyclogram_preset('paper').cut(0.0)
+    with pytest.raises(ValueError, match='`duration` must be positive, got -5'):
+        random_cyclogram(0, -5.0)
+    with pytest.raises(ValueError, match='`rates` must be an increasing pair, got'):
+        random_cyclogram(0, rates=(0.0, 1.0))
+    with pytest.raises(ValueError, match='`span` must be an increasing pair, got'):
+        random_cyclogram(0, span=(30.0, 10.0))

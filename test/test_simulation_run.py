@@ -1,0 +1,365 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A simulated run: its columns follow its truth, its seeds, and nothing else.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import welch
+
+from thermo_comp.simulation import (
+    MICRO_G,
+    START_NS,
+    ChamberRipple,
+    DriftModel,
+    Handling,
+    PartEffect,
+    SimulatedRun,
+    ThermometerModel,
+    UnitModel,
+    cyclogram_preset,
+    ideal_regime,
+    positions,
+    ramps_and_soaks,
+    simulate,
+    simulate_blocks,
+    unit_preset,
+)
+
+UP = np.array([0.48, -0.6, 0.64])
+DEMO = cyclogram_preset('demo')
+SHORT = ramps_and_soaks(20.0, 4.0, [(26.0, 1.0, 5.0)])
+COLUMNS = ('accel_stamp_ns', 'counts', 'board_stamp_ns', 'board', 'case_stamp_ns', 'case')
+CYCLES = ('cycle_s', 'position', 'specific_force', 'bias', 'scale')
+
+
+@pytest.fixture(scope='module')
+def unit() -> UnitModel:
+    return unit_preset('thermostatted', 4)
+
+
+def _joined(
+    blocks: list[SimulatedRun], name: str, *, is_truth: bool = False
+) -> NDArray[np.float64]:
+    return np.concatenate([getattr(b.truth if is_truth else b, name) for b in blocks])
+
+
+@pytest.mark.parametrize('block_size', [1777, 6000, 10**6])
+@pytest.mark.parametrize('name', ['thermostatted', 'mems'])
+def test_blocks_are_the_whole_bit_for_bit(name: str, block_size: int) -> None:
+    options = {
+        'rate_hz': 20.0,
+        'seed': 9,
+        'ripple': ChamberRipple(),
+        'handling': Handling(duration=20.0),
+    }
+    arguments = (unit_preset(name, 1), SHORT, positions(3, 1))
+    whole = simulate(*arguments, **options)
+    blocks = list(simulate_blocks(*arguments, block_size=block_size, **options))
+    assert len(blocks) == -(-len(whole.counts) // block_size)
+    for column in COLUMNS:
+        np.testing.assert_array_equal(_joined(blocks, column), getattr(whole, column))
+    for column in CYCLES:
+        np.testing.assert_array_equal(
+            _joined(blocks, column, is_truth=True), getattr(whole.truth, column)
+        )
+    # Readings stand in the block whose cycles they fall among.
+    for block in blocks[:-1]:
+        assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
+
+
+def test_same_seed_same_bits_other_seed_other_bits(unit: UnitModel) -> None:
+    first, again, other = (simulate(unit, SHORT, UP, seed=seed) for seed in (5, 5, 6))
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(first, column), getattr(again, column))
+    assert np.any(first.counts != other.counts)
+    assert np.any(first.board != other.board)
+    assert np.any(first.case != other.case)
+
+
+def test_start_stamp_shifts_the_stamps_only(unit: UnitModel) -> None:
+    here, there = (simulate(unit, SHORT, UP, start_ns=s) for s in (START_NS, 123_456_789))
+    for column in COLUMNS:
+        shift = START_NS - 123_456_789 if column.endswith('_ns') else 0
+        np.testing.assert_array_equal(getattr(here, column) - shift, getattr(there, column))
+
+
+def test_stamps_are_the_ends_of_the_cycles(unit: UnitModel) -> None:
+    run = simulate(unit, SHORT, UP, rate_hz=300.0)
+    assert len(run.counts) == SHORT.duration_s * 300
+    assert run.accel_stamp_ns[0] == START_NS + 3_333_333
+    assert run.accel_stamp_ns[-1] == START_NS + round(SHORT.duration_s * 1e9)
+    np.testing.assert_allclose(
+        (run.accel_stamp_ns - START_NS) * 1e-9 - run.truth.cycle_s, 0.5 / 300.0, atol=1e-9
+    )
+
+
+def test_one_noisy_axis_leaves_the_others_exactly_equal(unit: UnitModel) -> None:
+    quiet = unit.without_noise()
+    noisy = replace(quiet, noise_density=(0.0, 80.0, 0.0))
+    a, b = simulate(quiet, SHORT, UP), simulate(noisy, SHORT, UP)
+    np.testing.assert_array_equal(a.counts[:, [0, 2]], b.counts[:, [0, 2]])
+    assert np.any(a.counts[:, 1] != b.counts[:, 1])
+    np.testing.assert_array_equal(a.board, b.board)
+
+
+def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None:
+    """
+    Outliers come on top of the same noise; a drifting bias on top of the same white noise.
+
+    """
+    plain = simulate(unit, SHORT, UP)
+    hit = simulate(replace(unit, board=replace(unit.board, outlier_probability=0.05)), SHORT, UP)
+    is_hit = hit.board != plain.board
+    # 900 readings, 5 %: 45 expected with a standard deviation of 6.5.
+    assert 20 < np.count_nonzero(is_hit) < 75
+    assert np.abs(hit.board - plain.board).max() <= 5.0
+    np.testing.assert_array_equal(hit.case, plain.case)
+    np.testing.assert_array_equal(hit.counts, plain.counts)
+    still = simulate(unit.without_drift(), SHORT, UP)
+    moved = (plain.truth.bias - still.truth.bias) + (
+        plain.truth.scale - 1.0
+    ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
+    difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
+    # Two converters with the same starting phase: each within one count of its own integral.
+    assert np.abs(difference).max() < 1.0 + 1e-6
+
+
+def test_axes_permute() -> None:
+    base = replace(
+        unit_preset('bare-quartz', 2).without_noise(),
+        misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    )
+    order = [2, 0, 1]
+
+    def turned(value: tuple[float, float, float]) -> tuple[float, float, float]:
+        return value[order[0]], value[order[1]], value[order[2]]
+
+    effect = PartEffect('magnet', (70.0, 80.0, 90.0), (0.3, 0.2, 0.1), (1.0, 2.0, 3.0))
+    permuted = PartEffect(
+        'magnet', turned(effect.scale), turned(effect.scale_curvature), turned(effect.bias)
+    )
+    a = replace(base, drift=DriftModel((effect,)))
+    b = replace(
+        base,
+        drift=DriftModel((permuted,)),
+        scale_factor=turned(base.scale_factor),
+        bias_at_reference=turned(base.bias_at_reference),
+    )
+    one, two = simulate(a, SHORT, UP), simulate(b, SHORT, UP[order])
+    np.testing.assert_array_equal(one.truth.bias[:, order], two.truth.bias)
+    np.testing.assert_array_equal(one.truth.scale[:, order], two.truth.scale)
+    # Each channel's integrator starts with its own charge: sums differ by less than a count.
+    sums = np.cumsum(one.counts[:, order] - two.counts, axis=0)
+    assert np.abs(sums).max() <= 1
+
+
+def test_counts_follow_the_truth(unit: UnitModel) -> None:
+    """
+    Without noise the running sum of the counts is that of ``bias + K scale inverse(M) f``.
+
+    """
+    run = simulate(unit.without_noise(), DEMO, UP, rate_hz=50.0)
+    truth = run.truth
+    s = truth.specific_force @ np.linalg.inv(unit.M).T
+    charge = truth.bias + np.array(unit.scale_factor) * truth.scale * s
+    short = np.cumsum(charge - run.counts, axis=0)
+    assert np.ptp(short, axis=0).max() < 1.0 + 1e-6
+    np.testing.assert_allclose(np.linalg.norm(truth.specific_force, axis=1), truth.gravity)
+
+
+def test_white_noise_has_its_density(unit: UnitModel) -> None:
+    """
+    Second route: Welch's spectrum is flat at ``2 density^2`` (one-sided), and the scatter of
+    60 s means is ``density / sqrt(60)``.
+
+    """
+    still = unit.without_drift()
+    run = simulate(still, cyclogram_preset('soak'), UP, rate_hz=50.0, seed=3)
+    accel = run.counts / np.array(unit.scale_factor) / MICRO_G
+    frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
+    # The converter carries its remainder, so its own noise rises with f^2: 1 (ug)^2/Hz at 0.4 Hz.
+    band = (frequency > 0.01) & (frequency < 0.4)
+    # 128 lines of 87 half-overlapping averages scatter by 1 %.
+    np.testing.assert_allclose(
+        power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
+    )
+    means = accel.reshape(-1, 3000, 3).mean(axis=1)
+    # 240 means: 4.6 % of scatter in a standard deviation, three of them.
+    np.testing.assert_allclose(
+        means.std(axis=0), np.array(unit.noise_density) / np.sqrt(60.0), rtol=0.15
+    )
+
+
+@pytest.mark.parametrize('quantum', [0.0625, 1.0])
+def test_quantised_readings_lie_on_the_lattice(unit: UnitModel, quantum: float) -> None:
+    coarse = simulate(unit.with_thermometers(quantum=quantum), DEMO, UP, rate_hz=1.0)
+    fine = simulate(unit, DEMO, UP, rate_hz=1.0)
+    np.testing.assert_array_equal(coarse.board % quantum, 0.0)
+    assert np.abs(coarse.board - fine.board).max() <= quantum / 2.0
+    assert np.abs(coarse.case - fine.case).max() <= quantum / 2.0
+
+
+@pytest.mark.parametrize('rate_hz', [0.1, 0.7, 10.0])
+def test_thermometers_have_their_rate_noise_and_offset(unit: UnitModel, rate_hz: float) -> None:
+    offset = replace(unit, case=replace(unit.case, offset=0.3))
+    run = simulate(offset, DEMO, UP, rate_hz=1.0, temperature_rate_hz=rate_hz)
+    np.testing.assert_allclose(np.diff(run.case_stamp_ns) * 1e-9, 1.0 / rate_hz, atol=2e-9)
+    assert run.case_stamp_ns[0] == START_NS
+    assert run.board_stamp_ns[0] == START_NS + round(0.5e9 / rate_hz)
+    true = np.interp(
+        (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, run.truth.temperature('case')
+    )
+    error = run.case - true
+    # 540 readings at the least of 5 mK: the mean to 0.2 mK, the deviation to 3 %; five of each.
+    assert error.mean() == pytest.approx(0.3, abs=1.1e-3)
+    assert error.std() == pytest.approx(0.005, rel=0.16)
+
+
+def test_gaps_take_readings_away_and_nothing_else(unit: UnitModel) -> None:
+    gap = replace(unit, board=replace(unit.board, gaps_s=((100.0, 160.0), (500.0, 501.0))))
+    with_gap, plain = simulate(gap, SHORT, UP), simulate(unit, SHORT, UP)
+    is_kept = np.isin(plain.board_stamp_ns, with_gap.board_stamp_ns)
+    assert np.count_nonzero(~is_kept) == 61
+    np.testing.assert_array_equal(plain.board[is_kept], with_gap.board)
+
+
+def test_chamber_ripple_stays_within_its_amplitude(unit: UnitModel) -> None:
+    ripple = ChamberRipple(amplitude=0.1, period=240.0)
+    run = simulate(unit, DEMO, UP, rate_hz=1.0, ripple=ripple)
+    deviation = run.truth.air - DEMO.at(run.truth.grid_s)
+    assert np.abs(deviation).max() <= 0.1 + 1e-9
+    # A sine's deviation is its amplitude over root two; the lines and the wander take a little.
+    assert deviation.std() == pytest.approx(0.1 / np.sqrt(2.0), rel=0.1)
+
+
+def test_cold_start_warms_itself_up(unit: UnitModel) -> None:
+    """
+    Switched on in still air the board drifts by its self-heating; started warm it does not.
+
+    """
+    soak = cyclogram_preset('soak')
+    cold = simulate(unit, soak, UP, rate_hz=1.0, warm=False).truth.temperature('board')
+    warm = simulate(unit, soak, UP, rate_hz=1.0).truth.temperature('board')
+    assert cold[0] == pytest.approx(20.0)
+    assert np.ptp(warm) < 1e-9
+    assert cold[-1] == pytest.approx(warm[-1], abs=0.05)
+    assert warm[0] - cold[0] > 2.0
+
+
+def test_positions_in_one_run_are_handled_in_between(unit: UnitModel) -> None:
+    up = positions(4, 3)
+    run = simulate(
+        unit, SHORT, up, rate_hz=100.0, switch_s=[200.0, 400.0, 600.0], seed=2, gravity=9.81
+    )
+    truth = run.truth
+    for k in range(4):
+        rest = truth.specific_force[truth.position == k]
+        np.testing.assert_allclose(rest, np.tile(9.81 * up[k], (len(rest), 1)), rtol=1e-12)
+    handled = truth.position < 0
+    assert np.count_nonzero(handled) == 3 * 1000
+    burst = np.linalg.norm(truth.specific_force[handled], axis=1) - 9.81
+    # 2 m/s^2 at its height under a sin^2 envelope, of which |f| sees one direction: 1.2 RMS.
+    assert 0.8 < burst.std() < 1.6
+    smooth = simulate(
+        unit,
+        SHORT,
+        up,
+        switch_s=[200.0, 400.0, 600.0],
+        handling=Handling(vibration=0.0),
+        gravity=9.81,
+    ).truth.specific_force
+    np.testing.assert_allclose(np.linalg.norm(smooth, axis=1), 9.81)
+    rate = np.linalg.norm(np.diff(smooth, axis=0), axis=1) * 100.0 / 9.81
+    assert 1.0 < rate.max() < 4.0
+
+
+def test_quick_motion_saturates_and_says_so(unit: UnitModel) -> None:
+    run = simulate(unit, SHORT, positions(2), handling=Handling(vibration=80.0), gravity=9.80665)
+    assert run.is_saturated.any()
+    assert np.all(run.truth.position[run.is_saturated] == -1)
+    assert run.counts.max() == 32767
+    assert run.counts.min() == -32768
+
+
+@pytest.mark.parametrize(
+    ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
+)
+def test_positions_tell_the_nine_terms_apart(n: int, least: float) -> None:
+    """
+    Six faces leave the products of axes to the few degrees of a hand; from nine positions on all
+    terms of a quadric (bias, scale, misalignment) are seen, with the evenness of their number.
+
+    """
+    up = positions(n, 5)
+    np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)
+    x, y, z = up.T
+    quadric = np.stack([x * x, y * y, z * z, x * y, y * z, x * z, x, y, z], axis=1)
+    weakest = np.linalg.eigvalsh(quadric.T @ quadric)[0]
+    assert weakest > least if least else abs(weakest) < 1e-9
+    assert np.any(up != positions(n, 6))
+    assert np.abs(up.sum(axis=0)).max() < 0.1 * n
+
+
+def test_ideal_regime_is_the_heat_flow_into_the_board(unit: UnitModel) -> None:
+    run = simulate(unit, SHORT, UP, rate_hz=1.0)
+    flag = ideal_regime(run)
+    assert not flag[:240].any()
+    # A minute after the ramp began the board moves; five minutes after its end it still does.
+    assert flag[310:].all()
+    assert not ideal_regime(run, threshold_k_min=2.0).any()
+
+
+def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:
+    with pytest.raises(ValueError, match='`rate_hz` must be positive, got 0'):
+        simulate(unit, SHORT, UP, rate_hz=0.0)
+    with pytest.raises(ValueError, match='`grid_step` must be positive, got -1'):
+        simulate(unit, SHORT, UP, grid_step=-1.0)
+    with pytest.raises(ValueError, match='shorter than one cycle'):
+        simulate(unit, SHORT.cut(0.5), UP, rate_hz=1.0)
+    with pytest.raises(ValueError, match='`block_size` must be at least 1, got 0'):
+        simulate_blocks(unit, SHORT, UP, block_size=0)
+    with pytest.raises(ValueError, match='`gravity` must be positive, got nan'):
+        simulate(unit, SHORT, UP, gravity=float('nan'))
+    with pytest.raises(ValueError, match='`up` must hold non-zero vectors'):
+        simulate(unit, SHORT, [0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match='`up` must hold non-zero vectors'):
+        simulate(unit, SHORT, [0.0, 1.0])
+    with pytest.raises(ValueError, match='`switch_s` must hold 1 instants for 2 positions, got 2'):
+        simulate(unit, SHORT, positions(2), switch_s=[10.0, 300.0])
+    with pytest.raises(ValueError, match=r'`switch_s` must be more than 10\.0 s apart'):
+        simulate(unit, SHORT, positions(3), switch_s=[100.0, 105.0])
+    with pytest.raises(ValueError, match='`duration` must be positive, got 0'):
+        Handling(duration=0.0)
+    with pytest.raises(ValueError, match='`vibration` must not be negative, got -1'):
+        Handling(vibration=-1.0)
+    with pytest.raises(ValueError, match='`n` must be at least 1, got 0'):
+        positions(0)
+    with pytest.raises(ValueError, match='`spread_deg` must not be negative, got -1'):
+        positions(6, spread_deg=-1.0)
+    with pytest.raises(ValueError, match='`amplitude` must not be negative, got -1'):
+        ChamberRipple(amplitude=-1.0)
+    with pytest.raises(ValueError, match='`period` must be positive, got 0'):
+        ChamberRipple(period=0.0)
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'rate_hz': 0.0}, '`rate_hz` must be positive, got 0'),
+        ({'noise_sd': -1.0}, '`noise_sd` must not be negative, got -1'),
+        ({'quantum': float('nan')}, '`quantum` must not be negative, got nan'),
+        ({'phase': 1.0}, r'`phase` must lie in \[0, 1\), got 1'),
+        ({'outlier_probability': 2.0}, r'`outlier_probability` must lie in \[0, 1\], got 2'),
+    ],
+)
+def test_thermometer_refuses_what_cannot_be(change: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ThermometerModel('board', **change)
