@@ -62,7 +62,8 @@ def test_first_fit_finds_the_unit(golovach: FitResult) -> None:
 
 
 def test_two_regimes_beat_one_set_beats_raw(golovach: FitResult) -> None:
-    for row in golovach.residuals:
+    # On the ramps and over all; this short program has too few soaks to compare those.
+    for row in golovach.residuals[1:]:
         assert row.fitted.rms < row.one_set.rms < row.raw.rms, row.section
 
 

@@ -5,13 +5,18 @@ Owns the fit: bags of a thermal test -> still positions -> regression -> calibra
 
 """
 
-from .fit import FitResult, PositionReport, ResidualRow, fit
+from .evidence import PositionReport, ResidualRow
+from .fit import FitResult, fit
 from .gravity import normal_gravity, resolve_gravity
 from .options import FitOptions
+from .selection import Candidate
 from .sources import ArrayBlock, FitSource, SourceBlock
+from .verdict import Finding
 
 __all__ = [
     'ArrayBlock',
+    'Candidate',
+    'Finding',
     'FitOptions',
     'FitResult',
     'FitSource',

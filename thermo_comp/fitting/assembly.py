@@ -26,11 +26,13 @@ from ..calibration import (
     Unit,
 )
 from ..regime import DetectorSettings
+from .evidence import ResidualRow, inflation
 from .model import RegimeName
 from .reduction import ReducedBag
 from .regression import Outcome
 from .solution import regressors
 from .table import WindowTable
+from .verdict import Finding
 
 Array = npt.NDArray[np.float64]
 # Edges are widened by this part of the span, so that the run that was fitted is inside them.
@@ -52,12 +54,15 @@ class UnitFacts:
         White noise [m/s^2/sqrt(Hz)].
     board_lag : float
         Time constant of the board behind the case [s].
+    slow_error : ndarray, shape (2, 3)
+        What each regime's set leaves unexplained on each axis [m/s^2].
 
     """
 
     unit: Unit
     noise_density: Array
     board_lag: float
+    slow_error: Array
 
 
 def parameter_covariance(outcome: Outcome) -> Array:
@@ -92,9 +97,8 @@ def build_calibration(
     detector: DetectorSettings,
     facts: UnitFacts,
     reference_temperature: float,
-    residuals: Sequence[ResidualSummary] = (),
-    notes: Sequence[str] = (),
-    model_error: Array | None = None,
+    residuals: Sequence[ResidualRow] = (),
+    findings: Sequence[Finding] = (),
 ) -> Calibration:
     """
     Write a solution as a calibration.
@@ -113,12 +117,10 @@ def build_calibration(
         The unit.
     reference_temperature : float
         T_ref.
-    residuals : sequence of ResidualSummary, optional
+    residuals : sequence of ResidualRow, optional
         For the provenance.
-    notes : sequence of str, optional
-        For the provenance.
-    model_error : ndarray, shape (2, 3), optional
-        What each regime's set leaves unexplained on each axis [m/s^2].
+    findings : sequence of Finding, optional
+        For the provenance; what is good is left out.
 
     Returns
     -------
@@ -130,13 +132,13 @@ def build_calibration(
     covariance = parameter_covariance(outcome)
     n_bias = solution.bias.shape[1]
     sets = {}
-    left = np.zeros((2, 3)) if model_error is None else model_error
+    inflated = inflation(table, outcome)
     names: tuple[RegimeName, RegimeName] = ('static', 'dynamic')
     for regime, name in enumerate(names):
         axes = []
         for axis in range(3):
             where = outcome.layout.axis[axis]
-            block = covariance[np.ix_(where, where)]
+            block = inflated[axis] * covariance[np.ix_(where, where)]
             # Scale parameters become relative to K.
             unit = np.ones(len(where))
             unit[n_bias:] = 1.0 / solution.scale[axis, 0]
@@ -146,7 +148,7 @@ def build_calibration(
                     solution.bias[axis],
                     solution.scale[axis],
                     block * np.outer(unit, unit),
-                    float(left[regime, axis]),
+                    float(facts.slow_error[regime, axis]),
                 )
             )
         ranges = _ranges(table, outcome, regime, reference_temperature)
@@ -167,7 +169,7 @@ def build_calibration(
         dynamic=sets['dynamic'],
         noise_density_m_s2_sqrt_hz=_triple(facts.noise_density),
         misalignment=(_triple(matrix[0]), _triple(matrix[1]), _triple(matrix[2])),
-        misalignment_sd=_misalignment_sd(outcome, covariance),
+        misalignment_sd=_misalignment_sd(outcome, float(inflated.mean()) * covariance),
         memory_time_constants_s=tuple(solution.time_constants_s.tolist()),
         board_lag_s=facts.board_lag,
         detector=detector,
@@ -178,8 +180,18 @@ def build_calibration(
             sources=tuple(
                 Source(bag.source.name, bag.source.sha256 or '', bag.n_samples) for bag in bags
             ),
-            residuals=tuple(residuals),
-            notes=tuple(notes),
+            residuals=tuple(
+                ResidualSummary(
+                    row.section, row.fitted.n, row.raw.rms, row.fitted.rms, row.fitted.peak
+                )
+                for row in residuals
+                if row.fitted.n
+            ),
+            notes=tuple(
+                f'{finding.name}: {finding.message}'
+                for finding in findings
+                if finding.level != 'good'
+            ),
         ),
     )
 

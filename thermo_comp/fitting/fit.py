@@ -13,83 +13,41 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..calibration import Calibration, ResidualSummary, Unit
+from ..calibration import Calibration, Unit
 from ..errors import FitError
-from ..metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from ..regime import DetectorSettings
 from ..thermal import ThermalConfig
 from .assembly import UnitFacts, build_calibration
+from .evidence import PositionReport, ResidualRow, position_reports, residual_rows, slow_error
 from .history import ThermalHistory, thermal_history
-from .model import ModelSpec, polynomial
 from .options import COUNTS_FULL_SCALE, FitOptions
-from .reduction import ReducedBag, StillInterval, reduce_source
+from .reduction import ReducedBag, reduce_source
 from .regression import Freedom, Outcome, regress
+from .selection import Candidate, Selector, model_spec
 from .sensors import learn_detector
-from .solution import Solution, correct, regressors
+from .solution import Solution
 from .sources import FitSource
-from .start import constant_calibration, position_means, starting_solution
+from .start import ConstantCalibration, constant_calibration, position_means
 from .table import WindowTable, window_table
+from .verdict import (
+    POSITIONS_FOR_MISALIGNMENT,
+    POSITIONS_NEEDED,
+    Finding,
+    can_tell_misalignment,
+    enforce,
+    judge_bags,
+    judge_result,
+    judge_table,
+)
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-# Fewer positions than the nine unknowns of the triad leave M to chance.
-_POSITIONS_FOR_MISALIGNMENT = 9
-_FEWEST_POSITIONS = 6
 # Usual full scales of units that report m/s^2.
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 _STANDARD_GRAVITY = 9.80665
-
-
-@dataclass(frozen=True)
-class PositionReport:
-    """
-    One still interval as the fit saw it.
-
-    Parameters
-    ----------
-    source : str
-        The bag's name.
-    start_ns : int
-        Stamp of its start.
-    duration_s : float
-        Length.
-    up : tuple of float
-        Estimated direction of the specific force, in the output frame.
-    residual_rms : float
-        RMS of ``|f| - g`` over its windows.
-
-    """
-
-    source: str
-    start_ns: int
-    duration_s: float
-    up: tuple[float, float, float]
-    residual_rms: float
-
-
-@dataclass(frozen=True)
-class ResidualRow:
-    """
-    ``|f| - g`` of one section, uncorrected and corrected.
-
-    Parameters
-    ----------
-    section : str
-        ``static``, ``dynamic`` or ``all``.
-    raw : ResidualStatistics
-        With the constants at the reference temperature.
-    one_set : ResidualStatistics
-        With one quadratic set, blind to the regime.
-    fitted : ResidualStatistics
-        With the calibration.
-
-    """
-
-    section: str
-    raw: ResidualStatistics
-    one_set: ResidualStatistics
-    fitted: ResidualStatistics
+# Stands in where the bags do not tell how far the board lags behind the case.
+_USUAL_BOARD_LAG_S = 900.0
 
 
 @dataclass(frozen=True)
@@ -105,10 +63,14 @@ class FitResult:
         The estimates behind it, with the attitudes.
     outcome : Outcome
         The regression's end.
+    candidates : tuple of Candidate
+        The models that were tried, smallest first.
     residuals : tuple of ResidualRow
         Over the windows of the fit.
     positions : tuple of PositionReport
         The still intervals.
+    findings : tuple of Finding
+        What the data lacked, or not.
     table : WindowTable
         The windows.
     bags : tuple of ReducedBag
@@ -119,8 +81,10 @@ class FitResult:
     calibration: Calibration
     solution: Solution
     outcome: Outcome
+    candidates: tuple[Candidate, ...]
     residuals: tuple[ResidualRow, ...]
     positions: tuple[PositionReport, ...]
+    findings: tuple[Finding, ...]
     table: WindowTable
     bags: tuple[ReducedBag, ...]
 
@@ -156,11 +120,10 @@ def fit(
     detector = options.detector or learn_detector(bags)
     histories = []
     for number, bag in enumerate(bags):
-        tell('temperatures', 0.6 + 0.2 * number / len(bags))
+        tell('temperatures', 0.6 + 0.1 * number / len(bags))
         histories.append(history_of(bag, detector, options))
     table = window_table(bags, histories, options.reference_temperature)
-    tell('regression', 0.8)
-    return _fit_table(table, bags, detector, options)
+    return _fit_table(table, bags, detector, options, tell)
 
 
 def reduce_sources(
@@ -227,93 +190,133 @@ def history_of(bag: ReducedBag, detector: DetectorSettings, options: FitOptions)
     return thermal_history(bag, detector, options.window_s / 5.0, config)
 
 
-def golovach_spec() -> ModelSpec:
-    """
-    Give the paper's scheme: static linear, dynamic quadratic.
-
-    """
-    return ModelSpec('golovach', polynomial(1), polynomial(2))
-
-
 def _fit_table(
     table: WindowTable,
     bags: Sequence[ReducedBag],
     detector: DetectorSettings,
     options: FitOptions,
+    tell: Progress,
 ) -> FitResult:
-    n_positions = table.n_positions
-    if n_positions < _FEWEST_POSITIONS:
-        raise FitError(
-            f'{n_positions} still positions, need {_FEWEST_POSITIONS} for bias and scale and '
-            f'{_POSITIONS_FOR_MISALIGNMENT} for the misalignment'
-        )
-    with_misalignment = (
-        n_positions >= _POSITIONS_FOR_MISALIGNMENT
-        if options.misalignment is None
-        else options.misalignment
+    findings = list(enforce(judge_bags(bags, options), options))
+    constant, table_findings = first_guess(table, bags, options)
+    findings += enforce(table_findings, options)
+    with_misalignment = bool(np.any(constant.misalignment != np.eye(3)))
+    longest = max(len(history.board) * history.step_s for history in table.histories)
+    freedom = Freedom(
+        misalignment=with_misalignment,
+        time_constant_range_s=(2.0 * options.window_s, max(longest / 2.0, 4.0 * options.window_s)),
     )
-    constant = constant_calibration(position_means(table), options.gravity, with_misalignment)
-    freedom = Freedom(misalignment=with_misalignment)
+    coarse = table.coarsened(max(options.selection_window_s, options.window_s))
+    n_tried = 0
 
-    def run(spec: ModelSpec) -> Outcome:
-        start = starting_solution(table, spec, options.gravity, constant, np.zeros(0))
-        return regress(table, start, freedom)
+    def trying(_name: str) -> None:
+        nonlocal n_tried
+        n_tried += 1
+        tell('models', min(0.7 + 0.01 * n_tried, 0.95))
 
-    one_set = run(ModelSpec('quadratic', polynomial(2)))
-    chosen = run(golovach_spec())
+    selector = Selector(coarse, options.gravity, constant, freedom, trying)
+    if options.model == 'auto':
+        name = selector.choose()
+    else:
+        name = selector.try_model(model_spec(options.model, coarse)).spec.name
+    tell('regression', 0.95)
+    chosen = _refined(table, selector, name, freedom)
+    one_set = _refined(table, selector, 'quadratic', freedom)
     residuals = residual_rows(table, chosen.solution, one_set.solution)
-    density = noise_density(bags, chosen.solution)
-    facts = UnitFacts(_unit(bags, options), density, 900.0)
+    slow = slow_error(table, chosen)
+    findings += judge_result(chosen.solution, residuals, slow, options)
+    facts = UnitFacts(
+        _unit(bags, options), noise_density(bags, chosen.solution), board_lag(table), slow
+    )
     calibration = build_calibration(
-        chosen,
-        table,
-        bags,
-        detector,
-        facts,
-        options.reference_temperature,
-        [
-            ResidualSummary(
-                row.section, row.fitted.n, row.raw.rms, row.fitted.rms, row.fitted.peak
-            )
-            for row in residuals
-            if row.fitted.n
-        ],
+        chosen, table, bags, detector, facts, options.reference_temperature, residuals, findings
     )
     return FitResult(
         calibration=calibration,
         solution=chosen.solution,
         outcome=chosen,
+        candidates=selector.table_of(name),
         residuals=residuals,
         positions=position_reports(table, bags, chosen.solution),
+        findings=tuple(findings),
         table=table,
         bags=tuple(bags),
     )
 
 
-def residual_rows(
-    table: WindowTable, fitted: Solution, one_set: Solution
-) -> tuple[ResidualRow, ...]:
+def first_guess(
+    table: WindowTable, bags: Sequence[ReducedBag], options: FitOptions
+) -> tuple[ConstantCalibration, list[Finding]]:
     """
-    Compare raw, one set and the fitted sets on the same windows.
+    Fit the triad without temperature, and judge what the windows cover.
 
-    Raw is what the constants at the reference temperature leave: scale factor, bias and M of the
-    fitted calibration, no temperature.
+    Parameters
+    ----------
+    table : WindowTable
+        The windows.
+    bags : sequence of ReducedBag
+        Where they come from.
+    options : FitOptions
+        Whether M is wanted.
+
+    Returns
+    -------
+    ConstantCalibration
+        First guess; M is the identity when it is not to be estimated.
+    list of Finding
+        Findings.
+
+    Raises
+    ------
+    FitError
+        If there are fewer positions than anything can be fitted to.
 
     """
-    raw = (table.mean - fitted.bias[:, 0]) / fitted.scale[:, 0] @ fitted.misalignment.T
-    by_model = [statistics_by_regime(norm_residual(raw, fitted.gravity), table.is_dynamic)]
-    for solution in (one_set, fitted):
-        columns = regressors(
-            table, solution.spec, solution.time_constants_s, solution.start_memory
+    n = table.n_positions
+    if n < POSITIONS_NEEDED:
+        raise FitError(
+            f'{n} still positions, need {POSITIONS_NEEDED} for bias and scale and '
+            f'{POSITIONS_FOR_MISALIGNMENT} for the misalignment'
         )
-        force = correct(table, solution, columns)
-        by_model.append(
-            statistics_by_regime(norm_residual(force, fitted.gravity), table.is_dynamic)
+    means = position_means(table)
+    box = constant_calibration(means, options.gravity, with_misalignment=False)
+    force = box.force(means)
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    wanted = can_tell_misalignment(up) if options.misalignment is None else options.misalignment
+    has_case = all(len(bag.case.value) for bag in bags)
+    findings = judge_table(table, up, wanted, has_case)
+    if not wanted and options.misalignment is None:
+        findings.append(
+            Finding(
+                'misalignment',
+                'advice',
+                'these positions identify bias and scale only, M stays the identity; it needs '
+                f'{POSITIONS_FOR_MISALIGNMENT} well spread ones',
+            )
         )
-    return tuple(
-        ResidualRow(section, *(model[section] for model in by_model))
-        for section in ('static', 'dynamic', 'all')
-    )
+    if not wanted:
+        return box, findings
+    return constant_calibration(means, options.gravity, with_misalignment=True), findings
+
+
+def _refined(table: WindowTable, selector: Selector, name: str, freedom: Freedom) -> Outcome:
+    """
+    Repeat a candidate's fit on the fine windows, from where the coarse ones left it.
+
+    """
+    trial = selector.try_model(model_spec(name, table))
+    return regress(table, trial.outcome.solution, freedom)
+
+
+def board_lag(table: WindowTable) -> float:
+    """
+    Time constant of the board behind the case: slope of the gradient over the board's rate.
+
+    """
+    rate = table.rate - np.mean(table.rate)
+    power = float(rate @ rate)
+    lag = float(rate @ table.gradient) / power if power > 0.0 else np.nan
+    return lag if 1.0 <= lag <= 1e5 else _USUAL_BOARD_LAG_S
 
 
 def noise_density(bags: Sequence[ReducedBag], solution: Solution) -> Array:
@@ -327,37 +330,6 @@ def noise_density(bags: Sequence[ReducedBag], solution: Solution) -> Array:
     cycle = float(np.median([bag.cycle_s for bag in bags]))
     density = sample_sd / np.abs(solution.scale[:, 0]) * np.sqrt(cycle)
     return np.asarray(np.maximum(density, 1e-12))
-
-
-def position_reports(
-    table: WindowTable, bags: Sequence[ReducedBag], solution: Solution
-) -> tuple[PositionReport, ...]:
-    """
-    List the positions of a table with what the fit left on each.
-
-    """
-    columns = regressors(table, solution.spec, solution.time_constants_s, solution.start_memory)
-    residual = norm_residual(correct(table, solution, columns), solution.gravity)
-    result = []
-    for number, rows in enumerate(table.position_slices()):
-        bag = bags[int(table.bag[rows.start])]
-        interval = _interval_at(bag, float(table.time[rows.start]))
-        x, y, z = (float(v) for v in solution.up[number])
-        result.append(
-            PositionReport(
-                source=bag.source.name,
-                start_ns=interval.start_ns,
-                duration_s=(interval.end_ns - interval.start_ns) * 1e-9,
-                up=(x, y, z),
-                residual_rms=float(np.sqrt(np.mean(residual[rows] ** 2))),
-            )
-        )
-    return tuple(result)
-
-
-def _interval_at(bag: ReducedBag, time: float) -> StillInterval:
-    starts = [interval.time[0] for interval in bag.intervals]
-    return bag.intervals[max(0, int(np.searchsorted(starts, time, side='right')) - 1)]
 
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:

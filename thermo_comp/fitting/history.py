@@ -29,7 +29,12 @@ from ..thermal import (
 from .reduction import ReducedBag
 
 Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+
+# Rates are seen over two minutes; below this the chamber rests [K/s].
+_SECTION_HALF_WIDTH_S = 60.0
+_SECTION_RATE = 0.05 / 60.0
 
 _GRID_COLUMNS = (BOARD, VAR_BOARD, RATE, GRADIENT, WEIGHT, UNKNOWN)
 
@@ -68,6 +73,40 @@ class ThermalHistory:
 
         """
         return np.asarray(self.start_s + self.step_s * np.arange(len(self.board)))
+
+    def sections(self) -> IntArray:
+        """
+        Give each grid point the number of its stretch of the program: ramp up, soak, ramp down.
+
+        Stretches longer than a sixth of the bag are cut, so that a bag of one long soak still
+        has several.
+
+        Returns
+        -------
+        ndarray of int64, shape (n,)
+            Number of the stretch at each grid point, from 0.
+
+        """
+        case = self.board + self.gradient
+        half = max(1, round(_SECTION_HALF_WIDTH_S / self.step_s))
+        if len(case) <= 4 * half:
+            return np.zeros(len(case), dtype=np.int64)
+        padded = np.pad(case, half, mode='edge')
+        rate = (padded[2 * half :] - padded[: -2 * half]) / (2 * half * self.step_s)
+        least = max(_SECTION_RATE, 0.2 * float(np.quantile(np.abs(rate), 0.95)))
+        direction = np.where(np.abs(rate) < least, 0, np.sign(rate)).astype(np.int64)
+        longest = max(len(case) // 6, 2 * half)
+        result = np.zeros(len(case), dtype=np.int64)
+        number = 0
+        begin = 0
+        for i in range(1, len(case)):
+            # A change that the window itself would blur away is no new stretch.
+            lasts = (direction[i : i + 2 * half] == direction[i]).all()
+            if (direction[i] != direction[begin] and lasts) or i - begin >= longest:
+                number += 1
+                begin = i
+            result[i] = number
+        return result
 
 
 def thermal_history(

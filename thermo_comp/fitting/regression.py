@@ -29,7 +29,6 @@ Array = npt.NDArray[np.float64]
 # Huber's bend: at 3 sd the efficiency in pure noise is 99.6 %, and a wild window pulls no more
 # than one of 3 sd.
 _HUBER_SDS = 3.0
-_MAX_STEPS = 60
 # A step is the last when the quadratic model promises less than this part of one unit of
 # chi-square: a hundredth of the smallest shift that the data could tell.
 _CONVERGED_DECREASE = 1e-4
@@ -176,7 +175,8 @@ def regress(
     freedom: Freedom | None = None,
     *,
     is_robust: bool = True,
-    reweight: bool = True,
+    max_rounds: int = 4,
+    max_steps: int = 60,
 ) -> Outcome:
     """
     Minimise the weighted squares from a start.
@@ -191,8 +191,11 @@ def regress(
         What may move.
     is_robust : bool, optional
         Whether odd windows lose weight.
-    reweight : bool, optional
-        Whether the noise is re-estimated from the residuals as the fit goes.
+    max_rounds : int, optional
+        How often the noise may be re-estimated from the residuals and the fit repeated; with one
+        round the weights stay as they start.
+    max_steps : int, optional
+        Bound of the Gauss-Newton steps of one round.
 
     Returns
     -------
@@ -213,11 +216,11 @@ def regress(
     base = np.sqrt(table.count / typical)
     slices = table.position_slices()
     n_steps = 0
-    for _ in range(4 if reweight else 1):
-        inner = _minimise(table, state, freedom, base, slices, is_robust)
+    for _ in range(max_rounds):
+        inner = _minimise(table, state, freedom, base, slices, is_robust, max_steps)
         n_steps += inner.n_steps
         before, state = state.noise_sd, inner.solution
-        if not reweight:
+        if max_rounds == 1:
             break
         noise = noise_of(table, inner.residual, base)
         state = replace(state, noise_sd=noise)
@@ -278,6 +281,7 @@ def _minimise(
     base: Array,
     slices: list[slice],
     is_robust: bool,
+    max_steps: int,
 ) -> Outcome:
     layout = layout_of(start, freedom, table)
     sd = np.where(table.is_dynamic[:, None], start.noise_sd[1], start.noise_sd[0])
@@ -286,9 +290,9 @@ def _minimise(
     memory = table.memory(state.time_constants_s)
     damping = 0.0
     cost, columns, residual, huber = _evaluate(table, state, root_weight, is_robust, memory)
-    is_converged = False
+    is_converged = is_stuck = False
     n_steps = 0
-    while n_steps < _MAX_STEPS and not is_converged:
+    while n_steps < max_steps and not is_converged:
         normal, gradient = _normal_equations(
             table, state, columns, residual, root_weight * np.sqrt(huber), layout, slices
         )
@@ -307,10 +311,10 @@ def _minimise(
                 break
             if promised < _CONVERGED_DECREASE or damping > 1e8:
                 is_converged = promised < _CONVERGED_DECREASE
-                n_steps = n_steps if is_converged else _MAX_STEPS
+                is_stuck = True
                 break
             damping = max(damping * 10.0, 1e-6)
-        if damping > 1e8:
+        if is_stuck:
             break
     normal, _ = _normal_equations(
         table, state, columns, residual, root_weight * np.sqrt(huber), layout, slices

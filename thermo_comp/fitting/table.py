@@ -38,7 +38,8 @@ class WindowTable:
     Parameters
     ----------
     position, bag, section : ndarray of int64, shape (n,)
-        Number of the position, of the bag, and of the run of one regime within the bag.
+        Number of the position, of the bag, and of the stretch of the chamber's program within
+        the bag.
     time : ndarray, shape (n,)
         Time since the bag's first sample [s].
     count : ndarray, shape (n,)
@@ -188,7 +189,7 @@ def window_table(
         grid = history.time
         settled = history.var_board <= 4.0 * np.median(history.var_board)
         begin = float(grid[int(np.argmax(settled))])
-        runs = np.concatenate(([0], np.cumsum(np.diff(history.weight > 0.5) != 0)))
+        sections = history.sections()
         for interval in reduced.intervals:
             use = interval.time >= begin
             if not use.any():
@@ -201,7 +202,7 @@ def window_table(
             for name in ('gradient', 'rate', 'weight'):
                 columns[name].append(np.interp(time, grid, getattr(history, name)))
             nearest = np.clip(np.searchsorted(grid, time), 0, len(grid) - 1)
-            columns['section'].append(runs[nearest])
+            columns['section'].append(sections[nearest])
             columns['position'].append(np.full(len(time), position))
             columns['bag'].append(np.full(len(time), bag))
             position += 1
