@@ -1,0 +1,392 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A table becomes a bag in which every row is accounted for, and comes back from it unchanged.
+
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from conftest import Cli
+
+from thermo_comp.convert import ColumnMap, load_column_map, table_log, write_log
+from thermo_comp.convert.columns import STANDARD_GRAVITY
+from thermo_comp.convert.log import Readings, thin
+from thermo_comp.errors import RecordingError
+from thermo_comp.recording import read_recording
+
+ROOT = Path(__file__).resolve().parent.parent
+STEP_NS = 10_000_000
+
+
+def table(path: Path, n: int = 400, scale: float = 1.0) -> tuple[Path, dict[str, np.ndarray]]:
+    """
+    Write a still log with slow temperatures that are held between their own readings.
+
+    """
+    rng = np.random.default_rng(1)
+    columns = {
+        'ms': 1000 + 10 * np.arange(n),
+        'ax': np.round(scale * 0.6 + 1e-3 * scale * rng.standard_normal(n), 6),
+        'ay': np.round(1e-3 * scale * rng.standard_normal(n), 6),
+        'az': np.round(scale * 0.8 + 1e-3 * scale * rng.standard_normal(n), 6),
+        'wx': np.round(rng.standard_normal(n), 3),
+        'wy': np.round(rng.standard_normal(n), 3),
+        'wz': np.round(rng.standard_normal(n), 3),
+        'case': 20.0 + 0.5 * (np.arange(n) // 100),
+        'board': 25.0 + 0.125 * (np.arange(n) // 40),
+    }
+    lines = [','.join(columns)]
+    lines += [','.join(map(repr, map(float, row))) for row in zip(*columns.values(), strict=True)]
+    path.write_text('\n'.join(lines) + '\n')
+    return path, columns
+
+
+def column_map(**changes: object) -> ColumnMap:
+    data: dict[str, object] = {
+        'stamp': {'column': 'ms', 'unit': 'ms'},
+        'accel': {'columns': ('ax', 'ay', 'az'), 'unit': 'g', 'output': 'imu'},
+        'board': {'column': 'board'},
+        'case': {'column': 'case'},
+        'serial': 'unit7',
+        'frame_id': 'here',
+    }
+    return ColumnMap.model_validate({**data, **changes})
+
+
+def test_round_trip_through_the_bag(tmp_path: Path) -> None:
+    path, columns = table(tmp_path / 'log.csv')
+    gyro = {'columns': ('wx', 'wy', 'wz'), 'unit': 'deg/s'}
+    report = write_log(table_log(path, column_map(gyro=gyro)), tmp_path / 'bag')
+    recording = read_recording(tmp_path / 'bag')
+    block = recording.columns
+    assert recording.info.input == 'imu'
+    assert recording.info.metadata['serial'] == 'unit7'
+    assert recording.info.metadata['converted_from'] == 'log.csv'
+    assert block.frame_id == 'here'
+    assert block.accel_stamp_ns.tolist() == (columns['ms'] * 10**6).tolist()
+    expected = np.column_stack([columns[k] for k in ('ax', 'ay', 'az')]) * STANDARD_GRAVITY
+    np.testing.assert_array_equal(block.accel, expected)
+    assert block.imu is not None
+    np.testing.assert_allclose(
+        np.degrees(block.imu.angular_velocity),
+        np.column_stack([columns[k] for k in ('wx', 'wy', 'wz')]),
+        rtol=1e-14,  # one rounding in each direction
+    )
+    # The orientation is not there and says so; the rate is there with a covariance not known.
+    assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
+    assert not block.imu.angular_velocity_covariance.any()
+    # A held value is one message: 4 levels of the case, 10 of the board, each when it came.
+    assert block.case.tolist() == [20.0, 20.5, 21.0, 21.5]
+    assert block.case_stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
+    assert len(block.board) == report.board_messages == 10
+    # A reading stands before the sample of its own stamp: a node has it when the sample comes.
+    assert block.case_after.tolist() == [0, 100, 200, 300]
+    assert (report.rows, report.accel_messages) == (400, 400)
+    assert report.rate_hz == pytest.approx(100.0)
+    assert report.duration_s == pytest.approx(3.99)
+    assert 'gravity is 1 g' in report.believed
+
+
+def test_without_gyro_the_message_says_so(tmp_path: Path) -> None:
+    path, _ = table(tmp_path / 'log.csv')
+    write_log(table_log(path, column_map()), tmp_path / 'bag')
+    imu = read_recording(tmp_path / 'bag').columns.imu
+    assert imu is not None
+    assert imu.angular_velocity_covariance[:, 0].tolist() == [-1.0] * 400
+
+
+def test_counts_stay_counts(tmp_path: Path) -> None:
+    path, columns = table(tmp_path / 'log.csv', scale=2048.0)
+    accel = {'columns': ('ax', 'ay', 'az'), 'unit': 'counts', 'output': 'counts'}
+    write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag.mcap')
+    block = read_recording(tmp_path / 'bag.mcap').columns
+    np.testing.assert_array_equal(block.accel[:, 0], columns['ax'])
+    assert block.imu is None
+
+
+def test_counts_become_an_imu_with_a_sensitivity(tmp_path: Path) -> None:
+    path, columns = table(tmp_path / 'log.csv', scale=2048.0)
+    accel = {'columns': ('ax', 'ay', 'az'), 'unit': 'counts', 'output': 'imu'}
+    write_log(
+        table_log(path, column_map(accel={**accel, 'counts_per_g': 2048.0})), tmp_path / 'bag'
+    )
+    block = read_recording(tmp_path / 'bag').columns
+    np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
+    # The sensitivity is checked as a unit is.
+    wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
+    with pytest.raises(RecordingError, match='16384 per g are stated'):
+        write_log(wrong, tmp_path / 'other')
+    assert not (tmp_path / 'other').exists()
+
+
+def test_every_odd_row_is_accounted_for(tmp_path: Path) -> None:
+    path, _ = table(tmp_path / 'log.csv')
+    lines = path.read_text().splitlines()
+    lines[11] = lines[11].replace(lines[11].split(',')[1], 'nan')
+    lines[21] = 'garbage,' + lines[21].partition(',')[2]
+    lines[31] = '1300.0,2.0,0.0,0.8,0,0,0,20.0,25.0'
+    lines[41], lines[42] = lines[42], lines[41]
+    lines[51] = lines[50]
+    lines[400] = '4990.0,0.6'
+    path.write_text('\n'.join(lines))
+    accel = {'columns': ('ax', 'ay', 'az'), 'unit': 'g', 'output': 'imu', 'clip': (-1.99, 1.99)}
+    report = write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag')
+    block = read_recording(tmp_path / 'bag').columns
+    assert report.rows == 400
+    assert (report.short_rows.count, report.non_numeric.count) == (1, 2)
+    assert report.non_numeric.lines == (12, 22)
+    assert (report.clipped.count, report.clipped.lines) == (1, (32,))
+    assert (report.backwards.count, report.backwards.lines) == (1, (43,))
+    assert (report.repeated.count, report.repeated.lines) == (1, (52,))
+    assert len(block) == report.accel_messages == 397
+    # The clipped row and the disorder are the node's to judge: they are in the bag as they were.
+    assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
+    assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
+    # The log time keeps the file's order, where the stamps do not.
+    assert (np.diff(block.accel_log_ns) >= 0).all()
+
+
+def test_a_fixed_rate_gathers_no_rounding(tmp_path: Path) -> None:
+    path, _ = table(tmp_path / 'log.csv', n=300)
+    write_log(table_log(path, column_map(stamp={'rate_hz': 3.0})), tmp_path / 'bag')
+    stamps = read_recording(tmp_path / 'bag').columns.accel_stamp_ns
+    assert stamps[0] == 10**9
+    # Each stamp is the nearest integer to its own multiple of 1/3 s, and not of 0.333333333 s.
+    assert stamps[-1] == 10**9 + round(299 * 1e9 / 3.0)
+
+
+def test_runs_of_rows_make_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, _ = table(tmp_path / 'log.csv')
+    write_log(table_log(path, column_map()), tmp_path / 'whole')
+    monkeypatch.setattr('thermo_comp.convert.log._RUN_ROWS', 64)
+    write_log(table_log(path, column_map()), tmp_path / 'parts')
+    whole, parts = (read_recording(tmp_path / name).columns for name in ('whole', 'parts'))
+    for name in ('accel_stamp_ns', 'accel', 'board', 'board_after', 'case', 'case_after'):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
+
+
+@pytest.mark.parametrize(
+    ('unit', 'celsius'), [('K', 300.0), ('degF', 212.0), ('raw', 160.0), ('degC', 30.0)]
+)
+def test_temperature_units(tmp_path: Path, unit: str, celsius: float) -> None:
+    path, _ = table(tmp_path / 'log.csv')
+    raw = {'degc_per_count': 0.0625, 'degc_at_zero': 20.0} if unit == 'raw' else {}
+    text = path.read_text().replace(',25.', f',{celsius:g}.')
+    path.write_text(text)
+    board = {'column': 'board', 'unit': unit, **raw}
+    write_log(table_log(path, column_map(board=board)), tmp_path / 'bag')
+    first = float(read_recording(tmp_path / 'bag').columns.board[0])
+    # 300 K, the boiling point of water, 160 steps of 1/16 K above 20 degC.
+    assert first == pytest.approx({'K': 26.85, 'degF': 100.0, 'raw': 30.0, 'degC': 30.0}[unit])
+
+
+def test_implausible_temperatures_are_refused(tmp_path: Path) -> None:
+    path, _ = table(tmp_path / 'log.csv')
+    path.write_text(path.read_text().replace(',25.', ',298.'))
+    with pytest.raises(RecordingError, match=r'board temperature is 29.* looks like kelvins'):
+        write_log(table_log(path, column_map()), tmp_path / 'bag')
+
+
+def test_a_wrong_unit_is_refused_with_the_reason(tmp_path: Path) -> None:
+    path, _ = table(tmp_path / 'log.csv')
+    accel = {'columns': ('ax', 'ay', 'az'), 'unit': 'm/s^2', 'output': 'imu'}
+    with pytest.raises(RecordingError, match=r'stated in m/s\^2, but .*looks like g'):
+        write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag')
+
+
+def test_a_table_of_words_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / 'log.csv'
+    path.write_text('ms,ax,ay,az,board,case\n' + 'a,b,c,d,e,f\n' * 5)
+    with pytest.raises(RecordingError, match='none of its 5 rows holds numbers'):
+        write_log(table_log(path, column_map()), tmp_path / 'bag')
+
+
+class TestThinning:
+    stamps = np.arange(10, dtype=np.int64) * 10**9
+
+    def kept(self, values: list[float], publish: str, **more: float) -> list[int]:
+        readings = Readings(self.stamps[: len(values)], np.array(values))
+        result = thin(readings, publish, more.get('heartbeat_s', 1e9), more.get('period_s'))
+        return (result.stamp_ns // 10**9).tolist()
+
+    def test_change(self) -> None:
+        assert self.kept([1, 1, 2, 2, 2, 1], 'change') == [0, 2, 5]
+
+    def test_heartbeat(self) -> None:
+        assert self.kept([1] * 10, 'change', heartbeat_s=4.0) == [0, 4, 8]
+
+    def test_period(self) -> None:
+        assert self.kept([1, 2, 3, 4, 5, 6], 'period', period_s=2.0) == [0, 2, 4]
+
+    def test_all(self) -> None:
+        assert self.kept([1, 1, 1], 'all') == [0, 1, 2]
+
+    def test_missing_cells_are_no_readings(self) -> None:
+        assert self.kept([float('nan'), 1, float('nan'), 1, 2], 'change') == [1, 4]
+        assert self.kept([float('nan')] * 3, 'change') == []
+
+    def test_a_clock_that_starts_anew_is_worth_a_message(self) -> None:
+        readings = Readings(np.array([5, 6, 1, 2]) * 10**9, np.full(4, 20.0))
+        assert (thin(readings, 'change', 1e6).stamp_ns // 10**9).tolist() == [5, 1]
+
+
+class TestColumnMap:
+    def write(self, tmp_path: Path, **changes: object) -> Path:
+        data: dict[str, object] = {
+            'stamp': {'column': 't', 'unit': 's'},
+            'accel': {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'imu'},
+        }
+        path = tmp_path / 'map.yaml'
+        path.write_text(yaml.safe_dump({**data, **changes}))
+        return path
+
+    def test_shipped_examples_are_valid(self) -> None:
+        paths = sorted((ROOT / 'config' / 'columns').glob('*.yaml'))
+        assert paths
+        for path in paths:
+            load_column_map(path)
+
+    @pytest.mark.parametrize(
+        ('changes', 'key', 'message'),
+        [
+            ({'gravity': 9.8}, 'gravity', 'unknown key'),
+            ({'stamp': {'column': 't'}}, 'stamp', '`unit` of the stamp column'),
+            ({'stamp': {}}, 'stamp', 'give either `column` and `unit`, or `rate_hz`'),
+            ({'stamp': {'column': 't', 'unit': 's', 'rate_hz': 1.0}}, 'stamp', 'give either'),
+            ({'stamp': {'rate_hz': 0.0}}, 'stamp.rate_hz', 'greater than 0'),
+            ({'stamp': {'column': 't', 'unit': 'min'}}, 'stamp.unit', "'s', 'ms', 'us' or 'ns'"),
+            (
+                {'accel': {'columns': ['x', 'y'], 'unit': 'g', 'output': 'imu'}},
+                'accel',
+                'required',
+            ),
+            (
+                {'accel': {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'counts'}},
+                'accel',
+                'g cannot become counts',
+            ),
+            (
+                {'accel': {'columns': ['x', 'y', 'z'], 'unit': 'counts', 'output': 'imu'}},
+                'accel',
+                'only with `counts_per_g`',
+            ),
+            (
+                {
+                    'accel': {
+                        'columns': ['x', 'y', 'z'],
+                        'unit': 'g',
+                        'output': 'imu',
+                        'clip': [2.0, -2.0],
+                    }
+                },
+                'accel',
+                r'must be \[lowest, highest\]',
+            ),
+            ({'board': {'column': 'b', 'unit': 'raw'}}, 'board', 'needs `degc_per_count`'),
+            (
+                {'board': {'column': 'b', 'unit': 'raw', 'degc_per_count': 1.0}},
+                'board',
+                'needs `degc_at_zero`',
+            ),
+            ({'board': {'column': 'b', 'publish': 'period'}}, 'board', 'needs `period_s`'),
+            (
+                {
+                    'accel': {'columns': [0, 1, 2], 'unit': 'counts', 'output': 'counts'},
+                    'gyro': {'columns': [3, 4, 5], 'unit': 'rad/s'},
+                },
+                None,
+                'a gyro travels in an Imu message',
+            ),
+            ({'serial': ''}, 'serial', 'at least 1 character'),
+        ],
+    )
+    def test_mistakes_name_their_key(
+        self, tmp_path: Path, changes: dict[str, object], key: str | None, message: str
+    ) -> None:
+        path = self.write(tmp_path, **changes)
+        with pytest.raises(RecordingError, match=message) as caught:
+            load_column_map(path)
+        assert str(path) in str(caught.value)
+        assert key is None or (caught.value.topic or '').startswith(key)
+
+    def test_files_that_are_no_maps(self, tmp_path: Path) -> None:
+        path = tmp_path / 'map.yaml'
+        with pytest.raises(RecordingError, match='No such file'):
+            load_column_map(path)
+        path.write_text('- a\n- b\n')
+        with pytest.raises(RecordingError, match='a column map is a mapping'):
+            load_column_map(path)
+        path.write_text('a: [1\n')
+        with pytest.raises(RecordingError, match='not valid YAML'):
+            load_column_map(path)
+        path.write_bytes(b'\xff\xfe\x00a')
+        with pytest.raises(RecordingError, match='UTF-8'):
+            load_column_map(path)
+
+
+class TestCommand:
+    def test_says_what_it_did(self, tmp_path: Path, cli: Cli) -> None:
+        path, _ = table(tmp_path / 'log.csv')
+        map_path = tmp_path / 'map.yaml'
+        map_path.write_text(
+            'stamp: {column: ms, unit: ms}\n'
+            'accel: {columns: [ax, ay, az], unit: g, output: imu}\n'
+            'board: {column: board}\n'
+        )
+        arguments = ('convert', path, '--columns', map_path, '-o', tmp_path / 'bag')
+        said = cli(*arguments).stdout
+        assert '400 rows, 4.0 s at 100 Hz' in said
+        assert '400 imu/uncompensated' in said
+        assert cli(*arguments, code=1).stderr == (
+            f'thermo_comp: error: {tmp_path / "bag"}: exists already; --force overwrites it\n'
+        )
+        data = json.loads(cli(*arguments, '--force', '--json').stdout)
+        assert data['accel_messages'] == 400
+        assert data['stillness']['moving_ns'] == []
+        assert cli(*arguments, '--force', '-q').stdout == ''
+
+
+class TestFreezer:
+    """
+    A real MPU6050 in a freezer, with all the faults a real log has.
+
+    """
+
+    @pytest.fixture
+    def path(self, real_data: Path) -> Path:
+        path = real_data / 'freezer-mpu6050' / 'temp-calibration.csv'
+        if not path.is_file():
+            pytest.skip(f'no {path}')
+        return path
+
+    def test_every_row_is_there_and_the_faults_are_seen(self, path: Path, tmp_path: Path) -> None:
+        columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
+        report = write_log(table_log(path, columns), tmp_path / 'bag')
+        assert report.rows == report.accel_messages == 24514
+        assert report.clipped.count == 7
+        # Handled before 49 s and after 1945 s of its clock, which starts at 1.5 s.
+        first, last = report.stillness.moving_ns[0], report.stillness.moving_ns[-1]
+        assert first[0] == report.start_ns
+        assert first[1] * 1e-9 == pytest.approx(49.0, abs=3.0)
+        assert last[0] * 1e-9 == pytest.approx(1944.0, abs=3.0)
+        assert report.stillness.magnitude == pytest.approx(1.02, abs=0.03)
+        block = read_recording(tmp_path / 'bag').columns
+        assert len(block) == 24514
+        assert block.case.min() == pytest.approx(-17.8, abs=0.1)
+        assert block.board.min() == pytest.approx(3.6, abs=0.5)
+        # The air sensor holds its value between readings of its own: fewer messages than rows.
+        assert report.case_messages < 0.75 * report.rows
+
+    def test_a_map_with_the_wrong_unit_is_refused(self, path: Path, tmp_path: Path) -> None:
+        text = (ROOT / 'config' / 'columns' / 'freezer.yaml').read_text()
+        (tmp_path / 'map.yaml').write_text(text.replace('unit: g ', 'unit: m/s^2 '))
+        columns = load_column_map(tmp_path / 'map.yaml')
+        with pytest.raises(RecordingError, match='looks like g'):
+            write_log(table_log(path, columns), tmp_path / 'bag')

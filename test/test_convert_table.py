@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Tables of numbers: every layout reads alike, every bad cell is seen, every error names the place.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermo_comp.convert.table import NO_STAMP, exact_ns, read_table, sniff
+from thermo_comp.errors import RecordingError
+
+ROWS = [(1000, 0.5, -1.25), (1001, 0.25, 2e-3), (1003, -7.0, 1.5)]
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_bytes(text.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ('delimiter', 'newline', 'prefix'),
+    [
+        (',', '\n', ''),
+        (';', '\r\n', ''),
+        ('\t', '\n', '\ufeff'),
+        ('|', '\n', '# a logger wrote this\n'),
+        ('  ', '\n', '\n'),
+    ],
+    ids=['comma', 'semicolon-crlf', 'tab-bom', 'bar-comment', 'blanks'],
+)
+def test_every_layout_reads_alike(
+    tmp_path: Path, delimiter: str, newline: str, prefix: str
+) -> None:
+    lines = [delimiter.join(('t', 'a', 'b'))]
+    lines += [delimiter.join(map(str, row)) for row in ROWS]
+    path = write(tmp_path / 'log.txt', prefix + newline.join(lines) + newline)
+    table = read_table(path, ['b', 'a'], stamp='t', stamp_exponent=6)
+    assert table.stamp_ns is not None
+    assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
+    assert table.values['a'].tolist() == [row[1] for row in ROWS]
+    assert table.values['b'].tolist() == [row[2] for row in ROWS]
+    assert table.n_short == 0
+
+
+def test_headings_are_optional(tmp_path: Path) -> None:
+    path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
+    assert read_table(path, [2]).values[2].tolist() == [3.0, 6.0]
+    # A table whose first line is all words has headings, unless the user says otherwise.
+    path = write(tmp_path / 'words.txt', 'nan inf\n1 2\n')
+    assert read_table(path, [0], has_header=True).values[0].tolist() == [1.0]
+
+
+def test_line_numbers_are_those_of_an_editor(tmp_path: Path) -> None:
+    path = write(tmp_path / 'log.csv', '# made by hand\na,b\n\n1,2\nx,3\n4\n5,6\n')
+    table = read_table(path, ['a', 'b'])
+    assert table.line.tolist() == [4, 5, 7]
+    np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
+    # The row with one cell is not silently shifted: it is counted and left out.
+    assert table.n_short == 1
+
+
+def test_chunks_make_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = '\n'.join(f'{i},{i * i}' for i in range(1000))
+    path = write(tmp_path / 'log.csv', 'a,b\n' + rows + '\n')
+    whole = read_table(path, ['b'], stamp='a')
+    monkeypatch.setattr('thermo_comp.convert.table._CHUNK_ROWS', 7)
+    parts = read_table(path, ['b'], stamp='a')
+    assert whole.values['b'].tolist() == parts.values['b'].tolist()
+    assert whole.line.tolist() == parts.line.tolist()
+
+
+def test_stamps_are_exact() -> None:
+    # A float64 of nanoseconds since 1970 has steps of 256 ns.
+    cells = ['1767225600.123456789', '1767225600123456789e-9', ' +2 ', '1.5e-9']
+    assert exact_ns(cells, 9).tolist() == [
+        1767225600123456789,
+        1767225600123456789,
+        2 * 10**9,
+        2,
+    ]
+    assert exact_ns(['1767225600123456789'], 0).tolist() == [1767225600123456789]
+    bad = ['', 'soon', 'nan', 'inf', '1e40', '99999999999999999999']
+    assert exact_ns(bad, 0).tolist() == [NO_STAMP] * len(bad)
+
+
+def test_sniff_prefers_the_delimiter_that_splits_all_lines_alike() -> None:
+    assert sniff('a;b,c;d\n1,5;2,5;3,5\n') == ';'
+    assert sniff('1 2 3\n4 5 6\n') == ' '
+    assert sniff('a\tb\n1\t2\n') == '\t'
+
+
+@pytest.mark.parametrize(
+    ('text', 'column', 'message'),
+    [
+        ('', 'a', 'the table is empty'),
+        (' \n\n', 'a', 'the table is empty'),
+        ('# only a comment\n', 'a', 'the table is empty'),
+        ('a,b\n', 'a', 'headings but no rows'),
+        ('a,b\n1,2\n', 'c', "no column 'c'; there are: 'a', 'b'"),
+        ('a,a\n1,2\n', 'a', "2 columns are called 'a'"),
+        ('1,2\n3,4\n', 'a', "no column 'a': the table has no headings"),
+        ('1,2\n3,4\n', 2, 'no column 2: the table has 2, 0 to 1'),
+        ('1,2\n3,4\n', -1, 'no column -1: the table has 2, 0 to 1'),
+        ('a,b\n\0\0\n', 'a', 'it holds zero bytes'),
+    ],
+)
+def test_bad_tables_are_refused(
+    tmp_path: Path, text: str, column: str | int, message: str
+) -> None:
+    path = write(tmp_path / 'log.csv', text)
+    with pytest.raises(RecordingError, match=message) as caught:
+        read_table(path, [column])
+    assert str(path) in str(caught.value)
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match='No such file'):
+        read_table(tmp_path / 'absent.csv', ['a'])
+
+
+class TestParquet:
+    @pytest.fixture(autouse=True)
+    def needs_pyarrow(self) -> None:
+        pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+
+    def table(self, tmp_path: Path, **columns: object) -> Path:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        pq.write_table(pa.table(columns), tmp_path / 'log.parquet')
+        return tmp_path / 'log.parquet'
+
+    def test_reads_what_text_reads(self, tmp_path: Path) -> None:
+        path = self.table(
+            tmp_path, t=[row[0] for row in ROWS], a=[row[1] for row in ROWS], b=[1, None, 3]
+        )
+        table = read_table(path, ['a', 'b'], stamp='t', stamp_exponent=6)
+        assert table.stamp_ns is not None
+        assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
+        assert table.values['a'].tolist() == [row[1] for row in ROWS]
+        np.testing.assert_array_equal(table.values['b'], [1.0, np.nan, 3.0])
+
+    def test_its_own_timestamps_state_their_unit(self, tmp_path: Path) -> None:
+        path = self.table(
+            tmp_path, t=np.array([1767225600123, 0], dtype='datetime64[ms]'), a=[1.0, 2.0]
+        )
+        table = read_table(path, ['a'], stamp='t', stamp_exponent=9)
+        assert table.stamp_ns is not None
+        assert table.stamp_ns.tolist() == [1767225600123 * 10**6, 0]
+
+    def test_floats_of_seconds(self, tmp_path: Path) -> None:
+        path = self.table(tmp_path, t=[0.5, float('nan')], a=[1.0, 2.0])
+        table = read_table(path, ['a'], stamp='t', stamp_exponent=9)
+        assert table.stamp_ns is not None
+        assert table.stamp_ns.tolist() == [500_000_000, NO_STAMP]
+
+    def test_refusals(self, tmp_path: Path) -> None:
+        path = self.table(tmp_path, a=['one', 'two'])
+        with pytest.raises(RecordingError, match="column 'a' holds string"):
+            read_table(path, ['a'])
+        with pytest.raises(RecordingError, match="no column 'b'"):
+            read_table(path, ['b'])
+        with pytest.raises(RecordingError, match='the table is empty'):
+            read_table(self.table(tmp_path, a=np.array([], dtype=float)), ['a'])
+        path.write_text('a,b\n')
+        with pytest.raises(RecordingError, match='not a readable Parquet file'):
+            read_table(path, ['a'])
