@@ -207,6 +207,7 @@ def test_what_each_description_can_reach() -> None:
         seen = _Campaign(unit, cyclogram_preset('held-out'), 2)
         for kind, (low, high) in rows.items():
             error = _norm_error(kind, fitted, seen)
+            print(f'{name} {kind}: {error:.2f} ug')
             assert low < error < high, (name, kind, error)
     # The floor: 5 ug/sqrt(Hz) over 60 s is 0.65 ug, and a count per minute at 10 Hz adds 0.23.
 
