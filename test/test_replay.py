@@ -1,0 +1,249 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The offline run gives, bit for bit, what a compensator gives sample by sample in the bag's order.
+
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import rich_calibration
+from rosbags.highlevel import AnyReader
+
+from thermo_comp.calibration import Calibration, Unit
+from thermo_comp.compensator import Compensator
+from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.recording import BagWriter, Block, ImuColumns, Topics, read_recording
+from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, ReplayResult, replay, switches
+
+TOPICS = Topics()
+START_NS = 1_767_225_600_000_000_000
+SECOND_NS = 1_000_000_000
+
+
+def thermal_test(
+    path: Path, minutes: float = 40.0, rate_hz: float = 10.0, serial: str = '', imu: bool = False
+) -> Path:
+    """
+    Write a recording with a ramp between two soaks, board lagging, in several write groups.
+
+    """
+    rng = np.random.default_rng(7)
+    n = round(minutes * 60.0 * rate_hz)
+    stamps = START_NS + np.rint((np.arange(n) + 1.0) * (1e9 / rate_hz)).astype(np.int64)
+    seconds = np.arange(0.0, minutes * 60.0, 1.0)
+    case = np.interp(seconds, [0.0, 600.0, 1500.0], [12.0, 12.0, 27.0])
+    board = np.interp(seconds - 200.0, [0.0, 600.0, 1500.0], [14.0, 14.0, 28.0])
+    reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
+    accel = np.array([1800.0, -300.0, 2300.0]) + rng.integers(-3, 4, (n, 3))
+    if imu:
+        accel = accel / 300.0
+    metadata = {'serial': serial} if serial else {}
+    with BagWriter(path, metadata=metadata) as writer:
+        for rows, readings in zip(
+            np.array_split(np.arange(n), 7),
+            np.array_split(np.arange(len(seconds)), 7),
+            strict=True,
+        ):
+            for topic, values in ((TOPICS.board, board), (TOPICS.case, case)):
+                noisy = values[readings] + 0.004 * rng.standard_normal(len(readings))
+                writer.write_temperature(topic, reading_ns[readings], noisy)
+            if imu:
+                columns = imu_columns(rng, len(rows))
+                covariance = columns.linear_acceleration_covariance
+                writer.write_imu(
+                    TOPICS.imu, stamps[rows], accel[rows], covariance, 'imu_link', imu=columns
+                )
+            else:
+                writer.write_counts(TOPICS.counts, stamps[rows], accel[rows], 'imu_link')
+            writer.flush()
+    return path
+
+
+def imu_columns(rng: np.random.Generator, n: int) -> ImuColumns:
+    return ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
+
+
+def calibrated(**changes: object) -> Calibration:
+    return dataclasses.replace(rich_calibration(), **changes)
+
+
+def one_by_one(
+    block: Block, calibration: Calibration
+) -> tuple[list[tuple[int, ...]], list[tuple[int, bool]]]:
+    """
+    Run a whole recording through the streaming compensator, message by message.
+
+    """
+    compensator = Compensator(calibration)
+    readings = [
+        (int(after), kind, int(stamp), float(value))
+        for kind, (afters, stamps, values) in enumerate(
+            (
+                (block.board_after, block.board_stamp_ns, block.board),
+                (block.case_after, block.case_stamp_ns, block.case),
+            )
+        )
+        for after, stamp, value in zip(afters, stamps, values, strict=True)
+    ]
+    readings.sort(key=lambda reading: reading[0])
+    published = []
+    k = 0
+    for i, (stamp, sample) in enumerate(
+        zip(block.accel_stamp_ns.tolist(), block.accel.tolist(), strict=True)
+    ):
+        while k < len(readings) and readings[k][0] <= i:
+            push = (compensator.push_board, compensator.push_case)[readings[k][1]]
+            push(readings[k][2], readings[k][3])
+            k += 1
+        result = compensator.process(stamp, *sample)
+        if result is not None:
+            published.append((stamp, *result))
+    return published, compensator.take_flags()
+
+
+def output_of(path: Path) -> tuple[Block, list[tuple[int, bool]]]:
+    """
+    Read a corrected bag through a library that is not ours.
+
+    """
+    flags = []
+    with AnyReader([path]) as reader:
+        wanted = [c for c in reader.connections if c.topic == '/' + REGIME_TOPIC]
+        for connection, log_ns, data in reader.messages(wanted) if wanted else ():
+            flags.append((log_ns, bool(reader.deserialize(data, connection.msgtype).data)))
+    topics = Topics(imu=OUTPUT_TOPIC)
+    return read_recording(path, topics, 'imu', require=('accel',)).columns, flags
+
+
+def test_equals_the_stream_bit_for_bit(tmp_path: Path) -> None:
+    bag = thermal_test(tmp_path / 'bag')
+    calibration = rich_calibration()
+    result = replay(bag, calibration, tmp_path / 'out')
+    published, flags = one_by_one(read_recording(bag).columns, calibration)
+    block, found_flags = output_of(tmp_path / 'out')
+    expected = np.array([row[1:] for row in published])
+    assert block.accel_stamp_ns.tolist() == [row[0] for row in published]
+    assert block.accel_log_ns.tolist() == block.accel_stamp_ns.tolist()
+    assert block.accel.tobytes() == np.ascontiguousarray(expected[:, :3]).tobytes()
+    assert block.imu is not None
+    full = expected[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]]
+    assert block.imu.linear_acceleration_covariance.tobytes() == full.tobytes()
+    # What a counts message has not: neither orientation nor rate is claimed (REP 145).
+    assert set(block.imu.orientation_covariance[:, 0]) == {-1.0}
+    assert set(block.imu.angular_velocity_covariance[:, 0]) == {-1.0}
+    assert block.frame_id == 'imu_link'
+    assert found_flags == flags
+    assert result.n_flags == len(flags)
+    # Soak, ramp, soak: the detector sees the ramp.
+    assert [is_dynamic for _, is_dynamic in result.switches][:2] == [False, True]
+    assert result.switches == switches(flags)
+    assert result.counters.n_in == len(read_recording(bag).columns)
+    assert result.counters.n_out == len(block)
+
+
+def test_imu_input_passes_everything_else_through(tmp_path: Path) -> None:
+    unit = Unit('T-1', 'm/s^2', 160.0, 0.1)
+    bag = thermal_test(tmp_path / 'bag', minutes=5.0, imu=True)
+    result = replay(bag, calibrated(unit=unit), tmp_path / 'out.mcap', frame_id='tilted')
+    before = read_recording(bag).columns
+    after, _ = output_of(tmp_path / 'out.mcap')
+    assert before.imu is not None
+    assert after.imu is not None
+    assert after.frame_id == 'tilted'
+    assert result.counters.n_out == len(after) > 0
+    published = np.isin(before.accel_stamp_ns, after.accel_stamp_ns)
+    for name in (
+        'orientation',
+        'orientation_covariance',
+        'angular_velocity',
+        'angular_velocity_covariance',
+    ):
+        kept = getattr(before.imu, name)[published]
+        assert getattr(after.imu, name).tobytes() == kept.tobytes(), name
+
+
+def test_inputs_are_copied_as_they_are(tmp_path: Path) -> None:
+    bag = thermal_test(tmp_path / 'bag', minutes=3.0)
+    replay(bag, rich_calibration(), tmp_path / 'out', keep_inputs=True)
+    with AnyReader([bag]) as before, AnyReader([tmp_path / 'out']) as after:
+        messages = {}
+        for connection, _, data in before.messages():
+            messages.setdefault(connection.topic, []).append(bytes(data))
+        copies = {}
+        for connection, log_ns, data in after.messages():
+            if connection.topic in messages:
+                copies.setdefault(connection.topic, []).append(bytes(data))
+                stamp = after.deserialize(data, connection.msgtype).header.stamp
+                # One clock in the whole output: the log time is the stamp.
+                assert log_ns == stamp.sec * SECOND_NS + stamp.nanosec
+    assert copies == messages
+
+
+def test_time_outs_and_lost_temperatures_are_counted(tmp_path: Path) -> None:
+    bag = tmp_path / 'bag'
+    with BagWriter(bag) as writer:
+        stamps = START_NS + np.arange(2000) * 100_000_000
+        writer.write_temperature(TOPICS.board, [START_NS + 10 * SECOND_NS], [20.0])
+        writer.write_counts(TOPICS.counts, stamps, np.full((2000, 3), 1000.0))
+    result = replay(bag, rich_calibration(), tmp_path / 'out')
+    # Nothing before the first reading at 10 s, nothing later than 60 s after the only one.
+    assert result.counters.n_no_temperature == 100
+    assert result.counters.n_stale == 2000 - 100 - 601
+    assert result.counters.n_out == 601
+    assert result.n_flags == 0
+
+
+def test_another_unit_is_refused_unless_the_user_says_so(tmp_path: Path) -> None:
+    bag = thermal_test(tmp_path / 'bag', minutes=1.0, serial='T-2')
+    calibration = rich_calibration()
+    for serial in (None, 'T-2'):
+        with pytest.raises(CalibrationError, match=r'calibration is of unit T-1.* is of T-2'):
+            replay(bag, calibration, tmp_path / 'out', serial=serial)
+    assert not (tmp_path / 'out').exists()
+    assert isinstance(replay(bag, calibration, tmp_path / 'a', serial=''), ReplayResult)
+    assert isinstance(replay(bag, calibration, tmp_path / 'b', serial='T-1'), ReplayResult)
+
+
+def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path: Path) -> None:
+    bag = thermal_test(tmp_path / 'bag', minutes=1.0, imu=True)
+    with pytest.raises(CalibrationError, match=r'takes counts.*holds sensor_msgs/Imu'):
+        replay(bag, rich_calibration(), tmp_path / 'out', input='imu')
+    # Without being told, it looks for what the calibration is for.
+    with pytest.raises(RecordingError, match='accel/counts'):
+        replay(bag, rich_calibration(), tmp_path / 'out')
+
+
+def test_an_output_is_not_overwritten_unasked(tmp_path: Path) -> None:
+    bag = thermal_test(tmp_path / 'bag', minutes=1.0)
+    replay(bag, rich_calibration(), tmp_path / 'out')
+    with pytest.raises(RecordingError, match='exists already'):
+        replay(bag, rich_calibration(), tmp_path / 'out')
+    replay(bag, rich_calibration(), tmp_path / 'out', overwrite=True)
+
+
+def test_progress_goes_from_nothing_to_all(tmp_path: Path) -> None:
+    bag = thermal_test(tmp_path / 'bag', minutes=1.0)
+    parts: list[float] = []
+    replay(bag, rich_calibration(), tmp_path / 'out', progress=parts.append)
+    assert parts == sorted(parts)
+    assert parts[-1] == 1.0
+
+
+def test_memory_does_not_grow_with_the_bag(tmp_path: Path) -> None:
+    # Both are longer than a block; what is kept per bag are its flags, one per case reading.
+    peaks = []
+    for name, minutes in (('short', 3.0), ('long', 9.0)):
+        bag = thermal_test(tmp_path / name, minutes=minutes, rate_hz=500.0)
+        tracemalloc.start()
+        replay(bag, rich_calibration(), tmp_path / f'{name}.mcap')
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    # Three times the messages, and the larger needs less than a quarter more.
+    assert peaks[1] < 1.25 * peaks[0]
