@@ -1,0 +1,272 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the step from a serialized sample to a serialized `sensor_msgs/Imu`.
+
+A sample is read and an Imu is written at fixed places of their CDR form. Where these places are
+follows from the byte order and the length of `frame_id`, and is not taken on trust: for the first
+message of each kind the result is compared, byte by byte, with what rclpy's own deserialization
+and serialization give. A message that does not fit goes through rclpy, with identical values.
+
+CDR of a stamped message: 4 bytes of encapsulation (the second one odd: little endian), int32
+seconds, uint32 nanoseconds, uint32 length of the string with its final NUL, the string, and, at
+the next multiple of 8 counted from the end of the encapsulation, float64 values.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from struct import Struct
+from struct import error as StructError  # noqa: N812
+from typing import Any
+
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Imu, Temperature
+
+#: Compensates one sample: stamp and three components in, force and covariance out, None = drop.
+Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
+
+# An Imu is orientation 4 + 9, angular velocity 3 + 9, linear acceleration 3 + 9 float64 values.
+_PASSED = 25
+_IMU = 37
+_LAYOUTS_KEPT = 64
+
+# What rclpy raises for bytes that are not the message, or for a name that is not UTF-8.
+_UNREADABLE = (RuntimeError, ValueError)
+
+_STAMP = Struct('<iI')
+_FORCE = Struct('<12d')
+_NO_GYRO = Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
+_FOREIGN = Struct('>25Q')
+_NATIVE = Struct('<25Q')
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """
+    Where a sample of one kind holds its values, and the Imu that it becomes.
+
+    """
+
+    unpack: Callable[[bytes], tuple[Any, ...]]
+    encapsulation: bytes
+    name: bytes
+    buffer: bytearray
+    body: int
+    passed: slice | None
+    is_foreign: bool
+
+    def write(self, data: bytes, sec: int, nanosec: int, result: tuple[float, ...]) -> bytes:
+        fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
+        buffer, body = self.buffer, self.body
+        _STAMP.pack_into(buffer, 4, sec, nanosec)
+        if self.passed is not None:
+            block = data[self.passed]
+            if self.is_foreign:
+                block = _NATIVE.pack(*_FOREIGN.unpack(block))
+            buffer[body : body + 8 * _PASSED] = block
+        _FORCE.pack_into(
+            buffer, body + 8 * _PASSED, fx, fy, fz, c00, c01, c02, c01, c11, c12, c02, c12, c22
+        )
+        return bytes(buffer)
+
+
+_UNKNOWN = _Layout(Struct('<1x').unpack, b'', b'', bytearray(), 0, None, False)
+
+
+class SampleConverter:
+    """
+    Turns serialized samples into serialized Imu messages through a compensating function.
+
+    Parameters
+    ----------
+    message_type : type
+        `geometry_msgs.msg.Vector3Stamped` (counts) or `sensor_msgs.msg.Imu`.
+    frame_id : str, optional
+        The frame of the output; empty keeps that of the input.
+
+    """
+
+    def __init__(self, message_type: Any, frame_id: str = '') -> None:
+        self._message_type = message_type
+        self._frame_id = frame_id
+        self._layout = _UNKNOWN
+        self._layouts: dict[tuple[bytes, bytes, int], _Layout | None] = {}
+        #: What `process` last gave, for reports.
+        self.last_result: tuple[float, ...] | None = None
+        #: Messages that neither the layout nor rclpy could read.
+        self.n_malformed = 0
+        #: Messages that took the way through rclpy's deserialization.
+        self.n_fallback = 0
+
+    def convert(self, messages: Iterable[bytes], process: Process) -> Iterator[bytes]:
+        """
+        Compensate samples one by one.
+
+        Parameters
+        ----------
+        messages : iterable of bytes
+            Serialized samples, oldest first.
+        process : callable
+            Called once for each readable sample with its stamp [ns] and three components.
+
+        Yields
+        ------
+        bytes
+            A serialized Imu for each sample that `process` did not drop.
+
+        """
+        layout = self._layout
+        for data in messages:
+            try:
+                encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
+                is_known = name == layout.name and encapsulation == layout.encapsulation
+            except StructError:
+                is_known = False
+            if not is_known:
+                found = self._layout_of(data)
+                if found is None:
+                    written = self._convert_message(data, process)
+                    if written is not None:
+                        yield written
+                    continue
+                self._layout = layout = found
+                encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
+            result = process(sec * 1_000_000_000 + nanosec, x, y, z)
+            if result is not None:
+                self.last_result = result
+                yield layout.write(data, sec, nanosec, result)
+
+    def _layout_of(self, data: bytes) -> _Layout | None:
+        """
+        Look up, or learn and check, where this message holds its values.
+
+        """
+        if len(data) < 16:
+            return None
+        order = '<' if data[1] & 1 else '>'
+        (length,) = Struct(order + 'I').unpack_from(data, 12)
+        if not 0 < length <= len(data) - 16:
+            return None
+        key = (data[:4], data[12 : 16 + length], len(data))
+        if key not in self._layouts:
+            if len(self._layouts) >= _LAYOUTS_KEPT:
+                self._layouts.clear()
+            self._layouts[key] = self._learn(data, order, length)
+        return self._layouts[key]
+
+    def _learn(self, data: bytes, order: str, length: int) -> _Layout | None:
+        """
+        Build the layout of this message; None if rclpy reads or writes anything else.
+
+        """
+        is_imu = self._message_type is Imu
+        padding = -(12 + length) % 8
+        skip = 8 * _PASSED if is_imu else 0
+        rest = 72 if is_imu else 0
+        pattern = Struct(f'{order}4siI{4 + length}s{padding + skip}x3d{rest}x')
+        name = data[12 : 16 + length]
+        frame = self._frame_id.encode() + b'\0' if self._frame_id else name[4:]
+        head = Struct(f'<4x8xI{len(frame)}s{-(12 + len(frame)) % 8}x')
+        buffer = bytearray(head.pack(len(frame), frame) + _NO_GYRO + bytes(8 * (_IMU - _PASSED)))
+        buffer[:4] = b'\0\1\0\0'
+        start = 16 + length + padding
+        layout = _Layout(
+            pattern.unpack,
+            data[:4],
+            name,
+            buffer,
+            head.size,
+            slice(start, start + skip) if is_imu else None,
+            order == '>',
+        )
+        try:
+            sec, nanosec, _, *values = pattern.unpack(data)[1:]
+            message = deserialize_message(data, self._message_type)
+            example = tuple(range(1, 10))
+            written = layout.write(data, sec, nanosec, example)
+            expected = self._write_message(message, example)
+        except (StructError, *_UNREADABLE):
+            return None
+        # The bytes of padding are whatever rclpy found in memory.
+        end = 16 + len(frame)
+        is_same = _bits(values) == _bits(_components(message)) and (
+            (written[:end], written[head.size :]) == (expected[:end], expected[head.size :])
+        )
+        return layout if is_same else None
+
+    def _convert_message(self, data: bytes, process: Process) -> bytes | None:
+        """
+        Take the ordinary way, for what no layout fits.
+
+        """
+        try:
+            message = deserialize_message(data, self._message_type)
+        except _UNREADABLE:
+            self.n_malformed += 1
+            return None
+        self.n_fallback += 1
+        result = process(_stamp_ns(message), *_components(message))
+        if result is None:
+            return None
+        self.last_result = result
+        return self._write_message(message, result)
+
+    def _write_message(self, message: Any, result: tuple[float, ...]) -> bytes:
+        """
+        Write the Imu through rclpy.
+
+        """
+        if self._message_type is Imu:
+            imu = message
+        else:
+            imu = Imu(header=message.header)
+            imu.orientation_covariance[0] = -1.0
+            imu.angular_velocity_covariance[0] = -1.0
+        if self._frame_id:
+            imu.header.frame_id = self._frame_id
+        fx, fy, fz, c00, c01, c02, c11, c12, c22 = map(float, result)
+        force = imu.linear_acceleration
+        force.x, force.y, force.z = fx, fy, fz
+        imu.linear_acceleration_covariance[:] = [c00, c01, c02, c01, c11, c12, c02, c12, c22]
+        written: bytes = serialize_message(imu)
+        return written
+
+
+def read_temperature(data: bytes) -> tuple[int, float] | None:
+    """
+    Read a serialized `sensor_msgs/Temperature`.
+
+    Parameters
+    ----------
+    data : bytes
+        The serialized message.
+
+    Returns
+    -------
+    tuple of (int, float) or None
+        Stamp [ns] and temperature; None if the bytes are no such message.
+
+    """
+    try:
+        message = deserialize_message(data, Temperature)
+    except _UNREADABLE:
+        return None
+    return _stamp_ns(message), message.temperature
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
+
+
+def _components(message: Any) -> tuple[float, float, float]:
+    vector = message.vector if isinstance(message, Vector3Stamped) else message.linear_acceleration
+    return vector.x, vector.y, vector.z
+
+
+def _bits(values: Iterable[float]) -> bytes:
+    return Struct('<3d').pack(*values)

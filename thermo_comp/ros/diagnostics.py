@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what the node says about itself: the compensator's status as a `DiagnosticStatus`.
+
+The level follows one rule. ERROR: nothing good goes out, or samples are saturated. WARN: what goes
+out is worse than the calibration promises. OK: the rest. The message names every reason, the worst
+first; the key values hold the figures.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from ..compensator import CompensatorStatus, Counters
+from ..regime import Regime
+from .loading import LoadedCalibration
+
+#: A sample rate further from the calibrated one than this is worth a warning.
+RATE_TOLERANCE = 0.1
+
+_REGIMES = {Regime.UNKNOWN: 'unknown', Regime.STATIC: 'static', Regime.DYNAMIC: 'dynamic'}
+_DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """
+    What the node itself counts, beside the compensator's counters.
+
+    """
+
+    #: Output messages that the middleware did not accept.
+    n_unpublished: int = 0
+    #: Messages that could not be read.
+    n_malformed: int = 0
+    #: Samples that took the slow way through rclpy's deserialization.
+    n_fallback: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """
+    The node at one moment.
+
+    Attributes
+    ----------
+    status : CompensatorStatus
+    traffic : Traffic
+    variances : tuple of float or None
+        Diagonal of the covariance last published [m^2/s^4].
+
+    """
+
+    status: CompensatorStatus
+    traffic: Traffic
+    variances: tuple[float, float, float] | None
+
+
+def build(
+    name: str, loaded: LoadedCalibration, now: Snapshot, before: Snapshot
+) -> DiagnosticArray:
+    """
+    Say how the compensation is doing.
+
+    Parameters
+    ----------
+    name : str
+        Name of the node.
+    loaded : LoadedCalibration
+        The running calibration.
+    now, before : Snapshot
+        The node now and at the last report; differences tell what happened in between.
+
+    Returns
+    -------
+    diagnostic_msgs.msg.DiagnosticArray
+        Stamped with the newest input stamp, or 0 before there is any.
+
+    """
+    findings = sorted(_findings(loaded, now, before), key=lambda finding: -finding[0])
+    status = DiagnosticStatus(
+        level=bytes([findings[0][0] if findings else 0]),
+        name=f'{name}: compensation',
+        message='; '.join(text for _, text in findings) or _all_well(now),
+        hardware_id=loaded.calibration.unit.serial,
+        values=[KeyValue(key=key, value=value) for key, value in _values(loaded, now, before)],
+    )
+    array = DiagnosticArray(status=[status])
+    stamp_ns = now.status.stamp_ns or 0
+    array.header.stamp.sec, array.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+    return array
+
+
+def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
+    """
+    List everything that is not as it should be, with its level.
+
+    """
+    error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
+    status, new = now.status, _since(now.status.counters, before.status.counters)
+    found: list[tuple[int, str]] = []
+    if new.n_in == 0:
+        found.append((error, 'no samples are coming in'))
+    if status.state is None:
+        found.append((error, 'no board temperature yet, nothing is published'))
+    elif status.is_board_lost:
+        found.append(
+            (error, f'board temperature {status.board_age_s:.1f} s old, nothing is published')
+        )
+    elif status.is_board_stale:
+        found.append((warn, f'board temperature {status.board_age_s:.1f} s old, held'))
+    if new.n_saturated:
+        full_scale = loaded.calibration.unit.full_scale
+        found.append((error, f'{new.n_saturated} samples saturated (+-{full_scale:g}), dropped'))
+    if status.state is not None and status.is_case_lost:
+        found.append((warn, 'case temperature lost, the board sensor decides the regime'))
+    if status.temperature_excess_k:
+        found.append(
+            (
+                warn,
+                f'board temperature {status.temperature_excess_k:+.2f} K outside the '
+                'calibrated range, held at its edge',
+            )
+        )
+    if status.rate_excess_k_min:
+        found.append(
+            (
+                warn,
+                f'temperature rate {status.rate_excess_k_min:+.2f} K/min outside the '
+                'calibrated range, held at its edge',
+            )
+        )
+    for count, text in (
+        (new.n_not_finite, 'samples not finite, dropped'),
+        (new.n_out_of_order, 'samples out of order, dropped'),
+        (new.n_time_jumps, 'jumps of time backwards, estimators reset'),
+        (now.traffic.n_malformed - before.traffic.n_malformed, 'messages unreadable, dropped'),
+        (now.traffic.n_unpublished - before.traffic.n_unpublished, 'messages not accepted by DDS'),
+    ):
+        if count:
+            found.append((warn, f'{count} {text}'))
+    rate, calibrated = _sample_rate(now, before), 1.0 / loaded.calibration.unit.cycle_time_s
+    if rate is not None and abs(rate / calibrated - 1.0) > RATE_TOLERANCE:
+        found.append((warn, f'{rate:.4g} samples/s, calibrated for {calibrated:.4g}'))
+    return found
+
+
+def _all_well(now: Snapshot) -> str:
+    state = now.status.state
+    if state is None or state.regime == Regime.UNKNOWN:
+        return 'regime not known yet, the static set applies'
+    return f'{_REGIMES[state.regime]} regime'
+
+
+def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[tuple[str, str]]:
+    """
+    List the figures, in the order in which a reader wants them.
+
+    """
+    status, counters = now.status, now.status.counters
+    state = status.state
+    values = [('regime', 'unknown' if state is None else _REGIMES[state.regime])]
+    if state is not None:
+        values += [
+            ('direction', _DIRECTIONS[state.direction]),
+            ('dynamic weight', f'{state.weight:.3f}'),
+            ('board temperature [degC]', f'{state.board:.4f}'),
+            ('board temperature sd [K]', f'{math.sqrt(state.var_board):.4f}'),
+            ('board rate [K/min]', f'{60.0 * state.rate:.4f}'),
+            ('case minus board [K]', f'{state.gradient:.4f}'),
+            ('memory settled', str(state.is_settled)),
+        ]
+    values += [
+        ('board age [s]', f'{status.board_age_s:.3f}'),
+        ('case age [s]', f'{status.case_age_s:.3f}'),
+        ('temperature excess [K]', f'{status.temperature_excess_k:.3f}'),
+        ('rate excess [K/min]', f'{status.rate_excess_k_min:.3f}'),
+    ]
+    if now.variances is not None:
+        values += [
+            (f'sd {axis} [m/s^2]', f'{math.sqrt(variance):.3e}')
+            for axis, variance in zip('xyz', now.variances, strict=True)
+        ]
+    rate = _sample_rate(now, before)
+    values += [
+        ('sample rate [Hz]', 'unknown' if rate is None else f'{rate:.2f}'),
+        ('calibrated rate [Hz]', f'{1.0 / loaded.calibration.unit.cycle_time_s:.2f}'),
+        ('samples in', str(counters.n_in)),
+        ('samples out', str(counters.n_out - now.traffic.n_unpublished)),
+    ]
+    values += [
+        (entry.name.removeprefix('n_').replace('_', ' '), str(getattr(counters, entry.name)))
+        for entry in fields(Counters)
+        if entry.name != 'n_out'
+    ]
+    values += [
+        (entry.name.removeprefix('n_'), str(getattr(now.traffic, entry.name)))
+        for entry in fields(Traffic)
+    ]
+    return [
+        *values,
+        ('serial', loaded.calibration.unit.serial),
+        ('calibration file', loaded.path),
+        ('calibration sha256', loaded.sha256),
+        ('calibration date', loaded.calibration.provenance.created),
+    ]
+
+
+def _since(now: Counters, before: Counters) -> Counters:
+    return replace(
+        now,
+        **{one.name: getattr(now, one.name) - getattr(before, one.name) for one in fields(now)},
+    )
+
+
+def _sample_rate(now: Snapshot, before: Snapshot) -> float | None:
+    """
+    Return samples per second of data time since the last report; None where it can't be told.
+
+    """
+    start_ns, end_ns = before.status.stamp_ns, now.status.stamp_ns
+    n_new = now.status.counters.n_in - before.status.counters.n_in
+    if start_ns is None or end_ns is None or end_ns <= start_ns:
+        return None
+    if not (n_new and before.status.counters.n_in):
+        return None
+    return n_new / ((end_ns - start_ns) * 1e-9)

@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the step from the parameter `calibration_file` to a calibration that this node may run.
+
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..calibration import Calibration
+from ..calibration_file import SIZE_LIMIT, parse_calibration
+from ..errors import CalibrationError
+from ..files import read_bounded
+from .parameters import NodeConfig
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedCalibration:
+    """
+    A calibration and the file it stands for.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    path : str
+        As the user gave it.
+    sha256 : str
+        Of the very bytes that were parsed.
+
+    """
+
+    calibration: Calibration
+    path: str
+    sha256: str
+
+
+def load(config: NodeConfig) -> LoadedCalibration:
+    """
+    Read the calibration that a configuration asks for.
+
+    Parameters
+    ----------
+    config : NodeConfig
+        Names the file, the expected serial number and the input.
+
+    Returns
+    -------
+    LoadedCalibration
+        Parsed, validated, and of the right unit.
+
+    Raises
+    ------
+    CalibrationError
+        If no file is named, if it is not a valid calibration, or if it is not for this unit.
+
+    """
+    if not config.calibration_file:
+        raise CalibrationError(
+            'parameter `calibration_file` is not set; start with '
+            '--ros-args -p calibration_file:=PATH'
+        )
+    path = Path(config.calibration_file).expanduser()
+    try:
+        content = read_bounded(path, SIZE_LIMIT)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, 'strerror', None) or str(error)
+        raise CalibrationError(f'cannot be read: {reason}', path) from error
+    loaded = LoadedCalibration(
+        parse_calibration(content, path),
+        config.calibration_file,
+        hashlib.sha256(content).hexdigest(),
+    )
+    check(loaded, config)
+    return loaded
+
+
+def check(loaded: LoadedCalibration, config: NodeConfig) -> None:
+    """
+    Make sure that a calibration is for the unit and the input of a configuration.
+
+    Parameters
+    ----------
+    loaded : LoadedCalibration
+        A valid calibration.
+    config : NodeConfig
+        Names the expected serial number and the input.
+
+    Raises
+    ------
+    CalibrationError
+        If the serial number or the unit of the input differ.
+
+    """
+    unit = loaded.calibration.unit
+    if config.serial and unit.serial != config.serial:
+        raise CalibrationError(
+            f'must be {config.serial!r} (parameter `serial`), got {unit.serial!r}',
+            loaded.path,
+            'unit.serial',
+        )
+    if config.input == 'imu' and unit.input != 'm/s^2':
+        raise CalibrationError(
+            f"must be 'm/s^2' (parameter `input` is imu), got {unit.input!r}",
+            loaded.path,
+            'unit.input',
+        )

@@ -1,0 +1,282 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the node's parameters: one table gives types, defaults, ranges, descriptors and documentation.
+
+The table is `NodeConfig` itself, a frozen dataclass: what the node runs with at any moment is one
+such object, and a change makes another one or is refused as a whole.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import Field, dataclass, field, fields, replace
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from ..compensator import CompensatorConfig
+from ..errors import ThermoCompError
+
+_DEFAULTS = CompensatorConfig()
+
+_TYPES = {str: Parameter.Type.STRING, float: Parameter.Type.DOUBLE}
+
+
+def _parameter(
+    default: Any,
+    description: str,
+    bounds: tuple[float, float] | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    metadata = {'description': description, 'bounds': bounds, 'choices': choices}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class NodeConfig:
+    """
+    The node's parameters, every one of them live.
+
+    Attributes
+    ----------
+    calibration_file, serial, input, frame_id : str
+    transition_time, temperature_timeout, case_timeout, diagnostics_period : float
+        Seconds.
+
+    """
+
+    calibration_file: str = _parameter(
+        '', 'Path of the calibration (YAML). Required. Setting it again reads the file again.'
+    )
+    serial: str = _parameter(
+        '', 'Serial number that the calibration must be for; empty accepts any.'
+    )
+    input: str = _parameter(
+        'counts',
+        'What is compensated: accel/counts (Vector3Stamped) or imu/uncompensated (Imu).',
+        choices=('counts', 'imu'),
+    )
+    frame_id: str = _parameter(
+        '', "Frame of the output; empty keeps the input's. The values are not rotated."
+    )
+    transition_time: float = _parameter(
+        _DEFAULTS.transition_time_s,
+        'Time over which the sets cross over at a switch [s]; 0 switches at once.',
+        (0.0, 3600.0),
+    )
+    temperature_timeout: float = _parameter(
+        _DEFAULTS.temperature_timeout_s,
+        'Age of the board temperature at which publishing stops [s].',
+        (0.1, 86400.0),
+    )
+    case_timeout: float = _parameter(
+        _DEFAULTS.case_timeout_s,
+        'Age of the case temperature at which the board sensor decides the regime [s].',
+        (0.1, 86400.0),
+    )
+    diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
+
+    def compensator_config(self) -> CompensatorConfig:
+        """
+        Return the part that the compensator takes.
+
+        """
+        return CompensatorConfig(
+            transition_time_s=self.transition_time,
+            temperature_timeout_s=self.temperature_timeout,
+            case_timeout_s=self.case_timeout,
+        )
+
+
+_TABLE: Mapping[str, Field[Any]] = {entry.name: entry for entry in fields(NodeConfig)}
+
+
+class ParameterError(ThermoCompError):
+    """
+    A parameter value that the node can't take; names the parameter, the rule and the value.
+
+    """
+
+
+def declare(node: Node) -> NodeConfig:
+    """
+    Declare every parameter on a node and return what the user's overrides make of them.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        A node without these parameters.
+
+    Returns
+    -------
+    NodeConfig
+        The values in force.
+
+    Raises
+    ------
+    ParameterError
+        If an override has a wrong type or is out of its range.
+
+    """
+    values: dict[str, Any] = {}
+    for name, entry in _TABLE.items():
+        # Looked at before it is declared for good: an integer override of a float is welcome.
+        probe = ParameterDescriptor(dynamic_typing=True)
+        override = node.declare_parameter(name, entry.default, probe).value
+        node.undeclare_parameter(name)
+        values[name] = _checked(name, override)
+        node.declare_parameter(name, values[name], descriptor(name), ignore_override=True)
+    return NodeConfig(**values)
+
+
+def descriptor(name: str) -> ParameterDescriptor:
+    """
+    Describe one parameter as ROS tools show it.
+
+    Parameters
+    ----------
+    name : str
+        A field of `NodeConfig`.
+
+    Returns
+    -------
+    rcl_interfaces.msg.ParameterDescriptor
+        With type, range and description.
+
+    """
+    entry = _TABLE[name]
+    described = ParameterDescriptor(
+        name=name,
+        type=_TYPES[type(entry.default)].value,
+        description=entry.metadata['description'],
+    )
+    if entry.metadata['bounds']:
+        lower, upper = entry.metadata['bounds']
+        described.floating_point_range = [FloatingPointRange(from_value=lower, to_value=upper)]
+    if entry.metadata['choices']:
+        described.additional_constraints = f'one of: {", ".join(entry.metadata["choices"])}'
+    return described
+
+
+def coerce(parameters: Iterable[Parameter]) -> list[Parameter]:
+    """
+    Turn whole numbers into floats where a float is wanted (``ros2 param set ... 5``).
+
+    Parameters
+    ----------
+    parameters : iterable of rclpy.parameter.Parameter
+        As they came in.
+
+    Returns
+    -------
+    list of rclpy.parameter.Parameter
+        The same, with integers made floats for this node's float parameters.
+
+    """
+    return [
+        Parameter(one.name, Parameter.Type.DOUBLE, float(one.value))
+        if one.type_ == Parameter.Type.INTEGER
+        and one.name in _TABLE
+        and isinstance(_TABLE[one.name].default, float)
+        else one
+        for one in parameters
+    ]
+
+
+def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
+    """
+    Apply new parameter values to a configuration; others' parameters are passed over.
+
+    Parameters
+    ----------
+    config : NodeConfig
+        What is in force.
+    parameters : iterable of rclpy.parameter.Parameter
+        The values set together.
+
+    Returns
+    -------
+    NodeConfig
+        What would be in force.
+
+    Raises
+    ------
+    ParameterError
+        If a value has a wrong type or is out of its range.
+
+    """
+    values = {one.name: _checked(one.name, one.value) for one in parameters if one.name in _TABLE}
+    return replace(config, **values)
+
+
+def parameters_table() -> str:
+    """
+    Write the parameters as a Markdown table for the README.
+
+    Returns
+    -------
+    str
+        Header and one row per parameter, with a final newline.
+
+    """
+    rows = ['| parameter | type | default | range | what it does |', '|---|---|---|---|---|']
+    for name, entry in _TABLE.items():
+        kind = 'string' if isinstance(entry.default, str) else 'double'
+        default = f"'{entry.default}'" if isinstance(entry.default, str) else f'{entry.default:g}'
+        limits = ''
+        if entry.metadata['bounds']:
+            limits = '{:g} .. {:g}'.format(*entry.metadata['bounds'])
+        if entry.metadata['choices']:
+            limits = ', '.join(f'`{choice}`' for choice in entry.metadata['choices'])
+        description = entry.metadata['description']
+        rows.append(f'| `{name}` | {kind} | `{default}` | {limits} | {description} |')
+    return '\n'.join(rows) + '\n'
+
+
+def parameters_help() -> str:
+    """
+    Write the parameters as plain text for a terminal.
+
+    Returns
+    -------
+    str
+        Two lines per parameter.
+
+    """
+    return '\n'.join(
+        f'  {name}:={entry.default!r}\n      {entry.metadata["description"]}'
+        for name, entry in _TABLE.items()
+    )
+
+
+def _checked(name: str, value: Any) -> Any:
+    """
+    Return a value in its parameter's type; ParameterError where it does not fit.
+
+    """
+    entry = _TABLE[name]
+    if isinstance(entry.default, str):
+        if not isinstance(value, str):
+            raise ParameterError(
+                f'parameter `{name}` must be a string, got {value!r} '
+                f'({type(value).__name__}); quote it: \'"{value}"\''
+            )
+        choices = entry.metadata['choices']
+        if choices and value not in choices:
+            raise ParameterError(
+                f'parameter `{name}` must be one of {", ".join(choices)}, got {value!r}'
+            )
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ParameterError(f'parameter `{name}` must be a number, got {value!r}')
+    lower, upper = entry.metadata['bounds']
+    if not (math.isfinite(value) and lower <= value <= upper):
+        raise ParameterError(
+            f'parameter `{name}` must be between {lower:g} and {upper:g}, got {value:g}'
+        )
+    return float(value)

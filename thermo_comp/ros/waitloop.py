@@ -1,0 +1,329 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the node's loop around one wait set, and everything that leaves rclpy's documented API.
+
+rclpy's executor builds a wait set, a generator and a coroutine for each message, which costs ten
+times the compensation itself. Here the subscriptions of the hot path are kept from the executor,
+one wait set is reused, and a wake-up empties their queues. Everything else of the node (services,
+timers, other subscriptions, middleware events) is served by an ordinary executor, which is asked
+only when the wait set says that one of these is ready; while samples flow, the wait set holds them
+now and then only.
+
+Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
+`take_message` and `publish_raw` of the handles, `SignalHandlerGuardCondition`, and the node's
+`_parameter_overrides`.
+`test/test_waitloop.py` fails when any of them changes.
+
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.guard_condition import GuardCondition
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerGuardCondition
+from rclpy.subscription import Subscription
+
+#: The most messages taken in one go, so that a flood cannot keep the rest of the node waiting.
+DRAIN_LIMIT = 4096
+
+#: While samples flow, services and timers are looked after this often [ns].
+OTHERS_PERIOD_NS = 20_000_000
+
+RCLError = rclpy_implementation.RCLError
+
+
+class _Reserved(ReentrantCallbackGroup):  # type: ignore[misc]  # rclpy counts as untyped
+    """
+    Keeps subscriptions from the executor; their middleware events it still serves.
+
+    """
+
+    def can_execute(self, entity: Any) -> bool:
+        return not isinstance(entity, Subscription)
+
+
+class RawSubscription:
+    """
+    A subscription read in serialized form by whoever runs the loop, not by an executor.
+
+    Parameters
+    ----------
+    subscription : rclpy.subscription.Subscription
+        Created by `WaitLoop.subscribe`.
+
+    """
+
+    def __init__(self, subscription: Subscription) -> None:
+        self.subscription = subscription
+        self._message_type = subscription.msg_type
+        self._take: Callable[[Any, bool], Any] = subscription.handle.take_message
+
+    def drain(self) -> tuple[list[bytes], list[int]]:
+        """
+        Take what waits in the queue, oldest first, at most `DRAIN_LIMIT` messages.
+
+        Returns
+        -------
+        messages : list of bytes
+            Serialized.
+        received_ns : list of int
+            When the middleware got each of them; comparable between subscriptions.
+
+        """
+        take, message_type = self._take, self._message_type
+        messages: list[bytes] = []
+        received_ns: list[int] = []
+        while len(messages) < DRAIN_LIMIT:
+            taken = take(message_type, True)
+            if taken is None:
+                break
+            message, info = taken
+            messages.append(message)
+            received_ns.append(info['received_timestamp'])
+        return messages, received_ns
+
+
+class RawPublisher:
+    """
+    A publisher of serialized messages.
+
+    Parameters
+    ----------
+    publisher : rclpy.publisher.Publisher
+        An ordinary publisher of the node.
+
+    """
+
+    def __init__(self, publisher: Publisher) -> None:
+        self.publisher = publisher
+        #: Called with the bytes of one message; raises `RCLError` when they can't go out.
+        self.publish: Callable[[bytes], None] = publisher.handle.publish_raw
+
+
+@dataclass(frozen=True, slots=True)
+class _Entities:
+    """
+    A wait set, and what goes into it: the raw subscriptions alone, or everything.
+
+    """
+
+    wait_set: Any
+    fill_raw: list[tuple[Callable[[Any], Any], Any]]
+    fill: list[tuple[Callable[[Any], Any], Any]]
+    other_subscriptions: range
+
+    def is_other_ready(self) -> bool:
+        """
+        Tell whether something is ready that the executor serves.
+
+        """
+        ready, is_ready = self.wait_set.get_ready_entities, self.wait_set.is_ready
+        return bool(
+            ready('service')
+            or ready('timer')
+            or ready('client')
+            or any(is_ready('subscription', index) for index in self.other_subscriptions)
+        )
+
+
+class WaitLoop:
+    """
+    One wait set over a node: raw subscriptions for the caller, the rest for an executor.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        The node to serve. It must not be added to another executor.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._stop_guard = GuardCondition(None, None, context=node.context)
+        self._signal_guard = SignalHandlerGuardCondition(context=node.context)
+        self._reserved = _Reserved()
+        self._raw: list[RawSubscription] = []
+        self._is_stopping = False
+        self._is_stale = True
+        node.context.on_shutdown(self.stop)
+
+    def subscribe(self, message_type: Any, topic: str, qos: QoSProfile) -> RawSubscription:
+        """
+        Subscribe to a topic in serialized form, QoS overridable through parameters.
+
+        Parameters
+        ----------
+        message_type : type
+            The ROS message class.
+        topic : str
+            Relative topic name.
+        qos : rclpy.qos.QoSProfile
+            The default quality of service.
+
+        Returns
+        -------
+        RawSubscription
+            Whose `drain` gives the messages.
+
+        """
+        subscription = self._node.create_subscription(
+            message_type,
+            topic,
+            _never_called,
+            qos,
+            raw=True,
+            callback_group=self._reserved,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        raw = RawSubscription(subscription)
+        self._raw.append(raw)
+        self._is_stale = True
+        return raw
+
+    def unsubscribe(self, raw: RawSubscription) -> None:
+        """
+        Destroy a subscription of this loop.
+
+        Parameters
+        ----------
+        raw : RawSubscription
+            From `subscribe`.
+
+        """
+        self._raw.remove(raw)
+        self._is_stale = True
+        self._node.destroy_subscription(raw.subscription)
+
+    def stop(self) -> None:
+        """
+        Make `run` return; callable from any thread.
+
+        """
+        self._is_stopping = True
+        with suppress(InvalidHandle):
+            self._stop_guard.trigger()
+
+    def run(self, on_data: Callable[[], None]) -> None:
+        """
+        Wait and serve until the context shuts down, a signal arrives or `stop` is called.
+
+        Parameters
+        ----------
+        on_data : callable
+            Called after a wake-up; drains all raw subscriptions.
+
+        """
+        try:
+            while not self._is_stopping:
+                with ExitStack() as in_use:
+                    self._serve(on_data, self._collect(in_use))
+        except (RCLError, ExternalShutdownException):
+            if self._node.context.ok():
+                raise
+
+    def close(self) -> None:
+        """
+        Release the executor and the guard conditions; the node itself stays.
+
+        """
+        self._executor.shutdown()
+        self._stop_guard.destroy()
+        self._signal_guard.destroy()
+
+    def _collect(self, in_use: ExitStack) -> _Entities:
+        """
+        Build a wait set for all that the node has now, and the calls that fill it.
+
+        """
+        raw = [one.subscription for one in self._raw]
+        others = [one for one in self._node.subscriptions if one not in raw]
+        guards = [self._stop_guard, self._signal_guard]
+        timers, clients = list(self._node.timers), list(self._node.clients)
+        services = list(self._node.services)
+        for entity in (*raw, *others, *guards, *timers, *clients, *services):
+            in_use.enter_context(entity.handle)
+        in_use.enter_context(self._node.context.handle)
+        wait_set = rclpy_implementation.WaitSet(
+            len(raw) + len(others),
+            len(guards),
+            len(timers),
+            len(clients),
+            len(services),
+            0,
+            self._node.context.handle,
+        )
+        fill = [(wait_set.add_subscription, one.handle) for one in (*raw, *others)]
+        fill += [(wait_set.add_guard_condition, one.handle) for one in guards]
+        fill += [(wait_set.add_timer, one.handle) for one in timers]
+        fill += [(wait_set.add_client, one.handle) for one in clients]
+        fill += [(wait_set.add_service, one.handle) for one in services]
+        self._is_stale = False
+        return _Entities(wait_set, fill[: len(raw)], fill, range(len(raw), len(raw) + len(others)))
+
+    def _serve(self, on_data: Callable[[], None], entities: _Entities) -> None:
+        """
+        Wait and serve until the entities change or the loop is to stop.
+
+        """
+        clear, wait = entities.wait_set.clear_entities, entities.wait_set.wait
+        now_ns, others_due_ns = time.monotonic_ns, 0
+        while not (self._is_stopping or self._is_stale):
+            clear()
+            left_ns = others_due_ns - now_ns()
+            if left_ns > 0:
+                for add, handle in entities.fill_raw:
+                    add(handle)
+                wait(left_ns)
+                on_data()
+                continue
+            for add, handle in entities.fill:
+                add(handle)
+            wait(-1)
+            on_data()
+            others_due_ns = now_ns() + OTHERS_PERIOD_NS
+            if entities.wait_set.get_ready_entities('guard_condition'):
+                self._is_stopping = True
+            elif entities.is_other_ready():
+                self._executor.spin_once(timeout_sec=0.0)
+                self._is_stale = True
+
+
+def _never_called(message: bytes) -> None:
+    """
+    Stand in for the callback that an executor would call.
+
+    """
+
+
+def undeclared_overrides(node: Node) -> list[str]:
+    """
+    Name the parameters that the user gave and the node does not have: misspelt, most likely.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        With all its parameters declared.
+
+    Returns
+    -------
+    list of str
+        Their names, sorted.
+
+    """
+    return sorted(name for name in node._parameter_overrides if not node.has_parameter(name))  # noqa: SLF001
