@@ -7,6 +7,7 @@ Owns ``thermo_comp convert``: other people's logs into bags.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,42 +17,84 @@ from . import options
 from .output import Output
 
 if TYPE_CHECKING:
-    from ..convert import ConversionReport
+    from ..convert import ConversionReport, ForeignLog
     from ..convert.log import Finding
 
 
 def convert(
     log: Annotated[
-        Path, typer.Argument(help='Table of numbers: .csv, .tsv, .txt, .parquet.', metavar='FILE')
+        Path,
+        typer.Argument(
+            help='Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin).',
+            metavar='FILE',
+        ),
     ],
     output: Annotated[
         Path, typer.Option('--output', '-o', help='Bag to write; *.mcap makes a bare file.')
     ],
     columns: Annotated[
-        Path, typer.Option(help='Column map (YAML): what is where, in which unit.')
-    ],
+        Path | None,
+        typer.Option(help='Column map of a table (YAML): what is where, in which unit.'),
+    ] = None,
+    imu: Annotated[int | None, typer.Option(help='IMU of a log, counted from 0.')] = None,
+    baro: Annotated[
+        int | None, typer.Option(help='Barometer of a log, for the case temperature.')
+    ] = None,
+    allow_compensated: Annotated[
+        bool, typer.Option(help='Take an ArduPilot log corrected by INS_TCAL.')
+    ] = False,
     force: options.Force = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """
-    Make a bag of any table of numbers.
+    Make a bag of a table of numbers or of an autopilot's log.
 
-    The column map says which column is what and in which unit; what the
-    sensor reads at rest must agree with it. config/columns has examples.
+    A table needs a column map: which column is what, in which unit; what the
+    sensor reads at rest must agree with it. config/columns has examples. Of a
+    PX4 or ArduPilot log the IMU's own temperature becomes the board's, the
+    barometer's the case's.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
+      thermo_comp convert flight.ulg --imu 1 -o unit43
 
     """
-    from ..convert import load_column_map, table_log, write_log
+    from ..convert import write_log
 
     out = Output(as_json, quiet)
     options.refuse_existing(output, force)
-    column_map = load_column_map(columns)
+    read = _reader(log, columns, imu, baro, allow_compensated)
     with out.progress('converting', total=1.0) as done:
-        report = write_log(table_log(log, column_map), output, force, done)
+        report = write_log(read(), output, force, done)
     say(out, report)
+
+
+def _reader(
+    log: Path, columns: Path | None, imu: int | None, baro: int | None, allow_compensated: bool
+) -> Callable[[], ForeignLog]:
+    """
+    Tell the format by the file's name, and refuse options that it has no use for.
+
+    """
+    from ..convert import dataflash_log, load_column_map, table_log, ulog_log
+
+    suffix = log.suffix.lower()
+    is_log = suffix in ('.ulg', '.bin')
+    if is_log and columns is not None:
+        raise options.usage(f'a {suffix} log needs no --columns')
+    if allow_compensated and suffix != '.bin':
+        raise options.usage('--allow-compensated is for ArduPilot logs (.bin)')
+    if suffix == '.ulg':
+        return lambda: ulog_log(log, imu, baro)
+    if suffix == '.bin':
+        return lambda: dataflash_log(log, imu, baro, allow_compensated)
+    if imu is not None or baro is not None:
+        raise options.usage('--imu and --baro are for PX4 and ArduPilot logs (.ulg, .bin)')
+    if columns is None:
+        raise options.usage('a table needs --columns MAP')
+    column_map = load_column_map(columns)
+    return lambda: table_log(log, column_map)
 
 
 def say(out: Output, report: ConversionReport) -> None:

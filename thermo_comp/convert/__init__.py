@@ -7,13 +7,17 @@ Owns the way from other people's logs to bags: tables with a column map, PX4, Ar
 
 from .columnar import table_log
 from .columns import ColumnMap, load_column_map
+from .dataflash import dataflash_log
 from .log import ConversionReport, ForeignLog, write_log
+from .ulog import ulog_log
 
 __all__ = [
     'ColumnMap',
     'ConversionReport',
     'ForeignLog',
+    'dataflash_log',
     'load_column_map',
     'table_log',
+    'ulog_log',
     'write_log',
 ]

@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+ArduPilot logs: what a hand-written DataFlash file holds comes out of the bag, sensor by sensor.
+
+The writer below follows the public description of the format and shares no code with the reader.
+
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermo_comp.convert import write_log
+from thermo_comp.convert.dataflash import dataflash_log, read_dataflash
+from thermo_comp.errors import RecordingError
+from thermo_comp.recording import read_recording
+
+pytest.importorskip('pymavlink', reason='pymavlink is not installed: the extra `ardupilot`')
+
+SIZES = {'Q': 8, 'B': 1, 'f': 4, 'I': 4, 'H': 2, 'h': 2, 'c': 2, 'N': 16}
+NEW_IMU = ('QBffffffIIfBBHH', 'TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz')
+OLD_IMU = ('QffffffIIfBB', 'TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,ErrG,ErrA,Temp,GyHlt,AcHlt')
+NEW_BARO = ('QBffcfIffB', 'TimeUS,I,Alt,Press,Temp,CRt,SMS,Offset,GndTemp,H')
+OLD_BARO = ('Qffcf', 'TimeUS,Alt,Press,Temp,CRt')
+PARM = ('QNff', 'TimeUS,Name,Value,Default')
+N = 500
+STEP_US = 20_000
+
+
+class DataflashWriter:
+    """
+    A minimal DataFlash log: formats, then messages.
+
+    """
+
+    def __init__(self) -> None:
+        self.body = b''
+        self.types: dict[str, tuple[int, str]] = {}
+        self._format(0x80, 'FMT', 89, 'BBnNZ', 'Type,Length,Name,Format,Columns')
+
+    def _format(self, number: int, name: str, length: int, layout: str, columns: str) -> None:
+        self.body += b'\xa3\x95\x80' + struct.pack(
+            '<BB4s16s64s', number, length, name.encode(), layout.encode(), columns.encode()
+        )
+
+    def define(self, name: str, layout: str, columns: str) -> None:
+        number = 0x81 + len(self.types)
+        self.types[name] = (number, layout)
+        self._format(number, name, 3 + sum(SIZES[c] for c in layout), layout, columns)
+
+    def write(self, name: str, *values: object) -> None:
+        number, layout = self.types[name]
+        code = '<' + ''.join({'c': 'h', 'N': '16s'}.get(c, c) for c in layout)
+        self.body += b'\xa3\x95' + bytes([number]) + struct.pack(code, *values)
+
+
+def still(rng):
+    return np.float32(np.array([0.2, -0.1, -9.8]) + 0.03 * rng.standard_normal((N, 3)))
+
+
+def write_new(path: Path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)) -> np.ndarray:
+    log = DataflashWriter()
+    log.define('IMU', *NEW_IMU)
+    log.define('BARO', *NEW_BARO)
+    log.define('PARM', *PARM)
+    for name, value in parameters:
+        log.write('PARM', 1000, name.encode(), value, 0.0)
+    force = np.array([still(rng), still(rng)])
+    for k in range(N):
+        now = 2_000_000 + k * STEP_US
+        for i in (0, 1):
+            log.write(
+                'IMU', now + i, i, 0.1, 0.2, 0.3 + i, *force[i][k], 0, 0,
+                30.0 + i + 0.25 * (k // 10), 1, 1, 1000, 1000,
+            )  # fmt: skip
+        if k % 10 == 0:
+            log.write('BARO', now, 0, 1.0, 1e5, 2000 + k, 0.0, 0, 0.0, 20.0, 1)
+            log.write('BARO', now, 1, 1.0, 1e5, 1500 - k, 0.0, 0, 0.0, 20.0, 1)
+    path.write_bytes(log.body)
+    return force
+
+
+@pytest.mark.parametrize('imu', [0, 1])
+@pytest.mark.parametrize('baro', [0, 1])
+def test_new_instances(tmp_path, rng, imu, baro):
+    path = tmp_path / 'new.BIN'
+    force = write_new(path, rng)
+    write_log(dataflash_log(path, imu=imu, baro=baro), tmp_path / 'bag.mcap')
+    recording = read_recording(tmp_path / 'bag.mcap')
+    bag = recording.columns
+    np.testing.assert_array_equal(
+        bag.accel_stamp_ns, (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
+    )
+    np.testing.assert_array_equal(bag.accel, force[imu])
+    # 0.3 passed through a float32.
+    np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
+    # The chip's temperature stands still for ten samples: only its changes are messages.
+    np.testing.assert_array_equal(bag.board, 30.0 + imu + 0.25 * np.arange(N // 10))
+    # The barometer's is stored in hundredths of a degree.
+    hundredths = (2000 + np.arange(0, N, 10)) if baro == 0 else (1500 - np.arange(0, N, 10))
+    np.testing.assert_allclose(bag.case, hundredths / 100, rtol=1e-15)
+
+
+def test_old_types_are_the_instances(tmp_path, rng):
+    log = DataflashWriter()
+    for name in ('IMU', 'IMU2'):
+        log.define(name, *OLD_IMU)
+    for name in ('BARO', 'BAR2'):
+        log.define(name, *OLD_BARO)
+    force = {'IMU': still(rng), 'IMU2': still(rng)}
+    for k in range(N):
+        now = 2_000_000 + k * STEP_US
+        for i, name in enumerate(force):
+            log.write(name, now, 0.0, 0.0, 0.0, *force[name][k], 0, 0, 30.0 + i, 1, 1)
+        log.write('BARO', now, 0.0, 1e5, 2150, 0.0)
+        log.write('BAR2', now, 0.0, 1e5, 2250, 0.0)
+    path = tmp_path / 'old.BIN'
+    path.write_bytes(log.body)
+    for i, name in enumerate(force):
+        read = dataflash_log(path, imu=i, baro=i)
+        np.testing.assert_array_equal(read.accel, force[name])
+        np.testing.assert_array_equal(read.board.celsius, [30.0 + i])
+        np.testing.assert_array_equal(read.case.celsius, [21.5 + i])
+
+
+def test_chip_without_a_thermometer(tmp_path, rng):
+    # ArduPilot writes 0 where a driver gives no temperature.
+    log = DataflashWriter()
+    log.define('IMU', *NEW_IMU)
+    for k, force in enumerate(still(rng)):
+        log.write('IMU', 1000 + k * STEP_US, 0, 0.0, 0.0, 0.0, *force, 0, 0, 0.0, 1, 1, 1000, 1000)
+    path = tmp_path / 'none.BIN'
+    path.write_bytes(log.body)
+    assert dataflash_log(path).board is None
+
+
+def test_corrected_log_is_refused(tmp_path, rng):
+    path = tmp_path / 'corrected.BIN'
+    write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 1.0),))
+    with pytest.raises(RecordingError, match=r'INS_TCAL1_ENABLE was 1.*already'):
+        dataflash_log(path)
+    assert len(dataflash_log(path, allow_compensated=True).stamp_ns) == N
+    # The second IMU's drift was left as it is.
+    assert len(dataflash_log(path, imu=1).stamp_ns) == N
+
+
+def test_simulator_is_refused(tmp_path):
+    log = DataflashWriter()
+    log.define('IMU', *NEW_IMU)
+    log.define('PARM', *PARM)
+    log.write('PARM', 1000, b'SIM_ACC1_RND', 0.0, 0.0)
+    for k in range(N):
+        log.write(
+            'IMU', 1000 + k * STEP_US, 0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.80665, 0, 0, 25.0, 1, 1,
+            1000, 1000,
+        )  # fmt: skip
+    path = tmp_path / 'sitl.BIN'
+    path.write_bytes(log.body)
+    assert 'SIM_' in read_dataflash(path)[0].metadata['ardupilot_simulated']
+    with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
+        dataflash_log(path)
+
+
+def test_torn_log_is_read_up_to_the_tear(tmp_path, rng):
+    path = tmp_path / 'torn.BIN'
+    force = write_new(path, rng)
+    whole = path.read_bytes()
+    # 40 bytes into the last message of the last IMU row.
+    cut = whole.rindex(b'\xa3\x95\x81') + 40
+    path.write_bytes(whole[:cut])
+    log = read_dataflash(path)[0]
+    assert log.imus[1].n_short == 1
+    np.testing.assert_array_equal(log.imus[1].accel, force[1][: N - 1])
+
+
+def test_absent_instances_are_named(tmp_path, rng):
+    path = tmp_path / 'new.BIN'
+    write_new(path, rng)
+    with pytest.raises(RecordingError, match='no IMU 2; there are: 0, 1'):
+        dataflash_log(path, imu=2)
+    with pytest.raises(RecordingError, match='no barometer 5; there are: 0, 1'):
+        dataflash_log(path, baro=5)
+
+
+@pytest.mark.parametrize('content', [b'', b'time,x,y,z\n', b'\xa3\x95' + bytes(600)])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / 'other.BIN'
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r'not a DataFlash log|holds no IMU'):
+        dataflash_log(path)
+
+
+def test_command(tmp_path, rng, cli):
+    log = tmp_path / 'flight.BIN'
+    write_new(log, rng)
+    finished = cli('convert', log, '--imu', '1', '-o', tmp_path / 'bag.mcap')
+    assert f'{N:8} imu/uncompensated' in finished.stdout
+    finished = cli('convert', log, '--columns', log, '-o', tmp_path / 'two.mcap', code=2)
+    assert 'needs no --columns' in finished.stderr
+    finished = cli('convert', log, '--imu', '7', '-o', tmp_path / 'two.mcap', code=1)
+    assert 'no IMU 7' in finished.stderr
+    assert not (tmp_path / 'two.mcap').exists()

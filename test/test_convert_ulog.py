@@ -1,0 +1,215 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+PX4 logs: what a hand-written ULog file holds comes out of the bag, sensor by sensor.
+
+The writer below follows the public description of the format and shares no code with the reader.
+
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermo_comp.convert import write_log
+from thermo_comp.convert.ulog import read_ulog, ulog_log
+from thermo_comp.errors import RecordingError
+from thermo_comp.recording import read_recording
+
+pytest.importorskip('pyulog', reason='pyulog is not installed: the extra `px4`')
+
+ACCEL = 'sensor_accel:uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;'
+ACCEL += 'float x;float y;float z;float temperature;uint32_t error_count;uint8_t[3] clip_counter;'
+OLD_ACCEL = 'sensor_accel:uint64_t timestamp;float x;float y;float z;float temperature;'
+GYRO = 'sensor_gyro:uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;'
+BARO = 'sensor_baro:uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;'
+BARO += 'float pressure;float temperature;uint32_t error_count;'
+N = 600
+STEP_US = 10_000
+
+
+class UlogWriter:
+    """
+    A minimal ULog: header, flag bits, formats, subscriptions, data.
+
+    """
+
+    def __init__(self, *formats: str) -> None:
+        self.body = b'ULog\x01\x12\x35\x01' + struct.pack('<Q', 0)
+        self.message('B', bytes(40))
+        for text in formats:
+            self.message('F', text.encode())
+        self.message('I', b'\x0echar[5] ver_hwTESTB')
+        self.n_subscribed = 0
+
+    def message(self, kind: str, payload: bytes) -> None:
+        self.body += struct.pack('<HB', len(payload), ord(kind)) + payload
+
+    def subscribe(self, topic: str, instance: int) -> int:
+        self.message('A', struct.pack('<BH', instance, self.n_subscribed) + topic.encode())
+        self.n_subscribed += 1
+        return self.n_subscribed - 1
+
+    def data(self, subscription: int, payload: bytes) -> None:
+        self.message('D', struct.pack('<H', subscription) + payload)
+
+
+def still(rng, n=N, sd=0.03):
+    """Make forces of a sensor at rest, z down as PX4 has it [m/s^2], exact in float32."""
+    return np.float32(np.array([0.2, -0.1, -9.8]) + sd * rng.standard_normal((n, 3)))
+
+
+def write_two_imus(path: Path, rng, gyro_every=1) -> dict[str, np.ndarray]:
+    log = UlogWriter(ACCEL, GYRO, BARO)
+    ids = [log.subscribe('sensor_accel', i) for i in (0, 1)]
+    gyro_id = log.subscribe('sensor_gyro', 0)
+    baro_id = log.subscribe('sensor_baro', 0)
+    force = [still(rng), still(rng)]
+    celsius = [np.float32(30 + 0.01 * np.arange(N)), np.float32(25 - 0.01 * np.arange(N))]
+    for k in range(N):
+        now = 5_000_000 + k * STEP_US
+        for i, number in enumerate(ids):
+            x, y, z = force[i][k]
+            log.data(
+                number,
+                struct.pack(
+                    '<QQIffffI3B', now + 400, now + i, 77 + i, x, y, z, celsius[i][k], 0, 0, 0, 0
+                ),
+            )
+        if k % gyro_every == 0:
+            log.data(gyro_id, struct.pack('<QQfff', now + 400, now, 0.001 * k, 0.0, -0.5))
+        if k % 50 == 0:
+            log.data(
+                baro_id, struct.pack('<QQIffI', now + 90, now, 9, 1e5, 20 + 0.5 * (k // 50), 0)
+            )
+    path.write_bytes(log.body)
+    return {'force': np.array(force), 'celsius': np.array(celsius)}
+
+
+@pytest.fixture
+def flight(tmp_path, rng):
+    path = tmp_path / 'flight.ulg'
+    return path, write_two_imus(path, rng)
+
+
+@pytest.mark.parametrize('imu', [0, 1])
+def test_log_arrives_in_the_bag(flight, tmp_path, imu):
+    path, truth = flight
+    report = write_log(ulog_log(path, imu=imu), tmp_path / 'bag.mcap')
+    recording = read_recording(tmp_path / 'bag.mcap')
+    bag = recording.columns
+    assert report.accel_messages == N
+    # The sample's own time counts, not the time of its publication; each IMU has its own.
+    expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
+    np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
+    np.testing.assert_array_equal(bag.accel, truth['force'][imu])
+    # The chip changes at every sample; the barometer is the second, slower thermometer.
+    np.testing.assert_array_equal(bag.board, truth['celsius'][imu])
+    np.testing.assert_array_equal(bag.case, 20 + 0.5 * np.arange(12))
+    assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
+    assert recording.info.metadata['px4_hardware'] == 'TESTB'
+
+
+def test_gyro_of_the_same_instance_travels_along(flight, tmp_path):
+    path, _ = flight
+    write_log(ulog_log(path, imu=0), tmp_path / 'bag.mcap')
+    rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
+    # Both sensors have the same stamps here; the values passed through a float32.
+    np.testing.assert_allclose(rate[:, 0], 0.001 * np.arange(N), atol=1e-6)
+    assert ulog_log(path, imu=1).gyro is None
+
+
+def test_gyro_logged_sparsely_is_left_out(tmp_path, rng):
+    path = tmp_path / 'flight.ulg'
+    write_two_imus(path, rng, gyro_every=5)
+    assert ulog_log(path).gyro is None
+
+
+def test_old_layout_without_sample_time(tmp_path, rng):
+    log = UlogWriter(OLD_ACCEL)
+    number = log.subscribe('sensor_accel', 0)
+    force = still(rng)
+    for k in range(N):
+        log.data(number, struct.pack('<Qffff', 1_000_000 + k * STEP_US, *force[k], 31.5))
+    path = tmp_path / 'old.ulg'
+    path.write_bytes(log.body)
+    read = ulog_log(path)
+    np.testing.assert_array_equal(read.accel, force)
+    assert read.case is None
+    # A chip that stands still is heard of every 10 s; the log is 6 s long.
+    np.testing.assert_array_equal(read.board.celsius, [31.5])
+
+
+def test_thermometer_that_is_not_there(tmp_path, rng):
+    log = UlogWriter(ACCEL)
+    number = log.subscribe('sensor_accel', 0)
+    for k, (x, y, z) in enumerate(still(rng)):
+        now = 1_000_000 + k * STEP_US
+        log.data(
+            number, struct.pack('<QQIffffI3B', now, now, 1, x, y, z, float('nan'), 0, 0, 0, 0)
+        )
+    path = tmp_path / 'cold.ulg'
+    path.write_bytes(log.body)
+    assert ulog_log(path).board is None
+
+
+def test_torn_log_is_read_up_to_the_tear(flight):
+    path, truth = flight
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    read = read_ulog(path)
+    n = len(read.imus[0].stamp_ns)
+    assert 250 < n < 350
+    np.testing.assert_array_equal(read.imus[0].accel, truth['force'][0][:n])
+
+
+def test_simulator_is_refused(tmp_path):
+    log = UlogWriter(OLD_ACCEL)
+    number = log.subscribe('sensor_accel', 0)
+    for k in range(N):
+        log.data(number, struct.pack('<Qffff', 1_000_000 + k * STEP_US, 0.0, 0.0, -9.80665, 35.0))
+    path = tmp_path / 'sitl.ulg'
+    path.write_bytes(log.body)
+    with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
+        ulog_log(path)
+
+
+def test_absent_instances_are_named(flight):
+    path, _ = flight
+    with pytest.raises(RecordingError, match='no IMU 2; there are: 0, 1'):
+        ulog_log(path, imu=2)
+    with pytest.raises(RecordingError, match='no barometer 1; there are: 0'):
+        ulog_log(path, baro=1)
+
+
+def test_log_without_an_accelerometer(tmp_path):
+    log = UlogWriter(BARO)
+    log.data(log.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
+    path = tmp_path / 'baro.ulg'
+    path.write_bytes(log.body)
+    with pytest.raises(RecordingError, match='the log holds no IMU'):
+        ulog_log(path)
+
+
+@pytest.mark.parametrize('content', [b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / 'other.ulg'
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match='not a ULog file'):
+        ulog_log(path)
+
+
+def test_command(tmp_path, rng, cli):
+    log = tmp_path / 'flight.ulg'
+    write_two_imus(log, rng)
+    finished = cli('convert', log, '--imu', '1', '-o', tmp_path / 'bag.mcap')
+    assert f'{N:8} imu/uncompensated' in finished.stdout
+    finished = cli('convert', log, '--columns', log, '-o', tmp_path / 'two.mcap', code=2)
+    assert 'needs no --columns' in finished.stderr
+    finished = cli('convert', log, '--imu', '7', '-o', tmp_path / 'two.mcap', code=1)
+    assert 'no IMU 7' in finished.stderr
+    assert not (tmp_path / 'two.mcap').exists()

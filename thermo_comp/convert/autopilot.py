@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what the logs of autopilots have in common: numbered IMUs, their thermometer and the baro's.
+
+The thermometer inside the IMU sits with the converter and lags: it becomes the board temperature.
+The barometer beside it hardly heats itself and follows the surroundings: it becomes the case
+temperature. A simulator's log is refused: it has no noise, so nothing can be weighed by it.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from ..errors import RecordingError
+from .columnar import origin
+from .log import ForeignLog, Readings, thin
+from .units import Array, BoolArray, IntArray, find_stillness
+
+T = TypeVar('T')
+
+# A thermometer that stands still says so this often, so that nobody takes it for lost.
+_HEARTBEAT_S = 10.0
+
+
+@dataclass(frozen=True)
+class ImuRows:
+    """
+    One IMU's rows in an autopilot's log.
+
+    Parameters
+    ----------
+    stamp_ns : ndarray of int64, shape (n,)
+        Stamps since the autopilot's start.
+    accel : ndarray, shape (n, 3)
+        Specific force [m/s^2].
+    gyro : ndarray, shape (n, 3), or None
+        Angular rate [rad/s].
+    celsius : ndarray, shape (n,)
+        Temperature in the IMU; NaN where there is none.
+    serial : str
+        What tells this sensor from another; empty where the log does not say.
+    n_short : int
+        Rows that the file holds in part only.
+
+    """
+
+    stamp_ns: IntArray
+    accel: Array
+    gyro: Array | None
+    celsius: Array
+    serial: str = ''
+    n_short: int = 0
+
+
+@dataclass(frozen=True)
+class AutopilotLog:
+    """
+    What an autopilot's log says of its inertial sensors.
+
+    Parameters
+    ----------
+    path : str
+        The log.
+    imus : dict of {int: ImuRows}
+        By instance.
+    baros : dict of {int: Readings}
+        Temperatures of the barometers, by instance.
+    metadata : dict of {str: str}
+        What the log says of itself.
+
+    """
+
+    path: str
+    imus: dict[int, ImuRows]
+    baros: dict[int, Readings]
+    metadata: dict[str, str] = field(default_factory=dict)
+
+
+def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = None) -> ForeignLog:
+    """
+    Take one IMU and one barometer out of an autopilot's log.
+
+    Parameters
+    ----------
+    log : AutopilotLog
+        The log.
+    imu : int or None, optional
+        Instance; None takes the lowest.
+    baro : int or None, optional
+        Instance; None takes the lowest with a temperature, if there is one.
+
+    Returns
+    -------
+    ForeignLog
+        Ready to be written as a bag.
+
+    Raises
+    ------
+    RecordingError
+        If the instance is not there, or the readings have no noise: a simulator's.
+
+    """
+    rows = _choose(log.imus, imu, 'IMU', log.path)
+    _refuse_noiseless(log.path, rows)
+    baros = {number: _reported(readings) for number, readings in log.baros.items()}
+    if baro is None:
+        baros = {number: readings for number, readings in baros.items() if len(readings.celsius)}
+    case = _choose(baros, baro, 'barometer', log.path) if baros or baro is not None else None
+    board = _reported(Readings(rows.stamp_ns, rows.celsius))
+    return ForeignLog(
+        path=log.path,
+        input='imu',
+        unit='m/s^2',
+        factor=1.0,
+        stamp_ns=rows.stamp_ns,
+        accel=rows.accel,
+        gyro=rows.gyro,
+        board=_thinned(board),
+        case=None if case is None else _thinned(case),
+        line=np.arange(1, len(rows.stamp_ns) + 1),
+        serial=rows.serial,
+        n_short=rows.n_short,
+        metadata={**log.metadata, **origin(log.path, rows.serial)},
+    )
+
+
+def _choose(found: Mapping[int, T], wanted: int | None, what: str, path: str) -> T:
+    if not found:
+        raise RecordingError(f'the log holds no {what}', path=path)
+    number = min(found) if wanted is None else wanted
+    if number not in found:
+        there = ', '.join(map(str, sorted(found)))
+        raise RecordingError(f'the log holds no {what} {number}; there are: {there}', path=path)
+    return found[number]
+
+
+def _reported(readings: Readings) -> Readings:
+    """
+    Leave out what no thermometer said: NaN, and the zeros of a sensor that has none.
+
+    """
+    use: BoolArray = np.isfinite(readings.celsius)
+    if not readings.celsius[use].any():
+        use = np.zeros(len(use), dtype=np.bool_)
+    return Readings(readings.stamp_ns[use], readings.celsius[use])
+
+
+def _thinned(readings: Readings) -> Readings | None:
+    if not len(readings.celsius):
+        return None
+    return thin(readings, 'change', _HEARTBEAT_S)
+
+
+def _refuse_noiseless(path: str, rows: ImuRows) -> None:
+    use = np.isfinite(rows.accel).all(axis=1)
+    stamp_ns, accel = rows.stamp_ns[use], rows.accel[use]
+    newer = np.concatenate(([True], np.diff(stamp_ns) > 0)) if len(stamp_ns) else use[:0]
+    if find_stillness(stamp_ns[newer], accel[newer]).noise == 0.0:
+        raise RecordingError(
+            'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
+            'from which no calibration of a real sensor can come',
+            path=path,
+        )

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns PX4's ULog files (``.ulg``), behind the extra ``px4``.
+
+``sensor_accel`` holds what the driver read, before PX4's own thermal correction and calibration,
+with the temperature of the same chip; ``sensor_baro`` holds a second temperature. PX4 logs them at
+1 Hz unless the logger's profile asks for more (``SDLOG_PROFILE``: thermal calibration).
+
+References
+----------
+.. [1] https://docs.px4.io/main/en/dev_log/ulog_file_format
+
+"""
+
+from __future__ import annotations
+
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import RecordingError
+from .autopilot import AutopilotLog, ImuRows, foreign_log
+from .log import ForeignLog, Readings
+from .units import Array, IntArray
+
+_TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_baro')
+_AXES = ('x', 'y', 'z')
+
+
+def ulog_log(path: str | Path, imu: int | None = None, baro: int | None = None) -> ForeignLog:
+    """
+    Read one IMU and one barometer of a PX4 log.
+
+    Parameters
+    ----------
+    path : str or Path
+        The ``.ulg`` file.
+    imu : int or None, optional
+        Instance of ``sensor_accel``; None takes the lowest.
+    baro : int or None, optional
+        Instance of ``sensor_baro``; None takes the lowest.
+
+    Returns
+    -------
+    ForeignLog
+        Ready to be written as a bag.
+
+    Raises
+    ------
+    RecordingError
+        If pyulog is not installed, the file is no ULog, it holds no such instance, or its
+        accelerometer has no noise.
+
+    """
+    return foreign_log(read_ulog(path), imu, baro)
+
+
+def read_ulog(path: str | Path) -> AutopilotLog:
+    """
+    Read the inertial sensors of a PX4 log.
+
+    Parameters
+    ----------
+    path : str or Path
+        The ``.ulg`` file.
+
+    Returns
+    -------
+    AutopilotLog
+        All instances.
+
+    Raises
+    ------
+    RecordingError
+        If pyulog is not installed or the file is no ULog.
+
+    """
+    try:
+        from pyulog import ULog
+    except ImportError as failure:
+        raise RecordingError(
+            "a PX4 log needs pyulog: pip install 'thermo_comp[px4]'", path=path
+        ) from failure
+    with Path(path).open('rb') as file, redirect_stdout(StringIO()):
+        # Its own exception has no base but Exception, and a torn file makes it raise others: none
+        # of them says more than that this is not a whole ULog.
+        try:
+            log = ULog(file, list(_TOPICS))
+        except Exception as failure:
+            raise RecordingError(f'not a ULog file ({failure})', path=path) from failure
+    by_topic: dict[str, dict[int, Any]] = {topic: {} for topic in _TOPICS}
+    for data in log.data_list:
+        if len(data.data['timestamp']):
+            by_topic[data.name][int(data.multi_id)] = data.data
+    gyros = by_topic['sensor_gyro']
+    return AutopilotLog(
+        path=str(path),
+        imus={
+            number: _imu(columns, gyros.get(number))
+            for number, columns in by_topic['sensor_accel'].items()
+        },
+        baros={
+            number: Readings(_stamps(columns), _column(columns, 'temperature'))
+            for number, columns in by_topic['sensor_baro'].items()
+        },
+        metadata=_metadata(log),
+    )
+
+
+def _imu(columns: dict[str, Any], gyro: dict[str, Any] | None) -> ImuRows:
+    stamp_ns = _stamps(columns)
+    device = columns.get('device_id')
+    return ImuRows(
+        stamp_ns=stamp_ns,
+        accel=_vectors(columns),
+        gyro=None if gyro is None else _matched(stamp_ns, _stamps(gyro), _vectors(gyro)),
+        celsius=_column(columns, 'temperature'),
+        serial='' if device is None else f'px4-accel-{int(device[0])}',
+    )
+
+
+def _stamps(columns: dict[str, Any]) -> IntArray:
+    # When the sample was taken, where the log says it; older logs only say when it was published.
+    microseconds = columns.get('timestamp_sample', columns['timestamp'])
+    return np.asarray(microseconds, dtype=np.int64) * 1000
+
+
+def _column(columns: dict[str, Any], name: str) -> Array:
+    n = len(columns['timestamp'])
+    return np.asarray(columns.get(name, np.full(n, np.nan)), dtype=np.float64)
+
+
+def _vectors(columns: dict[str, Any]) -> Array:
+    return np.column_stack([_column(columns, axis) for axis in _AXES])
+
+
+def _matched(stamp_ns: IntArray, gyro_ns: IntArray, gyro: Array) -> Array | None:
+    """
+    Interpolate the rate to the accelerometer's stamps; None where it was logged more sparsely.
+
+    """
+    if 2 * len(gyro_ns) < len(stamp_ns) or not np.isfinite(gyro).all():
+        return None
+    origin_ns = stamp_ns[0]
+    at, where = (stamp_ns - origin_ns) * 1e-9, (gyro_ns - origin_ns) * 1e-9
+    return np.column_stack([np.interp(at, where, gyro[:, i]) for i in range(3)])
+
+
+def _metadata(log: Any) -> dict[str, str]:
+    said = {'px4_hardware': 'ver_hw', 'px4_software': 'ver_sw_release', 'px4_uuid': 'sys_uuid'}
+    metadata = {
+        key: str(log.msg_info_dict[name])
+        for key, name in said.items()
+        if name in log.msg_info_dict
+    }
+    if log.dropouts:
+        lost_ms = sum(int(dropout.duration) for dropout in log.dropouts)
+        metadata['px4_dropouts'] = f'{len(log.dropouts)}, {lost_ms} ms in all'
+    if log.file_corruption:
+        metadata['px4_corruption'] = 'parts of the file could not be read'
+    return metadata
