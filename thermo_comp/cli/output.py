@@ -168,8 +168,9 @@ def text(cell: Cell) -> str:
     if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
         return '-'
     if isinstance(cell, float):
-        digits = 0 if abs(cell) >= 999.5 else 3 - math.floor(math.log10(abs(cell) or 1.0))
-        return f'{cell:.{min(max(digits, 0), 6)}f}'
+        if cell == 0.0 or abs(cell) >= 999.5:
+            return f'{cell:.0f}'
+        return f'{cell:.{min(3 - math.floor(math.log10(abs(cell))), 6)}f}'
     return str(cell)
 
 

@@ -1,0 +1,272 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Bad input gets one clear line on stderr and an exit code, through the door that a user takes.
+
+1: the data or the result is bad. 2: the command line is wrong. Never a traceback (`cli` asserts
+that of every run), nothing on stdout, nothing left behind.
+
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import axis_set, calibration, regime_set, rich_calibration
+from conftest import Cli
+
+from thermo_comp.calibration_file import save_calibration
+from thermo_comp.recording import BagWriter, Topics
+
+TOPICS = Topics()
+START_NS = 1_767_225_600_000_000_000
+
+
+def bag(
+    path: Path,
+    *,
+    counts: bool = True,
+    board: bool = True,
+    case: bool = True,
+    serial: str = '',
+    n: int = 600,
+) -> Path:
+    """
+    Write a minute of a resting unit with the topics asked for.
+
+    """
+    stamps = START_NS + np.arange(n) * 100_000_000
+    with BagWriter(path, metadata={'serial': serial} if serial else None) as writer:
+        for topic, wanted in ((TOPICS.board, board), (TOPICS.case, case)):
+            if wanted:
+                writer.write_temperature(topic, stamps[::10], np.full(len(stamps[::10]), 20.0))
+        if counts:
+            writer.write_counts(TOPICS.counts, stamps, np.tile([1800.0, 0.0, 2400.0], (n, 1)))
+    return path
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
+    return tmp_path / 'unit.yaml'
+
+
+def refused(cli: Cli, code: int, message: str, *arguments: str | Path) -> None:
+    """
+    Run a command that must fail with exactly one line that says this.
+
+    """
+    finished = cli(*arguments, code=code)
+    lines = finished.stderr.splitlines()
+    assert len(lines) == 1, finished.stderr
+    assert lines[0].startswith('thermo_comp: error: ')
+    assert re.search(message, lines[0]), lines[0]
+    assert finished.stdout == ''
+
+
+class TestUsage:
+    @pytest.mark.parametrize(
+        ('arguments', 'message'),
+        [
+            (('fitt',), r"No such command 'fitt'.*Did you mean 'fit'"),
+            (('replay',), r"Missing argument 'BAG'.*thermo_comp replay --help"),
+            (('replay', 'a', '-o', 'b'), r"Missing option '--calibration'"),
+            (('replay', 'a', '-o', 'b', '-c', 'c', '--spin'), r'No such option.*--spin'),
+            (('replay', 'a', '-o', 'b', '-c', 'c', '--input', 'gps'), r"'gps' is not one of"),
+            (
+                ('replay', 'a', '-o', 'b', '-c', 'c', '--temperature-timeout', '0'),
+                r'`temperature_timeout_s` must be positive',
+            ),
+            (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
+            (('fit', 'a', '-o', 'b', '--latitude', '60'), r'--latitude and --height'),
+            (('evaluate', 'a', '-c', 'b', '--window', '0'), r'--window must be positive'),
+            (('evaluate', 'a', '-c', 'b', '--height', '3'), r'--latitude and --height'),
+            (('simulate', '-o', 'a', '--unit', 'gold'), r'must be one of thermostatted'),
+            (('simulate', '-o', 'a', '--profile', '20, up'), r"step 2 'up'"),
+            (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
+            (('convert', 'a', '-o', 'b'), r'--columns'),
+        ],
+        ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
+    )
+    def test_wrong_command_lines(
+        self, cli: Cli, tmp_path: Path, arguments: tuple[str, ...], message: str
+    ) -> None:
+        finished = cli(*arguments, code=2, cwd=tmp_path)
+        lines = finished.stderr.splitlines()
+        assert len(lines) == 1, finished.stderr
+        assert re.search(message, lines[0]), lines[0]
+        assert list(tmp_path.iterdir()) == []
+
+    def test_no_command_prints_the_help(self, cli: Cli) -> None:
+        finished = cli(code=2)
+        assert 'Usage: thermo_comp' in finished.stdout + finished.stderr
+
+
+class TestBags:
+    def replayed(
+        self, cli: Cli, unit: Path, path: Path, message: str, *more: str, code: int = 1
+    ) -> None:
+        out = unit.parent / 'out'
+        refused(cli, code, message, 'replay', path, '-c', unit, '-o', out, *more)
+        assert not out.exists()
+        assert not list(unit.parent.glob('.out*')), 'a partial output was left'
+
+    def test_missing(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        self.replayed(cli, unit, tmp_path / 'absent', r'absent: no such file or directory')
+
+    def test_no_bag(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        (tmp_path / 'notes.txt').write_text('hello')
+        self.replayed(cli, unit, tmp_path / 'notes.txt', r'not a bag: expected a directory, .mcap')
+        (tmp_path / 'folder').mkdir()
+        self.replayed(cli, unit, tmp_path / 'folder', r'the directory has no metadata.yaml')
+
+    def test_garbage_in_a_bag_s_clothes(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        for name in ('noise.mcap', 'noise.db3', 'noise.bag'):
+            (tmp_path / name).write_bytes(b'\x89MCAP0\r\n' + bytes(range(256)) * 8)
+            self.replayed(cli, unit, tmp_path / name, name)
+
+    def test_nothing_at_all_in_it(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        (tmp_path / 'nothing.mcap').write_bytes(b'')
+        self.replayed(cli, unit, tmp_path / 'nothing.mcap', r'nothing.mcap')
+
+    def test_no_messages(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        with BagWriter(tmp_path / 'empty'):
+            pass
+        self.replayed(cli, unit, tmp_path / 'empty', r'the bag holds no messages')
+
+    def test_missing_topic_says_what_there_is(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        path = bag(tmp_path / 'bag', counts=False)
+        self.replayed(
+            cli, unit, path, r'no such topic; the bag has .*/temperature/board.*--counts-topic'
+        )
+
+    def test_missing_board_temperature(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        path = bag(tmp_path / 'bag', board=False)
+        self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--board-topic')
+        refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
+        arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
+        refused(cli, 1, r'temperature/board', 'fit', path, *arguments)
+
+    def test_missing_case_temperature_is_no_error(
+        self, cli: Cli, unit: Path, tmp_path: Path
+    ) -> None:
+        # The regime falls back to the board sensor, as in the node.
+        path = bag(tmp_path / 'bag', case=False)
+        said = cli('replay', path, '-c', unit, '-o', tmp_path / 'out').stdout
+        assert '600 of 600 samples corrected' in said
+
+    def test_wrong_message_type(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        stamps = START_NS + np.arange(10)
+        with BagWriter(tmp_path / 'bag') as writer:
+            writer.write_temperature(TOPICS.counts, stamps, np.full(10, 20.0))
+            writer.write_temperature(TOPICS.board, stamps, np.full(10, 20.0))
+        self.replayed(
+            cli,
+            unit,
+            tmp_path / 'bag',
+            r'accel/counts: the topic has type sensor_msgs/msg/Temperature, expected '
+            r'geometry_msgs/msg/Vector3Stamped',
+        )
+
+    def test_another_unit_s_bag(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        path = bag(tmp_path / 'bag', serial='T-2')
+        self.replayed(cli, unit, path, r'unit.serial: this calibration is of unit T-1.*of T-2')
+        refused(cli, 1, r'is of unit T-1', 'evaluate', path, '-c', unit)
+
+    def test_existing_output(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        path = bag(tmp_path / 'bag')
+        (tmp_path / 'there').mkdir()
+        arguments = ('replay', path, '-c', unit, '-o', tmp_path / 'there')
+        refused(cli, 1, r'there: exists already; --force overwrites it', *arguments)
+        (tmp_path / 'there' / 'thesis.tex').write_text('years of work')
+        # Not even --force replaces what is no bag.
+        refused(cli, 1, r'thesis.tex, which belongs to no bag', *arguments, '--force')
+        assert (tmp_path / 'there' / 'thesis.tex').exists()
+
+    def test_output_that_cannot_be_written(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        path = bag(tmp_path / 'bag')
+        (tmp_path / 'file').write_text('')
+        out = tmp_path / 'file' / 'out'
+        refused(cli, 1, r'cannot be written', 'replay', path, '-c', unit, '-o', out)
+
+
+class TestCalibrations:
+    def used(self, cli: Cli, tmp_path: Path, text: str, message: str) -> None:
+        path = tmp_path / 'bad.yaml'
+        path.write_text(text)
+        recorded = tmp_path / 'bag'
+        if not recorded.exists():
+            bag(recorded)
+        refused(cli, 1, message, 'replay', recorded, '-c', path, '-o', tmp_path / 'out')
+
+    def test_nan_names_its_key(self, cli: Cli, tmp_path: Path, unit: Path) -> None:
+        text = re.sub(r'bias: 5\.0', 'bias: .nan', unit.read_text(), count=1)
+        assert '.nan' in text
+        self.used(cli, tmp_path, text, r'bad.yaml: axes.x.bias: ')
+
+    def test_missing_key(self, cli: Cli, tmp_path: Path, unit: Path) -> None:
+        text = unit.read_text().replace('gravity_m_s2', 'gravity')
+        self.used(cli, tmp_path, text, r'gravity')
+
+    def test_no_yaml(self, cli: Cli, tmp_path: Path) -> None:
+        self.used(cli, tmp_path, '{', r'not valid YAML')
+
+    def test_a_newer_format(self, cli: Cli, tmp_path: Path, unit: Path) -> None:
+        text = unit.read_text().replace('format_version: 1', 'format_version: 2')
+        self.used(cli, tmp_path, text, r'format_version: .*newer')
+
+    def test_missing_file(self, cli: Cli, tmp_path: Path) -> None:
+        recorded = bag(tmp_path / 'bag')
+        arguments = ('-c', tmp_path / 'absent.yaml', '-o', tmp_path / 'out')
+        refused(cli, 1, r'absent.yaml: cannot be read', 'replay', recorded, *arguments)
+        refused(cli, 1, r'absent.yaml: cannot be read', 'info', tmp_path / 'absent.yaml')
+
+
+class TestFits:
+    def test_too_few_positions(self, cli: Cli, tmp_path: Path) -> None:
+        paths = [bag(tmp_path / f'{i}.mcap') for i in range(2)]
+        arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
+        refused(cli, 1, r'', 'fit', *paths, *arguments)
+        assert not (tmp_path / 'new.yaml').exists()
+
+    def test_gravity_of_another_planet(self, cli: Cli, tmp_path: Path) -> None:
+        path = bag(tmp_path / 'bag.mcap')
+        arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '3.71')
+        refused(cli, 1, r'3.71 m/s\^2 is not found on Earth', 'fit', path, *arguments)
+
+    def test_bags_of_two_units(self, cli: Cli, tmp_path: Path) -> None:
+        paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
+        arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
+        refused(cli, 1, r'', 'fit', *paths, *arguments)
+
+
+class TestEvaluations:
+    def test_a_calibration_that_does_not_hold_is_exit_code_1(
+        self, cli: Cli, tmp_path: Path
+    ) -> None:
+        # The unit rests at 20 degC and reads exactly g; the calibration puts 50 mg of bias on it
+        # through a function of temperature that has no business there.
+        wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
+        sets = regime_set(wrong, wrong, wrong)
+        save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
+        path = tmp_path / 'bag'
+        stamps = START_NS + np.arange(3000) * 100_000_000
+        level = np.tile([0.0, 0.0, 300.0 * 9.80665], (3000, 1))
+        with BagWriter(path) as writer:
+            writer.write_temperature(TOPICS.board, stamps[::10], np.full(300, 20.0))
+            writer.write_counts(TOPICS.counts, stamps, level)
+        finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
+        assert 'it makes |g| worse' in finished.stdout
+        save_calibration(calibration(), tmp_path / 'right.yaml')
+        cli('evaluate', path, '-c', tmp_path / 'right.yaml')
+
+    def test_never_at_rest(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
+        rng = np.random.default_rng(1)
+        stamps = START_NS + np.arange(50) * 100_000_000
+        with BagWriter(tmp_path / 'bag') as writer:
+            writer.write_temperature(TOPICS.board, stamps[::10], np.full(5, 20.0))
+            writer.write_counts(TOPICS.counts, stamps, 1000.0 * rng.standard_normal((50, 3)))
+        refused(cli, 1, r'no window of 10 s at rest', 'evaluate', tmp_path / 'bag', '-c', unit)
