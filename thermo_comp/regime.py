@@ -3,22 +3,40 @@
 """
 Owns the causal static/dynamic decision with its memory; it has no clock of its own.
 
+The test (derived in docs/regime.md). A soak has a baseline rate. Two linear filters of different
+memory integrate the second derivative of the leading temperature: each gives the present rate,
+with a noise variance known in closed form. The dynamic state *opens* when the rate has left the
+baseline by more than the chamber's ripple can explain plus a threshold that follows from the
+allowed false alarms (Rice's formula for the crossings of a Gaussian process). It is *held* as long
+as any sensor's rate, now or half a lag ahead, may exceed the relaxed rate: through the ramp, where
+the second derivative is nil, and after it, until the board's lag has died.
+
+References
+----------
+.. [1] S. O. Rice, "Mathematical analysis of random noise", Bell System Technical Journal 24, 1945.
+.. [2] M. Basseville, I. V. Nikiforov, "Detection of Abrupt Changes", Prentice-Hall, 1993.
+
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from enum import IntEnum
+from math import acos, inf, isnan, log, nan, pi, sqrt
 
 from .thermometer import Thermometer, ThermometerSettings
 
-_SIGMAS = 5.0
+BEND_SHARES = (1.5, 15.0)  # accelerations the two filters are tuned to / the smallest onset
+SETTLING = 5.0  # memories until a filter's noise is the formula's
+EDGE_SIGMAS = 6.0  # edges that far apart are never crossed by noise
+SURE_SIGMAS = 2.0  # confidence of "the rate is below"
+OBVIOUS_SIGMAS = 5.0  # confidence of "the rate is above"
+OBVIOUS_SHARE = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
 
 
 class Regime(IntEnum):
     """
-    What the surroundings do to the unit.
+    What the surroundings do to the unit; values are those of the paper's S.
 
     """
 
@@ -30,33 +48,34 @@ class Regime(IntEnum):
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
     """
-    What the detector must see and what it must not; the calibration file's `detector` section.
+    What must be seen and what must not; its keys are the calibration file's `detector` section.
 
     Parameters
     ----------
     smallest_ramp_k_min : float
         The slowest ramp that must never be missed, K/min.
     false_alarms_per_hour : float
-        How often noise alone may open the dynamic state, per hour of soak.
-    soak_rate_k_min : float
-        The rate that a soak itself shows (ripple of the chamber), K/min.
+        How often the sensor's noise alone may open the dynamic state, per hour of soak.
+    ripple_c : float
+        Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K.
+        Through the lag it makes a rate of at most ``ripple_c / lag_s``, which is no onset.
     relaxed_rate_k_min : float
-        The lag has died when both rates are surely below this, K/min.
+        The lag has died when every sensor's rate is surely below this, K/min.
     dwell_s : float
-        The shortest stay in a state, s.
+        How long it must have been below, and the shortest dynamic state, s.
     case, board : ThermometerSettings
         The two sensors.
 
     Raises
     ------
     ValueError
-        If a value is not finite or outside its range.
+        If a value is not finite, outside its range, or contradicts another one.
 
     """
 
     smallest_ramp_k_min: float = 0.2
-    false_alarms_per_hour: float = 0.01
-    soak_rate_k_min: float = 0.015
+    false_alarms_per_hour: float = 0.02
+    ripple_c: float = 0.1
     relaxed_rate_k_min: float = 0.05
     dwell_s: float = 60.0
     case: ThermometerSettings = field(default_factory=ThermometerSettings)
@@ -69,12 +88,17 @@ class DetectorSettings:
         """
         for name in ('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'):
             value = getattr(self, name)
-            if not 0.0 < value < math.inf:
+            if not 0.0 < value < inf:
                 raise ValueError(f'`{name}` must be positive and finite, got {value}')
-        for name in ('soak_rate_k_min', 'dwell_s'):
+        for name in ('ripple_c', 'dwell_s'):
             value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f'`{name}` must be zero or positive, got {value}')
+            if not 0.0 <= value < inf:
+                raise ValueError(f'`{name}` must be zero or positive and finite, got {value}')
+        if self.relaxed_rate_k_min * OBVIOUS_SHARE >= self.smallest_ramp_k_min:
+            raise ValueError(
+                f'`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / {OBVIOUS_SHARE}, '
+                f'got {self.relaxed_rate_k_min} and {self.smallest_ramp_k_min}'
+            )
 
 
 class RegimeDetector:
@@ -86,24 +110,41 @@ class RegimeDetector:
     settings : DetectorSettings
         Thresholds in physical terms.
 
+    Attributes
+    ----------
+    regime : Regime
+        The state.
+    direction : int
+        In the dynamic state -1 cooling, +1 heating, 0 not yet sure; otherwise 0.
+    switched_ns : int or None
+        Stamp of the last switch.
+
     """
 
     def __init__(self, settings: DetectorSettings) -> None:
         self.settings = settings
-        self._soak_rate = settings.soak_rate_k_min / 60.0
         self._relaxed_rate = settings.relaxed_rate_k_min / 60.0
         self._dwell_ns = round(settings.dwell_s * 1e9)
+        self._case_onset = _OnsetTest(settings, settings.case)
+        self._board_onset = _OnsetTest(settings, settings.board)
+        self._case_calm = _CalmTest(settings.case)
+        self._board_calm = _CalmTest(settings.board)
         self.reset()
 
     def reset(self) -> None:
         """
-        Back to unknown.
+        Back to unknown, as after time has jumped back.
 
         """
         self.regime = Regime.UNKNOWN
         self.direction = 0
         self.switched_ns: int | None = None
         self._calm_ns: int | None = None
+        self._held_until_ns: int | None = None
+        self._case_onset.reset()
+        self._board_onset.reset()
+        self._case_calm.reset()
+        self._board_calm.reset()
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
         """
@@ -114,7 +155,7 @@ class RegimeDetector:
         stamp_ns : int
             Stamp of that reading, ns.
         case, board : Thermometer or None
-            The two estimates; None for a sensor that is lost.
+            The two estimates; None for a sensor that is lost. The case leads while it is there.
 
         Returns
         -------
@@ -122,35 +163,280 @@ class RegimeDetector:
             The regime from this stamp on.
 
         """
-        lead = case if case is not None else board
-        if lead is None or not lead.is_ready:
+        if case is not None:
+            lead, onset = case, self._case_onset
+        elif board is not None:
+            lead, onset = board, self._board_onset
+        else:
             return self.regime
-        speed = abs(lead.rate)
-        doubt = math.sqrt(lead.var_rate)
-        sensors = [one for one in (case, board) if one is not None and one.is_ready]
-        is_calm = all(
-            abs(one.rate) + 2.0 * math.sqrt(one.var_rate) < self._relaxed_rate for one in sensors
-        )
+        departure = onset.update(stamp_ns, lead, self.regime == Regime.STATIC)
+        if not lead.is_ready:
+            return self.regime
+
+        relaxed = self._relaxed_rate
+        is_calm = self._case_calm.update(stamp_ns, case, relaxed)
+        is_calm = self._board_calm.update(stamp_ns, board, relaxed) and is_calm
         if not is_calm:
             self._calm_ns = None
         elif self._calm_ns is None:
             self._calm_ns = stamp_ns
+
         if self.regime != Regime.DYNAMIC:
-            floor = self._soak_rate if self.regime == Regime.STATIC else self._relaxed_rate
-            if speed > floor + _SIGMAS * doubt:
-                self._switch(stamp_ns, Regime.DYNAMIC)
-        if self.regime != Regime.STATIC and self._calm_ns is not None:
-            start = self._calm_ns
-            if self.switched_ns is not None and self.switched_ns > start:
-                start = self.switched_ns
-            if stamp_ns - start >= self._dwell_ns:
-                self._switch(stamp_ns, Regime.STATIC)
-        if self.regime == Regime.DYNAMIC and speed > self._soak_rate + 2.0 * doubt:
-            self.direction = 1 if lead.rate > 0.0 else -1
+            if departure:
+                self._open(stamp_ns, departure, lead)
+            elif not is_calm:
+                speed = OBVIOUS_SHARE * relaxed
+                direction = _obvious(lead, speed)
+                if direction or (board is not None and board.is_ready and _obvious(board, speed)):
+                    self._open(stamp_ns, direction, lead)
+        else:
+            direction = _obvious(lead, onset.ripple_rate)
+            if direction:
+                self.direction = direction
+        if (
+            self.regime != Regime.STATIC
+            and self._calm_ns is not None
+            and stamp_ns - self._calm_ns >= self._dwell_ns
+            and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
+        ):
+            self.regime = Regime.STATIC
+            self.direction = 0
+            self.switched_ns = stamp_ns
+            onset.settle(lead)
         return self.regime
 
-    def _switch(self, stamp_ns: int, regime: Regime) -> None:
-        self.regime = regime
+    def _open(self, stamp_ns: int, direction: int, lead: Thermometer) -> None:
+        self.regime = Regime.DYNAMIC
+        self.direction = direction
         self.switched_ns = stamp_ns
-        if regime == Regime.STATIC:
-            self.direction = 0
+        # An onset is seen before the rate is large: give the ramp a quarter of its lag to show.
+        hold_ns = max(self._dwell_ns, round(0.25e9 * lead.settings.lag_s))
+        self._held_until_ns = stamp_ns + hold_ns
+
+
+class _OnsetTest:
+    """
+    Has the rate of one sensor left the baseline of the soak?
+
+    A continuous sensor is watched by two linear filters of temperature and rate with different
+    memories. One with cells is watched through its thermometer, and by the time that two edges
+    crossed in the same direction lie apart.
+
+    """
+
+    def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
+        smallest_rate = settings.smallest_ramp_k_min / 60.0
+        self.ripple_rate = min(settings.ripple_c / sensor.lag_s, 0.5 * smallest_rate)
+        self._baseline_s = 0.5 * sensor.lag_s
+        self._rate_variance = (sensor.typical_ramp_k_min / 60.0) ** 2
+        # The memory (1 / tracking frequency) that sees an acceleration soonest at 1 Hz, and from
+        # it the power of the acceleration that the filter expects, whatever the readings' rate.
+        self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
+        onset = smallest_rate / sensor.lag_s
+        memories = [1.45 * (sqrt(self._noise) / (share * onset)) ** 0.4 for share in BEND_SHARES]
+        self._powers = [self._noise / memory**4 for memory in memories]
+        # crossings per second of h: acos(rho) / (2 pi dt) exp(-h^2 / 2); two filters, two signs
+        per_second = settings.false_alarms_per_hour / 3600.0 / (2.0 * len(self._powers))
+        self._log_crossings = -log(2.0 * pi * per_second)
+        self._edge_noise = sensor.noise_sd_c * sqrt(2.0)
+        self._quantum = sensor.quantum_c
+        self._has_cells = sensor.has_cells
+        self._by_edges = sensor.quantum_c > EDGE_SIGMAS * self._edge_noise
+        self.reset()
+
+    def reset(self) -> None:
+        self._stamp_ns: int | None = None
+        self._n_restarts = -1
+        self._filters: list[tuple[float, float, float, float, float]] = []
+        self._dt = 0.0
+        self._thresholds: list[float] = []
+        self._settled_s = 0.0
+        self._age_s = 0.0
+        self._rate = 0.0
+        self._baseline = 0.0
+        self._doubt = self.ripple_rate  # of the baseline, which may begin at a crest
+        self._edge = nan
+        self._edge_ns = 0
+        self._reading = nan
+
+    def settle(self, sensor: Thermometer) -> None:
+        """
+        Begin a soak: what the rate is now is its baseline.
+
+        """
+        self._baseline = self._rate
+        self._doubt = max(self.ripple_rate, SURE_SIGMAS * sqrt(sensor.var_rate))
+        self._edge = nan  # edges that were crossed before the soak tell of the ramp
+
+    def update(self, stamp_ns: int, sensor: Thermometer, is_static: bool) -> int:
+        """
+        Take the sensor's last reading; return the sign of the departure, 0 = none.
+
+        """
+        stamp = self._stamp_ns
+        if stamp is None or sensor.n_restarts != self._n_restarts or not sensor.is_ready:
+            self._start(stamp_ns, sensor)
+            return 0
+        dt = (stamp_ns - stamp) * 1e-9
+        if dt <= 0.0:
+            return 0
+        self._stamp_ns = stamp_ns
+        self._age_s += dt
+        if dt != self._dt:
+            self._tune(dt)
+        baseline = self._baseline
+        ripple = self.ripple_rate + self._doubt
+        high = ripple + (baseline if baseline > 0.0 else 0.0)
+        low = -ripple + (baseline if baseline < 0.0 else 0.0)
+        if self._by_edges:
+            departure = self._watch_edges(stamp_ns, sensor, low, high)
+        else:
+            departure = self._watch_filters(sensor.measured, sensor.measured_variance, low, high)
+        if not is_static or self._age_s < self._settled_s:
+            return 0
+        if departure == 0 and not self._by_edges:
+            self._follow(self._rate, dt)
+        return departure
+
+    def _follow(self, rate: float, dt: float) -> None:
+        """
+        Let the baseline follow what the rate has been over a while, at most a ripple per memory.
+
+        """
+        limit = self.ripple_rate + self._doubt
+        share = dt / (dt + self._baseline_s)
+        self._baseline += share * min(max(rate - self._baseline, -limit), limit)
+        self._doubt -= share * self._doubt
+
+    def _start(self, stamp_ns: int, sensor: Thermometer) -> None:
+        self._stamp_ns = stamp_ns
+        self._n_restarts = sensor.n_restarts
+        self._age_s = 0.0
+        self._filters = [(sensor.temperature, 0.0, self._noise, 0.0, self._rate_variance)] * 2
+        self._edge = nan
+        self._edge_ns = stamp_ns
+        self._reading = sensor.reading
+
+    def _watch_filters(self, measured: float, variance: float, low: float, high: float) -> int:
+        departure = 0
+        dt = self._dt
+        filters = self._filters
+        for k in (1, 0):
+            power = self._powers[k]
+            t, v, p00, p01, p11 = filters[k]
+            t += dt * v
+            p00 += dt * (2.0 * p01 + dt * (p11 + power * dt / 3.0))
+            p01 += dt * (p11 + 0.5 * power * dt)
+            p11 += power * dt
+            if variance < inf:
+                spread = p00 + variance
+                gain = p01 / spread
+                innovation = measured - t
+                left = variance / spread
+                t += p00 / spread * innovation
+                v += gain * innovation
+                p11 -= gain * p01
+                p00 *= left
+                p01 *= left
+            filters[k] = (t, v, p00, p01, p11)
+            beyond = v - high if v > high else (low - v if v < low else 0.0)
+            if beyond * beyond > self._thresholds[k] * p11:
+                departure = 1 if v > high else -1
+        self._rate = v
+        return departure
+
+    def _watch_edges(self, stamp_ns: int, sensor: Thermometer, low: float, high: float) -> int:
+        self._rate = sensor.rate
+        departure = 0
+        reading, before = sensor.reading, self._reading
+        bound = self._quantum * 1e9 / (stamp_ns - self._edge_ns)
+        if reading == before and bound < self._doubt + abs(self._baseline):
+            # nothing crossed since: no rate above one quantum in that time
+            self._doubt = min(self._doubt, bound)
+            self._baseline = min(max(self._baseline, -bound), bound)
+        if reading != before:
+            edge = 0.5 * (reading + before)
+            apart = (stamp_ns - self._edge_ns) * 1e-9
+            moved = edge - self._edge
+            sure = abs(moved) - sqrt(self._squared) * self._edge_noise
+            if sure > 0.0 and sure > (high if moved > 0.0 else -low) * apart:
+                departure = 1 if moved > 0.0 else -1
+            if departure == 0 and not isnan(moved):
+                self._follow(moved / apart, apart)
+            self._edge = edge
+            self._edge_ns = stamp_ns
+            self._reading = reading
+        return departure
+
+    def _tune(self, dt: float) -> None:
+        """
+        Set the thresholds, squared and relative to a filter's own variance of the rate.
+
+        """
+        self._dt = dt
+        self._thresholds = []
+        for power in self._powers:
+            pace = dt * (power / (self._noise * dt)) ** 0.25
+            correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
+            self._squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
+            self._thresholds.append(
+                self._squared * (1.0 if self._has_cells else 0.25 + 0.08 * min(pace, 1.0))
+            )
+        self._settled_s = SETTLING * (self._noise * dt / self._powers[0]) ** 0.25
+
+
+class _CalmTest:
+    """
+    Is the rate of one sensor surely below the relaxed rate, now and half a lag ahead?
+
+    Ahead: a rate that moves away from its mean over the last quarter of a lag will go on to do so.
+
+    """
+
+    def __init__(self, sensor: ThermometerSettings) -> None:
+        self._quantum = sensor.quantum_c
+        self._memory_s = 0.25 * sensor.lag_s
+        self._stale_ns = round(0.5e9 * sensor.lag_s)
+        self.reset()
+
+    def reset(self) -> None:
+        self._stamp_ns: int | None = None
+        self._mean = 0.0
+
+    def update(self, stamp_ns: int, sensor: Thermometer | None, relaxed: float) -> bool:
+        """
+        Follow the rate of the sensor; a lost or stale one has no say.
+
+        """
+        if sensor is None or sensor.stamp_ns is None:
+            return True
+        if stamp_ns - sensor.stamp_ns > self._stale_ns:
+            return True
+        if not sensor.is_ready:
+            self._stamp_ns = None
+            return False
+        rate = sensor.rate
+        stamp = self._stamp_ns
+        self._stamp_ns = stamp_ns
+        if stamp is None:
+            self._mean = rate
+        else:
+            dt = (stamp_ns - stamp) * 1e-9
+            self._mean += dt / (dt + self._memory_s) * (rate - self._mean)
+        if self._quantum > 0.0 and sensor.changed_ns is not None:
+            still_s = (stamp_ns - sensor.changed_ns) * 1e-9
+            if self._quantum < relaxed * still_s:
+                return True
+        room = relaxed - SURE_SIGMAS * sqrt(sensor.var_rate)
+        return -room < rate < room and abs(3.0 * rate - 2.0 * self._mean) < relaxed
+
+
+def _obvious(sensor: Thermometer, rate: float) -> int:
+    """
+    Sign of the rate if it is surely beyond a limit, otherwise 0.
+
+    """
+    margin = abs(sensor.rate) - rate
+    if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
+        return 1 if sensor.rate > 0.0 else -1
+    return 0

@@ -3,16 +3,41 @@
 """
 Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stamped readings.
 
+Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, in which the
+acceleration hardly moves (a soak, the middle of a ramp), and *bending*, in which it wanders as
+ramps through a thermal lag make it wander [2]_ (an onset, an end). The estimate is their mixture,
+and its variance contains their disagreement. A sensor whose quantum exceeds its noise is read
+through its cells: a change of the reading measures the edge between two cells sharply, an
+unchanged one only says that the temperature has not left its cell.
+
+References
+----------
+.. [1] H. A. P. Blom, Y. Bar-Shalom, "The interacting multiple model algorithm for systems with
+   Markovian switching coefficients", IEEE Trans. Automatic Control 33(8), 1988.
+.. [2] R. A. Singer, "Estimating optimal tracking filter performance for manned maneuvering
+   targets", IEEE Trans. Aerospace and Electronic Systems AES-6(4), 1970.
+.. [3] R. E. Curry, "Estimation and Control with Quantized Measurements", MIT Press, 1970.
+
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from math import erf, exp, inf, isfinite, nan, sqrt
 
-_OUTLIER_SIGMAS = 6.0
-_RESTART_READINGS = 4
-_HORIZON_INTERVALS = 5.0
+State = tuple[float, float, float, float, float, float, float, float, float]
+"""Temperature, rate, acceleration; then P00, P01, P02, P11, P12, P22 of their covariance."""
+
+_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)
+
+OUTLIER_SIGMAS = 6.0  # innovations beyond this are not used ...
+RESTART_READINGS = 4  # ... unless that many agree in a row
+SOAK_S = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
+QUIET_SHARE = 5e-3  # quiet acceleration wander / bending one, of a sensor without cells
+CELL_SHARE = 0.4  # the same where cells hide slow changes
+CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells
+HORIZON_INTERVALS = 5.0  # extrapolation is linear up to here, then held
+NOISE_MEMORY = 200.0  # readings over which the innovations judge the declared noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,14 +48,14 @@ class ThermometerSettings:
     Parameters
     ----------
     noise_sd_c : float
-        Standard deviation of the white noise of one reading, K.
+        Standard deviation of the white noise of one reading, before quantization, K.
     quantum_c : float
         Step of the readings, K; 0 for a continuous sensor.
     typical_ramp_k_min : float
         Typical rate of the ramps it will see, K/min.
     lag_s : float
-        Thermal lag between the surroundings and the sensor, s. With the ramp it says how sharply
-        the temperature can bend: an onset is an acceleration of ``ramp / lag``.
+        Thermal lag between the surroundings and the sensor, s. Together with the ramp it says how
+        sharply the temperature bends: an onset is an acceleration of ``ramp / lag``.
 
     Raises
     ------
@@ -51,20 +76,54 @@ class ThermometerSettings:
         """
         for name in ('noise_sd_c', 'typical_ramp_k_min', 'lag_s'):
             value = getattr(self, name)
-            if not 0.0 < value < math.inf:
+            if not 0.0 < value < inf:
                 raise ValueError(f'`{name}` must be positive and finite, got {value}')
-        if not 0.0 <= self.quantum_c < math.inf:
+        if not 0.0 <= self.quantum_c < inf:
             raise ValueError(f'`quantum_c` must be zero or positive, got {self.quantum_c}')
+
+    @property
+    def has_cells(self) -> bool:
+        """
+        Whether the quantum exceeds the noise so far that a reading is a cell, not a value.
+
+        """
+        return self.quantum_c > CELL_SIGMAS * self.noise_sd_c
 
 
 class Thermometer:
     """
-    Kalman filter of temperature, rate and acceleration over the readings of one sensor.
+    Causal estimate of one sensor's temperature and its first two derivatives.
 
     Parameters
     ----------
     settings : ThermometerSettings
         The sensor.
+
+    Attributes
+    ----------
+    stamp_ns : int or None
+        Stamp of the last used reading.
+    changed_ns : int or None
+        Stamp at which the reading last changed; it stands still on a frozen sensor.
+    temperature, rate, acceleration : float
+        The estimate at `stamp_ns`, degC, K/s, K/s^2; NaN before the first reading.
+    var_temperature, var_rate, var_acceleration : float
+        Its variances, K^2, K^2/s^2, K^2/s^4; infinite before the first reading.
+    interval_s : float
+        Typical interval between readings, s; NaN before the second one.
+    is_ready : bool
+        Whether two readings in a row have been used, so that there is a rate.
+    measured, measured_variance : float
+        What the last used reading said of the temperature at its stamp, degC and K^2: the
+        reading itself, or its equivalent for a sensor with cells. Infinite variance: nothing.
+    noise_factor : float
+        Noise found / noise declared, at least 1; it already widens the variances.
+    bending : float
+        Probability of the bending mode.
+    reading : float
+        The last used reading, degC.
+    n_used, n_rejected, n_restarts : int
+        Counters: readings used, readings not used, fresh starts after a gap or a step.
 
     """
 
@@ -72,31 +131,42 @@ class Thermometer:
         self.settings = settings
         self.n_used = 0
         self.n_rejected = 0
+        self.n_restarts = 0
+        noise, quantum = settings.noise_sd_c, settings.quantum_c
+        self._noise = noise * noise
+        self._flat = noise * noise + quantum * quantum / 12.0
+        self._has_cells = settings.has_cells
+        self._quantum = quantum
         self._lag = settings.lag_s
-        self._acceleration_sd = settings.typical_ramp_k_min / 60.0 / settings.lag_s
         self._rate_sd = settings.typical_ramp_k_min / 60.0
-        self._noise = settings.noise_sd_c**2 + settings.quantum_c**2 / 12.0
+        self._bend = self._rate_sd / settings.lag_s
+        self._bending_power = 2.0 * self._bend * self._bend / settings.lag_s
+        share = CELL_SHARE if self._has_cells else QUIET_SHARE
+        self._quiet_power = self._bending_power * share * share
         self.reset()
 
     def reset(self) -> None:
         """
-        Forget the readings (not the counters), as after a jump of time.
+        Forget the readings (not the counters), as after time has jumped back.
 
         """
         self.stamp_ns: int | None = None
         self.changed_ns: int | None = None
-        self.reading = math.nan
-        self.temperature = math.nan
-        self.rate = math.nan
-        self.acceleration = math.nan
-        self.var_temperature = math.inf
-        self.var_rate = math.inf
-        self.var_acceleration = math.inf
-        self.interval_s = math.nan
+        self.reading = nan
+        self.temperature = self.rate = self.acceleration = nan
+        self.var_temperature = self.var_rate = self.var_acceleration = inf
+        self.interval_s = nan
         self.is_ready = False
-        self._p01 = self._p02 = self._p12 = 0.0
-        self._n_outliers = 0
-        self._outlier = math.nan
+        self.measured = nan
+        self.measured_variance = inf
+        self.noise_factor = 1.0
+        self.bending = 0.5
+        self._covariance = 0.0  # of temperature and rate
+        self._noise_scale = 1.0  # noise_factor squared
+        self._quiet: State = _NOWHERE
+        self._bent: State = _NOWHERE
+        self._n_strange = 0
+        self._strange = nan
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
@@ -115,7 +185,7 @@ class Thermometer:
             False when it was not used: not finite, not newer than the last one, or an outlier.
 
         """
-        if not math.isfinite(reading_c):
+        if not isfinite(reading_c):
             self.n_rejected += 1
             return False
         if self.stamp_ns is None:
@@ -125,56 +195,85 @@ class Thermometer:
             self.n_rejected += 1
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        if dt > self._lag:
+        lag = self._lag
+        if dt > lag:
+            self.n_restarts += 1
             self._start(stamp_ns, reading_c)
             return True
-        decay = math.exp(-dt / self._lag)
-        process = 2.0 * self._acceleration_sd**2 / self._lag * dt
-        half = 0.5 * dt * dt
-        p00, p11, p22 = self.var_temperature, self.var_rate, self.var_acceleration
-        p01, p02, p12 = self._p01, self._p02, self._p12
-        temperature = self.temperature + dt * self.rate + half * self.acceleration
-        rate = self.rate + dt * self.acceleration
-        acceleration = decay * self.acceleration
-        a01 = p01 + dt * p11 + half * p12
-        a02 = p02 + dt * p12 + half * p22
-        a00 = p00 + dt * p01 + half * p02
-        p00 = a00 + dt * a01 + half * a02 + process * half * half / 5.0
-        p01 = a01 + dt * a02 + process * half * dt / 4.0
-        p02 = decay * a02 + process * half / 3.0
-        a12 = p12 + dt * p22
-        p11 = p11 + dt * p12 + dt * a12 + process * dt * dt / 3.0
-        p12 = decay * a12 + process * dt / 2.0
-        p22 = decay * decay * p22 + process
-        innovation = reading_c - temperature
-        s = p00 + self._noise
-        if innovation * innovation > _OUTLIER_SIGMAS**2 * s + self.settings.quantum_c**2:
-            return self._suspect(stamp_ns, reading_c, math.sqrt(s))
-        self._n_outliers = 0
-        k0, k1, k2 = p00 / s, p01 / s, p02 / s
-        self.temperature = temperature + k0 * innovation
-        self.rate = rate + k1 * innovation
-        self.acceleration = acceleration + k2 * innovation
-        self.var_temperature = p00 - k0 * p00
-        self._p01 = p01 - k0 * p01
-        self._p02 = p02 - k0 * p02
-        self.var_rate = p11 - k1 * p01
-        self._p12 = p12 - k1 * p02
-        self.var_acceleration = p22 - k2 * p02
-        self.stamp_ns = stamp_ns
+
+        # the modes interact: each starts from its share of both
+        to_bending = dt / (dt + SOAK_S)
+        to_quiet = dt / (dt + lag)
+        bending = self.bending
+        prior_bending = bending * (1.0 - to_quiet) + (1.0 - bending) * to_bending
+        prior_quiet = 1.0 - prior_bending
+        quiet = _blend(self._quiet, self._bent, bending * to_quiet / prior_quiet)
+        bent = _blend(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
+        quiet = predict(quiet, dt, lag, self._quiet_power)
+        bent = predict(bent, dt, lag, self._bending_power)
+
+        # what the reading says
+        apart = bent[0] - quiet[0]
+        expected = quiet[0] + prior_bending * apart
+        variance = prior_quiet * quiet[3] + prior_bending * (bent[3] + prior_quiet * apart * apart)
+        scale = self._noise_scale
+        noise = self._flat * scale
+        spread = variance + noise
+        surprise = reading_c - expected
+        allowance = 5.0 * self._bend * dt * dt + 1.5 * self._quantum
+        if abs(surprise) > OUTLIER_SIGMAS * sqrt(spread) + allowance:
+            return self._suspect(stamp_ns, reading_c, sqrt(spread) + allowance)
+        self._n_strange = 0
+        measured = reading_c
+        if self._has_cells:
+            rate = quiet[1] + prior_bending * (bent[1] - quiet[1])
+            measured, noise = self._cell(reading_c, expected, variance, rate * dt)
+        else:
+            excess = surprise * surprise / spread - 1.0
+            scale *= 1.0 + (excess if excess < 8.0 else 8.0) / NOISE_MEMORY
+            self._noise_scale = scale = scale if scale > 1.0 else 1.0
+            self.noise_factor = sqrt(scale)
+
+        # each mode learns, and is judged by its innovation
+        if noise < inf:
+            quiet, innovation, s = correct(quiet, measured, noise)
+            bent, bent_innovation, bent_s = correct(bent, measured, noise)
+            evidence = 0.5 * (
+                innovation * innovation / s - bent_innovation * bent_innovation / bent_s
+            )
+            odds = prior_bending * sqrt(s / bent_s) * exp(min(max(evidence, -30.0), 30.0))
+            bending = odds / (prior_quiet + odds)
+        else:
+            bending = prior_bending
+
+        self._quiet = quiet
+        self._bent = bent
+        self.bending = bending
+        (
+            self.temperature,
+            self.rate,
+            self.acceleration,
+            self.var_temperature,
+            self._covariance,
+            _,
+            self.var_rate,
+            _,
+            self.var_acceleration,
+        ) = _blend(quiet, bent, bending)
+        self.measured = measured
+        self.measured_variance = noise
         if reading_c != self.reading:
             self.changed_ns = stamp_ns
-        self.reading = reading_c
-        self.interval_s = (
-            dt if self.n_used < 2 else self.interval_s + 0.05 * (dt - self.interval_s)
-        )
-        self.n_used += 1
+            self.reading = reading_c
+        self.stamp_ns = stamp_ns
+        self.interval_s = self.interval_s + 0.05 * (dt - self.interval_s) if self.is_ready else dt
         self.is_ready = True
+        self.n_used += 1
         return True
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
         """
-        Extrapolate to a stamp; held after a few reading intervals.
+        Extrapolate to a stamp, linearly within a few reading intervals, held beyond them.
 
         Parameters
         ----------
@@ -189,38 +288,201 @@ class Thermometer:
 
         """
         if self.stamp_ns is None:
-            return math.nan, math.nan, math.inf
+            return nan, nan, inf
         if not self.is_ready:
-            return self.temperature, 0.0, self.var_temperature
-        whole = (stamp_ns - self.stamp_ns) * 1e-9
-        horizon = _HORIZON_INTERVALS * self.interval_s
-        dt = min(max(whole, -horizon), horizon)
-        variance = self.var_temperature + 2.0 * dt * self._p01 + dt * dt * self.var_rate
-        beyond = whole - dt
-        variance += beyond * beyond * (self.var_rate + self.rate * self.rate)
+            return self.temperature, self.rate, self.var_temperature
+        ahead = (stamp_ns - self.stamp_ns) * 1e-9
+        horizon = HORIZON_INTERVALS * self.interval_s
+        dt = ahead if -horizon <= ahead <= horizon else (horizon if ahead > 0.0 else -horizon)
+        variance = self.var_temperature + dt * (2.0 * self._covariance + dt * self.var_rate)
+        beyond = ahead - dt
         return (
-            self.temperature + dt * (self.rate + 0.5 * dt * self.acceleration),
-            self.rate + dt * self.acceleration,
-            variance,
+            self.temperature + dt * self.rate,
+            self.rate,
+            variance + beyond * beyond * (self.var_rate + self.rate * self.rate),
         )
 
     def _start(self, stamp_ns: int, reading_c: float) -> None:
         self.reset()
         self.stamp_ns = self.changed_ns = stamp_ns
-        self.reading = self.temperature = reading_c
+        self.reading = self.measured = self.temperature = reading_c
         self.rate = self.acceleration = 0.0
-        self.var_temperature = self._noise
+        self.var_temperature = self.measured_variance = self._flat
         self.var_rate = self._rate_sd**2
-        self.var_acceleration = self._acceleration_sd**2
+        self.var_acceleration = self._bend**2
+        self._quiet = self._bent = (
+            reading_c, 0.0, 0.0, self._flat, 0.0, 0.0, self.var_rate, 0.0, self.var_acceleration
+        )  # fmt: skip
         self.n_used += 1
 
-    def _suspect(self, stamp_ns: int, reading_c: float, sd: float) -> bool:
-        if abs(reading_c - self._outlier) > _OUTLIER_SIGMAS * sd + self.settings.quantum_c:
-            self._n_outliers = 0
-        self._n_outliers += 1
-        self._outlier = reading_c
-        if self._n_outliers >= _RESTART_READINGS:
+    def _suspect(self, stamp_ns: int, reading_c: float, tolerance: float) -> bool:
+        """
+        Reject a strange reading, unless several in a row agree: then the sensor has stepped.
+
+        """
+        is_alike = abs(reading_c - self._strange) <= OUTLIER_SIGMAS * tolerance
+        self._n_strange = self._n_strange + 1 if is_alike else 1
+        self._strange = reading_c
+        if self._n_strange >= RESTART_READINGS:
+            self.n_restarts += 1
             self._start(stamp_ns, reading_c)
             return True
+        if not self._has_cells:
+            self._noise_scale *= 1.0 + 8.0 / NOISE_MEMORY
         self.n_rejected += 1
         return False
+
+    def _cell(
+        self, reading: float, expected: float, variance: float, move: float
+    ) -> tuple[float, float]:
+        """
+        Turn a quantized reading into the Gaussian measurement of the temperature it amounts to.
+
+        """
+        half = 0.5 * self._quantum
+        noise = self._noise
+        if variance < 4.0 * noise:
+            # The prior is narrower than the noise: matching the moments of the prior cut to the
+            # cell is accurate, and readings that flicker about an edge locate it.
+            spread = variance + noise
+            sd = sqrt(spread)
+            low = (reading - half - expected) / sd
+            high = (reading + half - expected) / sd
+            inside = 0.5 * (erf(high * 0.7071067811865476) - erf(low * 0.7071067811865476))
+            if inside < 1e-9:
+                return reading, self._flat
+            at_low = 0.3989422804014327 * exp(-0.5 * low * low) / inside
+            at_high = 0.3989422804014327 * exp(-0.5 * high * high) / inside
+            shift = at_low - at_high
+            loss = shift * shift + high * at_high - low * at_low
+            if loss < 1e-6:
+                return reading, inf
+            return expected + sd * shift / loss, spread / loss - variance
+        jump = abs(reading - self.reading)
+        if jump > 1.5 * self._quantum:
+            return reading, self._flat
+        if jump > half:
+            edge = 0.5 * (reading + self.reading) + 0.5 * move
+            return edge, min(noise + move * move / 12.0, self._flat)
+        # Unchanged. Saying so twice tells nothing new: the cell bounds the variance, and its
+        # edges hold back an estimate that would leave it, once per time it takes to move a sd.
+        if abs(expected - reading) > half:
+            edge = reading + (half if expected > reading else -half)
+            return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
+        box = half * half / 3.0
+        if variance > box:
+            return reading, variance * box / (variance - box)
+        return reading, inf
+
+
+def predict(state: State, dt: float, lag: float, power: float) -> State:
+    """
+    Carry a state over a time step: constant acceleration that decays and wanders.
+
+    Parameters
+    ----------
+    state : tuple of float
+        Temperature, rate, acceleration and the upper triangle of their covariance.
+    dt : float
+        The step, s.
+    lag : float
+        Decay time of the acceleration, s; infinite = none.
+    power : float
+        Spectral density of the white noise that drives the acceleration, K^2/s^5.
+
+    Returns
+    -------
+    tuple of float
+        The state at the end of the step.
+
+    """
+    t, v, a, p00, p01, p02, p11, p12, p22 = state
+    half = 0.5 * dt * dt
+    decay = 1.0 / (1.0 + dt / lag)
+    grown = power * dt
+    p12 += dt * p22
+    p02 += dt * p12 - half * p22
+    cross = p01 + dt * p11 + half * (p12 - dt * p22)
+    p00 += dt * (p01 + cross) + half * (p02 - dt * p12 + half * p22 + p02)
+    return (
+        t + dt * v + half * a,
+        v + dt * a,
+        decay * a,
+        p00 + grown * half * half / 5.0,
+        cross + dt * p02 + grown * half * dt / 4.0,
+        decay * p02 + grown * half / 3.0,
+        p11 + dt * (p12 + p12 - dt * p22) + grown * dt * dt / 3.0,
+        decay * p12 + grown * dt / 2.0,
+        decay * decay * p22 + grown,
+    )
+
+
+def correct(state: State, measured: float, variance: float) -> tuple[State, float, float]:
+    """
+    Let a state learn from one measurement of the temperature.
+
+    Parameters
+    ----------
+    state : tuple of float
+        Temperature, rate, acceleration and the upper triangle of their covariance.
+    measured : float
+        The measured temperature, degC.
+    variance : float
+        Its variance, K^2.
+
+    Returns
+    -------
+    state : tuple of float
+        The corrected state.
+    innovation : float
+        Measured minus expected, K.
+    spread : float
+        Variance of the innovation, K^2.
+
+    """
+    t, v, a, p00, p01, p02, p11, p12, p22 = state
+    spread = p00 + variance
+    innovation = measured - t
+    k0 = p00 / spread
+    k1 = p01 / spread
+    k2 = p02 / spread
+    left = variance / spread
+    return (
+        (
+            t + k0 * innovation,
+            v + k1 * innovation,
+            a + k2 * innovation,
+            left * p00,
+            left * p01,
+            left * p02,
+            p11 - k1 * p01,
+            p12 - k1 * p02,
+            p22 - k2 * p02,
+        ),
+        innovation,
+        spread,
+    )
+
+
+def _blend(one: State, other: State, share: float) -> State:
+    """
+    Mean and covariance of a mixture of two states.
+
+    """
+    t, v, a, p00, p01, p02, p11, p12, p22 = one
+    u, w, b, r00, r01, r02, r11, r12, r22 = other
+    u -= t
+    w -= v
+    b -= a
+    apart = share * (1.0 - share)
+    return (
+        t + share * u,
+        v + share * w,
+        a + share * b,
+        p00 + share * (r00 - p00) + apart * u * u,
+        p01 + share * (r01 - p01) + apart * u * w,
+        p02 + share * (r02 - p02) + apart * u * b,
+        p11 + share * (r11 - p11) + apart * w * w,
+        p12 + share * (r12 - p12) + apart * w * b,
+        p22 + share * (r22 - p22) + apart * b * b,
+    )
