@@ -116,8 +116,10 @@ class Windows:
 
     Attributes
     ----------
-    n_whole : int
+    n_walked : int
         Bytes of the records that were gone through so far.
+    n_kept : int
+        The same without a record at the end that cannot be trusted.
 
     """
 
@@ -125,7 +127,7 @@ class Windows:
         self._handle = handle
         self._span = span
         self._on_record = on_record
-        self.n_whole = 0
+        self.n_walked = self.n_kept = 0
 
     def __iter__(self) -> Iterator[tuple[Bytes, Messages]]:
         """
@@ -157,9 +159,11 @@ class Windows:
                 found_sum = zlib.crc32(piece, found_sum)
             data = np.frombuffer(rest + piece, np.uint8)
             messages, end, reason = walk(data, self._on_record, only)
-            self.n_whole += end
-            if is_torn and reason == ZERO_OPCODE:
+            self.n_kept = self.n_walked + end
+            if is_torn and reason == ZERO_OPCODE and len(messages.at):
+                self.n_kept = self.n_walked + int(messages.at[-1])
                 messages = _without_last(messages)
+            self.n_walked += end
             if len(messages.at):
                 yield data, messages
             if reason == OTHER_RECORD:

@@ -18,7 +18,7 @@ from .columns import Ints, Role
 from .encode import stamped_payloads
 from .topics import TEMPERATURE
 from .walk import MESSAGE_HEAD_BYTES, Messages
-from .wire import Bytes, Encoding, Stamped, decode_stamped, frame_runs
+from .wire import Bytes, Encoding, Stamped, decode_stamped, frame_runs, gather, scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,8 +180,12 @@ def pack(data: Bytes, start: Ints, size: Ints) -> tuple[Bytes, Ints]:
 
     """
     ends = np.cumsum(size)
-    within = np.arange(int(ends[-1]) if len(ends) else 0)
-    return data[within + np.repeat(start - (ends - size), size)], ends
+    packed = np.empty(int(np.sum(size)), np.uint8)
+    for each in np.unique(size).tolist():
+        if each:
+            own = np.flatnonzero(size == each)
+            scatter(packed, ends[own] - each, gather(data, start[own], each))
+    return packed, ends
 
 
 def _reencoded(stamped: Stamped, frames: list[tuple[int, str]]) -> tuple[Bytes, Ints]:

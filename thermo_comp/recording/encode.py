@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .columns import Floats, ImuColumns, Ints
-from .wire import Bytes, gather
+from .wire import Bytes, gather, scatter
 
 OPCODE_MESSAGE = 5
 
@@ -273,10 +273,7 @@ def merge_records(batches: list[Records]) -> tuple[Bytes, NDArray[np.uint16], In
     first = 0
     for batch in batches:
         for index, rows in batch.rows:
-            everywhere: NDArray[Any] = np.ndarray(
-                (data.size - rows.itemsize + 1,), rows.dtype, data.data, strides=(1,)
-            )
-            everywhere[begin[first + index]] = rows
+            scatter(data, begin[first + index], rows)
         first += len(batch.log_ns)
     return data, channel[order], log_ns[order], size
 

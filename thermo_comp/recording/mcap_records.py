@@ -268,7 +268,7 @@ def parse_chunk_head(head: bytes, position: int) -> tuple[ChunkSpan, int, int]:
     opcode, content, start_ns, end_ns, size, checksum, name_length = cursor.numbers('BQQQQII')
     if opcode != CHUNK:
         raise DamagedError(f'no chunk at byte {position}')
-    if name_length > 64:
+    if content < 40 or name_length > 64:
         raise DamagedError(f'the chunk at byte {position} has a damaged head')
     compression = cursor.take(name_length).decode('utf-8', 'replace')
     (compressed_size,) = cursor.numbers('Q')

@@ -263,6 +263,7 @@ class Survey:
         opcode = head[0]
         if opcode == 0:
             self.truncated = f'it is unreadable from byte {at} on'
+            self._distrust_last(at)
         elif opcode == mcap.CHUNK:
             self.truncated = 'it ends inside a chunk, of which the first {} messages are read'
             try:
@@ -318,26 +319,50 @@ class Survey:
         windows = Windows(self.handle, stretch, self._on_record)
         for _, messages in windows:
             self._count(messages)
-        stop = at + windows.n_whole
-        self.spans.append(replace(stretch, end=stop))
-        if stop == at:
+        if windows.n_walked == 0:
             raise DamagedError(f'the record at byte {at} is not whole')
-        return stop
+        self.spans.append(replace(stretch, end=at + windows.n_kept))
+        return at + windows.n_walked
 
-    def _check_last(self) -> None:
+    def _distrust_last(self, at: int) -> None:
         """
-        Leave out the last chunk of a file without a footer where it is not sound.
+        Read a last chunk that zeros follow up to them, as its own end may be zeros too.
 
         """
         last = self.spans[-1] if self.spans else None
-        if not isinstance(last, ChunkSpan):
+        if (
+            isinstance(last, ChunkSpan)
+            and not last.compression
+            and at == last.position + last.length
+        ):
+            self.counts.subtract(self._last_index)
+            end = at + mcap.PREFIX_BYTES
+            torn = StreamSpan(last.position, end, is_chunk=True, is_torn=True)
+            self.spans[-1] = torn
+            self._unscanned = [entry for entry in self._unscanned if entry[0] is not last]
+            self._unscanned.append((torn, True))
+
+    def _check_last(self) -> None:
+        """
+        Count the last whole chunk of a file without a footer, whose index may be cut off.
+
+        One that is not sound is left out.
+
+        """
+        last = self.spans[-1] if self.spans else None
+        if last is None or (isinstance(last, StreamSpan) and (last.is_torn or not last.is_chunk)):
+            return
+        self._unscanned = [entry for entry in self._unscanned if entry[0] is not last]
+        self.counts.subtract(self._last_index)
+        if isinstance(last, StreamSpan):
+            self.spans[-1] = replace(last, is_torn=True)
+            self._unscanned.append((self.spans[-1], True))
             return
         try:
-            load_chunk(self.handle, last, self._on_record)
+            _, messages = load_chunk(self.handle, last, self._on_record)
+            self._count(messages)
         except DamagedError:
             self.spans.pop()
-            self._unscanned = [entry for entry in self._unscanned if entry[0] is not last]
-            self.counts.subtract(self._last_index)
             self.truncated = f'{self.truncated}; its last chunk is damaged and left out'
 
     def _scan(self) -> int:
@@ -352,13 +377,15 @@ class Survey:
             else:
                 found = iter(Windows(self.handle, span, self._on_record))
             for _, messages in found:
-                if is_counted and len(messages.at):
+                if is_counted:
                     self._count(messages)
                 if isinstance(span, StreamSpan) and span.is_torn:
                     n_torn += len(messages.at)
         return n_torn
 
     def _count(self, messages: Messages) -> None:
+        if not len(messages.at):
+            return
         numbers, counts = np.unique(messages.channel, return_counts=True)
         self.counts.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
         self._spread(int(np.min(messages.log_ns)), int(np.max(messages.log_ns)))

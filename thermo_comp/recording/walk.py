@@ -202,9 +202,10 @@ def walk(
             break
         opcode, length = _PREFIX.unpack_from(view, at)
         step = PREFIX_BYTES + length
-        reason = _fault(opcode, length, at + step > len(data))
-        if only is not None and opcode not in only:
+        if opcode and only is not None and opcode not in only:
             reason = OTHER_RECORD
+        else:
+            reason = _fault(opcode, length, at + step > len(data))
         if reason:
             break
         n_equal = n_equal + 1 if length == length_before else 0

@@ -84,6 +84,27 @@ def gather(buffer: Bytes, at: Ints, n_bytes: int) -> NDArray[Any]:
     return everywhere[at]
 
 
+def scatter(buffer: Bytes, at: Ints, rows: NDArray[Any]) -> None:
+    """
+    Copy rows to positions of a buffer, the inverse of `gather`.
+
+    Parameters
+    ----------
+    buffer : ndarray of uint8, contiguous
+        Where to.
+    at : ndarray of int64, shape (n,)
+        Positions, each at least a row before the buffer's end.
+    rows : ndarray of void, shape (n,)
+        What.
+
+    """
+    if len(at):
+        everywhere: NDArray[Any] = np.ndarray(
+            (buffer.size - rows.itemsize + 1,), rows.dtype, buffer.data, strides=(1,)
+        )
+        everywhere[at] = rows
+
+
 def field(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
     """
     One number out of each gathered row.

@@ -97,10 +97,11 @@ class BagWriter:
         self._batches: list[Records] = []
         self._n_buffered_bytes = 0
         self._file: McapFile | None = None
+        self._target = self._path.resolve()
         _check_target(self._path, self._is_file, overwrite)
-        self._partial = partial_sibling(self._path)
+        self._partial = partial_sibling(self._target)
         with self._translated():
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._target.parent.mkdir(parents=True, exist_ok=True)
             if not self._is_file:
                 self._partial.mkdir()
             self._file = McapFile(
@@ -312,14 +313,18 @@ class BagWriter:
         """
         if self._file is None:
             return
-        self.flush()
-        with self._translated():
-            summary = self._open_file().finish(self._metadata)
-            if not self._is_file:
-                text = dump_metadata(summary, self._metadata)
-                _write_text(self._partial / 'metadata.yaml', text)
-                sync_directory(self._partial)
-            publish(self._partial, self._path)
+        try:
+            self.flush()
+            with self._translated():
+                summary = self._file.finish(self._metadata)
+                if not self._is_file:
+                    text = dump_metadata(summary, self._metadata)
+                    _write_text(self._partial / 'metadata.yaml', text)
+                    sync_directory(self._partial)
+                publish(self._partial, self._target)
+        except BaseException:
+            self.abort()
+            raise
         self._file = None
 
     def abort(self) -> None:
@@ -424,6 +429,9 @@ def _as_stamps(stamp_ns: ArrayLike) -> np.ndarray[tuple[int, ...], np.dtype[np.i
 
 def _check_target(path: Path, is_file: bool, overwrite: bool) -> None:
     if not path.exists():
+        folder = next((above for above in path.parents if above.exists()), path)
+        if not folder.is_dir():
+            raise RecordingError(f'cannot be written: {folder} is no directory', path)
         return
     if not overwrite:
         raise RecordingError('exists already; say so if it is to be overwritten', path)

@@ -1,0 +1,257 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns bags made by other tools, and the plain-Python account of what a reader must make of them.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType, IndexType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from thermo_comp.recording import Block
+
+VECTOR = 'geometry_msgs/msg/Vector3Stamped'
+IMU = 'sensor_msgs/msg/Imu'
+TEMPERATURE = 'sensor_msgs/msg/Temperature'
+STRING = 'std_msgs/msg/String'
+
+ACCEL, IMU_IN, BOARD, CASE, OTHER = (
+    '/accel/counts',
+    '/imu/uncompensated',
+    '/temperature/board',
+    '/temperature/case',
+    '/chatter',
+)
+TYPES = {ACCEL: VECTOR, IMU_IN: IMU, BOARD: TEMPERATURE, CASE: TEMPERATURE, OTHER: STRING}
+START_NS = 1_600_000_000_000_000_000
+
+
+@dataclass
+class Message:
+    """
+    One message of a test bag: what is put into it.
+
+    """
+
+    topic: str
+    log_ns: int
+    stamp_ns: int = 0
+    frame_id: str = ''
+    numbers: tuple[float, ...] = field(default=())
+    is_little: bool = True
+
+
+@lru_cache(maxsize=2)
+def typestore(ros: int = 2) -> Any:
+    return get_typestore(Stores.ROS2_JAZZY if ros == 2 else Stores.ROS1_NOETIC)
+
+
+def to_ros(message: Message, ros: int = 2) -> Any:
+    types = typestore(ros).types
+    if message.topic == OTHER:
+        return types[STRING]('x' * (message.stamp_ns % 50))
+    stamp = types['builtin_interfaces/msg/Time'](*divmod(message.stamp_ns, 10**9))
+    sequence = () if ros == 2 else (7,)
+    header = types['std_msgs/msg/Header'](*sequence, stamp, message.frame_id)
+    vector = types['geometry_msgs/msg/Vector3']
+    values = message.numbers
+    if message.topic == ACCEL:
+        return types[VECTOR](header, vector(*values))
+    if message.topic == IMU_IN:
+        return types[IMU](
+            header,
+            types['geometry_msgs/msg/Quaternion'](*values[0:4]),
+            np.array(values[4:13]),
+            vector(*values[13:16]),
+            np.array(values[16:25]),
+            vector(*values[25:28]),
+            np.array(values[28:37]),
+        )
+    return types[TEMPERATURE](header, *values)
+
+
+def serialize(message: Message) -> bytes:
+    kind = TYPES[message.topic]
+    return bytes(
+        typestore().serialize_cdr(to_ros(message), kind, little_endian=message.is_little)
+    )
+
+
+def write_mcap(
+    path: Path,
+    messages: list[Message],
+    *,
+    chunk_size: int = 1 << 20,
+    compression: str = 'none',
+    use_chunking: bool = True,
+    index_types: IndexType = IndexType.ALL,
+    use_statistics: bool = True,
+    repeat: bool = True,
+    enable_crcs: bool = True,
+) -> None:
+    """
+    Write a bare file with the `mcap` library.
+
+    """
+    with path.open('wb') as file:
+        writer = McapWriter(
+            file,
+            chunk_size=chunk_size,
+            compression=getattr(CompressionType, compression.upper()),
+            index_types=index_types,
+            use_chunking=use_chunking,
+            use_statistics=use_statistics,
+            repeat_channels=repeat,
+            repeat_schemas=repeat,
+            enable_crcs=enable_crcs,
+        )
+        writer.start('ros2')
+        channels: dict[str, int] = {}
+        schemas: dict[str, int] = {}
+        for message in messages:
+            kind = TYPES[message.topic]
+            if kind not in schemas:
+                text = typestore().generate_msgdef(kind, ros_version=2)[0]
+                schemas[kind] = writer.register_schema(kind, 'ros2msg', text.encode())
+            if message.topic not in channels:
+                channels[message.topic] = writer.register_channel(
+                    message.topic, 'cdr', schemas[kind]
+                )
+            writer.add_message(
+                channels[message.topic], message.log_ns, serialize(message), message.log_ns
+            )
+        writer.finish()
+
+
+def write_rosbag2(
+    path: Path,
+    messages: list[Message],
+    *,
+    storage: str = 'mcap',
+    compression: str = '',
+) -> None:
+    """
+    Write a rosbag2 directory with `rosbags`.
+
+    """
+    plugin = StoragePlugin.MCAP if storage == 'mcap' else StoragePlugin.SQLITE3
+    writer = Writer2(path, version=9, storage_plugin=plugin)
+    if compression:
+        writer.set_compression(getattr(CompressionMode, compression), CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
+        for message in messages:
+            if message.topic not in connections:
+                connections[message.topic] = writer.add_connection(
+                    message.topic, TYPES[message.topic], typestore=typestore()
+                )
+            writer.write(connections[message.topic], message.log_ns, serialize(message))
+
+
+def write_rosbag1(path: Path, messages: list[Message]) -> None:
+    """
+    Write a ROS 1 bag with `rosbags`.
+
+    """
+    store = typestore(1)
+    with Writer1(path) as writer:
+        connections: dict[str, Any] = {}
+        for message in messages:
+            kind = TYPES[message.topic]
+            if message.topic not in connections:
+                connections[message.topic] = writer.add_connection(
+                    message.topic, kind, typestore=store
+                )
+            data = store.serialize_ros1(to_ros(message, 1), kind)
+            writer.write(connections[message.topic], message.log_ns, data)
+
+
+def read_with_rosbags(path: Path) -> list[tuple[str, int, Any]]:
+    """
+    Topic, log time and content of each message, in the order that `rosbags` gives.
+
+    """
+    with Reader2(path) as reader:
+        return [
+            (c.topic, log_ns, typestore().deserialize_cdr(data, c.msgtype))
+            for c, log_ns, data in reader.messages()
+        ]
+
+
+def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
+    """
+    The columns that a bag with these messages, in reading order, must give.
+
+    """
+    columns: dict[str, list[Any]] = {
+        f'{role}_{name}': []
+        for role in ('accel', 'board', 'case')
+        for name in ('stamp_ns', 'log_ns', 'values', 'after')
+    }
+    roles = {ACCEL: 'accel', IMU_IN: 'accel', BOARD: 'board', CASE: 'case'}
+    for message in messages:
+        role = roles.get(message.topic)
+        if role is None:
+            continue
+        columns[f'{role}_after'].append(len(columns['accel_stamp_ns']))
+        columns[f'{role}_stamp_ns'].append(message.stamp_ns)
+        columns[f'{role}_log_ns'].append(message.log_ns)
+        columns[f'{role}_values'].append(
+            message.numbers[0]
+            if role != 'accel'
+            else list(message.numbers[25:28] if message.topic == IMU_IN else message.numbers)
+        )
+    return columns
+
+
+def assert_columns(block: Block, messages: list[Message]) -> None:
+    """
+    The block holds exactly these messages in this order.
+
+    """
+    expected = columns_of(messages)
+    for role in ('accel', 'board', 'case'):
+        for name in ('stamp_ns', 'log_ns'):
+            found = getattr(block, f'{role}_{name}')
+            assert found.dtype == np.int64
+            assert found.tolist() == expected[f'{role}_{name}'], (role, name)
+        values = getattr(block, role)
+        assert values.dtype == np.float64
+        # Bits, not values: a NaN with its payload must come through.
+        shape = (-1, 3) if role == 'accel' else (-1,)
+        wanted = np.array(expected[f'{role}_values'], np.float64).reshape(shape)
+        assert np.ascontiguousarray(values).tobytes() == wanted.tobytes(), role
+    assert block.board_after.tolist() == expected['board_after']
+    assert block.case_after.tolist() == expected['case_after']
+
+
+def regular_messages(n: int = 40, accel: str = ACCEL, every: int = 8) -> list[Message]:
+    """
+    A small well-behaved bag: counts, and both temperatures each some counts.
+
+    """
+    messages: list[Message] = []
+    width = 3 if accel == ACCEL else 37
+    for row in range(n):
+        time_ns = START_NS + 2_500_000 * row
+        if row % every == 0:
+            for topic, celsius in ((BOARD, 20.0), (CASE, 25.0)):
+                messages.append(
+                    Message(topic, time_ns, time_ns - 900, 'board', (celsius + row, 0.0))
+                )
+        numbers = tuple(float(row * width + k) for k in range(width))
+        messages.append(Message(accel, time_ns, time_ns - 1000, 'accel', numbers))
+    return messages

@@ -1,0 +1,325 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reading: any bag that another tool wrote gives the columns of its messages in a player's order.
+
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import IndexType
+from recording_helpers import (
+    ACCEL,
+    BOARD,
+    CASE,
+    IMU_IN,
+    OTHER,
+    START_NS,
+    Message,
+    assert_columns,
+    read_with_rosbags,
+    regular_messages,
+    serialize,
+    write_mcap,
+    write_rosbag1,
+    write_rosbag2,
+)
+
+from thermo_comp.recording import (
+    Recording,
+    Topics,
+    inspect_recording,
+    open_recording,
+    read_recording,
+)
+
+ALL_TOPICS = (ACCEL, BOARD, CASE, OTHER)
+WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
+
+
+@st.composite
+def bags(draw: st.DrawFn, accel: str = ACCEL, is_sorted: bool = False) -> list[Message]:
+    """
+    Messages in the order of writing: ties and steps back in log time, mixed frames and orders.
+
+    """
+    lowest = 0 if is_sorted else -3
+    frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
+    topics = (accel, BOARD, CASE, OTHER)
+    messages: list[Message] = []
+    log_ns = START_NS
+    for topic in draw(st.lists(st.sampled_from(topics), min_size=1, max_size=60)):
+        log_ns += draw(st.integers(lowest, 4)) * 1000
+        messages.append(
+            Message(
+                topic,
+                log_ns,
+                draw(st.integers(0, 2**31 * 10**9 - 1)),
+                draw(st.sampled_from(frames)),
+                tuple(draw(st.floats(width=64)) for _ in range(min(WIDTHS[topic], 3)))
+                + tuple(float(k) for k in range(3, WIDTHS[topic])),
+                draw(st.booleans()) if draw(st.booleans()) else True,
+            )
+        )
+    return messages
+
+
+def in_reading_order(messages: list[Message]) -> list[Message]:
+    return sorted(messages, key=lambda message: message.log_ns)
+
+
+def read(path: Path) -> Recording:
+    return read_recording(path, require=())
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    messages=bags(),
+    chunk_size=st.sampled_from([1, 150, 400, 1000, 5000, 1 << 20]),
+    compression=st.sampled_from(['none', 'lz4', 'zstd']),
+    index_types=st.sampled_from([IndexType.ALL, IndexType.CHUNK, IndexType.MESSAGE, IndexType(0)]),
+    use_statistics=st.booleans(),
+    repeat=st.booleans(),
+    enable_crcs=st.booleans(),
+)
+def test_any_chunked_file_gives_its_messages_in_order_of_log_time(
+    messages: list[Message], **options: object
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'bag.mcap')
+        write_mcap(path, messages, **options)
+        recording = read(path)
+        assert_columns(recording.columns, in_reading_order(messages))
+        assert recording.info.truncated is None
+        assert recording.info.n_messages == len(messages)
+        assert recording.info.start_ns == min(message.log_ns for message in messages)
+        assert recording.info.end_ns == max(message.log_ns for message in messages)
+        if options['index_types'] == IndexType.ALL and options['repeat']:
+            # The second route to the order: what rosbags yields for the very same file.
+            order = [(topic, log_ns) for topic, log_ns, _ in read_with_rosbags(path)]
+            assert order == [(m.topic, m.log_ns) for m in in_reading_order(messages)]
+
+
+@settings(max_examples=25, deadline=None)
+@given(messages=bags(), index_types=st.sampled_from([IndexType.ALL, IndexType(0)]))
+def test_a_file_without_chunks_is_read_as_it_stands(
+    messages: list[Message], index_types: IndexType
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'bag.mcap')
+        write_mcap(path, messages, use_chunking=False, index_types=index_types)
+        recording = read(path)
+        assert_columns(recording.columns, messages)
+        assert recording.info.n_messages == len(messages)
+
+
+@settings(max_examples=25, deadline=None)
+@given(messages=bags(accel=IMU_IN), chunk_size=st.sampled_from([500, 3000, 1 << 20]))
+def test_every_number_of_an_imu_message_arrives(messages: list[Message], chunk_size: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'bag.mcap')
+        write_mcap(path, messages, chunk_size=chunk_size, compression='lz4')
+        columns = read(path).columns
+        ordered = in_reading_order(messages)
+        assert_columns(columns, ordered)
+        numbers = [m.numbers for m in ordered if m.topic == IMU_IN]
+        if not numbers:
+            assert columns.imu is None or len(columns.imu.orientation) == 0
+            return
+        assert columns.imu is not None
+        together = np.hstack(
+            [
+                columns.imu.orientation,
+                columns.imu.orientation_covariance,
+                columns.imu.angular_velocity,
+                columns.imu.angular_velocity_covariance,
+                columns.accel,
+                columns.imu.linear_acceleration_covariance,
+            ]
+        )
+        assert together.tobytes() == np.array(numbers).tobytes()
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    messages=bags(is_sorted=True),
+    storage=st.sampled_from(['mcap', 'sqlite3']),
+    compression=st.sampled_from(['', 'FILE', 'MESSAGE', 'STORAGE']),
+)
+def test_directories_written_by_rosbags(
+    messages: list[Message], storage: str, compression: str
+) -> None:
+    compression = '' if storage == 'sqlite3' and compression == 'STORAGE' else compression
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'bag')
+        write_rosbag2(path, messages, storage=storage, compression=compression)
+        recording = read(path)
+        assert_columns(recording.columns, messages)
+        assert recording.info.storage == storage
+        assert recording.info.n_messages == len(messages)
+
+
+@settings(max_examples=10, deadline=None)
+@given(messages=bags(is_sorted=True))
+def test_ros_1_bags(messages: list[Message]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'bag.bag')
+        write_rosbag1(path, messages)
+        recording = read(path)
+        assert_columns(recording.columns, messages)
+        assert recording.info.storage == 'ros1'
+
+
+@pytest.mark.parametrize('accel', [ACCEL, IMU_IN])
+def test_raw_messages_are_the_very_bytes(tmp_path: Path, accel: str) -> None:
+    messages = regular_messages(accel=accel)
+    write_mcap(tmp_path / 'bag.mcap', messages, chunk_size=900)
+    write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
+    write_rosbag1(tmp_path / 'bag.bag', messages)
+    for name in ('bag.mcap', 'bag', 'bag.bag'):
+        with open_recording(tmp_path / name) as reader:
+            found = {raw.topic: raw for block in reader.blocks(raw=True) for raw in block.raw}
+        assert set(found) == {accel, BOARD, CASE}
+        for topic, raw in found.items():
+            pieces = np.split(raw.data, raw.ends)[:-1]
+            wanted = [m for m in messages if m.topic == topic]
+            assert [piece.tobytes() for piece in pieces] == [serialize(m) for m in wanted]
+            assert raw.log_ns.tolist() == [m.log_ns for m in wanted]
+
+
+def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path: Path) -> None:
+    messages = regular_messages(60)
+    for row, message in enumerate(messages):
+        message.frame_id = 'front' if row % 30 < 11 else 'a_longer_name'
+    write_mcap(tmp_path / 'bag.mcap', messages, chunk_size=1500)
+    with open_recording(tmp_path / 'bag.mcap') as reader:
+        blocks = list(reader.blocks())
+    frames = [message.frame_id for message in messages if message.topic == ACCEL]
+    assert [frame for block in blocks for frame in [block.frame_id] * len(block)] == frames
+    before, n_accel = 0, 0
+    for block in blocks:
+        # Each reading's place counts within its own block, so it can never exceed the block.
+        assert ((block.board_after >= 0) & (block.board_after <= len(block))).all()
+        before += len(block.board)
+        n_accel += len(block)
+    assert (before, n_accel) == (8, 60)
+    assert_columns(read(tmp_path / 'bag.mcap').columns, messages)
+
+
+def test_overlapping_chunks_of_single_topics_are_merged(tmp_path: Path) -> None:
+    """
+    WHY: a tool that writes a chunk per topic puts the temperatures behind the samples they are
+    for; read in file order, each would be applied a chunk too late. PROMISE: log-time order.
+
+    """
+    messages = regular_messages(200)
+    by_topic = sorted(
+        messages, key=lambda m: ((m.log_ns - START_NS) // 100_000_000, ALL_TOPICS.index(m.topic))
+    )
+    write_mcap(tmp_path / 'bag.mcap', by_topic, chunk_size=400)
+    # Ties in log time are in the order of the file, so there the counts come first here.
+    assert_columns(read(tmp_path / 'bag.mcap').columns, in_reading_order(by_topic))
+
+
+def test_split_files_follow_each_other(tmp_path: Path) -> None:
+    messages = regular_messages(90)
+    write_rosbag2(tmp_path / 'bag', messages[:50])
+    write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[50:80])
+    write_mcap(tmp_path / 'bag' / 'bag_10.mcap', messages[80:])
+    metadata = tmp_path / 'bag' / 'metadata.yaml'
+    text = metadata.read_text()
+    listed = text.replace(
+        'relative_file_paths:\n  - bag.mcap',
+        'relative_file_paths:\n  - bag.mcap\n  - ../elsewhere/bag_1.mcap\n  - bag_10.mcap',
+    )
+    assert listed != text
+    metadata.write_text(listed)
+    recording = read(tmp_path / 'bag')
+    assert_columns(recording.columns, messages)
+    assert recording.info.truncated is None
+    assert recording.info.n_messages == len(messages)
+
+    # The recorder was killed: no metadata.yaml; the numbers in the names give the order.
+    (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / 'bag' / 'bag_0.mcap')
+    (tmp_path / 'bag' / 'bag_1.mcap').rename(tmp_path / 'bag' / 'bag_2.mcap')
+    for text in (None, ''):
+        metadata.unlink(missing_ok=True)
+        if text is not None:
+            metadata.write_text(text)
+        recording = read(tmp_path / 'bag')
+        assert_columns(recording.columns, messages)
+        assert recording.info.truncated == (
+            'metadata.yaml is missing, the recording was not finished'
+        )
+
+
+def test_a_bare_database_and_one_without_metadata(tmp_path: Path) -> None:
+    messages = regular_messages()
+    write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    recording = read(tmp_path / 'bag')
+    assert_columns(recording.columns, messages)
+    assert 'metadata.yaml is missing' in str(recording.info.truncated)
+    shutil.copy(tmp_path / 'bag' / 'bag.db3', tmp_path / 'bare.db3')
+    assert_columns(read(tmp_path / 'bare.db3').columns, messages)
+
+
+def test_large_chunks_are_streamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('thermo_comp.recording.survey.MAX_CHUNK_BYTES', 2000)
+    monkeypatch.setattr('thermo_comp.recording.chunk.WINDOW_BYTES', 700)
+    messages = regular_messages(300)
+    for compression in ('none', 'lz4', 'zstd'):
+        write_mcap(
+            tmp_path / f'{compression}.mcap', messages, chunk_size=6000, compression=compression
+        )
+        assert_columns(read(tmp_path / f'{compression}.mcap').columns, messages)
+
+
+def test_info_is_known_before_the_messages_are_read(tmp_path: Path) -> None:
+    messages = regular_messages(40)
+    write_mcap(tmp_path / 'bag.mcap', [*messages, Message(OTHER, START_NS + 10**9)])
+    info = inspect_recording(tmp_path / 'bag.mcap')
+    assert info.topics == {
+        ACCEL: ('geometry_msgs/msg/Vector3Stamped', 40),
+        BOARD: ('sensor_msgs/msg/Temperature', 5),
+        CASE: ('sensor_msgs/msg/Temperature', 5),
+        OTHER: ('std_msgs/msg/String', 1),
+    }
+    assert (info.start_ns, info.end_ns) == (START_NS, START_NS + 10**9)
+    assert info.input == 'counts'
+    assert info.n_messages == 51
+
+
+def test_auto_prefers_counts_that_are_there(tmp_path: Path) -> None:
+    both = [*regular_messages(8), *regular_messages(8, IMU_IN)]
+    write_mcap(tmp_path / 'both.mcap', both)
+    write_mcap(tmp_path / 'imu.mcap', regular_messages(8, IMU_IN))
+    assert read(tmp_path / 'both.mcap').info.input == 'counts'
+    assert read(tmp_path / 'imu.mcap').info.input == 'imu'
+    chosen = read_recording(tmp_path / 'both.mcap', input='imu')
+    assert chosen.info.input == 'imu'
+    assert chosen.columns.imu is not None
+
+
+def test_a_topic_is_found_under_its_namespace(tmp_path: Path) -> None:
+    path = tmp_path / 'bag.mcap'
+    write_mcap(path, regular_messages(8))
+    with open_recording(path, Topics(counts='counts', board='/temperature/board/')) as reader:
+        assert reader.topics == {'accel': ACCEL, 'board': BOARD, 'case': CASE}
+
+
+def test_reading_twice_gives_the_same_and_an_early_stop_leaves_no_thread(tmp_path: Path) -> None:
+    path = tmp_path / 'bag.mcap'
+    write_mcap(path, regular_messages(2000), chunk_size=2000)
+    with open_recording(path) as reader:
+        first = next(iter(reader.blocks()))
+        again = next(iter(reader.blocks()))
+    assert first.accel.tobytes() == again.accel.tobytes()

@@ -1,0 +1,404 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Writing: other tools read back what was written, all of it at once or nothing.
+
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from recording_helpers import START_NS, read_with_rosbags, typestore
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader as Reader2
+
+from thermo_comp.errors import RecordingError
+from thermo_comp.recording import (
+    BagWriter,
+    ImuColumns,
+    open_recording,
+    read_recording,
+)
+from thermo_comp.recording.atomic import publish
+
+STEP_NS = 2_500_000
+REQUIRED: tuple[()] = ()
+
+
+def imu_columns(rng: np.random.Generator, n: int) -> ImuColumns:
+    return ImuColumns(
+        *(rng.normal(size=(n, width)) for width in (4, 9, 3, 9, 9)),
+    )
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    counts=st.lists(st.integers(0, 60), min_size=1, max_size=4),
+    frame_id=st.text(max_size=20).filter(lambda text: '\0' not in text),
+    compression=st.sampled_from(['none', 'lz4', 'zstd']),
+    chunk_bytes=st.sampled_from([1, 300, 2000, 1 << 20]),
+    is_file=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_rosbags_and_mcap_read_back_what_was_written(
+    counts: list[int],
+    frame_id: str,
+    compression: Any,
+    chunk_bytes: int,
+    is_file: bool,
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    written: list[tuple[int, int, str, bytes]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'bag.mcap' if is_file else 'bag')
+        with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes) as bag:
+            for group, n in enumerate(counts):
+                log_ns = START_NS + rng.integers(0, 50, n) * STEP_NS
+                stamp_ns = rng.integers(0, 2**31 * 10**9, n)
+                imu, linear = imu_columns(rng, n), rng.normal(size=(n, 3))
+                raw = [rng.bytes(int(size)) for size in rng.integers(1, 40, n)]
+                bag.write_counts('accel/counts', stamp_ns, linear, frame_id, log_ns)
+                bag.write_temperature('temperature/board', stamp_ns, linear[:, 0], log_ns)
+                covariance = imu.linear_acceleration_covariance
+                bag.write_imu('imu/data_raw', stamp_ns, linear, covariance, frame_id, imu, log_ns)
+                bag.write_bool('regime/dynamic', log_ns, linear[:, 0] > 0)
+                bag.write_raw('diagnostics', 'std_msgs/msg/String', log_ns, raw)
+                bag.flush()
+                for call, name in enumerate(('c', 't', 'i', 'b', 'r')):
+                    for row in range(n):
+                        written.append((group, int(log_ns[row]), name, row.to_bytes(2, 'big')))
+                expected = {
+                    'c': (stamp_ns, linear),
+                    't': (stamp_ns, linear),
+                    'i': (stamp_ns, linear),
+                }
+        file = path if is_file else path / 'bag_0.mcap'
+        names = {
+            '/accel/counts': 'c',
+            '/temperature/board': 't',
+            '/imu/data_raw': 'i',
+            '/regime/dynamic': 'b',
+            '/diagnostics': 'r',
+        }
+        # The file order: by group of calls, then log time, then the order of the calls.
+        wanted = [
+            (log_ns, name)
+            for _, log_ns, name, _ in sorted(written, key=lambda entry: entry[:2])
+        ]
+        with file.open('rb') as stream:
+            records = [
+                (record.log_time, record.channel_id)
+                for record in StreamReader(stream, validate_crcs=True).records
+                if type(record).__name__ == 'Message'
+            ]
+        with file.open('rb') as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            summary = reader.get_summary()
+            assert summary is not None
+            topics = {c.id: names[c.topic] for c in summary.channels.values()}
+            assert [(log_ns, topics[number]) for log_ns, number in records] == wanted
+            assert summary.statistics is not None
+            assert summary.statistics.message_count == len(wanted)
+            in_time = [message.log_time for _, _, message in reader.iter_messages()]
+            assert in_time == sorted(log_ns for log_ns, _ in wanted)
+        assert len(wanted) == sum(counts) * 5
+        with Reader2(path) as rosbag:
+            assert rosbag.message_count == len(wanted)
+            assert {c.topic for c in rosbag.connections} == set(names)
+            found = [(log_ns, names[c.topic]) for c, log_ns, _ in rosbag.messages()]
+        assert found == sorted(wanted, key=lambda entry: entry[0])
+        if counts[-1] and len(counts) == 1:
+            messages = {'c': [], 't': [], 'i': []}
+            with AnyReader([path]) as rosbag_any:
+                for c, _, data in rosbag_any.messages():
+                    if names[c.topic] in messages:
+                        message = rosbag_any.deserialize(data, c.msgtype)
+                        messages[names[c.topic]].append(message)
+            order = np.argsort(log_ns, kind='stable')
+            for name, (stamps, linear) in expected.items():
+                for row, message in zip(order, messages[name], strict=True):
+                    stamp = message.header.stamp
+                    assert stamp.sec * 10**9 + stamp.nanosec == stamps[row]
+                    if name == 't':
+                        assert message.temperature == linear[row, 0]
+                        continue
+                    assert message.header.frame_id == frame_id
+                    vector = message.vector if name == 'c' else message.linear_acceleration
+                    assert [vector.x, vector.y, vector.z] == linear[row].tolist()
+            for row, message in zip(order, messages['i'], strict=True):
+                q, w = message.orientation, message.angular_velocity
+                assert [q.x, q.y, q.z, q.w] == imu.orientation[row].tolist()
+                assert [w.x, w.y, w.z] == imu.angular_velocity[row].tolist()
+                for name in (
+                    'orientation_covariance',
+                    'angular_velocity_covariance',
+                    'linear_acceleration_covariance',
+                ):
+                    assert (getattr(message, name) == getattr(imu, name)[row]).all()
+
+
+def small(path: Path, value: float = 1.0, **options: Any) -> None:
+    with BagWriter(path, **options) as bag:
+        stamps = START_NS + STEP_NS * np.arange(5)
+        bag.write_counts('accel/counts', stamps, np.full((5, 3), value))
+
+
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_metadata_comes_back(tmp_path: Path, name: str) -> None:
+    pairs = {'serial': 'Ünit 7', 'git': 'a: b\n- c'}
+    small(tmp_path / name, metadata=pairs)
+    assert read_recording(tmp_path / name, require=()).info.metadata == pairs
+    if name == 'bag.mcap':  # even of a torn file
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content[: len(content) // 2])
+        assert read_recording(tmp_path / name, require=()).info.metadata == pairs
+
+
+def test_the_directory_is_what_rosbag2_writes(tmp_path: Path) -> None:
+    small(tmp_path / 'bag', metadata={'serial': '7'})
+    assert {p.name for p in (tmp_path / 'bag').iterdir()} == {'metadata.yaml', 'bag_0.mcap'}
+    content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    content = content['rosbag2_bagfile_information']
+    assert content['version'] == 9
+    assert content['storage_identifier'] == 'mcap'
+    assert content['relative_file_paths'] == ['bag_0.mcap']
+    assert content['message_count'] == 5
+    assert content['starting_time'] == {'nanoseconds_since_epoch': START_NS}
+    assert content['duration'] == {'nanoseconds': 4 * STEP_NS}
+    assert content['custom_data'] == {'serial': '7'}
+    (topic,) = content['topics_with_message_count']
+    kind = 'geometry_msgs/msg/Vector3Stamped'
+    assert topic['topic_metadata']['type'] == kind
+    assert topic['topic_metadata']['type_description_hash'] == typestore().hash_rihs01(kind)
+    with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == 'ros2'
+        summary = reader.get_summary()
+        assert summary is not None
+        (channel,) = summary.channels.values()
+        (schema,) = summary.schemas.values()
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert (schema.name, schema.encoding) == (kind, 'ros2msg')
+    assert schema.data.decode() == typestore().generate_msgdef(kind, ros_version=2)[0]
+    qos = yaml.safe_load(channel.metadata['offered_qos_profiles'])
+    assert qos == topic['topic_metadata']['offered_qos_profiles']
+    assert qos[0]['reliability'] == 'reliable'
+    assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
+
+
+def test_an_imu_without_gyro_claims_none(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        bag.write_imu('imu/data_raw', [START_NS], [[1.0, 2.0, 3.0]], np.eye(3).ravel(), 'link')
+    ((_, log_ns, message),) = read_with_rosbags(tmp_path / 'bag.mcap')
+    assert log_ns == START_NS
+    assert message.orientation_covariance[0] == message.angular_velocity_covariance[0] == -1.0
+    assert message.orientation.w == 1.0
+    assert message.linear_acceleration_covariance.tolist() == np.eye(3).ravel().tolist()
+
+
+def test_own_definition_of_a_raw_message(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        with pytest.raises(RecordingError, match='/x: the definition of message type a/msg/B is'):
+            bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
+        bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'], ('ros2msg', 'uint8 data\n'))
+        with pytest.raises(RecordingError, match='/x: already written with another type than std'):
+            bag.write_bool('x', [1], [True])
+    with AnyReader([tmp_path / 'bag.mcap']) as reader:
+        ((connection, _, data),) = reader.messages()
+        assert reader.deserialize(data, connection.msgtype).data == 7
+    with open_recording(tmp_path / 'bag.mcap', require=()) as ours:
+        assert ours.definitions['a/msg/B'] == ('ros2msg', 'uint8 data\n')
+
+
+def test_inputs_can_be_copied_beside_the_outputs(tmp_path: Path) -> None:
+    small(tmp_path / 'in')
+    with (
+        open_recording(tmp_path / 'in', require=('accel',)) as reader,
+        BagWriter(tmp_path / 'out') as bag,
+    ):
+        for block in reader.blocks(raw=True):
+            for raw in block.raw:
+                bag.write_raw(raw.topic, raw.type, raw.log_ns, raw, reader.definitions[raw.type])
+    found, given = (read_with_rosbags(tmp_path / name) for name in ('out', 'in'))
+    assert [entry[:2] for entry in found] == [entry[:2] for entry in given]
+    assert [entry[2].vector for entry in found] == [entry[2].vector for entry in given]
+
+
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    small(path, 1.0)
+    with pytest.raises(RecordingError, match='exists already'):
+        small(path, 2.0)
+
+    def value() -> float:
+        return float(read_recording(path, require=()).columns.accel[0, 0])
+
+    with pytest.raises(KeyError), BagWriter(path, overwrite=True) as bag:
+        bag.write_counts('accel/counts', [1], [[2.0, 2.0, 2.0]])
+        bag.flush()
+        assert value() == 1.0
+        raise KeyError
+    assert value() == 1.0
+    assert [p.name for p in tmp_path.iterdir()] == [name]  # nothing is left lying about
+    small(path, 3.0, overwrite=True)
+    assert value() == 3.0
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path: Path) -> None:
+    (tmp_path / 'home').mkdir()
+    (tmp_path / 'home' / 'thesis.tex').write_text('ten years of work')
+    with pytest.raises(RecordingError, match='is not replaced: it holds thesis.tex'):
+        BagWriter(tmp_path / 'home', overwrite=True)
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match='is a file and is not replaced'):
+        BagWriter(tmp_path / 'file', overwrite=True)
+    (tmp_path / 'folder.mcap').mkdir()
+    with pytest.raises(RecordingError, match='is a directory and is not replaced'):
+        BagWriter(tmp_path / 'folder.mcap', overwrite=True)
+
+
+def test_directories_are_exchanged_without_the_system_call_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ('old', 'new'):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+    monkeypatch.setattr('thermo_comp.recording.atomic._exchange', lambda one, other: False)
+    publish(tmp_path / 'new', tmp_path / 'old')
+    assert [p.name for p in tmp_path.iterdir()] == ['old']
+    assert [p.name for p in (tmp_path / 'old').iterdir()] == ['new']
+
+
+@contextmanager
+def limited_file_size(n_bytes: int) -> Iterator[None]:
+    """
+    Let no file of this process grow beyond a size: what a full disk does to a writer.
+
+    """
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_a_full_disk_is_one_clear_error(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    small(path, 1.0)
+    bag = BagWriter(path, overwrite=True, compression='none')
+    rng = np.random.default_rng(1)
+    stamps = START_NS + STEP_NS * np.arange(50_000)
+    with limited_file_size(100_000), pytest.raises(RecordingError, match=r'bag.*: cannot be wri'):
+        bag.write_counts('accel/counts', stamps, rng.normal(size=(50_000, 3)))
+        bag.close()
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert len(read_recording(path, require=()).columns) == 5
+
+
+def test_an_output_may_be_a_link(tmp_path: Path) -> None:
+    for name in ('bag', 'bag.mcap'):
+        small(tmp_path / 'disk' / name, 1.0)
+        (tmp_path / name).symlink_to(tmp_path / 'disk' / name)
+        small(tmp_path / name, 2.0, overwrite=True)
+        assert (tmp_path / name).is_symlink()
+        columns = read_recording(tmp_path / 'disk' / name, require=()).columns
+        assert float(columns.accel[0, 0]) == 2.0
+
+
+def test_a_target_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match='cannot be written: .*file is no directory'):
+        BagWriter(tmp_path / 'file' / 'bag.mcap')
+    if os.geteuid() == 0:
+        with pytest.raises(RecordingError, match='cannot be written'):
+            BagWriter('/proc/bag.mcap')
+    else:
+        (tmp_path / 'locked').mkdir(mode=0o500)
+        with pytest.raises(RecordingError, match='cannot be written: Permission denied'):
+            BagWriter(tmp_path / 'locked' / 'bag.mcap')
+
+
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_a_killed_writer_leaves_the_old_output_and_a_readable_rest(
+    tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / name
+    small(path, 1.0)
+    script = (
+        'import os, signal, sys, numpy as np\n'
+        'from thermo_comp.recording import BagWriter\n'
+        'bag = BagWriter(sys.argv[1], overwrite=True)\n'
+        'stamps = np.arange(30_000) * 2_500_000\n'
+        "bag.write_counts('accel/counts', stamps, np.zeros((30_000, 3)))\n"
+        'bag.flush()\n'
+        'os.kill(os.getpid(), signal.SIGKILL)\n'
+    )
+    killed = subprocess.run([sys.executable, '-c', script, str(path)], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert float(read_recording(path, require=()).columns.accel[0, 0]) == 1.0
+    (rest,) = (entry for entry in tmp_path.iterdir() if entry != path)
+    recovered = read_recording(rest, require=())
+    assert recovered.info.truncated is not None
+    # What had not filled a chunk of 1 MiB was still in memory: at most 14 000 messages of 76 bytes.
+    assert 16_000 < len(recovered.columns) <= 30_000
+
+
+def test_arguments_that_do_not_fit(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="`compression` must be zstd, lz4 or none, got 'gzip'"):
+        BagWriter(tmp_path / 'bag', compression='gzip')  # type: ignore[arg-type]
+    with BagWriter(tmp_path / 'bag') as bag:
+        with pytest.raises(ValueError, match=r'`xyz` must have shape \(2, 3\), got \(2, 2\)'):
+            bag.write_counts('a', [1, 2], [[1, 2], [3, 4]])
+        with pytest.raises(ValueError, match='`stamp_ns` must be one row of integers, got float'):
+            bag.write_counts('a', [1.5], [[1, 2, 3]])
+        with pytest.raises(ValueError, match='`stamp_ns` must not be negative, got -1'):
+            bag.write_counts('a', [-1], [[1, 2, 3]])
+        with pytest.raises(ValueError, match=r'`stamp_ns` must be below 2\*\*31 s, got 2147483648'):
+            bag.write_counts('a', [2**31 * 10**9], [[1, 2, 3]])
+        with pytest.raises(ValueError, match='`log_ns` must have 1 values, got 2'):
+            bag.write_counts('a', [1], [[1, 2, 3]], log_ns=[1, 2])
+        with pytest.raises(ValueError, match=r'`celsius` must have 1 values, got \(2,\)'):
+            bag.write_temperature('a', [1], [1.0, 2.0])
+        with pytest.raises(ValueError, match='`linear_acceleration` must have shape'):
+            bag.write_imu('a', [1], [[1.0, 2.0]], np.zeros(9))
+        with pytest.raises(ValueError, match='`linear_acceleration_covariance` must have shape'):
+            bag.write_imu('a', [1], [[1.0, 2.0, 3.0]], np.zeros((1, 3)))
+        with pytest.raises(ValueError, match=r'`values` must have 1 values, got \(2,\)'):
+            bag.write_bool('a', [1], [True, False])
+        with pytest.raises(ValueError, match='`log_ns` must have 1 values, got 2'):
+            bag.write_raw('a', 'std_msgs/msg/Bool', [1, 2], [b''])
+    with pytest.raises(RecordingError, match='the bag is closed'):
+        bag.write_bool('a', [1], [True])
+
+
+def test_a_bag_without_messages_is_a_bag(tmp_path: Path) -> None:
+    for name in ('bag', 'bag.mcap'):
+        with BagWriter(tmp_path / name):
+            pass
+        with Reader2(tmp_path / name) as reader:
+            assert reader.message_count == 0
+        assert read_recording(tmp_path / name, require=()).info.n_messages == 0
