@@ -229,7 +229,7 @@ class TestFits:
     def test_too_few_positions(self, cli: Cli, tmp_path: Path) -> None:
         paths = [bag(tmp_path / f'{i}.mcap') for i in range(2)]
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
-        refused(cli, 1, r'', 'fit', *paths, *arguments)
+        refused(cli, 1, r'2 still positions, need 6', 'fit', *paths, *arguments)
         assert not (tmp_path / 'new.yaml').exists()
 
     def test_gravity_of_another_planet(self, cli: Cli, tmp_path: Path) -> None:
@@ -240,7 +240,14 @@ class TestFits:
     def test_bags_of_two_units(self, cli: Cli, tmp_path: Path) -> None:
         paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
-        refused(cli, 1, r'', 'fit', *paths, *arguments)
+        refused(
+            cli,
+            1,
+            r'of different units: .*0.mcap of T-0, .*1.mcap of T-1',
+            'fit',
+            *paths,
+            *arguments,
+        )
 
 
 class TestEvaluations:

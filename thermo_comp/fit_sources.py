@@ -20,6 +20,7 @@ def fit_sources(
     paths: Sequence[str | Path],
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    serial: str | None = None,
 ) -> tuple[list[FitSource], Input]:
     """
     Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
@@ -32,6 +33,8 @@ def fit_sources(
         Names of the inputs.
     input : {'auto', 'counts', 'imu'}, optional
         What is read.
+    serial : str or None, optional
+        The unit as the user knows it; it wins over what the bags say.
 
     Returns
     -------
@@ -45,15 +48,18 @@ def fit_sources(
     RecordingError
         If one cannot be read or lacks a topic.
     FitError
-        If some hold counts and some Imu messages.
+        If some hold counts and some Imu messages, or they are of different units.
 
     """
     sources: list[FitSource] = []
     kinds: dict[str, str] = {}
+    serials: dict[str, str] = {}
     for path in map(Path, paths):
         with open_recording(path, topics, input, require=('accel', 'board')) as reader:
             info = reader.info
         kinds[info.input or 'counts'] = str(path)
+        if info.metadata.get('serial'):
+            serials[info.metadata['serial']] = str(path)
         sources.append(
             FitSource(
                 name=path.name,
@@ -66,6 +72,9 @@ def fit_sources(
         raise FitError(
             f'{kinds["counts"]} holds counts, {kinds["imu"]} Imu messages: choose one with --input'
         )
+    if serial is None and len(serials) > 1:
+        found = ', '.join(f'{path} of {unit}' for unit, path in sorted(serials.items()))
+        raise FitError(f'the bags are of different units: {found}')
     return sources, 'imu' if 'imu' in kinds else 'counts'
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from . import options
-from .output import Cell, Output
+from .output import Cell, Output, micro_g
 
 if TYPE_CHECKING:
     from ..evaluation import Evaluation
@@ -102,8 +102,8 @@ def say(out: Output, result: Evaluation) -> None:
         for name, statistics in result.statistics.items():
             one = statistics[section]
             if one.n:
-                micro_g = one.micro_g
-                rows.append((section, name, one.n, micro_g.mean, micro_g.rms, micro_g.peak))
+                ug = one.micro_g
+                rows.append((section, name, one.n, *map(micro_g, (ug.mean, ug.rms, ug.peak))))
     out.table(
         ('section', 'model', 'windows', 'mean ug', 'RMS ug', 'max ug'),
         rows,

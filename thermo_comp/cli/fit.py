@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from . import options
-from .output import Output
+from .output import Output, micro_g
 
 if TYPE_CHECKING:
     from ..fitting import FitResult
@@ -76,7 +76,7 @@ def fit(
         if path is not None:
             options.refuse_existing(path, force)
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
-    sources, kind = fit_sources(bags, topics, input_.value)
+    sources, kind = fit_sources(bags, topics, input_.value, serial)
     try:
         settings = FitOptions(
             gravity=resolve_gravity(gravity, latitude, height),
@@ -104,16 +104,19 @@ def _say(out: Output, result: FitResult, output: Path) -> None:
             (
                 row.section,
                 row.fitted.n,
-                row.raw.micro_g.rms,
-                row.one_set.micro_g.rms,
-                row.fitted.micro_g.rms,
-                row.fitted.micro_g.peak,
+                micro_g(row.raw.micro_g.rms),
+                micro_g(row.one_set.micro_g.rms),
+                micro_g(row.fitted.micro_g.rms),
+                micro_g(row.fitted.micro_g.peak),
             )
             for row in result.residuals
             if row.fitted.n
         ],
         title='|f| - g at rest, RMS',
     )
+    for finding in result.findings:
+        if finding.level != 'good':
+            out.line(f'- {finding.message}')
     out.line(
         f'{output}: unit {calibration.unit.serial}, {calibration.provenance.model}, '
         f'{len(result.positions)} positions'
@@ -124,7 +127,9 @@ def _say(out: Output, result: FitResult, output: Path) -> None:
             'serial': calibration.unit.serial,
             'model': calibration.provenance.model,
             'gravity': calibration.gravity_m_s2,
-            'residuals': result.residuals,
+            'residuals_m_s2': result.residuals,
             'positions': result.positions,
+            'candidates': result.candidates,
+            'findings': result.findings,
         }
     )

@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from . import options
-from .output import Cell, Output
+from .output import Cell, Output, micro_g
 
 
 def info(
@@ -125,7 +125,7 @@ def _calibration(out: Output, path: Path) -> None:
                 name,
                 f'{axis.scale_factor:.8g}',
                 f'{axis.bias:.6g}',
-                axis.bias / axis.scale_factor / MICRO_G,
+                micro_g(axis.bias / axis.scale_factor / MICRO_G),
             )
             for name, axis in zip(
                 'xyz',
@@ -156,9 +156,9 @@ def _calibration(out: Output, path: Path) -> None:
                 (
                     row.section,
                     row.n_windows,
-                    row.raw_rms_m_s2 / MICRO_G,
-                    row.rms_m_s2 / MICRO_G,
-                    row.max_m_s2 / MICRO_G,
+                    micro_g(row.raw_rms_m_s2 / MICRO_G),
+                    micro_g(row.rms_m_s2 / MICRO_G),
+                    micro_g(row.max_m_s2 / MICRO_G),
                 )
                 for row in provenance.residuals
             ],

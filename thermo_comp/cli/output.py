@@ -83,9 +83,7 @@ class Output:
         if self.as_json or self.quiet:
             return
         cells = [[text(cell) for cell in row] for row in rows]
-        right = [
-            any(isinstance(row[i], (int, float)) for row in rows) for i in range(len(columns))
-        ]
+        right = [all(_is_number(row[i]) for row in cells) for i in range(len(columns))]
         if sys.stdout.isatty():
             from rich import box
             from rich.console import Console
@@ -172,6 +170,22 @@ def text(cell: Cell) -> str:
             return f'{cell:.0f}'
         return f'{cell:.{min(3 - math.floor(math.log10(abs(cell))), 6)}f}'
     return str(cell)
+
+
+def micro_g(value: float) -> str:
+    """
+    Return a residual in micro-g as the tables show it.
+
+    """
+    return f'{value:.1f}' if abs(value) < 99.95 else f'{value:.0f}'
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return cell == '-'
+    return True
 
 
 def aligned(
