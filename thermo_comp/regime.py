@@ -228,7 +228,7 @@ class _OnsetTest:
         smallest_rate = settings.smallest_ramp_k_min / 60.0
         self.ripple_rate = min(settings.ripple_c / sensor.lag_s, 0.5 * smallest_rate)
         self._baseline_s = 0.5 * sensor.lag_s
-        self._rate_variance = (sensor.typical_ramp_k_min / 60.0) ** 2
+        self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
         # The memory (1 / tracking frequency) that sees an acceleration soonest at 1 Hz, and from
         # it the power of the acceleration that the filter expects, whatever the readings' rate.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0

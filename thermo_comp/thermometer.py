@@ -30,11 +30,12 @@ State = tuple[float, float, float, float, float, float, float, float, float]
 
 _NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)
 
-OUTLIER_SIGMAS = 6.0  # innovations beyond this are not used ...
-RESTART_READINGS = 4  # ... unless that many agree in a row
+OUTLIER_SIGMAS = 6.0  # innovations beyond this limit count less ...
+OUTLIER_LIMITS = 5.0  # ... and beyond this many limits not at all ...
+RESTART_READINGS = 4  # ... unless that many readings agree in a row
 SOAK_S = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
 QUIET_SHARE = 5e-3  # quiet acceleration wander / bending one, of a sensor without cells
-CELL_SHARE = 0.4  # the same where cells hide slow changes
+CELL_SHARE = 0.2  # the same where cells hide slow changes
 CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells
 HORIZON_INTERVALS = 5.0  # extrapolation is linear up to here, then held
 NOISE_MEMORY = 200.0  # readings over which the innovations judge the declared noise
@@ -51,8 +52,8 @@ class ThermometerSettings:
         Standard deviation of the white noise of one reading, before quantization, K.
     quantum_c : float
         Step of the readings, K; 0 for a continuous sensor.
-    typical_ramp_k_min : float
-        Typical rate of the ramps it will see, K/min.
+    fastest_ramp_k_min : float
+        Rate of the fastest ramps it will see, K/min.
     lag_s : float
         Thermal lag between the surroundings and the sensor, s. Together with the ramp it says how
         sharply the temperature bends: an onset is an acceleration of ``ramp / lag``.
@@ -66,7 +67,7 @@ class ThermometerSettings:
 
     noise_sd_c: float = 0.005
     quantum_c: float = 0.0
-    typical_ramp_k_min: float = 1.0
+    fastest_ramp_k_min: float = 3.0
     lag_s: float = 600.0
 
     def __post_init__(self) -> None:
@@ -74,7 +75,7 @@ class ThermometerSettings:
         Refuse values that no sensor has.
 
         """
-        for name in ('noise_sd_c', 'typical_ramp_k_min', 'lag_s'):
+        for name in ('noise_sd_c', 'fastest_ramp_k_min', 'lag_s'):
             value = getattr(self, name)
             if not 0.0 < value < inf:
                 raise ValueError(f'`{name}` must be positive and finite, got {value}')
@@ -138,7 +139,7 @@ class Thermometer:
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
-        self._rate_sd = settings.typical_ramp_k_min / 60.0
+        self._rate_sd = settings.fastest_ramp_k_min / 60.0
         self._bend = self._rate_sd / settings.lag_s
         self._bending_power = 2.0 * self._bend * self._bend / settings.lag_s
         share = CELL_SHARE if self._has_cells else QUIET_SHARE
@@ -220,18 +221,27 @@ class Thermometer:
         noise = self._flat * scale
         spread = variance + noise
         surprise = reading_c - expected
-        allowance = 5.0 * self._bend * dt * dt + 1.5 * self._quantum
-        if abs(surprise) > OUTLIER_SIGMAS * sqrt(spread) + allowance:
-            return self._suspect(stamp_ns, reading_c, sqrt(spread) + allowance)
-        self._n_strange = 0
+        limit = OUTLIER_SIGMAS * sqrt(spread) + 5.0 * self._bend * dt * dt + 1.5 * self._quantum
+        if abs(surprise) > limit:
+            if self._is_step(reading_c, limit):
+                self.n_restarts += 1
+                self._start(stamp_ns, reading_c)
+                return True
+            if abs(surprise) > OUTLIER_LIMITS * limit:
+                self.n_rejected += 1
+                return False
+            noise = max(noise, surprise * surprise / OUTLIER_SIGMAS**2 - variance)
+        else:
+            self._n_strange = 0
         measured = reading_c
         if self._has_cells:
             rate = quiet[1] + prior_bending * (bent[1] - quiet[1])
-            measured, noise = self._cell(reading_c, expected, variance, rate * dt)
+            measured, noise = self._cell(
+                reading_c, expected, variance, rate * dt, bent[6] * dt * dt
+            )
         else:
-            excess = surprise * surprise / spread - 1.0
-            scale *= 1.0 + (excess if excess < 8.0 else 8.0) / NOISE_MEMORY
-            self._noise_scale = scale = scale if scale > 1.0 else 1.0
+            excess = min(surprise * surprise / spread - 1.0, 8.0)
+            self._noise_scale = scale = max(1.0, scale * (1.0 + excess / NOISE_MEMORY))
             self.noise_factor = sqrt(scale)
 
         # each mode learns, and is judged by its innovation
@@ -315,25 +325,18 @@ class Thermometer:
         )  # fmt: skip
         self.n_used += 1
 
-    def _suspect(self, stamp_ns: int, reading_c: float, tolerance: float) -> bool:
+    def _is_step(self, reading: float, limit: float) -> bool:
         """
-        Reject a strange reading, unless several in a row agree: then the sensor has stepped.
+        Several strange readings in a row that agree are no outliers: the temperature has moved.
 
         """
-        is_alike = abs(reading_c - self._strange) <= OUTLIER_SIGMAS * tolerance
+        is_alike = abs(reading - self._strange) <= OUTLIER_LIMITS * limit
         self._n_strange = self._n_strange + 1 if is_alike else 1
-        self._strange = reading_c
-        if self._n_strange >= RESTART_READINGS:
-            self.n_restarts += 1
-            self._start(stamp_ns, reading_c)
-            return True
-        if not self._has_cells:
-            self._noise_scale *= 1.0 + 8.0 / NOISE_MEMORY
-        self.n_rejected += 1
-        return False
+        self._strange = reading
+        return self._n_strange >= RESTART_READINGS
 
     def _cell(
-        self, reading: float, expected: float, variance: float, move: float
+        self, reading: float, expected: float, variance: float, move: float, var_move: float
     ) -> tuple[float, float]:
         """
         Turn a quantized reading into the Gaussian measurement of the temperature it amounts to.
@@ -363,7 +366,7 @@ class Thermometer:
             return reading, self._flat
         if jump > half:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
-            return edge, min(noise + move * move / 12.0, self._flat)
+            return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
         # Unchanged. Saying so twice tells nothing new: the cell bounds the variance, and its
         # edges hold back an estimate that would leave it, once per time it takes to move a sd.
         if abs(expected - reading) > half:
