@@ -58,17 +58,17 @@ $(BIN)/python:
 	$$found -m venv $(VENV) || { \
 	  echo "thermo_comp: $$found cannot make a venv; on Debian and Ubuntu:" \
 	    "sudo apt install python3-venv" >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=24'
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=24'
 
 $(VENV)/.installed: setup.py setup.cfg pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros]'
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[ros]'
 	@touch $@
 
 $(VENV)/.installed-test: setup.py setup.cfg pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	$(BIN)/python -m pip install -qq --disable-pip-version-check \
 	  -e '.[ros,test,parquet,px4,ardupilot]'
 	@touch $(VENV)/.installed $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed-test
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[dev]'
 	@touch $@

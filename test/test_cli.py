@@ -1,0 +1,235 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The command line: help with examples, tables that fit and pipe, JSON that parses, quick starts.
+
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import rich_calibration
+from conftest import Cli
+
+from thermo_comp.calibration_file import save_calibration
+from thermo_comp.cli import output
+from thermo_comp.cli.app import app
+from thermo_comp.recording import inspect_recording, read_recording
+
+ROOT = Path(__file__).resolve().parent.parent
+COMMANDS = sorted(
+    command.name or command.callback.__name__
+    for command in app.registered_commands
+    if command.callback
+)
+
+
+@pytest.fixture(scope='session')
+def bag(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Path:
+    """
+    Simulate a short thermal test through the command line.
+
+    """
+    # 15 minutes at 10 Hz, without the 4 samples before the board's first reading at 0.5 s: 8996.
+    path = tmp_path_factory.mktemp('cli') / 'bag'
+    cli('simulate', '--profile', '20 4min, 30@2 6min', '--rate-hz', '10', '-o', path)
+    return path
+
+
+@pytest.fixture(scope='session')
+def unit(bag: Path) -> Path:
+    save_calibration(rich_calibration(), bag.parent / 'unit.yaml')
+    return bag.parent / 'unit.yaml'
+
+
+class TestHelp:
+    def test_all_commands_are_there(self) -> None:
+        wanted = {'fit', 'evaluate', 'replay', 'play', 'simulate', 'convert', 'info', 'report'}
+        assert wanted | {'demo'} <= set(COMMANDS)
+
+    @pytest.mark.parametrize('command', COMMANDS)
+    def test_has_an_example_and_fits(self, command: str, cli: Cli) -> None:
+        said = cli(command, '--help').stdout
+        assert re.search(rf'Example:?\s+thermo_comp {command} ', said), said
+        assert max(map(len, said.splitlines())) <= 80
+        assert said == cli(command, '-h').stdout
+
+    def test_version(self, cli: Cli) -> None:
+        from thermo_comp import __version__
+
+        assert cli('--version').stdout == f'thermo_comp {__version__}\n'
+
+    def test_shell_completion_is_offered(self, cli: Cli) -> None:
+        assert '--install-completion' in cli('--help').stdout
+
+
+class TestOutput:
+    def test_tables_pipe_as_plain_columns(self, bag: Path, cli: Cli) -> None:
+        said = cli('info', bag).stdout
+        assert '\x1b' not in said
+        assert said.isascii()
+        assert max(map(len, said.splitlines())) <= 80
+        row = next(line for line in said.splitlines() if line.startswith('/accel/counts'))
+        assert row.split() == ['/accel/counts', 'geometry_msgs/msg/Vector3Stamped', '8996']
+
+    def test_json_is_one_object(self, bag: Path, unit: Path, cli: Cli, tmp_path: Path) -> None:
+        data = json.loads(cli('info', bag, '--json').stdout)
+        assert data['samples'] == 8996
+        assert data['board']['highest'] > 20.0
+        data = json.loads(cli('info', unit, '--json').stdout)
+        assert data['calibration']['unit']['serial'] == 'T-1'
+        arguments = ('replay', bag, '-c', unit, '-o', tmp_path / 'out', '--serial', '', '--json')
+        data = json.loads(cli(*arguments).stdout)
+        assert data['samples_in'] == data['samples_out'] == 8996
+        # A case reading after the very last sample takes effect at none.
+        assert data['flags'] <= data['counters']['n_case']
+        arguments = ('evaluate', bag, '-c', unit, '--serial', '', '--json')
+        data = json.loads(cli(*arguments, code=None).stdout)
+        assert set(data['statistics_m_s2']) == {'raw', 'unit'}
+
+    def test_quiet_says_nothing(self, bag: Path, unit: Path, cli: Cli, tmp_path: Path) -> None:
+        arguments = ('replay', bag, '-c', unit, '-o', tmp_path / 'out', '--serial', '', '-q')
+        finished = cli(*arguments)
+        assert (finished.stdout, finished.stderr) == ('', '')
+
+    def test_a_reader_that_has_seen_enough_is_no_error(self, bag: Path) -> None:
+        command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
+        finished = subprocess.run(
+            ['bash', '-c', f'set -o pipefail; {command}'],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert finished.stderr == ''
+        assert len(finished.stdout.splitlines()) == 1
+
+    @pytest.mark.parametrize('no_color', [False, True])
+    def test_a_terminal_gets_rules_and_no_more_colour_than_it_wants(
+        self, bag: Path, no_color: bool
+    ) -> None:
+        said = on_a_terminal('info', str(bag), no_color=no_color)
+        assert '─' in said
+        if no_color:
+            assert not re.search(r'\x1b\[(3\d|9\d|38)', said)
+
+    def test_progress_is_shown_on_a_terminal_only(
+        self, bag: Path, unit: Path, cli: Cli, tmp_path: Path
+    ) -> None:
+        arguments = ('replay', str(bag), '-c', str(unit), '--serial', '')
+        said = on_a_terminal(*arguments, '-o', str(tmp_path / 'a'))
+        assert 'replaying' in said
+        finished = cli(*arguments, '-o', tmp_path / 'b')
+        assert 'replaying' not in finished.stdout + finished.stderr
+
+
+def on_a_terminal(*arguments: str, no_color: bool = False) -> str:
+    """
+    Run the command line on a pseudo-terminal and return what it showed.
+
+    """
+    leader, follower = pty.openpty()
+    environment = {**os.environ, 'COLUMNS': '80', 'TERM': 'xterm-256color'}
+    environment.pop('NO_COLOR', None)
+    if no_color:
+        environment['NO_COLOR'] = '1'
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'thermo_comp', *arguments],
+        cwd=ROOT,
+        env=environment,
+        stdin=follower,
+        stdout=follower,
+        stderr=follower,
+    )
+    os.close(follower)
+    shown = b''
+    while True:
+        try:
+            part = os.read(leader, 65536)
+        except OSError:  # the other end is closed: the process has ended
+            break
+        if not part:
+            break
+        shown += part
+    os.close(leader)
+    assert process.wait(timeout=60) == 0
+    return shown.decode()
+
+
+class TestSimulate:
+    def test_several_positions_are_several_bags(self, tmp_path: Path, cli: Cli) -> None:
+        program = ('--profile', '20 1min', '--rate-hz', '20', '--positions', '3')
+        cli('simulate', *program, '--unit', 'mems', '-o', tmp_path / 'sim')
+        paths = sorted((tmp_path / 'sim').iterdir())
+        assert [path.name for path in paths] == ['01.mcap', '02.mcap', '03.mcap']
+        ups = []
+        for path in paths:
+            info = inspect_recording(path)
+            assert info.metadata['serial'] == 'mems-0001'
+            truth = json.loads(info.metadata['truth'])
+            ups.append(truth['up'])
+            block = read_recording(path).columns
+            measured = block.accel.mean(axis=0) / truth['scale_factor']
+            # Bias and drift of a MEMS unit are a few per cent of g at most.
+            np.testing.assert_allclose(measured / 9.80665, truth['up'], atol=0.05)
+            # The first sample has both temperatures before it: what goes in can come out.
+            assert block.board_after[0] == 0
+            assert block.case_after[0] == 0
+        assert len({tuple(up) for up in ups}) == 3
+
+    def test_a_seed_is_a_recording(self, tmp_path: Path, cli: Cli) -> None:
+        program = ('simulate', '--profile', '20 1min', '--rate-hz', '20', '--seed', '5', '-o')
+        for folder in ('a', 'b'):
+            cli(*program, tmp_path / folder / 'bag.mcap')
+        a, b = (tmp_path / folder / 'bag.mcap' for folder in ('a', 'b'))
+        assert a.read_bytes() == b.read_bytes()
+
+
+class TestInfo:
+    def test_of_a_bag_says_what_a_fit_would_miss(self, bag: Path, cli: Cli) -> None:
+        said = cli('info', bag).stdout
+        assert 'serial: thermostatted-0001' in said
+        assert 'no cooling ramp' in said
+
+    def test_of_a_calibration(self, unit: Path, cli: Cli) -> None:
+        said = cli('info', unit).stdout
+        assert 'unit T-1, counts up to 32767' in said
+        assert re.search(r'dynamic\s+5\.0 \.\. 35\.0', said)
+
+
+class TestCells:
+    @pytest.mark.parametrize(
+        ('cell', 'text'),
+        [
+            (None, '-'),
+            (float('nan'), '-'),
+            (float('inf'), '-'),
+            (0.0, '0'),
+            (3, '3'),
+            ('a', 'a'),
+            (12.3456, '12.35'),
+            (-0.00012345, '-0.000123'),
+            (999.96, '1000'),
+            (123456.7, '123457'),
+        ],
+    )
+    def test_text(self, cell: output.Cell, text: str) -> None:
+        assert output.text(cell) == text
+
+    def test_plain_is_json_without_nan(self) -> None:
+        data = {'a': np.array([1.0, np.nan]), 'b': (np.int64(3), Path('x')), 3: np.True_}
+        assert output.plain(data) == {'a': [1.0, None], 'b': [3, 'x'], '3': True}
+
+    def test_columns_are_aligned(self) -> None:
+        lines = list(output.aligned(('n', 'name'), [('1', 'a'), ('10', 'bc')], (True, False)))
+        assert lines == [' n  name', ' 1  a', '10  bc']
+        assert list(output.aligned(('n',), [], (True,), 'title')) == ['title', 'n']

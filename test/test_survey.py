@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A look at a recording tells what a fit would miss in it.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermo_comp.recording import BagWriter, Topics
+from thermo_comp.survey import Survey, survey_recording
+
+TOPICS = Topics()
+START_NS = 1_767_225_600_000_000_000
+
+
+def survey(
+    path: Path,
+    temperature: np.ndarray | None,
+    *,
+    gap_s: float = 0.0,
+    noise: float = 0.5,
+    case: bool = True,
+    backwards: bool = False,
+) -> Survey:
+    """
+    Describe an hour at 5 Hz with readings every second.
+
+    """
+    rng = np.random.default_rng(5)
+    n = 18000
+    stamps = START_NS + (np.arange(n) + 1) * 200_000_000
+    stamps[n // 2 :] += round(gap_s * 1e9)
+    if backwards:
+        stamps[100] = stamps[98]
+    with BagWriter(path) as writer:
+        if temperature is not None:
+            readings = START_NS + np.arange(len(temperature)) * 10**9
+            writer.write_temperature(TOPICS.board, readings, temperature)
+            if case:
+                writer.write_temperature(TOPICS.case, readings, temperature)
+        log_ns = np.maximum.accumulate(stamps)
+        counts = np.array([0.0, 0.0, 3000.0]) + noise * rng.standard_normal((n, 3))
+        writer.write_counts(TOPICS.counts, stamps, counts, log_ns=log_ns)
+    return survey_recording(path)
+
+
+def up_and_down(low: float, high: float) -> np.ndarray:
+    seconds = np.arange(3600.0)
+    return np.interp(seconds, [0, 600, 1800, 2400, 3600], [low, low, high, high, low])
+
+
+def test_a_good_recording(tmp_path: Path) -> None:
+    result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0))
+    assert result.findings == []
+    assert (result.n, result.n_gaps, result.n_backwards) == (18000, 0, 0)
+    assert result.rate_hz == pytest.approx(5.0)
+    assert result.n_still == 1
+    assert result.still_s == pytest.approx(3600.0, abs=15.0)
+    assert result.board is not None
+    assert (result.board.lowest, result.board.highest, result.board.span) == (5.0, 35.0, 30.0)
+    # 30 K in 20 minutes, and again down.
+    assert result.board.steepest_heating_k_min == pytest.approx(1.5, rel=0.01)
+    assert result.board.steepest_cooling_k_min == pytest.approx(-1.5, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ('low', 'high', 'message'),
+    [(20.0, 24.0, 'spans 4.0 K: a fit needs 10'), (10.0, 28.0, 'spans 18.0 K: 25 are advised')],
+)
+def test_span(tmp_path: Path, low: float, high: float, message: str) -> None:
+    assert any(message in f for f in survey(tmp_path / 'bag', up_and_down(low, high)).findings)
+
+
+def test_one_direction_only(tmp_path: Path) -> None:
+    heating = np.interp(np.arange(3600.0), [0, 600, 3000, 3600], [5.0, 5.0, 35.0, 35.0])
+    findings = survey(tmp_path / 'bag', heating).findings
+    assert findings == ['no cooling ramp: the dynamic set would not know cooling']
+
+
+def test_a_quantum_is_no_ramp(tmp_path: Path) -> None:
+    # Whole degrees that flip: 1 K within a second is a step of the sensor, not 60 K/min.
+    flips = 20.0 + (np.arange(3600) % 2)
+    result = survey(tmp_path / 'bag', flips)
+    assert result.board is not None
+    assert result.board.quantum == 1.0
+    assert result.board.steepest_heating_k_min < 0.1
+
+
+def test_no_temperatures(tmp_path: Path) -> None:
+    findings = survey(tmp_path / 'bag', None).findings
+    assert any('no board temperature' in f for f in findings)
+    assert any('no case temperature' in f for f in findings)
+
+
+def test_gaps_and_disorder(tmp_path: Path) -> None:
+    result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=30.0, backwards=True)
+    assert result.n_gaps == 1
+    assert result.longest_gap_s == pytest.approx(30.2)
+    assert any('1 gaps, the longest 30.2 s' in f for f in result.findings)
+    assert result.n_backwards == 1
+    assert any('1 stamps do not rise' in f for f in result.findings)
+
+
+def test_no_samples(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_temperature(TOPICS.board, [START_NS], [20.0])
+    result = survey_recording(tmp_path / 'bag')
+    assert result.n == 0
+    assert any('no accelerometer samples' in f for f in result.findings)
+
+
+def test_progress(tmp_path: Path) -> None:
+    survey(tmp_path / 'bag', up_and_down(5.0, 35.0))
+    parts: list[float] = []
+    survey_recording(tmp_path / 'bag', progress=parts.append)
+    assert parts == sorted(parts)
+    assert parts[-1] == 1.0
