@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from .functions import CubicSpline, Exponential, Polynomial
@@ -400,11 +401,8 @@ def _smallest_scale(axis_set: AxisSet, regime_set: RegimeSet, reference: float) 
     lower, upper = (edge - reference for edge in regime_set.temperature_range_c)
     function = axis_set.scale_function
     temperatures = np.linspace(lower, upper, 513)
-    if isinstance(function, Polynomial) and len(function.coefficients) > 2:
-        slope = [power * c for power, c in enumerate(function.coefficients)][1:]
-        with np.errstate(all='ignore'):
-            roots = np.roots(slope[::-1]).real if np.all(np.isfinite(slope)) else np.empty(0)
-        temperatures = np.append(temperatures, np.clip(roots, lower, upper))
+    if isinstance(function, Polynomial):
+        temperatures = np.append(temperatures, _extremes(function, lower, upper))
     with np.errstate(all='ignore'):
         smallest = float(np.min(function.value(temperatures)))
     worst = _largest(regime_set.gradient_range_k) * abs(axis_set.gradient.scale)
@@ -413,6 +411,22 @@ def _smallest_scale(axis_set: AxisSet, regime_set: RegimeSet, reference: float) 
         worst += _largest(regime_set.memory_range_k) * abs(coefficient)
     result = smallest - worst
     return result if math.isfinite(result) else -math.inf
+
+
+def _extremes(function: Polynomial, lower: float, upper: float) -> npt.NDArray[np.float64]:
+    """
+    Find where a polynomial can have its extremes inside a range.
+
+    """
+    reach = max(abs(lower), abs(upper), 1.0)
+    slope = [power * c for power, c in enumerate(function.coefficients)][1:]
+    # A term that cannot move the function by 1e-12 anywhere in the range moves no extreme either,
+    # and as a leading coefficient it would overflow the companion matrix.
+    while slope and not abs(slope[-1]) * reach ** len(slope) > 1e-12:
+        slope.pop()
+    if len(slope) < 2 or not np.all(np.isfinite(slope)):
+        return np.empty(0)
+    return np.clip(np.roots(slope[::-1]).real, lower, upper)
 
 
 def _largest(edges: Range) -> float:
