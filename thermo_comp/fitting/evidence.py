@@ -226,6 +226,42 @@ def slow_error(table: WindowTable, outcome: Outcome) -> Array:
     return result
 
 
+def noise_density(table: WindowTable, bags: Sequence[ReducedBag], outcome: Outcome) -> Array:
+    """
+    White noise of the specific force as a density, from the scatter of the window means.
+
+    This is the noise that an integrating filter meets. A converter that carries its remainder
+    scatters more from sample to sample, but that part cancels in a sum.
+
+    Parameters
+    ----------
+    table : WindowTable
+        The windows.
+    bags : sequence of ReducedBag
+        Their cycle, and the samples' scatter where the windows are too few.
+    outcome : Outcome
+        The regression.
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        [m/s^2/sqrt(Hz)].
+
+    """
+    scale = np.abs(outcome.solution.scale[:, 0])
+    cycle = float(np.median([bag.cycle_s for bag in bags]))
+    everything = np.ones(len(table.time), dtype=bool)
+    single, block = _variances(table, outcome.residual / scale, everything, 2)
+    if block is None:
+        samples = [interval.sample_sd for bag in bags for interval in bag.intervals]
+        density = np.median(samples, axis=0) / scale * np.sqrt(cycle)
+    else:
+        # Pairs: v(1) - v(2) = w^2 / 2.
+        white = 2.0 * np.maximum(single - block, 0.0)
+        density = np.sqrt(white * float(np.median(table.count)) * cycle)
+    return np.asarray(np.maximum(density, 1e-9))
+
+
 def inflation(table: WindowTable, outcome: Outcome) -> Array:
     """
     Tell by how much correlated residuals make the covariance of white ones too small.

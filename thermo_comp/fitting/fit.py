@@ -18,7 +18,14 @@ from ..errors import FitError
 from ..regime import DetectorSettings
 from ..thermal import ThermalConfig
 from .assembly import UnitFacts, build_calibration
-from .evidence import PositionReport, ResidualRow, position_reports, residual_rows, slow_error
+from .evidence import (
+    PositionReport,
+    ResidualRow,
+    noise_density,
+    position_reports,
+    residual_rows,
+    slow_error,
+)
 from .history import ThermalHistory, thermal_history
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .reduction import ReducedBag, reduce_source
@@ -226,7 +233,7 @@ def _fit_table(
     slow = slow_error(table, chosen)
     findings += judge_result(chosen.solution, residuals, slow, options)
     facts = UnitFacts(
-        _unit(bags, options), noise_density(bags, chosen.solution), board_lag(table), slow
+        _unit(bags, options), noise_density(table, bags, chosen), board_lag(table), slow
     )
     calibration = build_calibration(
         chosen, table, bags, detector, facts, options.reference_temperature, residuals, findings
@@ -317,19 +324,6 @@ def board_lag(table: WindowTable) -> float:
     power = float(rate @ rate)
     lag = float(rate @ table.gradient) / power if power > 0.0 else np.nan
     return lag if 1.0 <= lag <= 1e5 else _USUAL_BOARD_LAG_S
-
-
-def noise_density(bags: Sequence[ReducedBag], solution: Solution) -> Array:
-    """
-    White noise of a sample, as a density, from the scatter inside the still cells.
-
-    """
-    sample_sd = np.median(
-        [interval.sample_sd for bag in bags for interval in bag.intervals], axis=0
-    )
-    cycle = float(np.median([bag.cycle_s for bag in bags]))
-    density = sample_sd / np.abs(solution.scale[:, 0]) * np.sqrt(cycle)
-    return np.asarray(np.maximum(density, 1e-12))
 
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:

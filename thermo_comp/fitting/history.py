@@ -10,7 +10,7 @@ regressor means in the fit what it means online.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -73,6 +73,17 @@ class ThermalHistory:
 
         """
         return np.asarray(self.start_s + self.step_s * np.arange(len(self.board)))
+
+    def coarsened(self, factor: int) -> ThermalHistory:
+        """
+        Keep every so manieth grid point: the state moves little between them.
+
+        """
+        kept = {
+            name: getattr(self, name)[::factor]
+            for name in ('board', 'var_board', 'rate', 'gradient', 'weight', 'is_unknown')
+        }
+        return replace(self, step_s=self.step_s * factor, **kept)
 
     def sections(self) -> IntArray:
         """

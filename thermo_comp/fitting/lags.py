@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns thermal memory over a recorded history: first-order lags of T_board and their sensitivity.
+Owns thermal memory over recorded histories: first-order lags of T_board and their sensitivity.
 
 ``dL/dt = (T_board - L) / tau`` has an exact solution for a temperature that is linear between
 grid points; the memory regressor is ``m = T_board - L``. The fit also needs its derivative with
@@ -12,6 +12,7 @@ respect to ``ln tau`` and the response to an unknown start, ``exp(-t / tau)``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,12 +20,13 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Memory:
     """
-    Memory regressors on a grid, one column per time constant.
+    Memory regressors, one column per time constant.
 
     Parameters
     ----------
@@ -44,68 +46,93 @@ class Memory:
     decay: Array
     decay_slope: Array
 
-    def at(self, where: Array, grid: Array) -> Memory:
+
+@dataclass(frozen=True)
+class BoardHistories:
+    """
+    Board temperatures of several bags on uniform grids of one step, and where windows lie on them.
+
+    Parameters
+    ----------
+    change : ndarray, shape (n_grid, n_bags)
+        Change of the temperature up to each grid point [K]; 0 at the first and past the end.
+    step_s : float
+        Grid step [s].
+    bag : ndarray of int64, shape (n,)
+        Bag of each window.
+    since : ndarray, shape (n,)
+        Time of each window since its grid's start [s].
+
+    """
+
+    change: Array
+    step_s: float
+    bag: IntArray
+    since: Array
+
+    @staticmethod
+    def of(boards: Sequence[Array], step_s: float, bag: IntArray, since: Array) -> BoardHistories:
         """
-        Interpolate to other times.
+        Stack temperature histories.
 
         Parameters
         ----------
-        where : ndarray, shape (m,)
-            Times wanted.
-        grid : ndarray, shape (n,)
-            Times of the rows.
+        boards : sequence of ndarray
+            Board temperature of each bag on its grid.
+        step_s : float
+            Grid step [s].
+        bag : ndarray of int64, shape (n,)
+            Bag of each window.
+        since : ndarray, shape (n,)
+            Time of each window since its grid's start [s].
+
+        Returns
+        -------
+        BoardHistories
+            The stack.
+
+        """
+        change = np.zeros((max(map(len, boards), default=1), len(boards)))
+        for number, board in enumerate(boards):
+            change[1 : len(board), number] = np.diff(board)
+        return BoardHistories(change, step_s, bag, since)
+
+    def memory(self, time_constants_s: Array) -> Memory:
+        """
+        Run the lags over the histories and take them at the windows.
+
+        Parameters
+        ----------
+        time_constants_s : ndarray, shape (k,)
+            Time constants [s].
 
         Returns
         -------
         Memory
-            With m rows.
+            Regressors, with one row per window.
 
         """
-        index = np.clip(np.searchsorted(grid, where) - 1, 0, max(len(grid) - 2, 0))
-        following = np.minimum(index + 1, len(grid) - 1)
-        width = np.maximum(grid[following] - grid[index], 1e-12)
-        part = np.clip((where - grid[index]) / width, 0.0, 1.0)[:, None]
-        return Memory(
-            *(
-                column[index] * (1.0 - part) + column[following] * part
-                for column in (self.value, self.slope, self.decay, self.decay_slope)
-            )
-        )
-
-
-def memory_regressors(board: Array, step_s: float, time_constants_s: Array) -> Memory:
-    """
-    Run the lags over a temperature history.
-
-    Parameters
-    ----------
-    board : ndarray, shape (n,)
-        Board temperature on a uniform grid.
-    step_s : float
-        Grid step [s].
-    time_constants_s : array_like, shape (k,)
-        Time constants [s].
-
-    Returns
-    -------
-    Memory
-        Regressors on the grid.
-
-    """
-    n, k = len(board), len(time_constants_s)
-    value, slope = np.zeros((n, k)), np.zeros((n, k))
-    decay, decay_slope = np.zeros((n, k)), np.zeros((n, k))
-    time = np.arange(n) * step_s
-    change = np.diff(board)
-    for j, tau in enumerate(time_constants_s):
-        ratio = step_s / float(tau)
-        keep = math.exp(-ratio)
-        # m_next = keep m + gain change, from the exact response to a linear piece.
-        gain = (1.0 - keep) / ratio
-        value[1:, j] = lfilter([gain], [1.0, -keep], change)
-        # Differentiated by ln tau: d keep = ratio keep, d gain = gain - keep.
-        drive = ratio * keep * value[:-1, j] + (gain - keep) * change
-        slope[1:, j] = lfilter([1.0], [1.0, -keep], drive)
-        decay[:, j] = np.exp(-time / float(tau))
-        decay_slope[:, j] = decay[:, j] * time / float(tau)
-    return Memory(value, slope, decay, decay_slope)
+        n, k = len(self.since), len(time_constants_s)
+        result = Memory(*(np.zeros((n, k)) for _ in range(4)))
+        last = len(self.change) - 1
+        place = np.clip(self.since / self.step_s, 0.0, last)
+        index = np.minimum(place.astype(np.int64), max(last - 1, 0))
+        following = np.minimum(index + 1, last)
+        part = place - index
+        for j, tau in enumerate(time_constants_s):
+            ratio = self.step_s / float(tau)
+            keep = math.exp(-ratio)
+            # m_next = keep m + gain change, from the exact response to a linear piece.
+            gain = (1.0 - keep) / ratio
+            value = lfilter([gain], [1.0, -keep], self.change, axis=0)
+            # Differentiated by ln tau: d keep = ratio keep, d gain = gain - keep.
+            drive = (gain - keep) * self.change
+            drive[1:] += ratio * keep * value[:-1]
+            slope = lfilter([1.0], [1.0, -keep], drive, axis=0)
+            for grid, column in ((value, result.value), (slope, result.slope)):
+                before, after = grid[index, self.bag], grid[following, self.bag]
+                column[:, j] = before + part * (after - before)
+            since = np.maximum(self.since, 0.0)
+            result.decay[:, j] = np.exp(-since / float(tau))
+            result.decay_slope[:, j] = result.decay[:, j] * since / float(tau)
+        return result

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .history import ThermalHistory
-from .lags import Memory, memory_regressors
+from .lags import BoardHistories, Memory
 from .reduction import ReducedBag
 
 Array = npt.NDArray[np.float64]
@@ -49,7 +50,7 @@ class WindowTable:
     t, gradient, rate, weight : ndarray, shape (n,)
         ``T_board - T_ref``, ``T_case - T_board``, ``dT_board/dt``, weight of the dynamic set.
     histories : tuple of ThermalHistory
-        One per bag, for the lags.
+        One per bag, all of one grid step, for the lags.
 
     """
 
@@ -104,21 +105,17 @@ class WindowTable:
             With one row per window.
 
         """
-        n, k = len(self.time), len(time_constants_s)
-        result = Memory(*(np.zeros((n, k)) for _ in range(4)))
-        if not k:
-            return result
-        for bag, history in enumerate(self.histories):
-            rows = np.flatnonzero(self.bag == bag)
-            if not len(rows):
-                continue
-            grid = memory_regressors(history.board, history.step_s, time_constants_s)
-            at = grid.at(self.time[rows], history.time)
-            result.value[rows] = at.value
-            result.slope[rows] = at.slope
-            result.decay[rows] = at.decay
-            result.decay_slope[rows] = at.decay_slope
-        return result
+        return self._board.memory(time_constants_s)
+
+    @cached_property
+    def _board(self) -> BoardHistories:
+        starts = np.array([history.start_s for history in self.histories])
+        return BoardHistories.of(
+            [history.board for history in self.histories],
+            self.histories[0].step_s,
+            self.bag,
+            self.time - starts[self.bag],
+        )
 
     def select(self, rows: BoolArray) -> WindowTable:
         """
@@ -156,7 +153,9 @@ class WindowTable:
 
         merged: dict[str, Any] = {name: getattr(self, name)[first] for name in _NUMBERS}
         merged |= {name: mean(getattr(self, name)) for name in _MEANS}
-        return replace(self, count=total, **merged)
+        factor = max(1, int(window_s / 6.0 / self.histories[0].step_s))
+        histories = tuple(history.coarsened(factor) for history in self.histories)
+        return replace(self, count=total, histories=histories, **merged)
 
 
 def window_table(
