@@ -63,6 +63,8 @@ class McapFile:
     chunk_bytes : int
     metadata : mapping of str to str
         Written at the front, so that even a torn file has it.
+    name : str
+        What the finished file will be called; the rosbag2 metadata in it say so.
 
     """
 
@@ -73,8 +75,9 @@ class McapFile:
         level: int | None,
         chunk_bytes: int,
         metadata: Mapping[str, str],
+        name: str,
     ) -> None:
-        self._name = path.name
+        self._name = name
         self._compression = '' if compression == 'none' else compression
         self._compress = _compressor(compression, level)
         self._chunk_bytes = chunk_bytes

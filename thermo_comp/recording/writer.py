@@ -104,12 +104,14 @@ class BagWriter:
             self._target.parent.mkdir(parents=True, exist_ok=True)
             if not self._is_file:
                 self._partial.mkdir()
+            name = self._path.name if self._is_file else f'{self._path.name}_0.mcap'
             self._file = McapFile(
-                self._partial if self._is_file else self._partial / f'{self._path.name}_0.mcap',
+                self._partial if self._is_file else self._partial / name,
                 compression,
                 level,
                 chunk_bytes,
                 self._metadata,
+                name,
             )
 
     def write_counts(
