@@ -1,0 +1,229 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the figures of the residuals: the paper's Fig. 6 and Fig. 7, and the histograms.
+
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
+
+from ..metrics import MICRO_G
+from .evidence import CHOSEN, RAW, Evidence
+from .figures_thermal import shade_dynamic, shown_bag
+from .style import (
+    AXIS_LINES,
+    DYNAMIC_LINE,
+    RUNG_LINES,
+    STATIC_LINE,
+    Line,
+    Sheet,
+    broken,
+    few_ticks,
+    legend_above,
+    log_axis,
+    new_figure,
+    plot_thinned,
+    time_unit,
+)
+
+Array = npt.NDArray[np.float64]
+
+
+def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
+    """
+    Draw the residual of each axis for each rung of the ladder (the paper's Fig. 6).
+
+    """
+    shown, facts = shown_bag(evidence)
+    unit, name = time_unit(facts.duration_s)
+    windows = evidence.windows
+    residuals = evidence.axis_residuals()
+    if windows is None or not residuals:
+        raise ValueError('`evidence` has no residuals')
+    rows = windows.bag == shown.index
+    height = 1.25 if sheet.is_narrow else 1.2
+    figure = new_figure(sheet, 0.5 + height * len(residuals))
+    panels = np.atleast_1d(figure.subplots(len(residuals), sharex=True))
+    shared = _shared_limit([r[rows] for rung, r in residuals.items() if rung != RAW])
+    for axes, (rung, residual) in zip(panels, residuals.items(), strict=True):
+        shade_dynamic(axes, shown, unit)
+        for i, axis in enumerate('xyz'):
+            time, value = broken(
+                windows.time[rows], residual[rows, i] / MICRO_G, windows.position[rows]
+            )
+            plot_thinned(axes, time / unit, value, sheet, label=axis, **AXIS_LINES[i])
+        axes.set_ylabel('µg')
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        few_ticks(axes, 5)
+        if rung != RAW and shared:
+            axes.set_ylim(-shared, shared)
+        text = _rms_text(residual[rows], windows.is_dynamic[rows])
+        title = f'{_rung_title(evidence, rung)}: {text}'
+        if axes is panels[0]:
+            legend_above(axes, sheet, title=title, alignment='left')
+        else:
+            axes.set_title(title)
+    panels[-1].set_xlabel(name)
+    panels[-1].set_xlim(0.0, facts.duration_s / unit)
+    figure.align_ylabels(panels)
+    return figure
+
+
+def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
+    """
+    Draw |g| over time, before and after, and after in detail (the paper's Fig. 7).
+
+    """
+    shown, facts = shown_bag(evidence)
+    unit, name = time_unit(facts.duration_s)
+    windows = evidence.windows
+    residuals = evidence.residuals
+    if windows is None or evidence.gravity is None or not residuals:
+        raise ValueError('`evidence` has no |g|')
+    rows = windows.bag == shown.index
+    rungs = list(residuals)
+    corrected = [rung for rung in rungs if rung != RAW]
+    sets = [[rungs[0], rungs[-1]] if corrected else rungs]
+    if len(corrected) > 1:
+        sets.append(corrected)
+    figure = new_figure(sheet, 0.5 + (2.1 if sheet.is_narrow else 1.9) * len(sets))
+    panels = np.atleast_1d(figure.subplots(len(sets), sharex=True))
+    for axes, drawn in zip(panels, sets, strict=True):
+        shade_dynamic(axes, shown, unit)
+        for rung in drawn:
+            time, value = broken(
+                windows.time[rows], residuals[rung][rows] / MICRO_G, windows.position[rows]
+            )
+            label = _rung_title(evidence, rung)
+            plot_thinned(axes, time / unit, value, sheet, label=label, **RUNG_LINES[rung])
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        axes.set_ylabel('|g| − g, µg')
+        _absolute_scale(axes, evidence.gravity)
+        legend_above(axes, sheet)
+    if len(corrected) > 1:
+        limit = _shared_limit([residuals[rung][rows][:, None] for rung in corrected])
+        panels[-1].set_ylim(-limit, limit)
+    panels[-1].set_xlabel(name)
+    panels[-1].set_xlim(0.0, facts.duration_s / unit)
+    return figure
+
+
+def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
+    """
+    Draw how the residuals are distributed: the judged rung by regime, and all rungs by size.
+
+    """
+    windows = evidence.windows
+    residuals = evidence.residuals
+    if windows is None or not residuals:
+        raise ValueError('`evidence` has no residuals')
+    judged = next(reversed(residuals))
+    title = _rung_title(evidence, judged)
+    parts = _by_regime(residuals[judged] / MICRO_G, windows.is_dynamic)
+    height = 1.5 * len(parts)
+    if sheet.is_narrow:
+        figure = new_figure(sheet, height + 2.6)
+        grid = figure.add_gridspec(len(parts) + 1, 1, height_ratios=[*[1.0] * len(parts), 1.5])
+        places = [grid[i, 0] for i in range(len(parts) + 1)]
+    else:
+        figure = new_figure(sheet, max(height, 2.6))
+        grid = figure.add_gridspec(len(parts), 2)
+        places = [*(grid[i, 0] for i in range(len(parts))), grid[:, 1]]
+    for place, (label, values, line) in zip(places, parts, strict=False):
+        axes = figure.add_subplot(place)
+        _draw_signed(axes, values, line)
+        axes.set_title(f'{title}, {label}: sd {float(values.std()):.3g} µg')
+    axes.set_xlabel('|g| − g, µg')
+    right = figure.add_subplot(places[-1])
+    low, high = _size_range(residuals)
+    edges = np.logspace(np.log10(low), np.log10(high), 41)
+    for rung, residual in residuals.items():
+        size = np.abs(residual) / MICRO_G
+        share = np.histogram(size, edges)[0] / max(len(size), 1) * 100.0
+        right.stairs(
+            share, edges, label=_rung_title(evidence, rung), baseline=None, **RUNG_LINES[rung]
+        )
+    log_axis(right, low, high)
+    right.set_ylim(0.0, None)
+    right.set_xlabel('size of |g| − g, µg')
+    right.set_ylabel('share of windows, %')
+    legend_above(right, sheet)
+    return figure
+
+
+def _by_regime(
+    residual: Array, is_dynamic: npt.NDArray[np.bool_]
+) -> list[tuple[str, Array, Line]]:
+    found = [
+        ('static', residual[~is_dynamic], STATIC_LINE),
+        ('dynamic', residual[is_dynamic], DYNAMIC_LINE),
+    ]
+    return [part for part in found if len(part[1])]
+
+
+def _draw_signed(axes: Axes, values: Array, line: Line) -> None:
+    limit = max(float(np.quantile(np.abs(values), 0.998)) * 1.1, 1e-3)
+    edges = np.linspace(-limit, limit, 33)
+    share = np.histogram(values, edges)[0] / len(values) * 100.0
+    axes.stairs(share, edges, fill=True, color='#CCCCCC')
+    axes.stairs(share, edges, color='#666666', linewidth=0.7)
+    sd, mean = float(values.std()), float(values.mean())
+    if sd > 0.0:
+        middle = np.linspace(-limit, limit, 121)
+        bell = np.exp(-0.5 * ((middle - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
+        axes.plot(middle, bell * (edges[1] - edges[0]) * 100.0, **line)
+    axes.axvline(0.0, color='black', linewidth=0.5)
+    axes.set_xlim(-limit, limit)
+    axes.set_ylim(0.0, None)
+    axes.set_ylabel('windows, %')
+    few_ticks(axes, 4)
+
+
+def _size_range(residuals: dict[str, Array]) -> tuple[float, float]:
+    """
+    Range of sizes worth showing [micro-g]: all that is large, and the small without its tail.
+
+    """
+    sizes = [np.abs(residual) / MICRO_G for residual in residuals.values()]
+    low = max(min(float(np.quantile(size, 0.02)) for size in sizes), 1e-2)
+    high = max(float(np.max(size)) for size in sizes)
+    return low, max(high, 2.0 * low)
+
+
+def _shared_limit(residuals: list[Array]) -> float:
+    largest = [float(np.quantile(np.abs(r), 0.998)) for r in residuals if r.size]
+    return 1.15 * max(largest, default=0.0) / MICRO_G
+
+
+def _rms_text(residual: Array, is_dynamic: npt.NDArray[np.bool_]) -> str:
+    parts = []
+    for label, rows in (('static', ~is_dynamic), ('dynamic', is_dynamic)):
+        if rows.any():
+            rms = float(np.sqrt(np.mean(residual[rows] ** 2))) / MICRO_G
+            parts.append(f'{label} {rms:.3g}')
+    return f'RMS {", ".join(parts)} µg'
+
+
+def _rung_title(evidence: Evidence, rung: str) -> str:
+    calibration = evidence.calibration
+    if rung == CHOSEN and calibration is not None and evidence.is_fit:
+        return f'chosen: {calibration.provenance.model}' if calibration.provenance.model else rung
+    return rung
+
+
+def _absolute_scale(axes: Axes, gravity: float) -> None:
+    right = axes.secondary_yaxis(
+        'right',
+        functions=(
+            lambda micro_g: np.asarray(micro_g) * MICRO_G + gravity,
+            lambda value: (np.asarray(value) - gravity) / MICRO_G,
+        ),
+    )
+    right.set_ylabel('|g|, m/s²')
+    right.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))

@@ -1,0 +1,432 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the page: evidence, verdict and figures as one HTML document that needs nothing else.
+
+Whatever comes from a bag or a calibration is text that somebody else wrote: it passes through
+`html.escape` on its way into the page, and the page's own policy forbids it to run or load
+anything.
+
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from .. import __version__
+from ..calibration import AXES, Calibration
+from ..metrics import MICRO_G
+from .evidence import CHOSEN, SECTIONS, Evidence
+from .inertial import SCHULER_PEAK_PER_MICRO_G, TIMES_S, position_error, schuler_peak
+from .plates import DrawnPlate
+from .verdict import Verdict
+
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+_STYLE = Path(__file__).with_name('page.css')
+_WORDS = {
+    'good': 'Verdict: holds',
+    'reserved': 'Verdict: holds, with reservations',
+    'poor': 'Verdict: does not hold',
+    'open': 'Verdict: open',
+}
+
+
+def render_page(
+    evidence: Evidence,
+    verdict: Verdict,
+    plates: Sequence[DrawnPlate],
+    *,
+    script: str = '',
+    nonce: str = '',
+    notice: str = '',
+) -> str:
+    """
+    Write the page.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        What it is about.
+    verdict : Verdict
+        In words.
+    plates : sequence of DrawnPlate
+        The figures.
+    script : str, optional
+        Script of the viewer that serves the page; a page in a file has none.
+    nonce : str, optional
+        Makes the page's policy let this one script run, and talk to its server.
+    notice : str, optional
+        Something that the viewer has to say.
+
+    Returns
+    -------
+    str
+        The HTML document.
+
+    """
+    policy = _POLICY
+    if script:
+        policy += f"; script-src 'nonce-{nonce}'; connect-src 'self'"
+    is_certificate = evidence.calibration is not None
+    title = 'Thermal calibration certificate' if is_certificate else 'Thermal test record'
+    parts = [
+        '<!DOCTYPE html>',
+        '<html lang="en"><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f'<title>{escape(evidence.serial)}: {title}</title>',
+        f'<style>{_STYLE.read_text(encoding="utf-8")}</style></head><body>',
+        f'<h1>{title}</h1>',
+        f'<p class="under">Unit {escape(evidence.serial)}</p>',
+        f'<p class="notice">{escape(notice)}</p>' if notice else '',
+        _verdict(verdict),
+        _facts(evidence),
+        _statistics(evidence),
+        _inertial(evidence),
+        '<h2>Figures</h2>' if plates else '',
+        *(_figure(plate) for plate in plates),
+        _axes(evidence.calibration),
+        _terms(evidence.calibration),
+        _candidates(evidence),
+        _positions(evidence),
+        _bags(evidence),
+        _footer(),
+        f'<script nonce="{nonce}">{script}</script>' if script else '',
+        '</body></html>\n',
+    ]
+    return '\n'.join(part for part in parts if part)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """
+    Give a number in significant digits, without an exponent where people do not expect one.
+
+    """
+    if not math.isfinite(value):
+        return '–'
+    if value == 0.0:
+        return '0'
+    size = math.floor(math.log10(abs(value)))
+    if not -5 < size < 7:
+        return f'{value:.{digits - 1}e}'
+    text = f'{round(value, digits - 1 - size):.{max(digits - 1 - size, 0)}f}'
+    return text.replace('-', '−')
+
+
+def _verdict(verdict: Verdict) -> str:
+    lists = ''.join(
+        f'<p>{name}:</p><ul>{"".join(f"<li>{escape(text)}</li>" for text in texts)}</ul>'
+        for name, texts in (('Reservations', verdict.reservations), ('Checked', verdict.checks))
+        if texts
+    )
+    return (
+        f'<section class="verdict {verdict.level}" aria-label="Verdict">'
+        f'<div class="under">{_WORDS[verdict.level]}</div>'
+        f'<p><strong>{escape(verdict.headline)}</strong></p>'
+        + ''.join(f'<p>{escape(text)}</p>' for text in verdict.sentences)
+        + f'{lists}</section>'
+    )
+
+
+def _facts(evidence: Evidence) -> str:
+    calibration = evidence.calibration
+    rows = [('Unit', evidence.serial)]
+    if calibration is not None:
+        provenance = calibration.provenance
+        static, dynamic = calibration.regime_sets()
+        rows += [
+            ('Calibrated', provenance.created or 'date not recorded'),
+            ('Fitted by', f'thermo_comp {provenance.tool_version or "(version not recorded)"}'),
+            ('Model', provenance.model or 'not recorded'),
+            ('Input', f'{calibration.unit.input}, full scale {calibration.unit.full_scale:g}'),
+            ('Reference temperature', f'{calibration.reference_temperature_c:g} °C'),
+            ('Valid, static', _ranges(static.temperature_range_c, static.rate_range_k_min)),
+            ('Valid, dynamic', _ranges(dynamic.temperature_range_c, dynamic.rate_range_k_min)),
+        ]
+    if evidence.gravity is not None:
+        rows.append(('Local gravity', f'{evidence.gravity:.7g} m/s²'))
+    if evidence.positions:
+        rows.append(('Positions', str(len(evidence.positions))))
+    cells = ''.join(f'<dt>{escape(name)}</dt><dd>{escape(text)}</dd>' for name, text in rows)
+    return f'<dl>{cells}</dl>'
+
+
+def _ranges(temperature: tuple[float, float], rate: tuple[float, float]) -> str:
+    return (
+        f'{temperature[0]:.1f} to {temperature[1]:.1f} °C, '
+        f'{rate[0]:+.2f} to {rate[1]:+.2f} K/min'.replace('-', '−')
+    )
+
+
+def _table(
+    headings: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    texts: int = 1,
+    caption: str = '',
+    chosen: Sequence[bool] = (),
+) -> str:
+    """
+    Write a table whose first `texts` columns are text and whose others are numbers.
+
+    """
+
+    def cells(row: Sequence[str], tag: str) -> str:
+        return ''.join(
+            f'<{tag}{"" if i < texts else " class=number"}>{escape(cell)}</{tag}>'
+            for i, cell in enumerate(row)
+        )
+
+    body = ''.join(
+        f'<tr{" class=chosen" if i < len(chosen) and chosen[i] else ""}>{cells(row, "td")}</tr>'
+        for i, row in enumerate(rows)
+    )
+    note = f'<p class="note">{escape(caption)}</p>' if caption else ''
+    return (
+        f'{note}<div class="scroll"><table><thead><tr>{cells(headings, "th")}</tr></thead>'
+        f'<tbody>{body}</tbody></table></div>'
+    )
+
+
+def _statistics(evidence: Evidence) -> str:
+    statistics = evidence.statistics
+    if not any(sections['all'].n for sections in statistics.values()):
+        return ''
+    rows, chosen = [], []
+    for section in SECTIONS:
+        for rung, sections in statistics.items():
+            one = sections[section].micro_g
+            if one.n:
+                rows.append(
+                    (section, rung, *map(number, (one.rms, one.peak, one.mean)), str(one.n))
+                )
+                chosen.append(rung == CHOSEN)
+    return '<h2>What is left of |g|</h2>' + _table(
+        ('section', 'correction', 'RMS, µg', 'largest, µg', 'mean, µg', 'windows'),
+        rows,
+        texts=2,
+        caption='|g| − g at rest, means over 10 s. Raw: scale factor, bias and misalignment at '
+        'the reference temperature only.',
+        chosen=chosen,
+    )
+
+
+def _inertial(evidence: Evidence) -> str:
+    rows = []
+    for rung in list(dict.fromkeys([*list(evidence.statistics)[:1], CHOSEN])):
+        for section in ('static', 'dynamic'):
+            one = evidence.statistics.get(rung, {}).get(section)
+            if one is not None and one.n:
+                rows.append(
+                    (
+                        rung,
+                        section,
+                        number(one.micro_g.rms),
+                        *(number(position_error(one.rms, time)) for time in TIMES_S),
+                        number(schuler_peak(one.rms)),
+                    )
+                )
+    if not rows:
+        return ''
+    return '<h2>What it means to an inertial navigator</h2>' + _table(
+        (
+            'correction',
+            'regime',
+            'error, µg',
+            *(f'after {time:g} s, m' for time in TIMES_S),
+            'Schuler peak, m',
+        ),
+        rows,
+        texts=2,
+        caption='Position error if the RMS residual were the constant error b of a horizontal '
+        f'axis: b t²/2, and at most {SCHULER_PEAK_PER_MICRO_G:.1f} m per µg in a Schuler period.',
+    )
+
+
+def _figure(plate: DrawnPlate) -> str:
+    return (
+        f'<figure id="figure-{plate.number}"><div class="wide">{plate.wide}</div>'
+        f'<div class="narrow">{plate.narrow}</div>'
+        f'<figcaption><strong>{plate.number}. {escape(plate.question)}</strong> '
+        f'{escape(plate.reading)}</figcaption></figure>'
+    )
+
+
+def _axes(calibration: Calibration | None) -> str:
+    if calibration is None:
+        return ''
+    unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    rows = [
+        (
+            axis,
+            number(reference.scale_factor, 9),
+            number(reference.bias, 6),
+            number(reference.bias / reference.scale_factor / MICRO_G, 5),
+            number(density / MICRO_G),
+            *(f'{value:.6f}'.replace('-', '−') for value in row),
+        )
+        for axis, reference, density, row in zip(
+            AXES,
+            axes,
+            calibration.noise_density_m_s2_sqrt_hz,
+            calibration.misalignment,
+            strict=True,
+        )
+    ]
+    return '<h2>The unit at the reference temperature</h2>' + _table(
+        (
+            'axis',
+            f'scale factor, {unit} per m/s²',
+            f'bias, {unit}',
+            'bias, µg',
+            'noise, µg/√Hz',
+            'M',
+            '',
+            '',
+        ),
+        rows,
+        caption='M takes the sensitivity axes to the output frame.',
+    )
+
+
+def _terms(calibration: Calibration | None) -> str:
+    if calibration is None:
+        return ''
+    rows = []
+    for regime, part in zip(('static', 'dynamic'), calibration.regime_sets(), strict=True):
+        for axis, one, reference in zip(
+            AXES,
+            part.axes(),
+            (calibration.axes.x, calibration.axes.y, calibration.axes.z),
+            strict=True,
+        ):
+            unit = reference.scale_factor * MICRO_G
+            terms = [
+                ('T case − T board, per K', one.gradient.bias, one.gradient.scale),
+                ('dT board/dt, per K/min', one.rate.bias / 60.0, one.rate.scale / 60.0),
+            ]
+            terms += [
+                (f'memory of {tau:.4g} s, per K', bias, scale)
+                for tau, bias, scale in zip(
+                    calibration.memory_time_constants_s,
+                    one.memory.bias,
+                    one.memory.scale,
+                    strict=False,
+                )
+            ]
+            rows += [
+                (regime, axis, name, number(bias / unit), number(scale * 1e6))
+                for name, bias, scale in terms
+                if bias or scale
+            ]
+    if not rows:
+        return ''
+    return '<h2>Terms while the temperature changes</h2>' + _table(
+        ('regime', 'axis', 'term', 'bias, µg', 'scale, ppm'), rows, texts=3
+    )
+
+
+def _candidates(evidence: Evidence) -> str:
+    if not evidence.candidates:
+        return ''
+    return '<h2>Candidate models</h2>' + _table(
+        ('model', 'parameters', 'fitted, µg', 'held out, µg'),
+        [
+            (
+                one.name + (' (chosen)' if one.is_chosen else ''),
+                str(one.n_parameters),
+                number(one.fitted_rms / MICRO_G),
+                number(one.held_out_rms / MICRO_G),
+            )
+            for one in evidence.candidates
+        ],
+        caption='RMS error per axis on the data that each was fitted on, and on whole stretches '
+        'between switches of the regime that it had not seen.',
+        chosen=[one.is_chosen for one in evidence.candidates],
+    )
+
+
+def _positions(evidence: Evidence) -> str:
+    if not evidence.positions:
+        return ''
+    rungs = list(evidence.residuals)
+    shown = [rungs[0], rungs[-1]] if len(rungs) > 1 else rungs
+    return '<h2>Positions</h2>' + _table(
+        ('no.', 'bag', 'rest, min', 'up x', 'up y', 'up z', *(f'{r}, µg RMS' for r in shown)),
+        [
+            (
+                str(one.number),
+                evidence.bags[one.bag].name,
+                f'{one.duration_s / 60.0:.1f}',
+                *(f'{value:+.4f}'.replace('-', '−') for value in one.up),
+                *(number(one.residual_rms[rung] / MICRO_G) for rung in shown),
+            )
+            for one in evidence.positions
+        ],
+        texts=2,
+        caption='Up: the direction of the specific force in the output frame.',
+    )
+
+
+def _bags(evidence: Evidence) -> str:
+    if evidence.bags:
+        head = ('bag', 'start, UTC', 'length, h', 'samples', 'Hz', 'T board, °C')
+        rows = []
+        for bag in evidence.bags:
+            start = dt.datetime.fromtimestamp(bag.start_ns // 10**9, dt.timezone.utc)
+            span = bag.board_span
+            remarks = f'<br>{escape("; ".join(bag.remarks))}' if bag.remarks else ''
+            cells = (
+                f'{start:%Y-%m-%d %H:%M}',
+                f'{bag.duration_s / 3600.0:.2f}',
+                str(bag.n_samples),
+                number(bag.rate_hz, 4),
+                f'{span[0]:.1f} to {span[1]:.1f}' if span else '–',
+            )
+            rows.append(
+                f'<tr><td>{escape(bag.name)}<br><code>{escape(bag.sha256) or "no hash"}</code>'
+                f'{remarks}</td>' + ''.join(f'<td class=number>{c}</td>' for c in cells) + '</tr>'
+            )
+        headings = ''.join(
+            f'<th{" class=number" if i else ""}>{name}</th>' for i, name in enumerate(head)
+        )
+        table = (
+            '<p class="note">With the SHA-256 of each.</p><div class="scroll"><table><thead><tr>'
+            f'{headings}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+        )
+        return f'<h2>Bags of this report</h2>{table}{_sources(evidence)}'
+    return _sources(evidence)
+
+
+def _sources(evidence: Evidence) -> str:
+    if evidence.calibration is None or evidence.is_fit:
+        return ''
+    sources = evidence.calibration.provenance.sources
+    if not sources:
+        return ''
+    rows = ''.join(
+        f'<tr><td>{escape(source.name)}<br><code>{escape(source.sha256) or "no hash"}</code></td>'
+        f'<td class=number>{source.n_samples}</td></tr>'
+        for source in sources
+    )
+    return (
+        '<h2>Bags that the calibration was fitted on</h2><div class="scroll"><table><thead><tr>'
+        '<th>bag</th><th class=number>samples</th></tr></thead>'
+        f'<tbody>{rows}</tbody></table></div>'
+    )
+
+
+def _footer() -> str:
+    now = dt.datetime.now(dt.timezone.utc)
+    return (
+        f'<footer>Report made {now:%Y-%m-%d %H:%M} UTC by thermo_comp {escape(__version__)}. '
+        '1 µg = 9.80665·10⁻⁶ m/s². |g|: magnitude of the specific force of a unit at rest. '
+        'Static and dynamic: the regime in which the node’s own detector saw each window. '
+        'The paper: S. V. Golovach, results of applying the method of algorithmic temperature '
+        'drift compensation for a three-axis accelerometer, 2016.</footer>'
+    )

@@ -1,0 +1,286 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the look of the figures and their way out: SVG that can stand in a page, PNG files.
+
+Every line differs from its neighbours by its dashes as well as by its colour, because
+certificates are printed in black and white. Colours are those of Okabe and Ito, which colour-blind
+readers tell apart.
+
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+
+from .decimate import thin
+from .evidence import CHOSEN, ONE_SET, RAW, STATIC_ALONE, TWO_REGIMES
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Line = dict[str, Any]
+
+BLACK, BLUE, RED, GREEN, GREY = '#000000', '#0072B2', '#D55E00', '#007A5A', '#8A8A8A'
+_DASHED, _DOTTED, _DASH_DOT = (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2))
+
+AXIS_LINES: tuple[Line, ...] = (
+    {'color': BLUE, 'linestyle': '-', 'linewidth': 1.1},
+    {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.1},
+    {'color': GREEN, 'linestyle': _DOTTED, 'linewidth': 1.5},
+)
+RUNG_LINES: dict[str, Line] = {
+    RAW: {'color': GREY, 'linestyle': '-', 'linewidth': 0.9},
+    ONE_SET: {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.1},
+    STATIC_ALONE: {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.1},
+    TWO_REGIMES: {'color': BLUE, 'linestyle': _DASH_DOT, 'linewidth': 1.1},
+    CHOSEN: {'color': BLACK, 'linestyle': '-', 'linewidth': 1.3},
+}
+BOARD_LINE: Line = {'color': BLACK, 'linestyle': '-', 'linewidth': 1.4}
+CASE_LINE: Line = {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.2}
+PROGRAM_LINE: Line = {'color': BLUE, 'linestyle': _DOTTED, 'linewidth': 1.4}
+STATIC_LINE: Line = {'color': BLUE, 'linestyle': '-', 'linewidth': 1.4}
+DYNAMIC_LINE: Line = {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.4}
+
+_RC: dict[str, Any] = {
+    'font.family': 'sans-serif',
+    'font.sans-serif': ['DejaVu Sans', 'Verdana', 'Helvetica', 'Arial', 'sans-serif'],
+    'font.size': 8.5,
+    'axes.titlesize': 8.5,
+    'axes.titlelocation': 'left',
+    'axes.titlepad': 4.0,
+    'axes.labelsize': 8.5,
+    'axes.linewidth': 0.7,
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'axes.grid': True,
+    'axes.axisbelow': True,
+    'axes.unicode_minus': True,
+    'grid.color': '#DDDDDD',
+    'grid.linewidth': 0.5,
+    'xtick.labelsize': 8,
+    'ytick.labelsize': 8,
+    'xtick.major.width': 0.7,
+    'ytick.major.width': 0.7,
+    'legend.fontsize': 8,
+    'legend.frameon': False,
+    'legend.handlelength': 2.8,
+    'legend.columnspacing': 1.4,
+    'legend.borderaxespad': 0.0,
+    'hatch.linewidth': 0.5,
+    # Names in figures come from files that others wrote: a dollar sign is a dollar sign.
+    'text.parse_math': False,
+    'text.usetex': False,
+    'svg.fonttype': 'none',
+    'path.simplify': True,
+}
+_PNG_DPI = 160
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """
+    The paper that a figure is drawn on.
+
+    Parameters
+    ----------
+    width : float
+        Inches.
+    n_bins : int
+        Pixels that a line may use across.
+    is_narrow : bool
+        A phone's screen: panels stand below each other.
+
+    """
+
+    width: float
+    n_bins: int
+    is_narrow: bool
+
+
+WIDE = Sheet(7.1, 420, False)
+NARROW = Sheet(3.75, 220, True)
+
+
+@contextmanager
+def drawing() -> Iterator[None]:
+    """
+    Draw in the report's style, whatever the user's matplotlib settings are.
+
+    """
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        settings: Any = mpl.rcParams
+        settings.update(_RC)
+        yield
+
+
+def new_figure(sheet: Sheet, height: float) -> Figure:
+    """
+    Make an empty figure as wide as the sheet.
+
+    """
+    return Figure(figsize=(sheet.width, height), layout='constrained')
+
+
+def svg(figure: Figure, name: str, label: str) -> str:
+    """
+    Write a figure as an SVG element for a page.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    name : str
+        Makes the ids in the element unique in the page; letters and digits.
+    label : str
+        What the figure shows, for readers who do not see it.
+
+    Returns
+    -------
+    str
+        The element, without a header; the page's style sheet gives its lines round joints.
+
+    """
+    buffer = io.StringIO()
+    nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}
+    figure.savefig(buffer, format='svg', metadata=nothing)
+    text = buffer.getvalue()
+    text = text[text.index('<svg') :]
+    for part in ('<metadata>.*?</metadata>', '<defs>\\s*<style.*?</style>\\s*</defs>'):
+        text = re.sub(part, '', text, flags=re.DOTALL)
+    text = re.sub(r'>\s+<', '><', text)
+    text = re.sub(r'\b(id="|href="#|url\(#)', rf'\g<1>{name}-', text)
+    # Two decimals are a hundredth of a point.
+    text = re.sub(
+        r'( d="|points=")([^"]*)"',
+        lambda path: path[1] + re.sub(r'(\.\d\d)\d+', r'\1', path[2]).replace('\n', '') + '"',
+        text,
+    )
+    head, rest = text.split('>', 1)
+    head = re.sub(r' (width|height|version|xmlns:xlink)="[^"]*"', '', head)
+    rest = rest.replace('xlink:href', 'href')
+    return f'{head} role="img" aria-label="{_attribute(label)}">{rest}'.strip()
+
+
+def png(figure: Figure) -> bytes:
+    """
+    Write a figure as a PNG file's content.
+
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='png', dpi=_PNG_DPI, metadata={'Software': None})
+    return buffer.getvalue()
+
+
+def _attribute(value: str) -> str:
+    for sign, entity in (('&', '&amp;'), ('<', '&lt;'), ('>', '&gt;'), ('"', '&quot;')):
+        value = value.replace(sign, entity)
+    return value
+
+
+def time_unit(duration_s: float) -> tuple[float, str]:
+    """
+    Choose the unit of a time axis.
+
+    Returns
+    -------
+    seconds : float
+        Seconds in one of it.
+    name : str
+        What the axis is called.
+
+    """
+    if duration_s >= 2.5 * 3600.0:
+        return 3600.0, 'time, h'
+    if duration_s >= 300.0:
+        return 60.0, 'time, min'
+    return 1.0, 'time, s'
+
+
+def plot_thinned(axes: Axes, time: Array, value: Array, sheet: Sheet, **line: Any) -> None:
+    """
+    Draw a long series with no more points than the sheet has pixels.
+
+    """
+    axes.plot(*thin(time, value, sheet.n_bins), **line)
+
+
+def broken(time: Array, value: Array, position: IntArray) -> tuple[Array, Array]:
+    """
+    Put a gap into a series of windows wherever it changes position or pauses.
+
+    Parameters
+    ----------
+    time, value : ndarray, shape (n,)
+        The series.
+    position : ndarray of int64, shape (n,)
+        Which position each window belongs to.
+
+    Returns
+    -------
+    time, value : ndarray, shape (m,)
+        With a NaN before each new stretch.
+
+    """
+    if len(time) < 2:
+        return time, value
+    steps = np.diff(time)
+    gap = (np.diff(position) != 0) | (steps > 5.0 * np.median(steps))
+    at = np.flatnonzero(gap) + 1
+    return np.insert(time, at, time[at - 1]), np.insert(value, at, np.nan)
+
+
+def legend_above(axes: Axes, sheet: Sheet, **keys: Any) -> None:
+    """
+    Put the legend above the axes, where it hides nothing, in as many columns as fit.
+
+    """
+    labels = axes.get_legend_handles_labels()[1]
+    # An entry takes its label and a handle as wide as some eight letters.
+    letters = 8 + max((len(label) for label in labels), default=0)
+    columns = max(1, int((50 if sheet.is_narrow else 100) / letters))
+    axes.legend(
+        loc='lower left', bbox_to_anchor=(0.0, 1.01), ncols=min(columns, len(labels)), **keys
+    )
+
+
+def few_ticks(axes: Axes, n: int = 5) -> None:
+    """
+    Keep the y axis of a low panel readable.
+
+    """
+    axes.yaxis.set_major_locator(MaxNLocator(n))
+
+
+def log_axis(axes: Axes, low: float, high: float) -> None:
+    """
+    Make the x axis logarithmic from `low` to `high`, with enough plain numbers on it.
+
+    """
+    axes.set_xscale('log')
+    axes.set_xlim(low, high)
+    is_short = high < 50.0 * low
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    axes.xaxis.set_minor_formatter(FuncFormatter(lambda _value, _: ''))
+
+
+def label_text(value: str, limit: int = 40) -> str:
+    """
+    Make text that others wrote fit for a figure: one line, printable, not too long.
+
+    """
+    clean = ''.join(c if c.isprintable() else ' ' for c in value).strip()
+    return clean if len(clean) <= limit else f'{clean[: limit - 1]}…'

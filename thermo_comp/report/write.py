@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the report as files: one HTML page and, if wanted, its figures as PNG.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..files import write_atomically
+from ..fitting import FitResult
+from .evidence import Evidence
+from .fitted import evidence_of_fit
+from .page import render_page
+from .plates import drawn_plates, png_files
+from .verdict import Verdict, judge
+
+
+def write_report(
+    subject: FitResult | Evidence,
+    path: str | Path,
+    *,
+    figures: str | Path | None = None,
+    paths: Sequence[str | Path] = (),
+    program: str | None = None,
+) -> Verdict:
+    """
+    Write a certificate as one self-contained HTML page.
+
+    Parameters
+    ----------
+    subject : FitResult or Evidence
+        A fit, or what `evidence_of_bags` gathered.
+    path : str or Path
+        The page; written atomically.
+    figures : str or Path or None, optional
+        Folder that gets the figures as PNG files, made if it is not there.
+    paths : sequence of str or Path, optional
+        The bags of a fit, in its order, to look up what simulated ones say of their chamber.
+    program : str or None, optional
+        The chamber's program of a fit, as `simulation.parse_cyclogram` reads it.
+
+    Returns
+    -------
+    Verdict
+        What the page says.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
+    RecordingError
+        If one of `paths` cannot be opened.
+    ValueError
+        If `program` cannot be read.
+
+    """
+    evidence = subject
+    if isinstance(evidence, FitResult):
+        evidence = evidence_of_fit(evidence, paths=paths, program=program)
+    verdict = judge(evidence)
+    page = render_page(evidence, verdict, drawn_plates(evidence))
+    if figures is not None:
+        folder = Path(figures)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in png_files(evidence).items():
+            write_atomically(folder / name, content)
+    write_atomically(path, page.encode())
+    return verdict
