@@ -29,7 +29,9 @@ from .thermometer import Thermometer, ThermometerSettings
 BEND_SHARES = (1.5, 15.0)  # accelerations the two filters are tuned to / the smallest onset
 SETTLING = 5.0  # memories until a filter's noise is the formula's
 EDGE_SIGMAS = 6.0  # edges that far apart are never crossed by noise
-SURE_SIGMAS = 2.0  # confidence of "the rate is below"
+SURE_SIGMAS = (
+    1.0  # of "the rate is below": in a calm the variance is mostly that of what may begin
+)
 OBVIOUS_SIGMAS = 5.0  # confidence of "the rate is above"
 OBVIOUS_SHARE = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
 
@@ -127,8 +129,8 @@ class RegimeDetector:
         self._dwell_ns = round(settings.dwell_s * 1e9)
         self._case_onset = _OnsetTest(settings, settings.case)
         self._board_onset = _OnsetTest(settings, settings.board)
-        self._case_calm = _CalmTest(settings.case)
-        self._board_calm = _CalmTest(settings.board)
+        self._case_calm = _CalmTest(settings, settings.case)
+        self._board_calm = _CalmTest(settings, settings.board)
         self.reset()
 
     def reset(self) -> None:
@@ -173,9 +175,8 @@ class RegimeDetector:
         if not lead.is_ready:
             return self.regime
 
-        relaxed = self._relaxed_rate
-        is_calm = self._case_calm.update(stamp_ns, case, relaxed)
-        is_calm = self._board_calm.update(stamp_ns, board, relaxed) and is_calm
+        is_calm = self._case_calm.update(stamp_ns, case)
+        is_calm = self._board_calm.update(stamp_ns, board) and is_calm
         if not is_calm:
             self._calm_ns = None
         elif self._calm_ns is None:
@@ -185,7 +186,7 @@ class RegimeDetector:
             if departure:
                 self._open(stamp_ns, departure, lead)
             elif not is_calm:
-                speed = OBVIOUS_SHARE * relaxed
+                speed = OBVIOUS_SHARE * self._relaxed_rate
                 direction = _obvious(lead, speed)
                 if direction or (board is not None and board.is_ready and _obvious(board, speed)):
                     self._open(stamp_ns, direction, lead)
@@ -393,17 +394,24 @@ class _CalmTest:
 
     """
 
-    def __init__(self, sensor: ThermometerSettings) -> None:
-        self._quantum = sensor.quantum_c
+    def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
+        self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
+        # A reading that stands still for longer than a relaxed rate takes through its cell, and
+        # than a reversal at the smallest ramp's acceleration stays in it, is calm in itself.
+        quantum = sensor.quantum_c
+        bend = settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
+        self._still_ns = round(
+            1e9 * max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
+        )
         self.reset()
 
     def reset(self) -> None:
         self._stamp_ns: int | None = None
         self._mean = 0.0
 
-    def update(self, stamp_ns: int, sensor: Thermometer | None, relaxed: float) -> bool:
+    def update(self, stamp_ns: int, sensor: Thermometer | None) -> bool:
         """
         Follow the rate of the sensor; a lost or stale one has no say.
 
@@ -423,10 +431,10 @@ class _CalmTest:
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)
-        if self._quantum > 0.0 and sensor.changed_ns is not None:
-            still_s = (stamp_ns - sensor.changed_ns) * 1e-9
-            if self._quantum < relaxed * still_s:
-                return True
+        changed = sensor.changed_ns
+        if self._still_ns and changed is not None and stamp_ns - changed > self._still_ns:
+            return True
+        relaxed = self._relaxed
         room = relaxed - SURE_SIGMAS * sqrt(sensor.var_rate)
         return -room < rate < room and abs(3.0 * rate - 2.0 * self._mean) < relaxed
 
