@@ -17,7 +17,7 @@ import typer
 
 from .. import __version__
 from ..errors import ThermoCompError
-from . import convert, evaluate, fit, info, output, replay, simulate
+from . import convert, evaluate, fit, info, output, replay, report, simulate
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
@@ -58,6 +58,7 @@ app.command()(fit.fit)
 app.command()(evaluate.evaluate)
 app.command()(replay.replay)
 app.command()(info.info)
+app.command()(report.report)
 app.command()(convert.convert)
 app.command()(simulate.simulate)
 

@@ -52,15 +52,11 @@ def evaluate(
     """
     from ..calibration_file import load_calibration
     from ..evaluation import evaluate as run
-    from ..fitting import normal_gravity
 
     out = Output(as_json, quiet)
     if not window > 0.0:
         raise options.usage(f'--window must be positive, got {window:g}')
-    if gravity is None and (latitude is None) != (height is None):
-        raise options.usage('give --gravity, or --latitude and --height')
-    if gravity is None and latitude is not None and height is not None:
-        gravity = normal_gravity(latitude, height)
+    gravity = options.place(gravity, latitude, height)
     names = [path.stem for path in calibration]
     if len(set(names)) < len(names):
         names = [str(path) for path in calibration]

@@ -70,7 +70,8 @@ def fit(
     from ..fitting import fit as run
 
     out = Output(as_json, quiet)
-    if gravity is None and (latitude is None or height is None):
+    gravity = options.place(gravity, latitude, height)
+    if gravity is None:
         raise options.usage('give --gravity, or --latitude and --height')
     for path in (output, report):
         if path is not None:
@@ -79,7 +80,7 @@ def fit(
     sources, kind = fit_sources(bags, topics, input_.value, serial)
     try:
         settings = FitOptions(
-            gravity=resolve_gravity(gravity, latitude, height),
+            gravity=resolve_gravity(gravity, None, None),
             model=model,
             serial=serial,
             input='counts' if kind == 'counts' else 'm/s^2',
@@ -93,7 +94,13 @@ def fit(
     with out.progress('fitting', total=1.0) as done:
         result = run(sources, settings, lambda _stage, part: done(part))
     save_calibration(result.calibration, output)
+    if report is not None:
+        from ..report import write_report
+
+        write_report(result, report, paths=bags)
     _say(out, result, output)
+    if report is not None:
+        out.line(f'{report}: certificate')
 
 
 def _say(out: Output, result: FitResult, output: Path) -> None:

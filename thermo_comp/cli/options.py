@@ -69,6 +69,40 @@ def topics_of(counts: str, imu: str, board: str, case: str) -> Topics:
     return Topics(counts, imu, board, case)
 
 
+def place(gravity: float | None, latitude: float | None, height: float | None) -> float | None:
+    """
+    Return local gravity from what the user gave of it, None where that is nothing.
+
+    Parameters
+    ----------
+    gravity, latitude, height : float or None
+        The options of these names.
+
+    Returns
+    -------
+    float or None
+        Local gravity.
+
+    Raises
+    ------
+    typer.BadParameter
+        If latitude or height stands alone, or is out of range.
+
+    """
+    if gravity is not None:
+        return gravity
+    if (latitude is None) != (height is None):
+        raise usage('give --gravity, or --latitude and --height')
+    if latitude is None or height is None:
+        return None
+    from ..fitting import normal_gravity
+
+    try:
+        return normal_gravity(latitude, height)
+    except ValueError as mistake:
+        raise usage(str(mistake)) from mistake
+
+
 def refuse_existing(output: Path, force: bool) -> None:
     """
     Refuse to overwrite an output before any work is done.

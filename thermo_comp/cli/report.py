@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp report``: a certificate of a calibration, from bags.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from . import options
+from .output import Output
+
+
+def report(
+    output: Annotated[Path, typer.Option('--output', '-o', help='Page to write (HTML).')],
+    bags: Annotated[
+        list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option('--calibration', '-c', help='Calibration of the unit (YAML).')
+    ] = None,
+    figures: Annotated[
+        Path | None, typer.Option(help='Folder for the figures as PNG files.', metavar='DIR')
+    ] = None,
+    gravity: options.Gravity = None,
+    latitude: options.Latitude = None,
+    height: options.Height = None,
+    serial: options.Serial = None,
+    program: Annotated[
+        str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
+    ] = None,
+    input_: options.InputOption = options.InputChoice.auto,
+    counts_topic: options.CountsTopic = 'accel/counts',
+    imu_topic: options.ImuTopic = 'imu/uncompensated',
+    board_topic: options.BoardTopic = 'temperature/board',
+    case_topic: options.CaseTopic = 'temperature/case',
+    force: options.Force = False,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Write the certificate of a unit: one HTML page, no network needed.
+
+    Shows temperatures, regime, |g| before and after, the functions of
+    temperature with their uncertainty, and a verdict in words. The report
+    of a fit itself, with its candidates, comes from: fit --report.
+
+    Example:
+      thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
+
+    """
+    from ..calibration_file import load_calibration
+    from ..replay import input_for
+    from ..report import evidence_of_bags, open_bag, write_report
+
+    out = Output(as_json, quiet)
+    if not bags and calibration is None:
+        raise options.usage('give bags, a calibration, or both')
+    gravity = options.place(gravity, latitude, height)
+    options.refuse_existing(output, force)
+    topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
+    paths = bags or []
+    loaded = None if calibration is None else load_calibration(calibration)
+    kind = input_.value if loaded is None else input_for(loaded, input_.value)
+    full_scale = None if loaded is None else loaded.unit.full_scale
+    opened = []
+    with out.progress('reading', total=max(len(paths), 1)) as done:
+        for number, path in enumerate(paths):
+            tell = partial(_tell, done, number)
+            opened.append(
+                open_bag(path, topics, kind, number=number, full_scale=full_scale, progress=tell)
+            )
+    try:
+        evidence = evidence_of_bags(
+            opened, loaded, gravity=gravity, serial=serial, program=program
+        )
+    except ValueError as mistake:
+        raise options.usage(str(mistake)) from mistake
+    verdict = write_report(evidence, output, figures=figures)
+    out.line(f'{output}: {verdict.headline}')
+    for reservation in verdict.reservations:
+        out.line(f'- {reservation}')
+    out.json({'output': output, 'verdict': verdict})
+    if verdict.level == 'poor':
+        raise typer.Exit(1)
+
+
+def _tell(done: Callable[[float], None], before: int, part: float) -> None:
+    done(before + part)
