@@ -85,9 +85,7 @@ def to_ros(message: Message, ros: int = 2) -> Any:
 
 def serialize(message: Message) -> bytes:
     kind = TYPES[message.topic]
-    return bytes(
-        typestore().serialize_cdr(to_ros(message), kind, little_endian=message.is_little)
-    )
+    return bytes(typestore().serialize_cdr(to_ros(message), kind, little_endian=message.is_little))
 
 
 def write_mcap(

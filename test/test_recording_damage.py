@@ -201,7 +201,9 @@ def test_a_torn_directory_says_which_file(tmp_path: Path) -> None:
     write_rosbag2(tmp_path / 'bag', messages[:20])
     write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[20:])
     metadata = tmp_path / 'bag' / 'metadata.yaml'
-    metadata.write_text(metadata.read_text().replace('- bag.mcap', '- bag.mcap\n  - bag_1.mcap', 1))
+    metadata.write_text(
+        metadata.read_text().replace('- bag.mcap', '- bag.mcap\n  - bag_1.mcap', 1)
+    )
     torn = tmp_path / 'bag' / 'bag_1.mcap'
     torn.write_bytes(torn.read_bytes()[:-20])
     info = inspect_recording(tmp_path / 'bag')

@@ -56,11 +56,12 @@ class Decoder:
     """
 
     def __init__(self, feeds: dict[Role, Feed], roles: dict[int, Role], keep_raw: bool) -> None:
-        self._feeds = list(feeds.items())
+        self._feeds = feeds
+        self._channels = {
+            role: np.array([n for n, own in roles.items() if own == role], np.uint16)
+            for role in feeds
+        }
         self._keep_raw = keep_raw
-        self._codes = np.zeros(1 << 16, np.uint8)
-        for channel, role in roles.items():
-            self._codes[channel] = 1 + [name for name, _ in self._feeds].index(role)
 
     def part(self, data: Bytes, messages: Messages, place: int | None) -> Part:
         """
@@ -86,18 +87,18 @@ class Decoder:
             A message whose bytes do not fit its type; without a path.
 
         """
-        codes = self._codes[messages.channel]
-        chosen = np.flatnonzero(codes)
-        log_ns = messages.log_ns[chosen]
+        log_ns = messages.log_ns
+        order = None
         if place is None and (log_ns[1:] < log_ns[:-1]).any():
             order = np.argsort(log_ns, kind='stable')
-            chosen, log_ns = chosen[order], log_ns[order]
-        codes = codes[chosen]
         part: Part = {}
-        for code, (role, feed) in enumerate(self._feeds, 1):
-            rank = np.flatnonzero(codes == code)
-            if len(rank):
-                own = chosen[rank]
+        for role, feed in self._feeds.items():
+            is_own = self._is_from(messages.channel, role)
+            own = rank = np.flatnonzero(is_own)
+            if order is not None:
+                rank = np.flatnonzero(is_own[order])
+                own = order[rank]
+            if len(own):
                 at = messages.at[own]
                 part[role] = self.rows(
                     feed,
@@ -105,10 +106,17 @@ class Decoder:
                     data,
                     at + MESSAGE_HEAD_BYTES,
                     messages.size[own],
-                    log_ns[rank],
+                    log_ns[own],
                     rank if place is None else at + place,
                 )
         return part
+
+    def _is_from(self, channel: NDArray[np.uint16], role: Role) -> NDArray[np.bool_]:
+        channels = self._channels[role]
+        is_own: NDArray[np.bool_] = (
+            channel == channels[0] if len(channels) == 1 else np.isin(channel, channels)
+        )
+        return is_own
 
     def rows(
         self,

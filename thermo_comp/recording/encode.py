@@ -1,22 +1,30 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way from columns to MCAP message records: one structured array per call, no loop.
+Owns the way from columns to MCAP message records: structured arrays, no loop over messages.
+
+Columns wait as they are. Once it is known which messages make a chunk, just their records are
+built, so that nothing larger than a chunk is ever laid out.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .columns import Floats, ImuColumns, Ints
+from .columns import Floats, Ints
 from .wire import Bytes, gather, scatter
 
 OPCODE_MESSAGE = 5
+_NS = 1_000_000_000
+
+#: Values of some of the numbers of a message: first column and the columns' values.
+Piece = tuple[int, Floats]
 
 
 def layout(n_bytes: int, /, **fields: tuple[Any, int]) -> np.dtype[Any]:
@@ -25,7 +33,7 @@ def layout(n_bytes: int, /, **fields: tuple[Any, int]) -> np.dtype[Any]:
 
     Parameters
     ----------
-    size : int
+    n_bytes : int
         Bytes of a row.
     **fields : (type, int)
         Type and offset of each field.
@@ -55,36 +63,43 @@ RECORD_HEAD = layout(
     log=('<u8', 15),
     publish=('<u8', 23),
 )
-_NS = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class Records:
+class Records(Protocol):
     """
-    Message records of one channel.
+    Messages of one channel that wait to be written.
 
     Attributes
     ----------
     channel : int
     log_ns : ndarray of int64, shape (n,)
     size : ndarray of int64, shape (n,)
-        Bytes of each whole record.
-    rows : list of (ndarray of int64, ndarray of void)
-        Records of equal size: their indices and their bytes.
+        Bytes of each whole record; may be one number broadcast.
 
     """
 
     channel: int
     log_ns: Ints
     size: Ints
-    rows: list[tuple[Ints, NDArray[Any]]]
+
+    def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
+        """
+        Build the records of the chosen messages.
+
+        Yields
+        ------
+        which : ndarray of int64 or slice
+            Places among the chosen.
+        rows : ndarray of void
+            Their records, all of one size.
+
+        """
+        ...
 
 
-def stamped_records(
-    channel: int, stamp_ns: Ints, log_ns: Ints, frame_id: str, numbers: Floats
-) -> Records:
+class StampedRecords:
     """
-    Make records of messages that are a header and float64 numbers.
+    Messages that are a header and float64 numbers.
 
     Parameters
     ----------
@@ -94,22 +109,207 @@ def stamped_records(
         Header stamps and log times.
     frame_id : str
         Of all of them.
-    numbers : ndarray, shape (n, k)
-        What follows the header.
-
-    Returns
-    -------
-    Records
+    n_numbers : int
+        How many numbers follow the header.
+    pieces : sequence of (int, ndarray)
+        Values of these numbers; those without a piece are 0.
 
     """
-    payload = _stamped_layout(frame_id, numbers.shape[1])
-    size = RECORD_HEAD.itemsize + payload.itemsize
-    rows: NDArray[Any] = np.zeros(
-        len(stamp_ns), layout(size, head=(RECORD_HEAD, 0), payload=(payload, RECORD_HEAD.itemsize))
-    )
-    _fill_head(rows['head'], channel, log_ns, size)
-    _fill_stamped(rows['payload'], stamp_ns, frame_id, numbers)
-    return _uniform(channel, log_ns, rows)
+
+    def __init__(
+        self,
+        channel: int,
+        stamp_ns: Ints,
+        log_ns: Ints,
+        frame_id: str,
+        n_numbers: int,
+        pieces: Sequence[Piece],
+    ) -> None:
+        self.channel = channel
+        self.log_ns = log_ns
+        self._stamp_ns = stamp_ns
+        self._frame_id = frame_id
+        self._pieces = pieces
+        self._payload = _stamped_layout(frame_id, n_numbers)
+        n_bytes = RECORD_HEAD.itemsize + self._payload.itemsize
+        self.size = np.broadcast_to(np.int64(n_bytes), log_ns.shape)
+        self._layout = layout(
+            n_bytes, head=(RECORD_HEAD, 0), payload=(self._payload, RECORD_HEAD.itemsize)
+        )
+
+    def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
+        """
+        Build the records of the chosen messages.
+
+        """
+        rows: NDArray[Any] = np.zeros(len(chosen), self._layout)
+        _fill_head(rows, self.channel, self.log_ns[chosen])
+        pieces = [(column, values[chosen]) for column, values in self._pieces]
+        _fill_stamped(rows['payload'], self._stamp_ns[chosen], self._frame_id, pieces)
+        yield slice(None), _as_void(rows)
+
+
+class BoolRecords:
+    """
+    Messages of std_msgs/Bool.
+
+    Parameters
+    ----------
+    channel : int
+        Number of the channel.
+    log_ns : ndarray of int64, shape (n,)
+        Log times.
+    values : ndarray of bool, shape (n,)
+        What they say.
+
+    """
+
+    _LAYOUT = layout(36, head=(RECORD_HEAD, 0), order=('u1', 32), value=('u1', 35))
+
+    def __init__(self, channel: int, log_ns: Ints, values: NDArray[np.bool_]) -> None:
+        self.channel = channel
+        self.log_ns = log_ns
+        self.size = np.broadcast_to(np.int64(self._LAYOUT.itemsize), log_ns.shape)
+        self._values = values
+
+    def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
+        """
+        Build the records of the chosen messages.
+
+        """
+        rows: NDArray[Any] = np.zeros(len(chosen), self._LAYOUT)
+        _fill_head(rows, self.channel, self.log_ns[chosen])
+        rows['order'] = 1
+        rows['value'] = self._values[chosen]
+        yield slice(None), _as_void(rows)
+
+
+class RawRecords:
+    """
+    Messages that are serialized already.
+
+    Parameters
+    ----------
+    channel : int
+        Number of the channel.
+    log_ns : ndarray of int64, shape (n,)
+        Log times.
+    data : ndarray of uint8
+        The messages behind each other.
+    ends : ndarray of int64, shape (n,)
+        Where each ends.
+
+    """
+
+    def __init__(self, channel: int, log_ns: Ints, data: Bytes, ends: Ints) -> None:
+        self.channel = channel
+        self.log_ns = log_ns
+        self._data = data
+        self._ends = ends
+        self._length = np.diff(ends, prepend=0)
+        self.size = self._length + RECORD_HEAD.itemsize
+
+    def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
+        """
+        Build the records of the chosen messages.
+
+        """
+        length = self._length[chosen]
+        for each in np.unique(length).tolist():
+            which = np.flatnonzero(length == each)
+            source = chosen[which]
+            rows: NDArray[Any] = np.zeros(
+                len(which),
+                layout(
+                    RECORD_HEAD.itemsize + each,
+                    head=(RECORD_HEAD, 0),
+                    payload=(np.dtype((np.void, each)), RECORD_HEAD.itemsize),
+                ),
+            )
+            _fill_head(rows, self.channel, self.log_ns[source])
+            if each:
+                rows['payload'] = gather(self._data, self._ends[source] - each, each)
+            yield which, _as_void(rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """
+    Message records behind each other.
+
+    Attributes
+    ----------
+    data : ndarray of uint8
+    channel : ndarray of uint16, shape (n,)
+    log_ns : ndarray of int64, shape (n,)
+    size : ndarray of int64, shape (n,)
+        Bytes of each record.
+
+    """
+
+    data: Bytes
+    channel: NDArray[np.uint16]
+    log_ns: Ints
+    size: Ints
+
+
+class Merged:
+    """
+    The messages of several channels in log-time order, cut into stretches on demand.
+
+    Parameters
+    ----------
+    batches : list of Records
+        For equal log times the earlier batch goes first.
+
+    """
+
+    def __init__(self, batches: list[Records]) -> None:
+        self._batches = batches
+        counts = [len(batch.log_ns) for batch in batches]
+        self._first = np.cumsum([0, *counts])
+        log_ns = np.concatenate([batch.log_ns for batch in batches])
+        size = np.concatenate([batch.size for batch in batches])
+        self._order = np.argsort(log_ns, kind='stable')
+        self._log_ns = log_ns[self._order]
+        self._size = size[self._order]
+        self._ends = np.cumsum(self._size)
+        self._owner = np.repeat(np.arange(len(batches)), counts)[self._order]
+        self._at = 0
+
+    def take(self, n_bytes: int) -> Stretch | None:
+        """
+        Build the next records, until they have at least so many bytes.
+
+        Parameters
+        ----------
+        n_bytes : int
+            The size wanted; the last stretch has less.
+
+        Returns
+        -------
+        Stretch or None
+            None where nothing is left.
+
+        """
+        begin = self._at
+        if begin == len(self._order):
+            return None
+        done = int(self._ends[begin] - self._size[begin])
+        end = min(int(np.searchsorted(self._ends, done + n_bytes)) + 1, len(self._order))
+        self._at = end
+        data = np.empty(int(self._ends[end - 1]) - done, np.uint8)
+        at = self._ends[begin:end] - self._size[begin:end] - done
+        owner = self._owner[begin:end]
+        channel = np.empty(end - begin, np.uint16)
+        for number in np.unique(owner).tolist():
+            batch = self._batches[number]
+            which = np.flatnonzero(owner == number)
+            channel[which] = batch.channel
+            chosen = self._order[begin:end][which] - self._first[number]
+            for some, rows in batch.rows(chosen):
+                scatter(data, at[which[some]], rows)
+        return Stretch(data, channel, self._log_ns[begin:end], self._size[begin:end])
 
 
 def stamped_payloads(stamp_ns: Ints, frame_id: str, numbers: Floats) -> Bytes:
@@ -133,7 +333,7 @@ def stamped_payloads(stamp_ns: Ints, frame_id: str, numbers: Floats) -> Bytes:
     """
     payload = _stamped_layout(frame_id, numbers.shape[1])
     rows: NDArray[Any] = np.zeros(len(stamp_ns), payload)
-    _fill_stamped(rows, stamp_ns, frame_id, numbers)
+    _fill_stamped(rows, stamp_ns, frame_id, [(0, numbers)])
     return rows.view(np.uint8).reshape(len(stamp_ns), payload.itemsize)
 
 
@@ -151,165 +351,31 @@ def _stamped_layout(frame_id: str, n_numbers: int) -> np.dtype[Any]:
     )
 
 
-def _fill_stamped(rows: NDArray[Any], stamp_ns: Ints, frame_id: str, numbers: Floats) -> None:
+def _fill_stamped(
+    rows: NDArray[Any], stamp_ns: Ints, frame_id: str, pieces: Sequence[Piece]
+) -> None:
     characters = frame_id.encode() + b'\0'
     rows['order'] = 1
     rows['sec'] = stamp_ns // _NS
     rows['nanosec'] = stamp_ns % _NS
     rows['length'] = len(characters)
     rows['frame'] = np.void(characters)
-    rows['numbers'] = numbers
+    numbers = rows['numbers']
+    for column, values in pieces:
+        numbers[:, column : column + values.shape[1]] = values
 
 
-def bool_records(channel: int, log_ns: Ints, values: NDArray[np.bool_]) -> Records:
-    """
-    Records of std_msgs/Bool.
-
-    Parameters
-    ----------
-    channel : int
-    log_ns : ndarray of int64, shape (n,)
-    values : ndarray of bool, shape (n,)
-
-    Returns
-    -------
-    Records
-
-    """
-    rows: NDArray[Any] = np.zeros(
-        len(log_ns), layout(36, head=(RECORD_HEAD, 0), order=('u1', 32), value=('u1', 35))
-    )
-    _fill_head(rows['head'], channel, log_ns, 36)
-    rows['order'] = 1
-    rows['value'] = values
-    return _uniform(channel, log_ns, rows)
-
-
-def raw_records(channel: int, log_ns: Ints, data: Bytes, ends: Ints) -> Records:
-    """
-    Records of messages that are serialized already.
-
-    Parameters
-    ----------
-    channel : int
-    log_ns : ndarray of int64, shape (n,)
-    data : ndarray of uint8
-        The messages behind each other.
-    ends : ndarray of int64, shape (n,)
-        Where each ends.
-
-    Returns
-    -------
-    Records
-
-    """
-    length = np.diff(ends, prepend=0)
-    size = length + RECORD_HEAD.itemsize
-    groups: list[tuple[Ints, NDArray[Any]]] = []
-    for each in np.unique(length).tolist():
-        index = np.flatnonzero(length == each)
-        payload = np.dtype((np.void, each))
-        rows: NDArray[Any] = np.zeros(
-            len(index),
-            layout(
-                RECORD_HEAD.itemsize + each,
-                head=(RECORD_HEAD, 0),
-                payload=(payload, RECORD_HEAD.itemsize),
-            ),
-        )
-        _fill_head(rows['head'], channel, log_ns[index], rows.itemsize)
-        if each:
-            rows['payload'] = gather(data, ends[index] - each, each)
-        groups.append((index, _as_void(rows)))
-    return Records(channel, log_ns, size, groups)
-
-
-def _fill_head(head: NDArray[Any], channel: int, log_ns: Ints, size: int) -> None:
+def _fill_head(rows: NDArray[Any], channel: int, log_ns: Ints) -> None:
+    head = rows['head']
     head['opcode'] = OPCODE_MESSAGE
-    head['size'] = size - 9
+    head['size'] = rows.itemsize - 9
     head['channel'] = channel
     head['log'] = log_ns
     head['publish'] = log_ns
 
 
-def _uniform(channel: int, log_ns: Ints, rows: NDArray[Any]) -> Records:
-    size = np.full(len(rows), rows.itemsize, np.int64)
-    return Records(channel, log_ns, size, [(np.arange(len(rows)), _as_void(rows))])
-
-
 def _as_void(rows: NDArray[Any]) -> NDArray[Any]:
     return rows.view(np.dtype((np.void, rows.itemsize)))
-
-
-def merge_records(batches: list[Records]) -> tuple[Bytes, NDArray[np.uint16], Ints, Ints]:
-    """
-    Lay the records of several channels behind each other in log-time order.
-
-    Parameters
-    ----------
-    batches : list of Records
-        For equal log times the earlier batch goes first.
-
-    Returns
-    -------
-    data : ndarray of uint8
-    channel : ndarray of uint16, shape (n,)
-    log_ns : ndarray of int64, shape (n,)
-    size : ndarray of int64, shape (n,)
-        Of each record in the order of `data`.
-
-    """
-    log_ns = np.concatenate([batch.log_ns for batch in batches])
-    size = np.concatenate([batch.size for batch in batches])
-    channel = np.repeat(
-        np.array([batch.channel for batch in batches], np.uint16),
-        [len(batch.log_ns) for batch in batches],
-    )
-    order = np.argsort(log_ns, kind='stable')
-    size = size[order]
-    begin = np.empty(len(order), np.int64)
-    begin[order] = np.cumsum(size) - size
-    data = np.empty(int(size.sum()), np.uint8)
-    first = 0
-    for batch in batches:
-        for index, rows in batch.rows:
-            scatter(data, begin[first + index], rows)
-        first += len(batch.log_ns)
-    return data, channel[order], log_ns[order], size
-
-
-def imu_numbers(
-    n: int, linear_acceleration: Floats, covariance: Floats, imu: ImuColumns | None
-) -> Floats:
-    """
-    The numbers of sensor_msgs/Imu after its header.
-
-    Parameters
-    ----------
-    n : int
-    linear_acceleration : ndarray, shape (n, 3)
-    covariance : ndarray, shape (n, 9) or (9,)
-    imu : ImuColumns or None
-        The rest; without it no orientation and no angular velocity is claimed: the first element
-        of either covariance is -1, the orientation is the identity.
-
-    Returns
-    -------
-    ndarray, shape (n, 37)
-
-    """
-    numbers = np.zeros((n, 37))
-    if imu is None:
-        numbers[:, 3] = 1.0
-        numbers[:, 4] = numbers[:, 16] = -1.0
-    else:
-        numbers[:, 0:4] = imu.orientation
-        numbers[:, 4:13] = imu.orientation_covariance
-        numbers[:, 13:16] = imu.angular_velocity
-        numbers[:, 16:25] = imu.angular_velocity_covariance
-    numbers[:, 25:28] = linear_acceleration
-    numbers[:, 28:37] = covariance
-    return numbers
 
 
 def as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
@@ -321,6 +387,7 @@ def as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
     name : str
         The argument's name, for the error.
     values : array_like of int, shape (n,)
+        The column.
     n : int, optional
         The length it must have.
 
@@ -354,8 +421,11 @@ def as_numbers(name: str, values: ArrayLike, n: int, width: int) -> Floats:
     Parameters
     ----------
     name : str
+        The argument's name, for the error.
     values : array_like, shape (n, width), or (width,) for the same in each row
+        The column.
     n, width : int
+        The shape it must have.
 
     Returns
     -------

@@ -13,7 +13,9 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -35,11 +37,10 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from numpy.typing import NDArray
 
 from .. import __version__
-from .columns import Ints
 from .definitions import Definition, offered_qos
+from .encode import Merged, Stretch
 from .rosbag2_metadata import FileSummary, TopicSummary, dump_yaml, information
 from .wire import Bytes
 
@@ -47,6 +48,7 @@ MAGIC = b'\x89MCAP0\r\n'
 #: Name of the metadata record that holds the writer's key-value pairs.
 METADATA_NAME = 'thermo_comp'
 
+_MAX_PACKING = 2
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 
@@ -87,7 +89,9 @@ class McapFile:
         self._counts: dict[int, int] = {}
         self._chunks: list[ChunkIndex] = []
         self._metadata_index: list[MetadataIndex] = []
-        self._tail = _nothing()
+        self._tail: list[Stretch] = []
+        self._packing: deque[tuple[Stretch, Future[tuple[bytes | memoryview, int]]]] = deque()
+        self._pool = ThreadPoolExecutor(1, 'recording')
         self._start_ns: int | None = None
         self._end_ns = 0
         self._at = 0
@@ -142,34 +146,41 @@ class McapFile:
         self._put_record(channel)
         return channel.id
 
-    def append(self, data: Bytes, channel: NDArray[np.uint16], log_ns: Ints, size: Ints) -> None:
+    def append(self, merged: Merged) -> None:
         """
-        Add message records; whole chunks are written, the rest waits for more.
+        Add messages; whole chunks are written, the rest waits for more.
 
         Parameters
         ----------
-        data : ndarray of uint8
-            The records behind each other.
-        channel : ndarray of uint16, shape (n,)
-        log_ns : ndarray of int64, shape (n,)
-        size : ndarray of int64, shape (n,)
+        merged : Merged
+            The messages.
 
         """
-        data = np.concatenate([self._tail[0], data])
-        channel = np.concatenate([self._tail[1], channel])
-        log_ns = np.concatenate([self._tail[2], log_ns])
-        size = np.concatenate([self._tail[3], size])
-        ends = np.cumsum(size)
-        row = begin = 0
         while True:
-            last = int(np.searchsorted(ends, begin + self._chunk_bytes))
-            if last >= len(ends):
-                break
-            end = int(ends[last])
-            rows = slice(row, last + 1)
-            self._put_chunk(data[begin:end], channel[rows], log_ns[rows], size[rows])
-            row, begin = last + 1, end
-        self._tail = (data[begin:].copy(), channel[row:], log_ns[row:], size[row:])
+            waiting = sum(len(stretch.data) for stretch in self._tail)
+            stretch = merged.take(self._chunk_bytes - waiting)
+            if stretch is None:
+                return
+            self._tail.append(stretch)
+            if waiting + len(stretch.data) >= self._chunk_bytes:
+                self._close_chunk()
+
+    def _close_chunk(self) -> None:
+        """
+        Have the waiting messages compressed, and write what was compressed meanwhile.
+
+        """
+        stretch, self._tail = _joined(self._tail), []
+        self._packing.append((stretch, self._pool.submit(self._pack, stretch.data)))
+        while len(self._packing) > _MAX_PACKING:
+            self._put_packed()
+
+    def _put_packed(self) -> None:
+        stretch, future = self._packing.popleft()
+        self._put_chunk(stretch, *future.result())
+
+    def _pack(self, data: Bytes) -> tuple[bytes | memoryview, int]:
+        return self._compress(data), zlib.crc32(data)
 
     def finish(self, custom: Mapping[str, str]) -> FileSummary:
         """
@@ -185,9 +196,10 @@ class McapFile:
         FileSummary
 
         """
-        if len(self._tail[1]):
-            self._put_chunk(*self._tail)
-            self._tail = _nothing()
+        if self._tail:
+            self._close_chunk()
+        while self._packing:
+            self._put_packed()
         summary = self._summary()
         text = dump_yaml(information(summary, custom)).strip()
         self._put_metadata('rosbag2', {'serialized_metadata': text})
@@ -202,6 +214,7 @@ class McapFile:
         Close the file as it is.
 
         """
+        self._pool.shutdown(wait=True, cancel_futures=True)
         self._stream.close()
 
     def _put(self, data: bytes | memoryview) -> None:
@@ -220,13 +233,11 @@ class McapFile:
         self._put_record(Metadata(name, dict(content)))
         self._metadata_index.append(MetadataIndex(begin, self._at - begin, name))
 
-    def _put_chunk(
-        self, data: Bytes, channel: NDArray[np.uint16], log_ns: Ints, size: Ints
-    ) -> None:
+    def _put_chunk(self, stretch: Stretch, packed: bytes | memoryview, checksum: int) -> None:
+        log_ns, size, channel = stretch.log_ns, stretch.size, stretch.channel
         start, end = int(np.min(log_ns)), int(np.max(log_ns))
         self._start_ns = start if self._start_ns is None else min(self._start_ns, start)
         self._end_ns = max(self._end_ns, end)
-        packed = self._compress(data)
         name = self._compression.encode()
         begin = self._at
         self._put(
@@ -236,8 +247,8 @@ class McapFile:
                 40 + len(name) + len(packed),
                 start,
                 end,
-                len(data),
-                zlib.crc32(data),
+                len(stretch.data),
+                checksum,
                 len(name),
                 name,
                 len(packed),
@@ -267,7 +278,7 @@ class McapFile:
                 message_index_length=self._at - begin - chunk_length,
                 message_index_offsets=offsets,
                 message_start_time=start,
-                uncompressed_size=len(data),
+                uncompressed_size=len(stretch.data),
             )
         )
 
@@ -332,15 +343,14 @@ class McapFile:
         self._put(MAGIC)
 
 
-_Waiting = tuple[Bytes, NDArray[np.uint16], Ints, Ints]
-
-
-def _nothing() -> _Waiting:
-    return (
-        np.empty(0, np.uint8),
-        np.empty(0, np.uint16),
-        np.empty(0, np.int64),
-        np.empty(0, np.int64),
+def _joined(stretches: list[Stretch]) -> Stretch:
+    if len(stretches) == 1:
+        return stretches[0]
+    return Stretch(
+        np.concatenate([stretch.data for stretch in stretches]),
+        np.concatenate([stretch.channel for stretch in stretches]),
+        np.concatenate([stretch.log_ns for stretch in stretches]),
+        np.concatenate([stretch.size for stretch in stretches]),
     )
 
 

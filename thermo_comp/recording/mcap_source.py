@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import cast
 
@@ -164,8 +165,8 @@ def _read(survey: Survey, selection: dict[Role, str], raw: bool) -> Iterator[Par
         return
     order = sorted(range(len(chunks)), key=lambda row: (chunks[row].start_ns, row))
     is_overlapping = any(
-        chunks[later].start_ns <= chunks[earlier].end_ns or later < earlier
-        for earlier, later in zip(order, order[1:], strict=False)
+        chunks[later].start_ns < chunks[earlier].end_ns or later < earlier
+        for earlier, later in pairwise(order)
     )
     loaded = _loaded(survey.handle, [chunks[row] for row in order])
     if is_overlapping:

@@ -27,8 +27,13 @@ MESSAGE_HEAD_BYTES = 31
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 _PREFIX = struct.Struct('<BQ')
 _INDEX_HEAD = struct.Struct('<BQHI')
-#: So many equal lengths in a row make it worth while to compare many at once.
-_REGULAR = 4
+_NOWHERE = np.empty(0, np.int64)
+#: So many records are walked singly before the lengths met are taken for the usual ones.
+_PATIENCE = 16
+_MAX_LENGTHS = 16
+_LEAP_BYTES = 1 << 20
+#: False candidates met in one leap before it is given up.
+_MAX_LINKS = 256
 
 #: Why a walk stopped, besides damage that is said in other words.
 ENDS_EARLY = 'a record ends too early'
@@ -125,21 +130,21 @@ def _indexed(index: memoryview, size: int) -> Ints | None:
 
 def _checked(data: Bytes, at: Ints, on_record: OnRecord) -> Messages | None:
     """
-    The messages at these places if they tile the data together with what is between them.
+    Read the messages at these places if they tile the data with what is between them.
 
     """
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    size = field(head, 1, '<i8') - (MESSAGE_HEAD_BYTES - PREFIX_BYTES)
-    if (field(head, 0, 'u1') != MESSAGE).any() or int(np.min(size)) < 0:
+    # Unsigned on purpose: a length that is too small wraps around to one that is too large.
+    length = field(head, 1, '<u8') - np.uint64(MESSAGE_HEAD_BYTES - PREFIX_BYTES)
+    if int(np.max(length)) > len(data) or (field(head, 0, 'u1') != MESSAGE).any():
         return None
-    limit = len(data) - MESSAGE_HEAD_BYTES
-    if int(np.max(size)) > limit:
-        return None
+    size = length.view(np.int64)
     ends = at + size
     ends += MESSAGE_HEAD_BYTES
-    if int(np.min(at[1:] - ends[:-1], initial=0)) < 0 or int(ends[-1]) > len(data):
+    between = at[1:] - ends[:-1]
+    breaks = np.flatnonzero(between)
+    if int(ends[-1]) > len(data) or (between[breaks] < 0).any():
         return None
-    breaks = np.flatnonzero(at[1:] != ends[:-1])
     gaps = [(0, int(at[0])), (int(ends[-1]), len(data))]
     gaps[1:1] = zip(ends[breaks].tolist(), at[breaks + 1].tolist(), strict=True)
     found: list[tuple[int, bytes]] = []
@@ -193,36 +198,36 @@ def walk(
     """
     view = data.data
     runs: list[Ints] = []
-    at, length_before, n_equal = 0, -1, 0
     singles: list[int] = []
+    lengths: set[int] = set()
+    at, n_single, n_before_leap = 0, 0, _PATIENCE
     reason = ''
     while at < len(data):
         if at + PREFIX_BYTES > len(data):
             reason = ENDS_EARLY
             break
         opcode, length = _PREFIX.unpack_from(view, at)
-        step = PREFIX_BYTES + length
+        end = at + PREFIX_BYTES + length
         if opcode and only is not None and opcode not in only:
             reason = OTHER_RECORD
         else:
-            reason = _fault(opcode, length, at + step > len(data))
+            reason = _fault(opcode, length, end > len(data))
         if reason:
             break
-        n_equal = n_equal + 1 if length == length_before else 0
-        length_before = length
-        if opcode == MESSAGE:
-            n_run = _run(data, at, length) if n_equal >= _REGULAR else 1
-            if n_run > 1:
-                runs.append(np.array(singles, np.int64))
-                singles = []
-                runs.append(at + step * np.arange(n_run))
-            else:
-                singles.append(at)
-            at += step * n_run
-        else:
-            begin = at + PREFIX_BYTES
-            on_record(opcode, bytes(view[begin : begin + length]))
-            at += step
+        if opcode != MESSAGE:
+            on_record(opcode, bytes(view[at + PREFIX_BYTES : end]))
+            at = end
+            continue
+        singles.append(at)
+        at = end
+        n_single += 1
+        if len(lengths) < _MAX_LENGTHS:
+            lengths.add(length)
+        if n_single >= n_before_leap:
+            places, at = _leap(data, at, lengths)
+            runs += [np.array(singles, np.int64), places]
+            singles, n_single = [], 0
+            n_before_leap = _PATIENCE if len(places) > n_before_leap else 2 * n_before_leap
     runs.append(np.array(singles, np.int64))
     places = np.concatenate(runs)
     head = gather(data, places, MESSAGE_HEAD_BYTES)
@@ -238,22 +243,46 @@ def _fault(opcode: int, length: int, is_beyond: bool) -> str:
     return ENDS_EARLY if is_beyond else ''
 
 
-def _run(data: Bytes, at: int, length: int) -> int:
+def _leap(data: Bytes, at: int, lengths: set[int]) -> tuple[Ints, int]:
     """
-    How many message records of one length follow each other from here on.
+    Find the message records from here on whose lengths have been met before, all at once.
+
+    Whatever looks like the front of such a record is a candidate. Those that form a chain, each
+    where the one before it ends, are the records; candidates inside a record are no records.
+
+    Parameters
+    ----------
+    data : ndarray of uint8
+        The bytes.
+    at : int
+        Where a record begins.
+    lengths : set of int
+        Lengths of the contents of message records.
+
+    Returns
+    -------
+    places : ndarray of int64, shape (n,)
+        Of the records; perhaps none.
+    end : int
+        Where the last of them ends.
 
     """
-    step = PREFIX_BYTES + length
-    n_possible = (len(data) - at) // step
-    n_same, n_next = 1, 16
-    while n_same < n_possible:
-        n_next = min(n_next, n_possible - n_same)
-        begin = at + n_same * step
-        opcodes: Bytes = np.ndarray((n_next,), np.uint8, data.data, begin, (step,))
-        lengths: NDArray[np.uint64] = np.ndarray((n_next,), '<u8', data.data, begin + 1, (step,))
-        different = np.flatnonzero((opcodes != MESSAGE) | (lengths != length))
-        if len(different):
-            return n_same + int(different[0])
-        n_same += n_next
-        n_next *= 4
-    return n_same
+    stop = min(at + _LEAP_BYTES, len(data) - PREFIX_BYTES)
+    places = np.flatnonzero(data[at:stop] == MESSAGE) + at if stop > at else _NOWHERE
+    found = gather(data, places + 1, 8).view('<u8')
+    is_known = np.zeros(len(places), np.bool_)
+    for length in lengths:
+        is_known |= found == length
+    places, ends = places[is_known], found[is_known].astype(np.int64)
+    ends += places + PREFIX_BYTES
+    is_whole = ends <= len(data)
+    places, ends = places[is_whole], ends[is_whole]
+    chain: list[Ints] = []
+    first = 0
+    while len(chain) < _MAX_LINKS and first < len(places) and places[first] == at:
+        breaks = np.flatnonzero(places[first + 1 :] != ends[first:-1])
+        last = first + int(breaks[0]) if len(breaks) else len(places) - 1
+        chain.append(places[first : last + 1])
+        at = int(ends[last])
+        first = int(np.searchsorted(places, at))
+    return (np.concatenate(chain) if chain else _NOWHERE), at

@@ -226,10 +226,9 @@ def _decode(
         body += 3  # (12 + length + 7) // 8 * 8, counted from after the encapsulation
         body &= -8
         body += 4
-    rest = size - body
-    if len(rest) and not (
-        int(np.min(rest)) >= 8 * n_numbers and int(np.max(rest)) <= 8 * n_numbers + _MAX_PADDING
-    ):
+    # Unsigned on purpose: too few bytes wrap around to far too many.
+    padding = (size - (body + 8 * n_numbers)).view(np.uint64)
+    if len(padding) and int(np.max(padding)) > _MAX_PADDING:
         raise _misfit('a header and its numbers')
     body += start
     n_taken = n_numbers if n_wanted is None else n_wanted

@@ -23,21 +23,22 @@ from numpy.typing import ArrayLike
 
 from ..errors import RecordingError
 from .atomic import partial_sibling, publish, sync_directory
-from .columns import ImuColumns, RawMessages
+from .columns import ImuColumns, Ints, RawMessages
 from .definitions import Definition, known_definition
 from .encode import (
+    BoolRecords,
+    Merged,
+    Piece,
+    RawRecords,
     Records,
+    StampedRecords,
     as_numbers,
     as_times,
-    bool_records,
-    imu_numbers,
-    merge_records,
-    raw_records,
-    stamped_records,
 )
 from .mcap_out import McapFile
 from .rosbag2_metadata import dump_metadata
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
+from .wire import N_NUMBERS
 
 Compression = Literal['none', 'lz4', 'zstd']
 
@@ -75,7 +76,9 @@ class BagWriter:
     -----
     Messages are buffered until `flush`, which merges all topics in log-time order; 64 MiB of them
     are flushed unasked. So one group of calls whose time spans overlap and a `flush` make a file
-    in log-time order, whatever order the calls had.
+    in log-time order, whatever order the calls had. Arrays are not copied: leave them as they are
+    until the `flush`. A process that is killed loses what is buffered and up to four chunks; the
+    rest stands in a hidden file beside the target and can be read as a torn bag.
 
     """
 
@@ -142,7 +145,9 @@ class BagWriter:
             The disk is full or the like.
 
         """
-        self._write_stamped(topic, VECTOR3_STAMPED, stamp_ns, log_ns, frame_id, xyz, 3, 'xyz')
+        stamps = _as_stamps(stamp_ns)
+        numbers = as_numbers('xyz', xyz, len(stamps), 3)
+        self._write_stamped(topic, VECTOR3_STAMPED, stamps, log_ns, frame_id, [(0, numbers)])
 
     def write_temperature(
         self,
@@ -179,7 +184,7 @@ class BagWriter:
         if column.shape != stamps.shape:
             raise ValueError(f'`celsius` must have {len(stamps)} values, got {column.shape}')
         numbers = np.column_stack([column, np.broadcast_to(np.asarray(variance), column.shape)])
-        self._write_stamped(topic, TEMPERATURE, stamps, log_ns, frame_id, numbers, 2, 'celsius')
+        self._write_stamped(topic, TEMPERATURE, stamps, log_ns, frame_id, [(0, numbers)])
 
     def write_imu(
         self,
@@ -217,13 +222,31 @@ class BagWriter:
         """
         stamps = _as_stamps(stamp_ns)
         n = len(stamps)
-        numbers = imu_numbers(
-            n,
-            as_numbers('linear_acceleration', linear_acceleration, n, 3),
-            as_numbers('linear_acceleration_covariance', linear_acceleration_covariance, n, 9),
-            imu,
-        )
-        self._write_stamped(topic, IMU, stamps, log_ns, frame_id, numbers, 37, 'imu')
+        pieces: list[Piece] = [
+            (25, as_numbers('linear_acceleration', linear_acceleration, n, 3)),
+            (
+                28,
+                as_numbers('linear_acceleration_covariance', linear_acceleration_covariance, n, 9),
+            ),
+        ]
+        if imu is None:
+            nothing = np.zeros((1, 25))
+            nothing[0, 3] = 1.0
+            nothing[0, [4, 16]] = -1.0
+            pieces.append((0, np.broadcast_to(nothing, (n, 25))))
+        else:
+            pieces += [
+                (0, as_numbers('imu.orientation', imu.orientation, n, 4)),
+                (4, as_numbers('imu.orientation_covariance', imu.orientation_covariance, n, 9)),
+                (13, as_numbers('imu.angular_velocity', imu.angular_velocity, n, 3)),
+                (
+                    16,
+                    as_numbers(
+                        'imu.angular_velocity_covariance', imu.angular_velocity_covariance, n, 9
+                    ),
+                ),
+            ]
+        self._write_stamped(topic, IMU, stamps, log_ns, frame_id, pieces)
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
         """
@@ -247,7 +270,7 @@ class BagWriter:
         flags = np.atleast_1d(np.asarray(values, np.bool_))
         if flags.shape != times.shape:
             raise ValueError(f'`values` must have {len(times)} values, got {flags.shape}')
-        self._add(bool_records(self._channel(topic, BOOL), times, flags))
+        self._add(BoolRecords(self._channel(topic, BOOL), times, flags))
 
     def write_raw(
         self,
@@ -286,7 +309,7 @@ class BagWriter:
             ends = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
         times = as_times('log_ns', log_ns, len(ends))
         channel = self._channel(topic, type, definition)
-        self._add(raw_records(channel, times, data, ends))
+        self._add(RawRecords(channel, times, data, ends))
 
     def flush(self) -> None:
         """
@@ -301,7 +324,7 @@ class BagWriter:
         if self._batches:
             batches, self._batches, self._n_buffered_bytes = self._batches, [], 0
             with self._translated():
-                self._open_file().append(*merge_records(batches))
+                self._open_file().append(Merged(batches))
 
     def close(self) -> None:
         """
@@ -370,17 +393,14 @@ class BagWriter:
         self,
         topic: str,
         kind: str,
-        stamp_ns: ArrayLike,
+        stamp_ns: Ints,
         log_ns: ArrayLike | None,
         frame_id: str,
-        numbers: ArrayLike,
-        width: int,
-        name: str,
+        pieces: list[Piece],
     ) -> None:
-        stamps = _as_stamps(stamp_ns)
-        times = stamps if log_ns is None else as_times('log_ns', log_ns, len(stamps))
-        columns = as_numbers(name, numbers, len(stamps), width)
-        self._add(stamped_records(self._channel(topic, kind), stamps, times, frame_id, columns))
+        times = stamp_ns if log_ns is None else as_times('log_ns', log_ns, len(stamp_ns))
+        channel = self._channel(topic, kind)
+        self._add(StampedRecords(channel, stamp_ns, times, frame_id, N_NUMBERS[kind], pieces))
 
     def _channel(self, topic: str, kind: str, definition: tuple[str, str] | None = None) -> int:
         name = '/' + topic.strip('/')
@@ -422,7 +442,7 @@ class BagWriter:
             ) from error
 
 
-def _as_stamps(stamp_ns: ArrayLike) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+def _as_stamps(stamp_ns: ArrayLike) -> Ints:
     stamps = as_times('stamp_ns', stamp_ns)
     if len(stamps) and int(np.max(stamps)) >= _LAST_SECOND * 1_000_000_000:
         raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))}')
