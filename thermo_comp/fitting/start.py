@@ -23,6 +23,9 @@ from .table import WindowTable
 
 Array = npt.NDArray[np.float64]
 
+# Even a cheap sensor that drifts over 60 K stays within this of an ellipsoid; motion does not.
+_LARGEST_RMS = 0.05
+
 
 @dataclass(frozen=True)
 class ConstantCalibration:
@@ -86,7 +89,9 @@ def constant_calibration(
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, with_misalignment))
     calibration, rms = min(tried, key=lambda found: found[1])
-    if not np.all(calibration.scale > 0.0) or not rms < 0.2 * gravity:
+    # Scattered points are met best by a patch of a huge ellipsoid with its centre far away.
+    is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
+    if not np.all(calibration.scale > 0.0) or not is_around or not rms < _LARGEST_RMS * gravity:
         raise FitError('the positions lie on no ellipsoid: is every one of them at rest?')
     return calibration
 
