@@ -17,7 +17,7 @@ import typer
 
 from .. import __version__
 from ..errors import ThermoCompError
-from . import convert, evaluate, fit, info, output, replay, report, simulate
+from . import convert, evaluate, fit, info, output, play, replay, report, simulate
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
@@ -57,6 +57,7 @@ def _top(
 app.command()(fit.fit)
 app.command()(evaluate.evaluate)
 app.command()(replay.replay)
+app.command()(play.play)
 app.command()(info.info)
 app.command()(report.report)
 app.command()(convert.convert)
@@ -94,8 +95,9 @@ def run(arguments: list[str]) -> int:
         0 done, 1 the data or the result is bad, 2 the command line is wrong.
 
     """
+    arguments, ros_arguments = split_ros_arguments(arguments)
     try:
-        code = app(arguments, prog_name='thermo_comp', standalone_mode=False)
+        code = app(arguments, prog_name='thermo_comp', standalone_mode=False, obj=ros_arguments)
         sys.stdout.flush()
     except _UsageMistake as mistake:
         return _usage(mistake)
@@ -114,6 +116,34 @@ def run(arguments: list[str]) -> int:
         output.error(f'{where}{failure.strerror or failure}')
         return 1
     return code if isinstance(code, int) else 0
+
+
+def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """
+    Take out what stands between ``--ros-args`` and ``--`` (or the end), as ROS 2 does.
+
+    Parameters
+    ----------
+    arguments : list of str
+        The command line.
+
+    Returns
+    -------
+    own, ros : list of str
+        The rest, and what is ROS's; both without the markers.
+
+    """
+    own: list[str] = []
+    ros: list[str] = []
+    target = own
+    for argument in arguments:
+        if argument == '--ros-args':
+            target = ros
+        elif argument == '--' and target is ros:
+            target = own
+        else:
+            target.append(argument)
+    return own, ros
 
 
 def _usage(mistake: Exception) -> int:

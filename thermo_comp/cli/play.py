@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp play``: a bag onto the live topics of the node.
+
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from typing import Annotated
+
+import typer
+
+from ..errors import ThermoCompError
+from . import options
+from .output import Output
+
+
+def play(
+    context: typer.Context,
+    bag: options.Bag,
+    rate: Annotated[
+        float,
+        typer.Option(help='Seconds of the bag per second; 0 = as fast as it is taken.', min=0.0),
+    ] = 1.0,
+    loop: Annotated[bool, typer.Option('--loop', '-l', help='Play it again and again.')] = False,
+    clock: Annotated[
+        bool, typer.Option('--clock/--no-clock', help='Publish /clock, the time of the bag.')
+    ] = True,
+    wait: Annotated[
+        float, typer.Option(help='Longest wait for a subscriber on every topic [s].', min=0.0)
+    ] = 10.0,
+    input_: options.InputOption = options.InputChoice.auto,
+    counts_topic: options.CountsTopic = 'accel/counts',
+    imu_topic: options.ImuTopic = 'imu/uncompensated',
+    board_topic: options.BoardTopic = 'temperature/board',
+    case_topic: options.CaseTopic = 'temperature/case',
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Play a bag onto the live topics of the node, with /clock.
+
+    Whatever the topics are called in the bag, they go out as accel/counts
+    (or imu/uncompensated), temperature/board and temperature/case; remap
+    them after --ros-args. It ends when every reliable subscriber has got
+    everything.
+
+    Example:
+      thermo_comp play chamber.mcap --rate 20
+      thermo_comp play chamber.mcap --ros-args -r __ns:=/imu0
+
+    """
+    require_ros()
+    from ..ros.player import play as run
+
+    out = Output(as_json, quiet)
+    with out.progress('playing', total=1.0) as done:
+        report = run(
+            bag,
+            rate=rate,
+            n_loops=0 if loop else 1,
+            clock=clock,
+            wait_s=wait,
+            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            input=input_.value,
+            ros_args=context.obj or (),
+            progress=done,
+        )
+    for topic in report.unheard:
+        out.note(f'nobody listened to {topic}')
+    for topic in report.lossy:
+        out.note(f'{topic} has a best-effort subscriber, which can lose messages')
+    out.table(('topic', 'messages'), sorted(report.n_messages.items()))
+    out.line(f'played in {report.duration_s:.1f} s')
+    out.json(
+        {
+            'messages': report.n_messages,
+            'duration_s': report.duration_s,
+            'unheard': report.unheard,
+            'lossy': report.lossy,
+        }
+    )
+
+
+def require_ros() -> None:
+    """
+    Say what is missing where there is no ROS.
+
+    Raises
+    ------
+    ThermoCompError
+        If rclpy is not installed.
+
+    """
+    if find_spec('rclpy') is None:
+        raise ThermoCompError(
+            f'this command needs ROS 2 for {sys.executable}: source its setup file, or '
+            "pip install 'thermo_comp[ros]'"
+        )
