@@ -17,7 +17,7 @@ import typer
 
 from .. import __version__
 from ..errors import ThermoCompError
-from . import convert, evaluate, fit, info, output, play, replay, report, simulate
+from . import convert, evaluate, fit, info, output, play, replay, report, simulate, view
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
@@ -60,6 +60,7 @@ app.command()(replay.replay)
 app.command()(play.play)
 app.command()(info.info)
 app.command()(report.report)
+app.command()(view.view)
 app.command()(convert.convert)
 app.command()(simulate.simulate)
 

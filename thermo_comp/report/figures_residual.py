@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
 from ..metrics import MICRO_G
-from .evidence import CHOSEN, RAW, Evidence
+from .evidence import RAW, Evidence
 from .figures_thermal import shade_dynamic, shown_bag
 from .style import (
     AXIS_LINES,
@@ -64,7 +64,7 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
         if rung != RAW and shared:
             axes.set_ylim(-shared, shared)
         text = _rms_text(residual[rows], windows.is_dynamic[rows])
-        title = f'{_rung_title(evidence, rung)}: {text}'
+        title = f'{rung}: {text}'
         if axes is panels[0]:
             legend_above(axes, sheet, title=title, alignment='left')
         else:
@@ -100,8 +100,7 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
             time, value = broken(
                 windows.time[rows], residuals[rung][rows] / MICRO_G, windows.position[rows]
             )
-            label = _rung_title(evidence, rung)
-            plot_thinned(axes, time / unit, value, sheet, label=label, **RUNG_LINES[rung])
+            plot_thinned(axes, time / unit, value, sheet, label=rung, **RUNG_LINES[rung])
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_ylabel('|g| − g, µg')
         _absolute_scale(axes, evidence.gravity)
@@ -124,7 +123,6 @@ def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
     if windows is None or not residuals:
         raise ValueError('`evidence` has no residuals')
     judged = next(reversed(residuals))
-    title = _rung_title(evidence, judged)
     parts = _by_regime(residuals[judged] / MICRO_G, windows.is_dynamic)
     height = 1.5 * len(parts)
     if sheet.is_narrow:
@@ -138,7 +136,7 @@ def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
     for place, (label, values, line) in zip(places, parts, strict=False):
         axes = figure.add_subplot(place)
         _draw_signed(axes, values, line)
-        axes.set_title(f'{title}, {label}: sd {float(values.std()):.3g} µg')
+        axes.set_title(f'{judged}, {label}: sd {float(values.std()):.3g} µg')
     axes.set_xlabel('|g| − g, µg')
     right = figure.add_subplot(places[-1])
     low, high = _size_range(residuals)
@@ -146,9 +144,7 @@ def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
     for rung, residual in residuals.items():
         size = np.abs(residual) / MICRO_G
         share = np.histogram(size, edges)[0] / max(len(size), 1) * 100.0
-        right.stairs(
-            share, edges, label=_rung_title(evidence, rung), baseline=None, **RUNG_LINES[rung]
-        )
+        right.stairs(share, edges, label=rung, baseline=None, **RUNG_LINES[rung])
     log_axis(right, low, high)
     right.set_ylim(0.0, None)
     right.set_xlabel('size of |g| − g, µg')
@@ -208,13 +204,6 @@ def _rms_text(residual: Array, is_dynamic: npt.NDArray[np.bool_]) -> str:
             rms = float(np.sqrt(np.mean(residual[rows] ** 2))) / MICRO_G
             parts.append(f'{label} {rms:.3g}')
     return f'RMS {", ".join(parts)} µg'
-
-
-def _rung_title(evidence: Evidence, rung: str) -> str:
-    calibration = evidence.calibration
-    if rung == CHOSEN and calibration is not None and evidence.is_fit:
-        return f'chosen: {calibration.provenance.model}' if calibration.provenance.model else rung
-    return rung
 
 
 def _absolute_scale(axes: Axes, gravity: float) -> None:

@@ -58,9 +58,14 @@ def shade_dynamic(axes: Axes, shown: ShownBag, unit: float) -> None:
     Shade the time in which the flag says dynamic.
 
     """
+    spans: list[tuple[float, float]] = []
     for stretch in shown.trace.stretches:
         if stretch.regime == Regime.DYNAMIC:
-            axes.axvspan(stretch.start / unit, stretch.stop / unit, color=_SHADE, lw=0, zorder=0)
+            # Heating into cooling is one span: no bright seam between two of them.
+            start = spans.pop()[0] if spans and spans[-1][1] == stretch.start else stretch.start
+            spans.append((start, stretch.stop))
+    for start, stop in spans:
+        axes.axvspan(start / unit, stop / unit, color=_SHADE, lw=0, zorder=0)
 
 
 def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:

@@ -47,6 +47,7 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
     rows, columns = (6, 1) if sheet.is_narrow else (2, 3)
     figure = new_figure(sheet, 9.6 if sheet.is_narrow else 4.2)
     panels = np.array(figure.subplots(rows, columns, sharex=True)).reshape(2, 3)
+    widest: dict[Axes, float] = {}
     references = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     for i, axis in enumerate(AXES):
         for name, regime_set, line, hatch, marker in _sets(calibration):
@@ -60,12 +61,15 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
                 ),
                 strict=True,
             ):
-                _draw_band(axes, temperature, value, sd, line, hatch)
+                if sd is not None:
+                    _draw_band(axes, temperature, value, BAND_SDS * sd, line, hatch)
+                    widest[axes] = max(widest.get(axes, 0.0), BAND_SDS * float(np.max(sd)))
                 # The ends of the valid range are marked; a range of a few K stays visible so.
                 ends = {'marker': marker, 'markersize': 3.5, 'markevery': [0, -1]}
                 axes.plot(temperature, value, label=name, **line, **ends)
-        panels[0, i].set_title(f'bias, {axis}')
-        panels[1, i].set_title(f'scale, {axis}')
+        for axes, name, unit in ((panels[0, i], 'bias', 'µg'), (panels[1, i], 'scale', 'ppm')):
+            band = f': ±{widest[axes]:.2g} {unit} at most' if axes in widest else ''
+            axes.set_title(f'{name} {axis}{band}')
     for axes in panels.ravel():
         axes.axvline(calibration.reference_temperature_c, color=GREY, linewidth=0.8)
         axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -92,19 +96,18 @@ def _sets(calibration: Calibration) -> list[tuple[str, RegimeSet, Line, str, str
 
 
 def _draw_band(
-    axes: Axes, temperature: Array, value: Array, sd: Array | None, line: Line, hatch: str
+    axes: Axes, temperature: Array, value: Array, half: Array, line: Line, hatch: str
 ) -> None:
-    if sd is not None:
-        axes.fill_between(
-            temperature,
-            value - BAND_SDS * sd,
-            value + BAND_SDS * sd,
-            facecolor=line['color'],
-            edgecolor=line['color'],
-            alpha=0.25,
-            hatch=hatch,
-            linewidth=0,
-        )
+    axes.fill_between(
+        temperature,
+        value - half,
+        value + half,
+        facecolor=line['color'],
+        edgecolor=line['color'],
+        alpha=0.25,
+        hatch=hatch,
+        linewidth=0,
+    )
 
 
 def bias_curve(

@@ -20,6 +20,7 @@ from ..fitting.selection import golovach_spec
 from ..fitting.solution import Solution, correct, regressors
 from ..fitting.start import constant_calibration, position_means, starting_solution
 from ..fitting.table import WindowTable
+from ..fitting.verdict import Finding
 from ..recording import inspect_recording
 from ..simulation import Cyclogram, parse_cyclogram
 from .evidence import (
@@ -101,10 +102,15 @@ def evidence_of_fit(
             forces=_ladder(result),
         ),
         candidates=_candidates(result),
-        findings=tuple(one.message for one in result.findings if one.level == 'advice'),
-        checks=tuple(one.message for one in result.findings if one.level == 'good'),
+        findings=tuple(one.message for one in result.findings if _is_reservation(one)),
+        checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
         is_fit=True,
     )
+
+
+def _is_reservation(finding: Finding) -> bool:
+    # More positions than enough would be better still: no reservation.
+    return finding.level == 'advice' and finding.name != 'positions'
 
 
 def _program(paths: Sequence[str | Path], index: int, program: str | None) -> Cyclogram | None:

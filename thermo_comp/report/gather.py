@@ -216,7 +216,7 @@ def evidence_of_bags(
         bags=tuple(bag_facts(bag.reduced, bag.info.truncated) for bag in bags),
         shown=shown,
         windows=_join([part for _, part in parts], calibration, unit),
-        findings=() if calibration is None else calibration.provenance.notes,
+        findings=_notes(calibration),
     )
 
 
@@ -411,6 +411,15 @@ def _ladder(calibration: Calibration, mean: Array, states: tuple[Array, ...]) ->
         forces[STATIC_ALONE] = corrected(tuple(blind))
     forces[CHOSEN] = corrected(states)
     return forces
+
+
+def _notes(calibration: Calibration | None) -> tuple[str, ...]:
+    """
+    Give what the fit had to say against the calibration, but for its wish for more positions.
+
+    """
+    notes = () if calibration is None else calibration.provenance.notes
+    return tuple(note for note in notes if not note.startswith('positions: '))
 
 
 def _serial(bags: Sequence[OpenedBag], calibration: Calibration | None, serial: str | None) -> str:

@@ -103,7 +103,7 @@ def render_page(
 
 def number(value: float, digits: int = 3) -> str:
     """
-    Give a number in significant digits, without an exponent where people do not expect one.
+    Give a number in significant digits, with no more decimals than those.
 
     """
     if not math.isfinite(value):
@@ -111,9 +111,10 @@ def number(value: float, digits: int = 3) -> str:
     if value == 0.0:
         return '0'
     size = math.floor(math.log10(abs(value)))
-    if not -5 < size < 7:
+    if size > 8:
         return f'{value:.{digits - 1}e}'
-    text = f'{round(value, digits - 1 - size):.{max(digits - 1 - size, 0)}f}'
+    decimals = digits - 1 - size
+    text = f'{round(value, decimals):.{min(max(decimals, 0), digits)}f}'
     return text.replace('-', '−')
 
 

@@ -158,14 +158,15 @@ def _row(tracker: ThermalTracker) -> tuple[float, ...]:
 
 def _settled(value: Array, variance: Array) -> Array:
     """
-    Leave out an estimate while it still settles, as at the start: its sd is thrice the usual.
+    Leave out an estimate until it has settled: its sd has come down to thrice the usual.
 
     """
     known = np.isfinite(value) & np.isfinite(variance)
     if not known.any():
         return np.full(len(value), np.nan)
     usual = float(np.median(variance[known]))
-    return np.where(known & (variance <= 9.0 * usual), value, np.nan)
+    first = int(np.argmax(known & (variance <= 9.0 * usual)))
+    return np.where(known & (np.arange(len(value)) >= first), value, np.nan)
 
 
 class _Feed:

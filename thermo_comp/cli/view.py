@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp view``: a calibration's certificate in the browser, live.
+
+"""
+
+from __future__ import annotations
+
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import ThermoCompError
+from . import options
+from .output import Output
+
+
+def view(
+    calibration: Annotated[
+        Path, typer.Argument(help='Calibration of the unit (YAML).', metavar='YAML')
+    ],
+    bags: Annotated[
+        list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
+    ] = None,
+    port: Annotated[
+        int, typer.Option(help='Port on this machine; 0 takes any free one.', min=0, max=65535)
+    ] = 8042,
+    browser: Annotated[
+        bool, typer.Option('--browser', help='Open it in the default browser, too.')
+    ] = False,
+    gravity: options.Gravity = None,
+    latitude: options.Latitude = None,
+    height: options.Height = None,
+    serial: options.Serial = None,
+    program: Annotated[
+        str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
+    ] = None,
+    input_: options.InputOption = options.InputChoice.auto,
+    counts_topic: options.CountsTopic = 'accel/counts',
+    imu_topic: options.ImuTopic = 'imu/uncompensated',
+    board_topic: options.BoardTopic = 'temperature/board',
+    case_topic: options.CaseTopic = 'temperature/case',
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Look at a calibration in the browser while you work on it.
+
+    Serves the certificate on this machine only, until Ctrl-C. The page
+    reloads itself whenever the calibration or a bag changes, as when fit
+    runs again.
+
+    Example:
+      thermo_comp view unit42.yaml held_out.mcap
+
+    """
+    from ..report.live import LiveOptions, LiveReport, LiveServer
+
+    for path in (calibration, *(bags or [])):
+        if not path.exists():
+            raise ThermoCompError(f'{path}: no such file or directory')
+    out = Output(quiet=quiet)
+    report = LiveReport(
+        calibration,
+        bags or [],
+        LiveOptions(
+            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            input=input_.value,
+            gravity=options.place(gravity, latitude, height),
+            serial=serial,
+            program=program,
+        ),
+    )
+    try:
+        server = LiveServer(report, port)
+    except OSError as failure:
+        raise ThermoCompError(
+            f'port {port}: {failure.strerror}; give another one with --port'
+        ) from failure
+    with server:
+        out.line(f'{server.url}  (Ctrl-C ends it)')
+        sys.stdout.flush()  # whoever reads this through a pipe waits for the address
+        if browser:
+            webbrowser.open(server.url)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            out.note('ended')

@@ -1,0 +1,260 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the live view: the certificate served on this machine, made anew when its files change.
+
+The page asks for the version of its files once a second and reloads itself when that differs. A
+file that cannot be read, as while it is being written, is said above the last good page. Served
+on the loopback interface only, and only under its own names, so that no other site's page can
+reach it through the browser.
+
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from ..calibration_file import load_calibration
+from ..errors import ThermoCompError
+from ..recording import Input, Topics
+from ..replay import input_for
+from .evidence import Evidence
+from .gather import OpenedBag, evidence_of_bags, open_bag
+from .page import render_page
+from .plates import DrawnPlate, drawn_plates
+from .verdict import Verdict, judge
+
+HOST = '127.0.0.1'
+_NAMES = ('127.0.0.1', 'localhost')
+_POLL_MS = 1000
+# A client that keeps a connection open without a word is let go after this [s].
+_CLIENT_TIMEOUT_S = 30.0
+_SCRIPT = """
+const shown = "%s";
+setInterval(async () => {
+  try {
+    const answer = await fetch("version", {cache: "no-store"});
+    if (answer.ok && await answer.text() !== shown) location.reload();
+  } catch (error) { document.title = "(not served any more) " + document.title.slice(-60); }
+}, %d);
+"""
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """
+    How the viewer reads the bags; see `evidence_of_bags`.
+
+    """
+
+    topics: Topics | None = None
+    input: Input = 'auto'
+    gravity: float | None = None
+    serial: str | None = None
+    program: str | None = None
+
+
+@dataclass(frozen=True)
+class _Made:
+    evidence: Evidence
+    verdict: Verdict
+    plates: list[DrawnPlate]
+
+
+class LiveReport:
+    """
+    The page of a calibration and bags, always as the files are.
+
+    Parameters
+    ----------
+    calibration : Path
+        The calibration file.
+    bags : sequence of Path, optional
+        Bags to judge it on; each is read again only when it has changed.
+    options : LiveOptions, optional
+        How they are read.
+
+    """
+
+    def __init__(
+        self, calibration: Path, bags: Sequence[Path] = (), options: LiveOptions | None = None
+    ) -> None:
+        self._calibration = calibration
+        self._bags = list(bags)
+        self._options = options or LiveOptions()
+        self._lock = threading.Lock()
+        self._opened: dict[Path, tuple[str, OpenedBag]] = {}
+        self._version = ''
+        self._made: _Made | None = None
+        self._notice = ''
+
+    def version(self) -> str:
+        """
+        Tell the state of the files: another text whenever one of them has changed.
+
+        """
+        return _signature([self._calibration, *self._bags])
+
+    def page(self) -> str:
+        """
+        Make the page, if the files have changed, and return it.
+
+        Returns
+        -------
+        str
+            The HTML document.
+
+        """
+        with self._lock:
+            version = self.version()
+            if version != self._version:
+                self._make(version)
+            made = self._made
+            if made is None:
+                # Nothing good was seen yet: a page with the reason, which goes on asking.
+                evidence = Evidence(serial=self._calibration.name, unit='counts')
+                made = _Made(evidence, Verdict('open', 'Nothing to show yet.', (), ()), [])
+            return render_page(
+                made.evidence,
+                made.verdict,
+                made.plates,
+                script=_SCRIPT % (version, _POLL_MS),
+                nonce=secrets.token_urlsafe(16),
+                notice=self._notice,
+            )
+
+    def _make(self, version: str) -> None:
+        self._version = version
+        try:
+            evidence = self._evidence()
+            self._made = _Made(evidence, judge(evidence), drawn_plates(evidence))
+            self._notice = ''
+        except (ThermoCompError, OSError, ValueError) as error:
+            older = '' if self._made is None else '\nThe page below is older.'
+            self._notice = f'{error}{older}'
+
+    def _evidence(self) -> Evidence:
+        options = self._options
+        calibration = load_calibration(self._calibration)
+        bags = []
+        for number, path in enumerate(self._bags):
+            signature = _signature([path])
+            known = self._opened.get(path)
+            if known is None or known[0] != signature:
+                bag = open_bag(
+                    path,
+                    options.topics,
+                    input_for(calibration, options.input),
+                    number=number,
+                    full_scale=calibration.unit.full_scale,
+                )
+                known = (signature, bag)
+                self._opened[path] = known
+            bags.append(known[1])
+        return evidence_of_bags(
+            bags,
+            calibration,
+            gravity=options.gravity,
+            serial=options.serial,
+            program=options.program,
+        )
+
+
+class LiveServer(ThreadingHTTPServer):
+    """
+    Serves one live report on the loopback interface.
+
+    Parameters
+    ----------
+    report : LiveReport
+        The report.
+    port : int, optional
+        Port; 0 takes any that is free.
+
+    Raises
+    ------
+    OSError
+        If the port is taken.
+
+    """
+
+    daemon_threads = True
+
+    def __init__(self, report: LiveReport, port: int = 0) -> None:
+        self.report = report
+        super().__init__((HOST, port), _Handler)
+
+    @property
+    def url(self) -> str:
+        """
+        Where the page is.
+
+        """
+        return f'http://{HOST}:{self.server_port}/'
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: LiveServer
+    timeout = _CLIENT_TIMEOUT_S
+    server_version = 'thermo_comp'
+    sys_version = ''
+
+    def do_GET(self) -> None:
+        """
+        Answer with the page or with its version.
+
+        """
+        name, _, port = self.headers.get('Host', '').partition(':')
+        if name not in _NAMES or port != str(self.server.server_port):
+            self._answer(HTTPStatus.FORBIDDEN, 'text/plain', 'another host\n')
+        elif self.path == '/':
+            self._answer(HTTPStatus.OK, 'text/html', self.server.report.page())
+        elif self.path == '/version':
+            self._answer(HTTPStatus.OK, 'text/plain', self.server.report.version())
+        else:
+            self._answer(HTTPStatus.NOT_FOUND, 'text/plain', 'nothing here\n')
+
+    def _answer(self, status: HTTPStatus, kind: str, text: str) -> None:
+        content = text.encode()
+        self.send_response(status)
+        self.send_header('Content-Type', f'{kind}; charset=utf-8')
+        self.send_header('Content-Length', str(len(content)))
+        self.send_header('Cache-Control', 'no-store')
+        self.send_header('X-Content-Type-Options', 'nosniff')
+        self.send_header('X-Frame-Options', 'DENY')
+        self.end_headers()
+        try:
+            self.wfile.write(content)
+        except (BrokenPipeError, ConnectionResetError):
+            # The reader has closed the page meanwhile.
+            self.close_connection = True
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base's name
+        """
+        Say nothing: a request a second is no news.
+
+        """
+
+
+def _signature(paths: Sequence[Path]) -> str:
+    return hashlib.sha256('\n'.join(map(_state, paths)).encode()).hexdigest()[:16]
+
+
+def _state(path: Path) -> str:
+    """
+    Describe a file, or a bag's files, by what changes when somebody writes them.
+
+    """
+    try:
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        found = [(str(file), file.stat()) for file in files]
+    except OSError as error:
+        return f'{path}: {error.errno}'
+    return repr([(name, s.st_mtime_ns, s.st_size, s.st_ino) for name, s in found])
