@@ -46,7 +46,7 @@ def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
         for begin in range(0, n, block):
             index = np.arange(begin, min(begin + block, n))
             stamp_ns = START_NS + index * (1_000_000_000 // RATE_HZ)
-            xyz = np.round(rng.normal(0.0, 8.0, (len(index), 3)) + [200.0, -3000.0, 28000.0])
+            xyz = np.round(rng.normal([200.0, -3000.0, 28000.0], 8.0, (len(index), 3)))
             bag.write_counts('accel/counts', stamp_ns, xyz, 'accel_link')
             slow = stamp_ns[index % (RATE_HZ // TEMPERATURE_HZ) == 0]
             celsius = 20.0 + 15.0 * np.sin((slow - START_NS) * 1e-9 / 600.0)
@@ -57,7 +57,7 @@ def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
 
 def read_ours_whole(path: Path) -> int:
     """
-    The whole bag into memory.
+    Read the whole bag into memory.
 
     """
     return len(read_recording(path).columns)
@@ -65,7 +65,7 @@ def read_ours_whole(path: Path) -> int:
 
 def read_ours_blocks(path: Path) -> int:
     """
-    Block by block, as the compensator does it.
+    Read block by block, as the compensator does it.
 
     """
     with open_recording(path) as reader:
@@ -74,7 +74,7 @@ def read_ours_blocks(path: Path) -> int:
 
 def read_rosbags(path: Path) -> int:
     """
-    Every message of the three topics, deserialized, its numbers kept.
+    Read and deserialize every message.
 
     """
     from rosbags.rosbag2 import Reader
@@ -91,7 +91,7 @@ def read_rosbags(path: Path) -> int:
 
 def read_mcap(path: Path) -> int:
     """
-    Every message, its bytes not decoded.
+    Read every message, its bytes not decoded.
 
     """
     from mcap.reader import make_reader
@@ -105,7 +105,7 @@ def read_mcap(path: Path) -> int:
 
 def rate(read: Callable[[Path], int], path: Path, n: int, repeats: int) -> float:
     """
-    Messages per second, best of some repeats.
+    Measure messages per second, best of some repeats.
 
     """
     best = float('inf')
@@ -121,7 +121,7 @@ def measure(
     folder: Path, n: int, n_peers: int, repeats: int, chunk_bytes: int
 ) -> Iterator[dict[str, float | str]]:
     """
-    One row of results per compression.
+    Yield one row of results per compression.
 
     """
     for compression in COMPRESSIONS:

@@ -191,7 +191,7 @@ def read_with_rosbags(path: Path) -> list[tuple[str, int, Any]]:
 
 def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
     """
-    The columns that a bag with these messages, in reading order, must give.
+    Make the columns that a bag with these messages, in reading order, must give.
 
     """
     columns: dict[str, list[Any]] = {
@@ -217,7 +217,7 @@ def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
 
 def assert_columns(block: Block, messages: list[Message]) -> None:
     """
-    The block holds exactly these messages in this order.
+    Check that the block holds exactly these messages in this order.
 
     """
     expected = columns_of(messages)
@@ -238,7 +238,7 @@ def assert_columns(block: Block, messages: list[Message]) -> None:
 
 def regular_messages(n: int = 40, accel: str = ACCEL, every: int = 8) -> list[Message]:
     """
-    A small well-behaved bag: counts, and both temperatures each some counts.
+    Make a small well-behaved bag: counts, and both temperatures each some counts.
 
     """
     messages: list[Message] = []

@@ -53,6 +53,17 @@ def read(path: Path) -> Recording:
     return read_recording(path, require=())
 
 
+def outcome(path: Path) -> Recording | RecordingError:
+    """
+    Read a bag that may be damaged; any other exception than the right one fails the test.
+
+    """
+    try:
+        return read(path)
+    except RecordingError as error:
+        return error
+
+
 def chunk_places(path: Path) -> list[tuple[int, int]]:
     """
     Position and length of each chunk record, by the `mcap` library's reading of the summary.
@@ -166,13 +177,12 @@ def test_cut_anywhere(data: st.DataObject, compression: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         path.write_bytes(content[:cut])
-        try:
-            recording = read(path)
-        except RecordingError as error:
-            assert cut < 60, error  # only a file without a whole header holds nothing at all
+        found = outcome(path)
+        if isinstance(found, RecordingError):
+            assert cut < 60, found  # only a file without a whole header holds nothing at all
         else:
-            assert recording.info.truncated is not None
-            assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
+            assert found.info.truncated is not None
+            assert_columns(found.columns, regular_messages(24)[: found.info.n_messages])
 
 
 def test_zeros_at_the_end_are_no_messages(tmp_path: Path) -> None:
@@ -187,13 +197,11 @@ def test_zeros_at_the_end_are_no_messages(tmp_path: Path) -> None:
         content, position, _ = small_bag('none', is_chunked)
         for at in range(position + 60 if is_chunked else 700, len(content), 37):
             path.write_bytes(content[:at] + bytes(4096))
-            try:
-                recording = read(path)
-            except RecordingError:
-                continue
-            assert recording.info.truncated is not None
-            n = len(recording.columns) + len(recording.columns.board) + len(recording.columns.case)
-            assert_columns(recording.columns, messages[:n])
+            found = outcome(path)
+            if isinstance(found, Recording):
+                assert found.info.truncated is not None
+                n = len(found.columns) + len(found.columns.board) + len(found.columns.case)
+                assert_columns(found.columns, messages[:n])
 
 
 def test_a_torn_directory_says_which_file(tmp_path: Path) -> None:
@@ -228,13 +236,12 @@ def test_changed_bytes_are_an_error_or_harmless(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         path.write_bytes(content)
-        try:
-            recording = read(path)
-        except RecordingError as error:
-            assert '\n' not in str(error)
-            assert 'bag.mcap' in str(error)
+        found = outcome(path)
+        if isinstance(found, RecordingError):
+            assert '\n' not in str(found)
+            assert 'bag.mcap' in str(found)
         else:
-            assert len(recording.columns) <= 24
+            assert len(found.columns) <= 24
 
 
 @settings(max_examples=150, deadline=None)
@@ -245,12 +252,11 @@ def test_any_bytes_are_an_error_or_an_empty_bag(content: bytes, has_magic: bool)
         for name in ('bag.mcap', 'bag.db3', 'bag.bag'):
             path = Path(folder, name)
             path.write_bytes(magic + content if has_magic else content)
-            try:
-                recording = read(path)
-            except RecordingError as error:
-                assert '\n' not in str(error)
+            found = outcome(path)
+            if isinstance(found, RecordingError):
+                assert '\n' not in str(found)
             else:
-                assert len(recording.columns) == 0
+                assert len(found.columns) == 0
 
 
 def chunk_record(content: bytes, compression: str, size: int, checksum: int = 0) -> bytes:
@@ -433,7 +439,9 @@ def test_topics_that_are_not_there_or_are_something_else(tmp_path: Path) -> None
     write_mcap(path, messages)
     with pytest.raises(RecordingError, match=r'counts: no such topic; the bag has /accel/counts '):
         open_recording(path, Topics(counts='my/counts'), input='counts')
-    with pytest.raises(RecordingError, match='or x/imu: no such topic.*--counts-topic or --imu-t'):
+    with pytest.raises(
+        RecordingError, match=r'or x/imu: no such topic.*--counts-topic or --imu-t'
+    ):
         open_recording(path, Topics(counts='x/counts', imu='x/imu'))
     with pytest.raises(RecordingError, match='name another with --case-topic'):
         open_recording(path, Topics(case='other/case'))

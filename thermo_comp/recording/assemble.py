@@ -52,7 +52,7 @@ class Rows:
 
     def cut(self, begin: int, end: int) -> Rows:
         """
-        The rows from `begin` up to `end` as views.
+        Take the rows from `begin` up to `end` as views.
 
         """
         before = [text for row, text in self.frames if row <= begin][-1:]
@@ -82,6 +82,7 @@ def join_rows(pieces: list[Rows], width: int) -> Rows:
     Parameters
     ----------
     pieces : list of Rows
+        In reading order.
     width : int
         Numbers per row where there is no piece at all.
 
@@ -212,6 +213,7 @@ def join_blocks(blocks: Iterable[Block], is_imu: bool) -> Block:
     Parameters
     ----------
     blocks : iterable of Block
+        In reading order.
     is_imu : bool
         Whether the columns of sensor_msgs/Imu are there even if no block is.
 

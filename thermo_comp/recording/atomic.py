@@ -19,7 +19,7 @@ _RENAME_EXCHANGE = 2
 
 def partial_sibling(path: Path) -> Path:
     """
-    A name beside `path` for the unfinished output; it keeps the suffix, so that tools open it.
+    Name the unfinished output beside `path`; it keeps the suffix, so that tools open it.
 
     """
     return path.with_name(

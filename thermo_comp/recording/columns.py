@@ -80,7 +80,7 @@ class RecordingInfo:
     @property
     def n_messages(self) -> int:
         """
-        Number of messages over all topics.
+        Count the messages of all topics.
 
         """
         return sum(count for _, count in self.topics.values())
@@ -176,7 +176,7 @@ class Block:
 
     def __len__(self) -> int:
         """
-        Number of accelerometer messages.
+        Count the accelerometer messages.
 
         """
         return len(self.accel_stamp_ns)

@@ -103,14 +103,16 @@ class McapFile:
 
     def channel(self, topic: str, kind: str, definition: Definition) -> int | None:
         """
-        The number of a topic's channel, made where it is new.
+        Give the number of a topic's channel, made where it is new.
 
         Parameters
         ----------
         topic : str
+            Its full name.
         kind : str
             Message type.
         definition : Definition
+            Of the message type.
 
         Returns
         -------

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import cast
@@ -130,7 +131,7 @@ class McapSource:
         """
         n_ranks = 0
         for survey in self._surveys:
-            try:
+            with _translated(survey.path):
                 for part in _read(survey, selection, raw):
                     last = n_ranks
                     for rows in part.values():
@@ -138,12 +139,6 @@ class McapSource:
                         last = max(last, int(rows.rank[-1]) + 1)
                     n_ranks = last
                     yield part
-            except DamagedError as error:
-                raise RecordingError(f'damaged: {error}', survey.path) from error
-            except RecordingError as error:
-                raise RecordingError(error.message, survey.path, error.topic) from error
-            except OSError as error:
-                raise RecordingError(f'cannot be read: {error.strerror}', survey.path) from error
 
     def close(self) -> None:
         """
@@ -262,6 +257,22 @@ def _loaded(
             yield span, data, messages
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    """
+    Say which file it is that is damaged.
+
+    """
+    try:
+        yield
+    except DamagedError as error:
+        raise RecordingError(f'damaged: {error}', path) from error
+    except RecordingError as error:
+        raise RecordingError(error.message, path, error.topic) from error
+    except OSError as error:
+        raise RecordingError(f'cannot be read: {error.strerror}', path) from error
 
 
 def _ignore(opcode: int, content: bytes) -> None:

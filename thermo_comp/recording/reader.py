@@ -41,7 +41,7 @@ class Source(Protocol):
 
     def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
         """
-        Decoded messages of the chosen topics in reading order.
+        Decode the messages of the chosen topics, in reading order.
 
         """
         ...
@@ -225,6 +225,7 @@ def inspect_recording(path: str | Path, topics: Topics | None = None) -> Recordi
     Parameters
     ----------
     path : str or Path
+        The bag.
     topics : Topics, optional
         Names of the inputs, to tell `RecordingInfo.input`.
 

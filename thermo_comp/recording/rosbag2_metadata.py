@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from ..errors import RecordingError
+from ..files import read_bounded
 from .definitions import offered_qos
 
 _VERSION = 9
@@ -57,11 +58,12 @@ class FileSummary:
 
 def information(summary: FileSummary, custom: Mapping[str, str]) -> dict[str, Any]:
     """
-    The content of metadata.yaml below its only key.
+    Build the content of metadata.yaml below its only key.
 
     Parameters
     ----------
     summary : FileSummary
+        What the file holds.
     custom : mapping of str to str
         Kept as ``custom_data``.
 
@@ -110,7 +112,7 @@ def information(summary: FileSummary, custom: Mapping[str, str]) -> dict[str, An
 
 def dump_metadata(summary: FileSummary, custom: Mapping[str, str]) -> str:
     """
-    The text of metadata.yaml.
+    Write the text of metadata.yaml.
 
     """
     return dump_yaml({'rosbag2_bagfile_information': information(summary, custom)})
@@ -118,7 +120,7 @@ def dump_metadata(summary: FileSummary, custom: Mapping[str, str]) -> str:
 
 def dump_yaml(content: Any) -> str:
     """
-    YAML in block style with the keys in their order.
+    Write YAML in block style with the keys in their order.
 
     """
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=10_000)
@@ -170,16 +172,15 @@ def read_metadata(directory: Path) -> Description | None:
     """
     path = directory / 'metadata.yaml'
     try:
-        with path.open('rb') as file:
-            text = file.read(_MAX_BYTES + 1)
+        text = read_bounded(path, _MAX_BYTES)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise RecordingError(f'cannot be read: {error.strerror}', path) from error
+    except ValueError as error:
+        raise RecordingError(f'cannot be read: {error}', path) from error
     if not text.strip():
         return None
-    if len(text) > _MAX_BYTES:
-        raise RecordingError('too large for the metadata of a bag', path)
     try:
         content = yaml.safe_load(text)['rosbag2_bagfile_information']
         files = tuple(directory / PurePath(str(name)).name for name in _names(content))

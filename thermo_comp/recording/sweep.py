@@ -71,7 +71,7 @@ def in_log_order(parts: Iterable[tuple[Part, int | None]]) -> Iterator[Part]:
 
 def _merged(parts: list[Part]) -> Part:
     """
-    All rows of each role in order of log time and place.
+    Join the rows of each role in order of log time and place.
 
     """
     roles: list[Role] = sorted({role for part in parts for role in part})
@@ -86,7 +86,7 @@ def _merged(parts: list[Part]) -> Part:
 
 def _split(part: Part, next_ns: int | None) -> tuple[Part, Part]:
     """
-    What stands before a time, ranked from 0, and the rest.
+    Part what stands before a time, ranked from 0, from the rest.
 
     """
     done: Part = {}

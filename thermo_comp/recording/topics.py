@@ -85,20 +85,18 @@ def select_topics(
         raise RecordingError('the bag holds no messages', path)
     found: dict[Role, str] = {}
     accel = _accel_key(path, present, topics, input)
-    for role in ('accel', 'board', 'case'):
-        key = accel if role == 'accel' else role
+    keys: dict[Role, str | None] = {'accel': accel, 'board': 'board', 'case': 'case'}
+    for role, key in keys.items():
         name = None if key is None else _find(path, present, getattr(topics, key), key)
-        if name is None:
+        if name is None or key is None:
             if role in require:
                 raise _missing(path, present, topics, key)
             continue
-        assert key is not None
         _check_type(path, name, present[name][0], key)
-        if present[name][1] == 0:
-            if role in require:
-                raise RecordingError('the topic has no messages', path, name)
-            continue
-        found[role] = name
+        if present[name][1]:
+            found[role] = name
+        elif role in require:
+            raise RecordingError('the topic has no messages', path, name)
     return Selection(found, accel if 'accel' in found else None)
 
 

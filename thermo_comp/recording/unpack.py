@@ -72,7 +72,7 @@ def _unpack_zstd(packed: Bytes, size: int) -> Bytes:
         with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(
             packed.data, read_across_frames=True
         ) as reader:
-            while len(view) and (n_read := reader.readinto(view)):
+            while len(view) > 0 and (n_read := reader.readinto(view)):
                 view = view[n_read:]
             if reader.read(1):
                 raise DamagedError(f'more than the {size} bytes that it claims')
@@ -172,6 +172,7 @@ def open_stream(compression: str, source: Region) -> Stream:
     Parameters
     ----------
     compression : str
+        As the chunk names it: empty, ``lz4`` or ``zstd``.
     source : Region
         The compressed bytes, possibly cut off.
 

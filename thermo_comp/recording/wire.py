@@ -66,9 +66,11 @@ def gather(buffer: Bytes, at: Ints, n_bytes: int) -> NDArray[Any]:
     Parameters
     ----------
     buffer : ndarray of uint8, contiguous
+        Where from.
     at : ndarray of int64, shape (n,)
         Positions, each at least `n_bytes` before the buffer's end.
     n_bytes : int
+        Bytes of a row.
 
     Returns
     -------
@@ -107,11 +109,12 @@ def scatter(buffer: Bytes, at: Ints, rows: NDArray[Any]) -> None:
 
 def field(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
     """
-    One number out of each gathered row.
+    Look at one number of each gathered row.
 
     Parameters
     ----------
     rows : ndarray of void, shape (n,)
+        Contiguous.
     offset : int
         Where the number stands in the row [bytes].
     kind : str
@@ -145,11 +148,13 @@ def decode_stamped(
     Parameters
     ----------
     buffer : ndarray of uint8, contiguous
+        The bytes they are in.
     start, size : ndarray of int64, shape (n,)
         Where each serialized message stands; all within the buffer.
     kind : str
         A key of `N_NUMBERS`.
     encoding : {'cdr', 'ros1'}
+        How they are serialized.
     n_wanted : int, optional
         Take only so many leading numbers.
 
@@ -244,12 +249,14 @@ def _misfit(kind: str) -> RecordingError:
 
 def frame_runs(buffer: Bytes, messages: Stamped) -> list[tuple[int, str]]:
     """
-    Where `frame_id` changes along the messages.
+    Find where `frame_id` changes along the messages.
 
     Parameters
     ----------
     buffer : ndarray of uint8
+        The bytes they are in.
     messages : Stamped
+        Decoded.
 
     Returns
     -------
@@ -286,7 +293,7 @@ def frame_runs(buffer: Bytes, messages: Stamped) -> list[tuple[int, str]]:
 
 def _all_equal(texts: NDArray[Any]) -> bool:
     """
-    Whether all rows have the bytes of the first one, compared word by word.
+    Tell whether all rows have the bytes of the first one, compared word by word.
 
     """
     offset = 0
@@ -310,6 +317,7 @@ def imu_columns(numbers: Floats) -> ImuColumns:
     Parameters
     ----------
     numbers : ndarray, shape (n, 37)
+        As they follow the header.
 
     Returns
     -------

@@ -131,9 +131,13 @@ class BagWriter:
         Parameters
         ----------
         topic : str
+            With or without a leading slash.
         stamp_ns : array_like of int, shape (n,)
+            Header stamps.
         xyz : array_like, shape (n, 3)
+            Counts per cycle.
         frame_id : str, optional
+            Of all of them.
         log_ns : array_like of int, shape (n,), optional
             Log times; the stamps by default.
 
@@ -164,10 +168,15 @@ class BagWriter:
         Parameters
         ----------
         topic : str
+            With or without a leading slash.
         stamp_ns : array_like of int, shape (n,)
+            Header stamps.
         celsius : array_like, shape (n,)
+            degC.
         log_ns : array_like of int, shape (n,), optional
+            Log times; the stamps by default.
         frame_id : str, optional
+            Of all of them.
         variance : array_like, shape (n,) or scalar, optional
             K^2; 0 means unknown.
 
@@ -202,15 +211,20 @@ class BagWriter:
         Parameters
         ----------
         topic : str
+            With or without a leading slash.
         stamp_ns : array_like of int, shape (n,)
+            Header stamps.
         linear_acceleration : array_like, shape (n, 3)
             m/s^2.
         linear_acceleration_covariance : array_like, shape (n, 9) or (9,)
+            m^2/s^4.
         frame_id : str, optional
+            Of all of them.
         imu : ImuColumns, optional
             Orientation and angular velocity with their covariances. Without it neither is
             claimed: identity orientation, zero rate, and -1 as first element of each covariance.
         log_ns : array_like of int, shape (n,), optional
+            Log times; the stamps by default.
 
         Raises
         ------
@@ -255,8 +269,11 @@ class BagWriter:
         Parameters
         ----------
         topic : str
+            With or without a leading slash.
         log_ns : array_like of int, shape (n,)
+            Log times.
         values : array_like of bool, shape (n,)
+            What they say.
 
         Raises
         ------
@@ -286,10 +303,13 @@ class BagWriter:
         Parameters
         ----------
         topic : str
+            With or without a leading slash.
         type : str
             E.g. ``diagnostic_msgs/msg/DiagnosticArray``.
         log_ns : array_like of int, shape (n,)
+            Log times.
         messages : sequence of bytes, or RawMessages
+            The serialized messages.
         definition : (str, str), optional
             Encoding (``ros2msg``, ``ros2idl``) and text of the type's definition, as
             `RecordingReader.definitions` gives it; by default that of ROS 2 Jazzy.
