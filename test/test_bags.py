@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The sample bags are what their README says: small, complete, and made by its two commands.
+
+"""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cli
+
+from thermo_comp.recording import read_recording
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / 'bags' / 'README.md').read_text()
+COMMANDS = [line for line in README.splitlines() if line.startswith('thermo_comp ')]
+SHIPPED = sorted((ROOT / 'bags').rglob('*.mcap'))
+
+
+def test_they_are_small() -> None:
+    assert len(SHIPPED) == 10
+    assert sum(path.stat().st_size for path in (ROOT / 'bags').rglob('*')) <= 6_000_000
+
+
+@pytest.mark.parametrize('command', COMMANDS, ids=['fit', 'held_out'])
+def test_their_commands_make_them(command: str, tmp_path: Path, cli: Cli) -> None:
+    arguments = shlex.split(command)[1:]
+    # The same content, packed faster.
+    arguments[arguments.index('--level') + 1] = '1'
+    cli(*arguments, cwd=tmp_path)
+    made = sorted((tmp_path / 'bags').rglob('*.mcap'))
+    assert made
+    for path in made:
+        shipped = read_recording(ROOT / path.relative_to(tmp_path))
+        anew = read_recording(path)
+        assert anew.info.metadata == shipped.info.metadata, path.name
+        for name in ('accel_stamp_ns', 'accel', 'board_stamp_ns', 'case_stamp_ns', 'board_after'):
+            np.testing.assert_array_equal(
+                getattr(anew.columns, name), getattr(shipped.columns, name), err_msg=path.name
+            )
+        # Another processor's exponential may differ in the last bit, which a count does not see.
+        for name in ('board', 'case'):
+            np.testing.assert_allclose(
+                getattr(anew.columns, name), getattr(shipped.columns, name), rtol=1e-12
+            )
+
+
+def test_every_sample_can_be_corrected() -> None:
+    # Both temperatures stand before the first sample, so counts in can be counts out.
+    for path in SHIPPED:
+        block = read_recording(path).columns
+        assert (block.board_after[0], block.case_after[0]) == (0, 0)
+        assert (np.diff(block.accel_stamp_ns) > 0).all()
+
+
+def test_the_readme_counts_right() -> None:
+    for name, samples in (('fit/01.mcap', '17 876'), ('held_out.mcap', '15 407')):
+        n = len(read_recording(ROOT / 'bags' / name).columns)
+        assert n == int(samples.replace(' ', ''))
+        assert samples in README
