@@ -16,8 +16,8 @@ from dataclasses import dataclass, fields, replace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from ..compensator import CompensatorStatus, Counters
 from ..regime import Regime
+from ..status import CompensatorStatus, Counters
 from .loading import LoadedCalibration
 
 #: A sample rate further from the calibrated one than this is worth a warning.

@@ -19,8 +19,8 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from ..compensator import CompensatorConfig
 from ..errors import ThermoCompError
+from ..status import CompensatorConfig
 
 _DEFAULTS = CompensatorConfig()
 

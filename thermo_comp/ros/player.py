@@ -1,0 +1,335 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the player: a bag onto the node's live input topics, with `/clock`, paced or flow controlled.
+
+Whatever the topics are called in the bag, they go out under the node's own relative names, so
+remappings and a namespace apply as to a sensor driver. The messages are those of the bag, byte
+for byte, in the bag's order; ROS 1 messages are rewritten in CDR.
+
+Flow control: after `WINDOW` samples the player waits until every reliable subscriber has
+acknowledged them, so no more than that is ever under way, which fits into the queues of the
+transport. Fast DDS asks for acknowledgement with every message only while the publisher's history
+is full, and otherwise every 3 s; hence the small histories, which transient-local durability keeps
+full.
+
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import Vector3Stamped
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, Temperature
+
+from ..errors import ThermoCompError
+from ..recording import Block, Input, RecordingReader, Role, Topics, open_recording
+from ..recording.encode import stamped_payloads
+
+NODE_NAME = 'thermo_comp_player'
+
+#: Samples under way at most.
+WINDOW = 200
+TEMPERATURE_DEPTH = 10
+#: Wall time between two messages on `/clock` [s].
+CLOCK_PERIOD = 0.01
+#: The longest nap, so that an interrupt is heeded [s].
+NAP = 0.1
+#: Time a best-effort subscriber is given to find the player; nothing tells when it has [s].
+SETTLING = 0.3
+#: How long a subscriber may leave a window unacknowledged [s].
+PATIENCE = 30.0
+
+_NAMES: dict[Role, str] = {'board': 'temperature/board', 'case': 'temperature/case'}
+_ACCEL = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
+
+
+@dataclass(slots=True)
+class PlayReport:
+    """
+    What a player did.
+
+    """
+
+    #: Messages sent, by the topic's full name.
+    n_messages: dict[str, int] = field(default_factory=dict)
+    #: Wall time from the first message to the last acknowledgement [s].
+    duration_s: float = 0.0
+    #: Topics to which nobody listened.
+    unheard: list[str] = field(default_factory=list)
+    #: Topics with a best-effort subscriber, which can lose messages.
+    lossy: list[str] = field(default_factory=list)
+
+
+def play(
+    path: str | Path,
+    *,
+    rate: float = 1.0,
+    n_loops: int = 1,
+    clock: bool = True,
+    wait_s: float = 10.0,
+    topics: Topics | None = None,
+    input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    ros_args: Sequence[str] = (),
+    progress: Callable[[float], None] | None = None,
+) -> PlayReport:
+    """
+    Publish a bag's samples and temperatures.
+
+    Parameters
+    ----------
+    path : str or Path
+        The bag.
+    rate : float, optional
+        Seconds of the bag per second; 0 = as fast as the subscribers take it.
+    n_loops : int, optional
+        How often the bag is played; 0 = until interrupted.
+    clock : bool, optional
+        Publish `/clock`, the bag's log time.
+    wait_s : float, optional
+        Longest wait for a subscriber on every topic before the start [s].
+    topics : Topics, optional
+        Names of the topics in the bag.
+    input : {'auto', 'counts', 'imu'}, optional
+        Which accelerometer topic of the bag is played.
+    ros_args : sequence of str, optional
+        ROS arguments, such as ``['-r', '__ns:=/imu0']``.
+    progress : callable, optional
+        Called with the fraction done, now and then.
+
+    Returns
+    -------
+    PlayReport
+        What was sent.
+
+    Raises
+    ------
+    ValueError
+        If `rate` or `n_loops` is negative.
+    RecordingError
+        If the bag can't be read.
+    ThermoCompError
+        If a reliable subscriber stopped taking messages.
+
+    """
+    if not rate >= 0.0:
+        raise ValueError(f'`rate` must be zero or positive, got {rate}')
+    if n_loops < 0:
+        raise ValueError(f'`n_loops` must be zero or positive, got {n_loops}')
+    context = Context()
+    required: tuple[Role, ...] = ('accel',)
+    with open_recording(path, topics, input, require=required) as reader:
+        rclpy.init(args=['--ros-args', *ros_args], context=context)
+        try:
+            player = _Player(context, reader, rate, clock)
+            player.wait_for_subscribers(wait_s)
+            n_done = 0
+            while n_loops == 0 or n_done < n_loops:
+                player.play_once(progress)
+                n_done += 1
+            return player.finish()
+        finally:
+            context.try_shutdown()
+
+
+class _Player:
+    """
+    A node with the publishers of one bag.
+
+    """
+
+    def __init__(
+        self, context: Context, reader: RecordingReader, rate: float, clock: bool
+    ) -> None:
+        self._reader = reader
+        self._rate = rate
+        self._node = rclpy.create_node(NODE_NAME, context=context)
+        accel_type, accel_name = _ACCEL[reader.info.input or 'counts']
+        self._publishers: dict[Role, Any] = {
+            role: self._node.create_publisher(
+                accel_type if role == 'accel' else Temperature,
+                accel_name if role == 'accel' else _NAMES[role],
+                _qos(WINDOW if role == 'accel' else TEMPERATURE_DEPTH),
+            )
+            for role in reader.topics
+        }
+        self._clock = self._node.create_publisher(Clock, '/clock', 1) if clock else None
+        self._total = sum(reader.info.topics[name][1] for name in reader.topics.values())
+        self._n_sent: dict[Role, int] = dict.fromkeys(self._publishers, 0)
+        self._report = PlayReport()
+        self._started = time.monotonic()
+        self._next_clock = 0.0
+
+    def wait_for_subscribers(self, wait_s: float) -> None:
+        """
+        Wait until every topic has a subscriber, or for so long.
+
+        """
+        deadline = time.monotonic() + wait_s
+        while any(self._unheard()) and time.monotonic() < deadline:
+            time.sleep(min(NAP, 0.02))
+        self._report.unheard = [one.topic_name for one in self._unheard()]
+        self._report.lossy = [
+            one.topic_name
+            for one in self._publishers.values()
+            if any(
+                end.qos_profile.reliability != ReliabilityPolicy.RELIABLE
+                for end in self._node.get_subscriptions_info_by_topic(one.topic_name)
+            )
+        ]
+        if self._report.lossy and wait_s > 0.0:
+            time.sleep(SETTLING)
+        self._started = time.monotonic()
+
+    def _unheard(self) -> list[Any]:
+        return [one for one in self._publishers.values() if not one.get_subscription_count()]
+
+    def play_once(self, progress: Callable[[float], None] | None) -> None:
+        """
+        Send the whole bag.
+
+        """
+        start_wall = time.monotonic()
+        start_ns: int | None = None
+        n_before = sum(self._n_sent.values())
+        for block in self._reader.blocks(raw=self._reader.info.storage != 'ros1'):
+            for log_ns, role, data in _in_order(block, self._reader.topics):
+                start_ns = log_ns if start_ns is None else start_ns
+                if self._rate:
+                    self._pace(start_wall, start_ns, log_ns)
+                elif time.monotonic() >= self._next_clock:
+                    self._tell_time(log_ns)
+                self._publishers[role].publish(data)
+                self._n_sent[role] += 1
+                if role == 'accel' and self._n_sent[role] % WINDOW == 0:
+                    self._await_acknowledgement(role)
+            if progress is not None:
+                progress(min(1.0, (sum(self._n_sent.values()) - n_before) / max(1, self._total)))
+
+    def finish(self) -> PlayReport:
+        """
+        Wait until everything has arrived and account for it.
+
+        """
+        for role in self._publishers:
+            self._await_acknowledgement(role)
+        self._report.duration_s = time.monotonic() - self._started
+        for role, publisher in self._publishers.items():
+            self._report.n_messages[publisher.topic_name] = self._n_sent[role]
+        return self._report
+
+    def _pace(self, start_wall: float, start_ns: int, log_ns: int) -> None:
+        """
+        Sleep until a message is due; tell the time meanwhile.
+
+        """
+        due = start_wall + (log_ns - start_ns) * 1e-9 / self._rate
+        while True:
+            now = time.monotonic()
+            if now >= self._next_clock:
+                elapsed_ns = int((min(now, due) - start_wall) * self._rate * 1e9)
+                self._tell_time(start_ns + elapsed_ns)
+            if now >= due:
+                return
+            time.sleep(min(due - now, CLOCK_PERIOD if self._clock else NAP))
+
+    def _tell_time(self, log_ns: int) -> None:
+        self._next_clock = time.monotonic() + CLOCK_PERIOD
+        if self._clock is not None:
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(log_ns, 1_000_000_000)
+            self._clock.publish(message)
+
+    def _await_acknowledgement(self, role: Role) -> None:
+        publisher = self._publishers[role]
+        deadline = time.monotonic() + PATIENCE
+        while not publisher.wait_for_all_acked(Duration(seconds=NAP)):
+            if time.monotonic() > deadline:
+                raise ThermoCompError(
+                    f'{publisher.topic_name}: a subscriber took nothing for {PATIENCE:g} s'
+                )
+
+
+def _qos(depth: int) -> QoSProfile:
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
+def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, Role, bytes]]:
+    """
+    Serialize a block's messages in the order of the bag: log time, role, bytes.
+
+    """
+    columns: list[tuple[Role, Any, Any, Iterator[bytes]]] = [
+        ('board', block.board_log_ns, block.board_after - 0.5, _readings(block, 'board', topics)),
+        ('case', block.case_log_ns, block.case_after - 0.5, _readings(block, 'case', topics)),
+        ('accel', block.accel_log_ns, np.arange(len(block)), _samples(block, topics)),
+    ]
+    log_ns = np.concatenate([times for _, times, _, _ in columns])
+    places = np.concatenate([place for _, _, place, _ in columns])
+    which = np.repeat(np.arange(len(columns)), [len(times) for _, times, _, _ in columns])
+    # Readings between the same two samples: by log time.
+    for index in np.lexsort((log_ns, places)).tolist():
+        role, _, _, messages = columns[which[index]]
+        yield int(log_ns[index]), role, next(messages)
+
+
+def _samples(block: Block, topics: Mapping[Role, str]) -> Iterator[bytes]:
+    if block.raw:
+        return _raw(block, topics.get('accel'))
+    numbers = block.accel
+    if block.imu is not None:
+        imu = block.imu
+        numbers = np.hstack(
+            [
+                imu.orientation,
+                imu.orientation_covariance,
+                imu.angular_velocity,
+                imu.angular_velocity_covariance,
+                block.accel,
+                imu.linear_acceleration_covariance,
+            ]
+        )
+    return _rows(stamped_payloads(block.accel_stamp_ns, block.frame_id, numbers))
+
+
+def _readings(
+    block: Block, role: Literal['board', 'case'], topics: Mapping[Role, str]
+) -> Iterator[bytes]:
+    if block.raw:
+        return _raw(block, topics.get(role))
+    stamps, celsius = (
+        (block.board_stamp_ns, block.board)
+        if role == 'board'
+        else (block.case_stamp_ns, block.case)
+    )
+    numbers = np.stack([celsius, np.zeros_like(celsius)], axis=1)
+    return _rows(stamped_payloads(stamps, '', numbers))
+
+
+def _raw(block: Block, topic: str | None) -> Iterator[bytes]:
+    for messages in block.raw:
+        if messages.topic == topic:
+            start = 0
+            data = messages.data.tobytes()
+            for end in messages.ends.tolist():
+                yield data[start:end]
+                start = end
+
+
+def _rows(payloads: NDArray[np.uint8]) -> Iterator[bytes]:
+    return (row.tobytes() for row in payloads)

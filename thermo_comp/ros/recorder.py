@@ -1,0 +1,254 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the recorder of the node's output: live topics into a bag that any rosbag2 tool opens.
+
+The bag's log time is the header stamp, and for a flag the newest stamp before it, as in what
+`replay` writes; so a bag that was played faster than real time is recorded in its own time.
+
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from struct import Struct
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Bool
+
+from ..errors import RecordingError
+from ..recording import BagWriter
+from .waitloop import WaitLoop
+
+NODE_NAME = 'thermo_comp_recorder'
+
+#: The node's outputs.
+OUTPUTS: Mapping[str, Any] = {'imu/data_raw': Imu, 'regime/dynamic': Bool}
+_TYPES = {Imu: 'sensor_msgs/msg/Imu', Bool: 'std_msgs/msg/Bool'}
+
+_QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+_STAMP = Struct('<iI')
+
+
+class Recorder:
+    """
+    Records topics in a thread of its own for as long as the context lasts.
+
+    Parameters
+    ----------
+    path : str or Path
+        The bag; ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
+    topics : mapping of str to type, optional
+        Relative topic names and message classes; the node's outputs if not given.
+    ros_args : sequence of str, optional
+        ROS arguments, such as ``['-r', '__ns:=/imu0']``.
+    overwrite : bool, optional
+        Replace a bag that is there.
+
+    Raises
+    ------
+    RecordingError
+        If the bag can't be written.
+
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        topics: Mapping[str, Any] = OUTPUTS,
+        ros_args: Sequence[str] = (),
+        overwrite: bool = False,
+    ) -> None:
+        self._path = Path(path)
+        self._topics = topics
+        self._ros_args = ros_args
+        self._overwrite = overwrite
+        self._changed = threading.Condition()
+        self._counts = dict.fromkeys(topics, 0)
+        self._failure: RecordingError | None = None
+        self._newest_ns = 0
+        # Flags that came before any stamp.
+        self._early: dict[str, list[bytes]] = {}
+
+    def __enter__(self) -> Recorder:
+        """
+        Start recording.
+
+        """
+        self._writer = BagWriter(self._path, overwrite=self._overwrite)
+        self._context = Context()
+        rclpy.init(args=['--ros-args', *self._ros_args], context=self._context)
+        self._node = rclpy.create_node(NODE_NAME, context=self._context)
+        self._loop = WaitLoop(self._node)
+        self._subscriptions = {
+            name: self._loop.subscribe(message_type, name, _QOS)
+            for name, message_type in self._topics.items()
+        }
+        self._thread = threading.Thread(target=self._run, name='recorder')
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        _error: BaseException | None,
+        _trace: TracebackType | None,
+    ) -> None:
+        """
+        Stop; finish the bag, or drop it after an error.
+
+        """
+        self._loop.stop()
+        self._thread.join()
+        self._loop.close()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+        if kind is not None or self._failure is not None:
+            self._writer.abort()
+        else:
+            self._writer.close()
+        if kind is None and self._failure is not None:
+            raise self._failure
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """
+        Messages recorded so far, by the relative topic name.
+
+        """
+        with self._changed:
+            return dict(self._counts)
+
+    def wait_for_publishers(self, timeout_s: float) -> bool:
+        """
+        Wait until every topic has a publisher.
+
+        Parameters
+        ----------
+        timeout_s : float
+            Longest wait [s].
+
+        Returns
+        -------
+        bool
+            False after the time-out.
+
+        """
+        deadline = time.monotonic() + timeout_s
+        ends = [one.subscription for one in self._subscriptions.values()]
+        while not all(end.get_publisher_count() for end in ends):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.02)
+        return True
+
+    def wait_until(self, is_done: Callable[[Mapping[str, int]], bool], timeout_s: float) -> bool:
+        """
+        Wait until the counts are as wanted.
+
+        Parameters
+        ----------
+        is_done : callable
+            Gets the counts after each change.
+        timeout_s : float
+            Longest time without a new message [s].
+
+        Returns
+        -------
+        bool
+            False after the time-out.
+
+        """
+        with self._changed:
+            while not is_done(self._counts):
+                if self._failure is not None or not self._changed.wait(timeout_s):
+                    return False
+        return True
+
+    def _run(self) -> None:
+        try:
+            self._loop.run(self._take)
+            self._take()
+        except RecordingError as error:
+            with self._changed:
+                self._failure = error
+                self._changed.notify_all()
+
+    def _take(self) -> None:
+        """
+        Write what has arrived.
+
+        """
+        new: dict[str, int] = {}
+        for name, subscription in self._subscriptions.items():
+            messages = self._early.pop(name, []) + subscription.drain()[0]
+            times = [self._log_time(name, data) for data in messages]
+            if not self._newest_ns:
+                self._early[name] = messages
+            elif messages:
+                kind = _TYPES[self._topics[name]]
+                self._writer.write_raw(name, kind, times, messages)
+                new[name] = len(messages)
+        if new:
+            with self._changed:
+                for name, count in new.items():
+                    self._counts[name] += count
+                self._changed.notify_all()
+
+    def _log_time(self, name: str, data: bytes) -> int:
+        if self._topics[name] is not Bool:
+            sec, nanosec = _STAMP.unpack_from(data, 4)
+            self._newest_ns = sec * 1_000_000_000 + nanosec
+        return self._newest_ns
+
+
+def record(
+    path: str | Path,
+    until: Callable[[Mapping[str, int]], bool],
+    *,
+    topics: Mapping[str, Any] = OUTPUTS,
+    timeout_s: float = 10.0,
+    ros_args: Sequence[str] = (),
+    overwrite: bool = False,
+) -> dict[str, int]:
+    """
+    Record topics until the counts of their messages are as wanted.
+
+    Parameters
+    ----------
+    path : str or Path
+        The bag; ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
+    until : callable
+        Gets the number of messages per topic after each change; True ends the recording.
+    topics : mapping of str to type, optional
+        Relative topic names and message classes; the node's outputs if not given.
+    timeout_s : float, optional
+        The recording also ends when nothing came for this long [s].
+    ros_args : sequence of str, optional
+        ROS arguments.
+    overwrite : bool, optional
+        Replace a bag that is there.
+
+    Returns
+    -------
+    dict of str to int
+        Messages recorded per topic.
+
+    Raises
+    ------
+    RecordingError
+        If the bag can't be written.
+
+    """
+    with Recorder(path, topics=topics, ros_args=ros_args, overwrite=overwrite) as recorder:
+        recorder.wait_until(until, timeout_s)
+        return recorder.counts
