@@ -127,6 +127,7 @@ class RegimeDetector:
         self.settings = settings
         self._relaxed_rate = settings.relaxed_rate_k_min / 60.0
         self._dwell_ns = round(settings.dwell_s * 1e9)
+        self._forget_ns = round(1e9 * max(settings.case.lag_s, settings.board.lag_s))
         self._case_onset = _OnsetTest(settings, settings.case)
         self._board_onset = _OnsetTest(settings, settings.board)
         self._case_calm = _CalmTest(settings, settings.case)
@@ -141,6 +142,7 @@ class RegimeDetector:
         self.regime = Regime.UNKNOWN
         self.direction = 0
         self.switched_ns: int | None = None
+        self._stamp_ns: int | None = None
         self._calm_ns: int | None = None
         self._held_until_ns: int | None = None
         self._case_onset.reset()
@@ -171,6 +173,9 @@ class RegimeDetector:
             lead, onset = board, self._board_onset
         else:
             return self.regime
+        if self._stamp_ns is not None and stamp_ns - self._stamp_ns > self._forget_ns:
+            self.reset()
+        self._stamp_ns = stamp_ns
         departure = onset.update(stamp_ns, lead, self.regime == Regime.STATIC)
         if not lead.is_ready:
             return self.regime
@@ -266,7 +271,7 @@ class _OnsetTest:
 
         """
         self._baseline = self._rate
-        self._doubt = max(self.ripple_rate, SURE_SIGMAS * sqrt(sensor.var_rate))
+        self._doubt = max(self.ripple_rate, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # edges that were crossed before the soak tell of the ramp
 
     def update(self, stamp_ns: int, sensor: Thermometer, is_static: bool) -> int:
@@ -353,7 +358,7 @@ class _OnsetTest:
         bound = self._quantum * 1e9 / (stamp_ns - self._edge_ns)
         if reading == before and bound < self._doubt + abs(self._baseline):
             # nothing crossed since: no rate above one quantum in that time
-            self._doubt = min(self._doubt, bound)
+            self._doubt = max(min(self._doubt, bound), self.ripple_rate)
             self._baseline = min(max(self._baseline, -bound), bound)
         if reading != before:
             edge = 0.5 * (reading + before)
@@ -396,6 +401,7 @@ class _CalmTest:
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
+        self._ahead = max(self._relaxed, 3.0 * settings.ripple_c / sensor.lag_s)
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
         # A reading that stands still for longer than a relaxed rate takes through its cell, and
@@ -436,7 +442,7 @@ class _CalmTest:
             return True
         relaxed = self._relaxed
         room = relaxed - SURE_SIGMAS * sqrt(sensor.var_rate)
-        return -room < rate < room and abs(3.0 * rate - 2.0 * self._mean) < relaxed
+        return -room < rate < room and abs(3.0 * rate - 2.0 * self._mean) < self._ahead
 
 
 def _obvious(sensor: Thermometer, rate: float) -> int:
