@@ -192,9 +192,9 @@ def test_an_absent_set_and_an_empty_range_are_refused(cubic: Calibration) -> Non
 
 
 def test_impossible_arguments_are_refused(cubic: Calibration) -> None:
-    with pytest.raises(ValueError, match='`instance` must be 0..3, got 4'):
+    with pytest.raises(ValueError, match=r'`instance` must be 0\.\.3, got 4'):
         export_px4(cubic, instance=4)
-    with pytest.raises(ValueError, match='`imu` must be 1..3, got 0'):
+    with pytest.raises(ValueError, match=r'`imu` must be 1\.\.3, got 0'):
         export_ardupilot(cubic, imu=0)
     with pytest.raises(ValueError, match='`up` must be a unit vector'):
         export_px4(cubic, up=(0.0, 0.0, 9.81))
