@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Holds the viewers' layouts to the bags: every path in them leads to a number in a replayed bag.
+
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import GRAVITY, SECOND_NS, calibration
+from conftest import ROOT
+from rosbags.typesys import Stores, get_typestore
+
+from thermo_comp.calibration import Axes, AxisReference, Unit
+from thermo_comp.recording import BagWriter, inspect_recording
+from thermo_comp.replay import replay
+
+FOXGLOVE = ROOT / 'config' / 'thermo_comp.foxglove.json'
+PLOTJUGGLER = ROOT / 'config' / 'plotjuggler_layout.xml'
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+# Only the live node publishes diagnostics; the panels for them stay empty on a replayed bag.
+LIVE_ONLY = {'/diagnostics'}
+
+
+def replayed(folder: Path, kind: str) -> dict[str, str]:
+    """
+    Replay a minute of a bag with its inputs kept; return the type of each topic.
+
+    """
+    stamps = 10**18 + np.arange(600) * (SECOND_NS // 10)
+    slow = 10**18 + np.arange(-1, 60) * SECOND_NS
+    source = folder / f'{kind}.mcap'
+    with BagWriter(source) as writer:
+        writer.write_temperature('temperature/board', slow, 20.0 + np.arange(61) * 0.01)
+        writer.write_temperature('temperature/case', slow, 20.0 + np.arange(61) * 0.02)
+        if kind == 'counts':
+            writer.write_counts('accel/counts', stamps, np.tile((10.0, 20.0, 2900.0), (600, 1)))
+        else:
+            force = np.tile((0.1, 0.2, GRAVITY), (600, 1))
+            writer.write_imu('imu/uncompensated', stamps, force, np.zeros(9))
+    unit = Unit('T-1', 'counts' if kind == 'counts' else 'm/s^2', 32767.0, 0.1)
+    scale = 300.0 if kind == 'counts' else 1.0
+    one = calibration(unit=unit, axes=Axes(*[AxisReference(scale, 0.0)] * 3))
+    output = folder / f'{kind}_corrected.mcap'
+    replay(source, one, output, keep_inputs=True)
+    return {name: topic[0] for name, topic in inspect_recording(output).topics.items()}
+
+
+@pytest.fixture(scope='module')
+def topics(tmp_path_factory) -> dict[str, str]:
+    folder = tmp_path_factory.mktemp('layouts')
+    return {**replayed(folder, 'counts'), **replayed(folder, 'imu')}
+
+
+def field_kind(message: str, fields: list[str]) -> str:
+    """
+    Follow field names through message definitions; return what stands at their end.
+
+    """
+    name = message
+    for part in fields:
+        field, _, index = part.partition('[')
+        known = dict(TYPES.fielddefs[name][1])
+        assert field in known, f'{name} has no {field}'
+        kind, description = known[field]
+        if kind.name in ('ARRAY', 'SEQUENCE'):
+            assert index, f'{name}.{field} is an array'
+            (kind, description), length = description
+            assert int(index.rstrip(']')) < length
+        name = description[0] if kind.name == 'BASE' else description
+    return name
+
+
+def panels() -> dict[str, dict]:
+    return json.loads(FOXGLOVE.read_text())['configById']
+
+
+def foxglove_paths() -> list[str]:
+    return [path['value'] for panel in panels().values() for path in panel.get('paths', [])]
+
+
+def script() -> str:
+    (only,) = json.loads(FOXGLOVE.read_text())['userNodes'].values()
+    return only['sourceCode']
+
+
+def test_foxglove_paths_lead_to_numbers(topics):
+    found = set()
+    (output,) = re.findall(r'export const output = "(.*)"', script())
+    fields_of_script = re.findall(r'(\w+): number', re.search(r'type Output = .*', script())[0])
+    for path in foxglove_paths():
+        topic = max((t for t in [*topics, output] if path.startswith(f'{t}.')), key=len)
+        fields = path[len(topic) + 1 :].removesuffix('.@sqrt').split('.')
+        if topic == output:
+            assert fields[0] in fields_of_script
+        else:
+            assert field_kind(topics[topic], fields) in ('float64', 'bool')
+        found.add(topic)
+    assert found == {output, *topics}
+
+
+def test_foxglove_script_and_diagnostics_name_topics_that_exist(topics):
+    (inputs,) = re.findall(r'export const inputs = (\[.*\])', script())
+    assert set(json.loads(inputs)) <= set(topics)
+    rendered = {p['topicToRender'] for p in panels().values() if 'topicToRender' in p}
+    assert rendered == LIVE_ONLY
+
+
+def test_foxglove_shows_every_panel_once():
+    shown = re.findall(
+        r'"(?:first|second)": "([^"]*)"', json.dumps(json.loads(FOXGLOVE.read_text())['layout'])
+    )
+    assert sorted(shown) == sorted(panels())
+    kinds = {name.split('!')[0] for name in shown}
+    assert {'Plot', 'StateTransitions', 'DiagnosticSummary'} <= kinds
+
+
+def plotjuggler() -> ET.Element:
+    return ET.fromstring(PLOTJUGGLER.read_text())  # noqa: S314 - our own file
+
+
+def source_kind(topics: dict[str, str], series: str) -> str:
+    topic = max((t for t in topics if series.startswith(f'{t}/')), key=len)
+    fields = series[len(topic) + 1 :].split('/')
+    # PlotJuggler spells an element of a covariance [row;column], as a field of its own.
+    if match := re.fullmatch(r'\[([012]);([012])\]', fields[-1]):
+        place = 3 * int(match[1]) + int(match[2])
+        fields = [*fields[:-2], f'{fields[-2]}[{place}]']
+    return field_kind(topics[topic], fields)
+
+
+def test_plotjuggler_curves_lead_to_numbers(topics):
+    root = plotjuggler()
+    snippets = {snippet.get('name'): snippet for snippet in root.iter('snippet')}
+    curves = {curve.get('name') for curve in root.iter('curve')}
+    sources = {
+        element.text
+        for pattern in ('.//linked_source', './/additional_sources/*')
+        for element in root.findall(pattern)
+    }
+    assert set(snippets) <= curves
+    for series in (curves - set(snippets)) | sources:
+        assert source_kind(topics, series) in ('float64', 'bool')
+
+
+def test_plotjuggler_splitters_count_what_they_hold():
+    for splitter in plotjuggler().iter('DockSplitter'):
+        assert int(splitter.get('count')) == len(splitter)
+        assert len(splitter.get('sizes').split(';')) == len(splitter)
+
+
+@pytest.mark.parametrize(
+    ('name', 'expected'),
+    [
+        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes: at m = 60 its rate is 1.7 K/min, two lags
+        # of 30 s earlier 1.68 (within the lags' sampling at 1 Hz), its second derivative 0.02.
+        ('/thermo_comp/board_k_min', 1.68),
+        ('/thermo_comp/case_k_min', 1.68),
+        ('/thermo_comp/case_k_min2', 0.02),
+    ],
+)
+def test_plotjuggler_functions_give_the_derivatives(name, expected):
+    lua = shutil.which('lua5.4') or shutil.which('lua5.3') or shutil.which('lua')
+    if lua is None:
+        pytest.skip('no Lua interpreter here (Debian: lua5.4)')
+    (snippet,) = (s for s in plotjuggler().iter('snippet') if s.get('name') == name)
+    code = f"""
+        {snippet.findtext('global')}
+        function calc(time, value)
+          {snippet.findtext('function')}
+        end
+        for t = 0, 3600 do result = calc(t, 20 + 0.5 * t / 60 + 0.01 * (t / 60) ^ 2) end
+        print(result)
+    """
+    shown = subprocess.run([lua, '-e', code], capture_output=True, text=True, check=True)
+    assert float(shown.stdout) == pytest.approx(expected, abs=1e-3)
