@@ -1,26 +1,75 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the bags say of the thermometers: noise, quantum, ramp rates; the detector's settings.
+Owns what the bags say of the thermometers: noise, quantum, lag, ramps; the detector's settings.
+
+Rates are taken here from both sides, over a minute each, which only a recording allows; what is
+learnt makes the causal thermometers and the detector expect what this chamber did.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from ..regime import DetectorSettings
+from ..regime import OBVIOUS_SHARE, DetectorSettings
 from ..thermometer import ThermometerSettings
 from .reduction import Readings, ReducedBag
 
 Array = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 # Below this no thermometer is worth believing, and the recursion would follow rounding errors.
 _SMALLEST_NOISE = 1e-4
+_BIN_S = 10.0
+_BINS_PER_SIDE = 6
+# A ramp is clear when its rate is this far above the noise of rates.
+_CLEAR = 5.0
+_LAG_RANGE_S = (30.0, 3600.0)
+_RIPPLE_RANGE_C = (0.02, 1.0)
+_SMALLEST_RAMP_K_MIN = 0.1
+# The unit may meet ramps faster than the chamber's.
+_RAMP_MARGIN = 1.5
+
+
+@dataclass(frozen=True)
+class Course:
+    """
+    One thermometer's course over one bag, seen from both sides.
+
+    Parameters
+    ----------
+    rate : ndarray, shape (n,)
+        Rate on a grid of ten seconds [K/s].
+    rate_sd : float
+        Noise of it.
+
+    """
+
+    rate: Array
+    rate_sd: float
+
+    @property
+    def is_resting(self) -> BoolArray:
+        """
+        Where the chamber rests: no ramp for five minutes before and after.
+
+        """
+        moving = np.abs(self.rate) > max(0.2 * self.fastest, _CLEAR * self.rate_sd)
+        near = np.convolve(moving, np.ones(61), mode='same') > 0.5
+        return np.asarray(~near)
+
+    @property
+    def fastest(self) -> float:
+        """
+        Rate that all but a hundredth of the course stays below [K/s].
+
+        """
+        return float(np.quantile(np.abs(self.rate), 0.99))
 
 
 def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
@@ -39,10 +88,17 @@ def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
 
     """
     base = DetectorSettings()
+    board = learn_thermometer([bag.board for bag in bags], base.board)
+    case = learn_thermometer([bag.case for bag in bags], base.case)
+    courses = _courses([bag.case for bag in bags], case.noise_sd_c, case.quantum_c)
+    smallest = min(base.smallest_ramp_k_min, _slowest_ramp(courses, base.smallest_ramp_k_min))
     return replace(
         base,
-        board=learn_thermometer([bag.board for bag in bags], base.board),
-        case=learn_thermometer([bag.case for bag in bags], base.case),
+        smallest_ramp_k_min=smallest,
+        relaxed_rate_k_min=min(base.relaxed_rate_k_min, 0.4 * smallest / OBVIOUS_SHARE),
+        ripple_c=_ripple(courses, case.lag_s, base.ripple_c),
+        board=board,
+        case=case,
     )
 
 
@@ -50,14 +106,14 @@ def learn_thermometer(
     recorded: Sequence[Readings], base: ThermometerSettings
 ) -> ThermometerSettings:
     """
-    Estimate one sensor's quantum and noise.
+    Estimate one sensor's quantum, noise, lag and fastest ramp.
 
     Parameters
     ----------
     recorded : sequence of Readings
         Its readings, bag by bag.
     base : ThermometerSettings
-        What to keep where there are too few readings.
+        What to keep where there are too few readings, or no ramp.
 
     Returns
     -------
@@ -68,19 +124,29 @@ def learn_thermometer(
     long = [readings.value for readings in recorded if len(readings.value) >= 30]
     if not long:
         return base
-    values = np.concatenate(long)
-    quantum = quantum_of(values)
-    # A straight ramp has no second difference; white noise of sd s gives s sqrt(6).
-    second = np.concatenate([np.diff(value, 2) for value in long])
-    if quantum:
-        # Rounded readings stand still most of the time, so a median would say 0: the mean square
-        # without the largest hundredth serves, less what rounding alone gives.
-        square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
-        variance = max(float(square.mean()) / 6.0 - quantum**2 / 12.0, (0.1 * quantum) ** 2)
-        noise = float(np.sqrt(variance))
-    else:
-        noise = float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
-    return replace(base, noise_sd_c=max(noise, _SMALLEST_NOISE), quantum_c=quantum)
+    quantum = quantum_of(np.concatenate(long))
+    noise = max(_noise_of(long, quantum), _SMALLEST_NOISE)
+    courses = _courses(recorded, noise, quantum)
+    clear = [one for one in courses if one.fastest > _CLEAR * one.rate_sd]
+    if not clear:
+        return replace(base, noise_sd_c=noise, quantum_c=quantum)
+    fastest = max(one.fastest for one in clear)
+    # A ramp begins through a lag with the acceleration ramp / lag; the means of a minute on
+    # either side see it when it is half a minute old, and spread it over the minute.
+    lags = []
+    for one in clear:
+        bend = np.abs(one.rate[_BINS_PER_SIDE:] - one.rate[:-_BINS_PER_SIDE])
+        steepest = float(np.quantile(bend, 0.995)) / (_BIN_S * _BINS_PER_SIDE)
+        if steepest > 0.0:
+            lags.append(one.fastest / steepest)
+    lag = float(np.clip(np.median(lags), *_LAG_RANGE_S)) if lags else base.lag_s
+    return replace(
+        base,
+        noise_sd_c=noise,
+        quantum_c=quantum,
+        fastest_ramp_k_min=max(base.fastest_ramp_k_min, _RAMP_MARGIN * 60.0 * fastest),
+        lag_s=round(lag, 1),
+    )
 
 
 def quantum_of(values: Array) -> float:
@@ -105,4 +171,75 @@ def quantum_of(values: Array) -> float:
     step = float(np.median(gaps[gaps < 1.5 * np.min(gaps)]))
     steps = gaps / step
     is_grid = np.abs(steps - np.rint(steps)) < 0.1
-    return step if is_grid.mean() > 0.9 else 0.0
+    return round(step, 9) if is_grid.mean() > 0.9 else 0.0
+
+
+def _noise_of(values: Sequence[Array], quantum: float) -> float:
+    # A straight ramp has no second difference; white noise of sd s gives s sqrt(6).
+    second = np.concatenate([np.diff(value, 2) for value in values])
+    if not quantum:
+        return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
+    # Rounded readings stand still most of the time, so a median would say 0: the mean square
+    # without the largest hundredth serves, less what rounding alone gives.
+    square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
+    variance = max(float(square.mean()) / 6.0 - quantum**2 / 12.0, (0.1 * quantum) ** 2)
+    return float(np.sqrt(variance))
+
+
+def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
+    """
+    Rates of each bag that is long enough to have any.
+
+    """
+    side = _BIN_S * _BINS_PER_SIDE
+    result = []
+    for readings in recorded:
+        if len(readings.value) < 30:
+            continue
+        time = (readings.stamp_ns - readings.stamp_ns[0]) * 1e-9
+        n_bins = int(time[-1] / _BIN_S)
+        if n_bins < 6 * _BINS_PER_SIDE:
+            continue
+        # The mean over a bin is a difference of the integral at its edges.
+        integral = np.concatenate(
+            ([0.0], np.cumsum(0.5 * (readings.value[1:] + readings.value[:-1]) * np.diff(time)))
+        )
+        edges = np.interp(np.arange(n_bins + 1) * _BIN_S, time, integral)
+        means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side
+        rate = (means[_BINS_PER_SIDE:] - means[:-_BINS_PER_SIDE]) / side
+        per_side = max(1.0, side * (len(time) - 1) / time[-1])
+        # Rounding errors of neighbours are alike as long as the temperature stays in one step.
+        spread = np.sqrt(2.0 * (noise**2 / per_side + quantum**2 / 12.0))
+        result.append(Course(rate, float(spread) / side))
+    return result
+
+
+def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
+    """
+    Seven tenths of the slowest long ramp [K/min], within reason.
+
+    """
+    slowest = usual / 0.7
+    for one in courses:
+        clear = np.abs(one.rate) > max(_CLEAR * one.rate_sd, 0.1 / 60.0)
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], clear.astype(np.int8), [0]))))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            if (stop - start) * _BIN_S > 600.0:
+                middle = float(np.quantile(np.abs(one.rate[start:stop]), 0.9)) * 60.0
+                slowest = min(slowest, middle)
+    return max(0.7 * slowest, _SMALLEST_RAMP_K_MIN)
+
+
+def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
+    """
+    Amplitude of the surroundings' ripple in soaks: through the lag it made the rates seen.
+
+    """
+    rates = [one.rate[one.is_resting] for one in courses]
+    resting = np.concatenate(rates) if rates else np.zeros(0)
+    if len(resting) < 60 or not courses:
+        return usual
+    noise = float(np.median([one.rate_sd for one in courses]))
+    swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
+    clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
+    return float(np.clip(clean * lag_s, *_RIPPLE_RANGE_C))
