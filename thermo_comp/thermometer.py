@@ -32,7 +32,7 @@ _NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)
 
 OUTLIER_SIGMAS = 6.0  # innovations beyond this limit count less ...
 OUTLIER_LIMITS = 5.0  # ... and beyond this many limits not at all ...
-RESTART_READINGS = 4  # ... unless that many readings agree in a row
+RESTART_READINGS = 4  # ... unless that many in a row lie on one side
 SOAK_S = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
 QUIET_SHARE = 5e-3  # quiet acceleration wander / bending one, of a sensor without cells
 CELL_SHARE = 0.2  # the same where cells hide slow changes
@@ -136,6 +136,8 @@ class Thermometer:
         noise, quantum = settings.noise_sd_c, settings.quantum_c
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
+        self.noise_factor = 1.0
+        self._noise_scale = 1.0  # its square
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -148,7 +150,7 @@ class Thermometer:
 
     def reset(self) -> None:
         """
-        Forget the readings (not the counters), as after time has jumped back.
+        Forget the readings, as after time has jumped back; what was counted or learnt stays.
 
         """
         self.stamp_ns: int | None = None
@@ -160,14 +162,12 @@ class Thermometer:
         self.is_ready = False
         self.measured = nan
         self.measured_variance = inf
-        self.noise_factor = 1.0
         self.bending = 0.5
         self._covariance = 0.0  # of temperature and rate
-        self._noise_scale = 1.0  # noise_factor squared
         self._quiet: State = _NOWHERE
         self._bent: State = _NOWHERE
+        self._surprise = 0.0
         self._n_strange = 0
-        self._strange = nan
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
@@ -221,9 +221,17 @@ class Thermometer:
         noise = self._flat * scale
         spread = variance + noise
         surprise = reading_c - expected
+        is_turning = surprise * self._surprise < 0.0
+        self._surprise = surprise
+        if is_turning and not self._has_cells:
+            # Only surprises that change sign are noise; a bend makes a row of one sign.
+            excess = min(surprise * surprise / spread - 1.0, 8.0)
+            self._noise_scale = max(1.0, scale * (1.0 + excess / NOISE_MEMORY))
+            self.noise_factor = sqrt(self._noise_scale)
         limit = OUTLIER_SIGMAS * sqrt(spread) + 5.0 * self._bend * dt * dt + 1.5 * self._quantum
         if abs(surprise) > limit:
-            if self._is_step(reading_c, limit):
+            self._n_strange = 1 if is_turning else self._n_strange + 1
+            if self._n_strange >= RESTART_READINGS:
                 self.n_restarts += 1
                 self._start(stamp_ns, reading_c)
                 return True
@@ -239,10 +247,6 @@ class Thermometer:
             measured, noise = self._cell(
                 reading_c, expected, variance, rate * dt, bent[6] * dt * dt
             )
-        else:
-            excess = min(surprise * surprise / spread - 1.0, 8.0)
-            self._noise_scale = scale = max(1.0, scale * (1.0 + excess / NOISE_MEMORY))
-            self.noise_factor = sqrt(scale)
 
         # each mode learns, and is judged by its innovation
         if noise < inf:
@@ -317,23 +321,14 @@ class Thermometer:
         self.stamp_ns = self.changed_ns = stamp_ns
         self.reading = self.measured = self.temperature = reading_c
         self.rate = self.acceleration = 0.0
-        self.var_temperature = self.measured_variance = self._flat
+        noise = self._flat * self._noise_scale
+        self.var_temperature = self.measured_variance = noise
         self.var_rate = self._rate_sd**2
         self.var_acceleration = self._bend**2
         self._quiet = self._bent = (
-            reading_c, 0.0, 0.0, self._flat, 0.0, 0.0, self.var_rate, 0.0, self.var_acceleration
+            reading_c, 0.0, 0.0, noise, 0.0, 0.0, self.var_rate, 0.0, self.var_acceleration
         )  # fmt: skip
         self.n_used += 1
-
-    def _is_step(self, reading: float, limit: float) -> bool:
-        """
-        Several strange readings in a row that agree are no outliers: the temperature has moved.
-
-        """
-        is_alike = abs(reading - self._strange) <= OUTLIER_LIMITS * limit
-        self._n_strange = self._n_strange + 1 if is_alike else 1
-        self._strange = reading
-        return self._n_strange >= RESTART_READINGS
 
     def _cell(
         self, reading: float, expected: float, variance: float, move: float, var_move: float
