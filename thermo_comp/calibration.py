@@ -329,7 +329,9 @@ class Calibration:
             '(lag times rate) while the case sensor is lost.'
         ),
     ] = 900.0
-    detector: DetectorSettings = field(default_factory=DetectorSettings)
+    detector: Annotated[
+        DetectorSettings, Field(description='The thermometers and the regime detector.')
+    ] = field(default_factory=DetectorSettings)
     provenance: Provenance = Provenance()
 
     def __post_init__(self) -> None:

@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what the documentation takes from the code: the schema and the two reference pages.
+
+Run ``python docs/make_reference.py`` after changing a key or a parameter; a test compares.
+
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from thermo_comp.calibration_file import calibration_schema
+from thermo_comp.ros.parameters import parameters_table
+
+ROOT = Path(__file__).resolve().parent.parent
+AXES = ('x', 'y', 'z')
+
+CALIBRATION_HEAD = """\
+# The calibration file
+
+One file = one unit = one object, in YAML, written by `thermo_comp fit`. An annotated example is
+`config/calibration.example.yaml`, the JSON Schema
+`config/calibration.schema.json`; this page is made from it.
+
+The reader refuses, with the file, the key, the value and what was expected: unknown or missing
+keys, texts where numbers belong, NaN and infinity, ranges that do not rise, functions that are not
+normalised at the reference, a scale that could reach zero within its ranges, a covariance that is
+none, a newer `format_version`, YAML aliases and tags, files above 1 MiB. Numbers are written with
+all their digits, so a file that is read and written again is the same file.
+"""
+
+INTERFACE = """\
+# ROS interface of the node
+
+Node `thermo_comp`, executable `thermo_comp_node`. All names are relative and can be remapped. Input
+stamps are carried through; the node never stamps with its own clock and needs no `use_sim_time`.
+
+## Topics
+
+| direction | topic | type | QoS |
+|---|---|---|---|
+| in | `accel/counts` | geometry_msgs/Vector3Stamped, counts per cycle | best effort, keep last 2000 |
+| in, with `input:=imu` | `imu/uncompensated` | sensor_msgs/Imu, m/s^2; angular rate, orientation and their covariances pass through | same |
+| in | `temperature/board`, `temperature/case` | sensor_msgs/Temperature, degC | best effort, keep last 50 |
+| out | `imu/data_raw` | sensor_msgs/Imu, specific force in m/s^2 | reliable |
+| out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every case temperature; nothing while unknown | reliable, transient local |
+| out | `/diagnostics` | diagnostic_msgs/DiagnosticArray, 1 Hz, hardware_id = serial | reliable |
+
+Each QoS policy can be overridden at start with the usual `qos_overrides./topic.subscription.reliability`
+parameters.
+
+`linear_acceleration_covariance` is a full 3x3: noise of the sample plus what is uncertain about the
+calibration at this thermal state. Without angular rate or orientation in the input, the first element
+of their covariance is -1 (REP 145).
+
+## Parameters
+
+{parameters}
+
+A change is checked as a whole before anything is applied. A `calibration_file` that cannot be used is
+refused in the response, with the reason, and the running calibration stays. The coefficients are in the
+file and not in parameters, because parameters arrive one at a time and half a polynomial is a wrong one.
+
+```console
+$ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
+```
+
+## What is not published
+
+| input | what happens |
+|---|---|
+| NaN or infinite counts | dropped, counted, WARN |
+| counts at full scale | dropped, counted, ERROR while it lasts |
+| no board temperature yet | nothing is published, ERROR |
+| board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
+| case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
+| temperature or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
+| a stamp that repeats or goes back a little | dropped, counted |
+| a stamp that goes back by more than a second | the estimators start anew, said once |
+"""
+
+
+def calibration_page() -> str:
+    """
+    Return the calibration file's reference.
+
+    """
+    schema = calibration_schema()
+    definitions = schema['$defs']
+    parts = [CALIBRATION_HEAD, *_section('The top level', schema, definitions, heading=2)]
+    for name in (
+        'Unit',
+        'Axes',
+        'AxisReference',
+        'RegimeSet',
+        'AxisSet',
+        'Polynomial',
+        'CubicSpline',
+        'Exponential',
+        'LinearTerm',
+        'MemoryTerm',
+        'DetectorSettings',
+        'ThermometerSettings',
+        'Provenance',
+        'Source',
+        'ResidualSummary',
+    ):
+        parts += _section(name, definitions[name], definitions, heading=3)
+    return '\n'.join(parts)
+
+
+def _section(
+    name: str, part: dict[str, Any], definitions: dict[str, Any], heading: int
+) -> list[str]:
+    text = part.get('description', '').strip().split('\n\n')[0].replace('\n', ' ')
+    lines = [f'{"#" * heading} {name}', '', text if heading > 2 else '', '']
+    lines += ['| key | type | default | meaning |', '|---|---|---|---|']
+    required = part.get('required', [])
+    told = _parameters(part.get('description', ''))
+    for key, value in part.get('properties', {}).items():
+        default = 'required' if key in required else f'`{json.dumps(value.get("default"))}`'
+        if len(default) > 40:
+            default = 'see there'
+        meaning = (
+            value.get('description', '') or told.get(key, '') or _described(value, definitions)
+        )
+        lines.append(f'| `{key}` | {_type(value)} | {default} | {meaning} |')
+    return [*lines, '']
+
+
+def _parameters(docstring: str) -> dict[str, str]:
+    """
+    Read the meanings out of a numpydoc `Parameters` section.
+
+    """
+    result: dict[str, str] = {}
+    names: list[str] = []
+    _, _, section = docstring.partition('Parameters\n----------\n')
+    for line in section.partition('\n\n')[0].splitlines():
+        if not line.startswith(' '):
+            names = [name.strip() for name in line.partition(' : ')[0].split(',')]
+        else:
+            for name in names:
+                result[name] = f'{result.get(name, "")} {line.strip()}'.strip()
+    return result
+
+
+def _described(value: dict[str, Any], definitions: dict[str, Any]) -> str:
+    reference = value.get('$ref', '').rpartition('/')[2]
+    text: str = definitions.get(reference, {}).get('description', '')
+    return text.strip().split('\n\n')[0].replace('\n', ' ')
+
+
+def _type(value: dict[str, Any]) -> str:
+    if '$ref' in value:
+        return str(value['$ref'].rpartition('/')[2])
+    for several in ('oneOf', 'anyOf'):
+        if several in value:
+            return ' or '.join(_type(one) for one in value[several])
+    if 'enum' in value:
+        return ' or '.join(f'`{one}`' for one in value['enum'])
+    if 'const' in value:
+        return f'`{value["const"]}`'
+    kind = str(value.get('type', ''))
+    if kind == 'array':
+        items = value.get('prefixItems')
+        inner = _type(items[0]) if items else _type(value.get('items', {}))
+        return f'list of {len(items)} {inner}' if items else f'list of {inner}'
+    bounds = [
+        f'{sign} {value[word]:g}'
+        for word, sign in (
+            ('exclusiveMinimum', '>'),
+            ('minimum', '>='),
+            ('exclusiveMaximum', '<'),
+            ('maximum', '<='),
+        )
+        if word in value
+    ]
+    return ' '.join([kind, *bounds])
+
+
+def pages() -> dict[Path, str]:
+    """
+    Return every generated file with its text.
+
+    """
+    return {
+        ROOT / 'config' / 'calibration.schema.json': json.dumps(calibration_schema(), indent=2)
+        + '\n',
+        ROOT / 'docs' / 'calibration_file.md': calibration_page(),
+        ROOT / 'docs' / 'ros_interface.md': INTERFACE.format(parameters=parameters_table()),
+    }
+
+
+if __name__ == '__main__':
+    for path, text in pages().items():
+        path.write_text(text)
