@@ -186,17 +186,17 @@ class SampleConverter:
         try:
             sec, nanosec, _, *values = pattern.unpack(data)[1:]
             message = deserialize_message(data, self._message_type)
+            # Looked at before the message is written over.
+            is_read = _bits(values) == _bits(_components(message))
             example = tuple(range(1, 10))
             written = layout.write(data, sec, nanosec, example)
             expected = self._write_message(message, example)
         except (StructError, *_UNREADABLE):
             return None
-        # The bytes of padding are whatever rclpy found in memory.
-        end = 16 + len(frame)
-        is_same = _bits(values) == _bits(_components(message)) and (
-            (written[:end], written[head.size :]) == (expected[:end], expected[head.size :])
-        )
-        return layout if is_same else None
+        # Not compared: the bytes of padding, which are whatever rclpy found in memory.
+        end, body = 16 + len(frame), head.size
+        is_written = written[:end] == expected[:end] and written[body:] == expected[body:]
+        return layout if is_read and is_written else None
 
     def _convert_message(self, data: bytes, process: Process) -> bytes | None:
         """
@@ -217,7 +217,7 @@ class SampleConverter:
 
     def _write_message(self, message: Any, result: tuple[float, ...]) -> bytes:
         """
-        Write the Imu through rclpy.
+        Write the Imu through rclpy; an Imu message is changed on the way.
 
         """
         if self._message_type is Imu:

@@ -396,3 +396,7 @@ def _serve(is_running: threading.Event) -> None:
         node.run()
     finally:
         node.close()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -128,7 +128,9 @@ class Recorder:
         with self._changed:
             return dict(self._counts)
 
-    def wait_for_publishers(self, timeout_s: float) -> bool:
+    def wait_for_publishers(
+        self, timeout_s: float, while_true: Callable[[], bool] = lambda: True
+    ) -> bool:
         """
         Wait until every topic has a publisher.
 
@@ -136,17 +138,19 @@ class Recorder:
         ----------
         timeout_s : float
             Longest wait [s].
+        while_true : callable, optional
+            The wait ends when this says False.
 
         Returns
         -------
         bool
-            False after the time-out.
+            False if they did not come.
 
         """
         deadline = time.monotonic() + timeout_s
         ends = [one.subscription for one in self._subscriptions.values()]
         while not all(end.get_publisher_count() for end in ends):
-            if time.monotonic() > deadline:
+            if time.monotonic() > deadline or not while_true():
                 return False
             time.sleep(0.02)
         return True

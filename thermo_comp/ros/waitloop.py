@@ -144,6 +144,8 @@ class WaitLoop:
     """
     One wait set over a node: raw subscriptions for the caller, the rest for an executor.
 
+    The node's entities are made before `run` or in a callback while it runs.
+
     Parameters
     ----------
     node : rclpy.node.Node

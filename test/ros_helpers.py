@@ -1,0 +1,183 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the other end of the node in tests: a peer on real DDS that publishes, listens and calls.
+
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import Vector3Stamped
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu, Temperature
+
+from thermo_comp.ros.node import CompensationNode
+
+SECOND_NS = 1_000_000_000
+#: Longest wait for anything on DDS [s]; only a broken test ever waits as long.
+TIMEOUT = 30.0
+DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def stamped(message: Any, stamp_ns: int, frame_id: str = '') -> Any:
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
+    message.header.frame_id = frame_id
+    return message
+
+
+def stamp_of(message: Any) -> int:
+    return message.header.stamp.sec * SECOND_NS + message.header.stamp.nanosec
+
+
+class Peer:
+    """
+    A node with a thread of its own; everything received wakes `wait_for`.
+
+    """
+
+    def __init__(self) -> None:
+        self.context = Context()
+        rclpy.init(args=[], context=self.context)
+        self.node = rclpy.create_node('peer', context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._news = threading.Condition()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        with contextlib.suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._thread.join(TIMEOUT)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+    def listen(
+        self, kind: Any, topic: str, qos: QoSProfile = DEEP, raw: bool = False
+    ) -> list[Any]:
+        """Collect what comes on a topic into the list that is returned."""
+        heard: list[Any] = []
+
+        def hear(message: Any) -> None:
+            with self._news:
+                heard.append(message)
+                self._news.notify_all()
+
+        self.node.create_subscription(kind, topic, hear, qos, raw=raw)
+        return heard
+
+    def wait_for(self, condition: Callable[[], Any], what: str = 'the condition') -> None:
+        with self._news:
+            assert self._news.wait_for(condition, TIMEOUT), f'{what} did not come true'
+
+    def poll(self, condition: Callable[[], Any], what: str) -> None:
+        """Wait for something that no message announces, such as a match."""
+        pause = threading.Event()
+        for _ in range(int(TIMEOUT / 0.02)):
+            if condition():
+                return
+            pause.wait(0.02)
+        raise AssertionError(f'{what} did not come true')
+
+    def publisher(self, kind: Any, topic: str, qos: QoSProfile = DEEP) -> Any:
+        publisher = self.node.create_publisher(kind, topic, qos)
+        self.poll(publisher.get_subscription_count, f'a subscriber to {topic}')
+        return publisher
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        client = self.node.create_client(kind, name)
+        assert client.wait_for_service(TIMEOUT), name
+        future = client.call_async(request)
+        done = threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        assert done.wait(TIMEOUT), f'{name} did not answer'
+        self.node.destroy_client(client)
+        return future.result()
+
+    def set_parameters(self, **values: Any) -> list[SetParametersResult]:
+        request = SetParameters.Request(parameters=_messages(values))
+        return self.call(SetParameters, 'thermo_comp/set_parameters', request).results
+
+    def set_atomically(self, **values: Any) -> SetParametersResult:
+        request = SetParametersAtomically.Request(parameters=_messages(values))
+        name = 'thermo_comp/set_parameters_atomically'
+        return self.call(SetParametersAtomically, name, request).result
+
+    def describe(self, *names: str) -> list[Any]:
+        request = DescribeParameters.Request(names=list(names))
+        return self.call(
+            DescribeParameters, 'thermo_comp/describe_parameters', request
+        ).descriptors
+
+
+def _messages(values: dict[str, Any]) -> list[ParameterMessage]:
+    return [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+
+
+class Driver:
+    """
+    Publishes samples and temperatures as a unit's drivers do, and knows what it sent.
+
+    """
+
+    def __init__(
+        self, peer: Peer, kind: Any = Vector3Stamped, topic: str = 'accel/counts'
+    ) -> None:
+        self._peer = peer
+        self._samples = peer.publisher(kind, topic)
+        self._board = peer.publisher(Temperature, 'temperature/board')
+        self._case = peer.publisher(Temperature, 'temperature/case')
+
+    def temperatures(self, stamp_ns: int, board: float, case: float | None = None) -> None:
+        self._board.publish(stamped(Temperature(temperature=board), stamp_ns))
+        if case is not None:
+            self._case.publish(stamped(Temperature(temperature=case), stamp_ns))
+
+    def board_only(self, stamp_ns: int, celsius: float) -> None:
+        self._board.publish(stamped(Temperature(temperature=celsius), stamp_ns))
+
+    def counts(self, stamp_ns: int, x: float, y: float, z: float, frame_id: str = 'imu') -> None:
+        message = stamped(Vector3Stamped(), stamp_ns, frame_id)
+        message.vector.x, message.vector.y, message.vector.z = x, y, z
+        self._samples.publish(message)
+
+    def imu(self, message: Imu) -> None:
+        self._samples.publish(message)
+
+
+@contextlib.contextmanager
+def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
+    """
+    Run the real node in a thread of this process, in a context of its own.
+
+    """
+    context = Context()
+    rclpy.init(args=['--ros-args', *ros_args], context=context)
+    try:
+        node = CompensationNode(context)
+        thread = threading.Thread(target=node.run, daemon=True)
+        thread.start()
+        try:
+            yield node
+        finally:
+            node.stop()
+            thread.join(TIMEOUT)
+            assert not thread.is_alive()
+            node.close()
+    finally:
+        context.try_shutdown()

@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Serialized in, serialized out: always what rclpy would make of the same message, or a fallback.
+
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from geometry_msgs.msg import Vector3Stamped
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Imu, Temperature
+
+from thermo_comp.ros.conversions import SampleConverter, read_temperature
+
+floats = st.floats(allow_nan=True, allow_infinity=True, width=64)
+# A NUL ends the string in CDR, and lone surrogates have no UTF-8.
+frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
+
+
+def process(stamp_ns: int, x: float, y: float, z: float) -> tuple[float, ...]:
+    """Stand in for the compensator: nine values that tell every input from every other."""
+    return (z, x, y, 1.5, 0.25, float(stamp_ns % 1009), 2.5, 0.125, 3.5)
+
+
+def cdr(order: str, stamp: tuple[int, int], frame: str, values: list[float]) -> bytes:
+    """Write a stamped message of float64 values by the book: a second route to the bytes."""
+    name = frame.encode() + b'\0'
+    head = struct.pack(f'{order}iII', *stamp, len(name)) + name
+    head += bytes(-len(head) % 8)
+    return (b'\0\1\0\0' if order == '<' else b'\0\0\0\0') + head + pack(order, values)
+
+
+def pack(order: str, values: list[float]) -> bytes:
+    return struct.pack(f'{order}{len(values)}d', *values)
+
+
+def doubles(data: bytes) -> list[bytes]:
+    """Cut the 37 values of a serialized Imu, as bytes: NaN differs from itself as a float."""
+    body = data[-37 * 8 :]
+    return [body[i : i + 8] for i in range(0, len(body), 8)]
+
+
+def convert(converter: SampleConverter, *messages: bytes) -> list[bytes]:
+    return list(converter.convert(messages, process))
+
+
+@given(
+    order=st.sampled_from('<>'),
+    sec=st.integers(-(2**31), 2**31 - 1),
+    nanosec=st.integers(0, 2**32 - 1),
+    frame=frames,
+    values=st.lists(floats, min_size=3, max_size=3),
+)
+def test_counts_become_an_imu(
+    order: str, sec: int, nanosec: int, frame: str, values: list[float]
+) -> None:
+    converter = SampleConverter(Vector3Stamped)
+    written = convert(converter, *[cdr(order, (sec, nanosec), frame, values)] * 2)
+    assert written[0] == written[1]
+    assert converter.n_fallback == 0
+    imu = deserialize_message(written[0], Imu)
+    assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (sec, nanosec)
+    assert imu.header.frame_id == frame
+    x, y, z = (pack('<', [value]) for value in values)
+    force = process(sec * 10**9 + nanosec, *values)
+    covariance = [force[k] for k in (3, 4, 5, 4, 6, 7, 5, 7, 8)]
+    found = doubles(written[0])
+    assert found[25:28] == [z, x, y]
+    assert b''.join(found[28:]) == pack('<', covariance)
+    # REP 145: what is not measured is marked, and the quaternion is a valid one all the same.
+    assert b''.join(found[:4]) == pack('<', [0.0, 0.0, 0.0, 1.0])
+    assert found[4] == found[16] == pack('<', [-1.0])
+    assert not any(b''.join(found[5:16] + found[17:25]))
+
+
+@given(
+    order=st.sampled_from('<>'),
+    frame=frames,
+    override=st.sampled_from(['', 'other_link']),
+    values=st.lists(floats, min_size=37, max_size=37),
+)
+def test_imu_passes_everything_else_bit_for_bit(
+    order: str, frame: str, override: str, values: list[float]
+) -> None:
+    converter = SampleConverter(Imu, override)
+    (written,) = convert(converter, cdr(order, (5, 7), frame, values))
+    assert converter.n_fallback == 0
+    assert deserialize_message(written, Imu).header.frame_id == (override or frame)
+    assert b''.join(doubles(written)[:25]) == pack('<', values[:25])
+    x, y, z = values[25:28]
+    assert b''.join(doubles(written)[25:28]) == pack('<', [z, x, y])
+
+
+def test_signalling_nan_survives_the_byte_swap() -> None:
+    # A float that passes through a register may come out quiet; these must not pass through one.
+    payload = 0x7FF0_0000_0000_0001
+    values = struct.pack('>37Q', *[payload] * 37)
+    message = cdr('>', (1, 2), 'imu', [])[:] + values
+    converter = SampleConverter(Imu)
+    (written,) = list(converter.convert([message], lambda *_: tuple(map(float, range(9)))))
+    assert converter.n_fallback == 0
+    assert doubles(written)[:25] == [struct.pack('<Q', payload)] * 25
+
+
+def test_frames_of_other_lengths_in_one_stream() -> None:
+    # WHY: two drivers on one topic, or one that changes its frame, move every later byte.
+    converter = SampleConverter(Vector3Stamped)
+    names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
+    written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))
+    read = [deserialize_message(data, Imu) for data in written]
+    assert [imu.header.frame_id for imu in read] == names
+    assert [imu.linear_acceleration.y for imu in read] == list(range(6))
+    assert converter.n_fallback == 0
+
+
+def test_frames_without_end_use_bounded_memory() -> None:
+    converter = SampleConverter(Vector3Stamped)
+    written = convert(converter, *(cdr('<', (1, 0), str(k), [1, 2, 3]) for k in range(300)))
+    assert [deserialize_message(data, Imu).header.frame_id for data in written] == [
+        str(k) for k in range(300)
+    ]
+    assert len(converter._layouts) < 100
+
+
+@pytest.mark.parametrize('kind', [Vector3Stamped, Imu])
+@pytest.mark.parametrize('override', ['', 'other_link'])
+def test_what_no_layout_fits_goes_through_rclpy(kind: Any, override: str) -> None:
+    values = [float(k) for k in range(37 if kind is Imu else 3)]
+    good = cdr('<', (3, 4), 'imu', values)
+    fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
+    # rclpy reads a message with bytes behind its end; the layout, which is exact, does not.
+    (expected,), (found,) = convert(fast, good), convert(slow, good + bytes(8))
+    assert (fast.n_fallback, slow.n_fallback) == (0, 1)
+    assert deserialize_message(found, Imu) == deserialize_message(expected, Imu)
+    assert doubles(found) == doubles(expected)
+    assert slow.last_result == fast.last_result is not None
+    # The stream goes on the fast way.
+    convert(slow, good)
+    assert slow.n_fallback == 1
+
+
+@pytest.mark.parametrize(
+    'bad',
+    [
+        b'',
+        b'\0\1',
+        cdr('<', (1, 2), 'imu', [1.0, 2.0]),
+        b'\0\1\0\0' + b'\xff' * 60,
+        cdr('<', (1, 2), 'imu', [1.0, 2.0, 3.0])[:-1],
+    ],
+)
+def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad: bytes) -> None:
+    converter = SampleConverter(Vector3Stamped)
+    good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
+    written = convert(converter, good, bad, good)
+    assert len(written) == 2
+    assert written[0] == written[1]
+    assert converter.n_malformed == 1
+
+
+def test_dropped_samples_give_nothing() -> None:
+    converter = SampleConverter(Vector3Stamped)
+    good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
+    assert list(converter.convert([good, good + bytes(8)], lambda *_: None)) == []
+    assert converter.last_result is None
+
+
+def test_same_bytes_as_rclpy_writes() -> None:
+    # Regression of the layout against the serialization in use, where padding is not compared.
+    imu = Imu()
+    imu.header.frame_id = 'imu_link'
+    imu.angular_velocity.z = 0.25
+    imu.linear_acceleration.x = math.pi
+    (written,) = convert(SampleConverter(Imu), serialize_message(imu))
+    back = deserialize_message(written, Imu)
+    assert len(written) == len(serialize_message(back))
+    assert back.angular_velocity.z == 0.25
+    assert back.linear_acceleration.y == math.pi
+
+
+def test_temperature() -> None:
+    assert read_temperature(cdr('<', (2, 5), 'board', [21.5, 0.0])) == (2 * 10**9 + 5, 21.5)
+    assert read_temperature(cdr('>', (2, 5), '', [21.5, 0.0])) == (2 * 10**9 + 5, 21.5)
+    assert read_temperature(serialize_message(Temperature())[:-9]) is None
+    assert read_temperature(b'') is None

@@ -1,0 +1,230 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The one file that leaves rclpy's documented API: these tests fail loudly when rclpy changes.
+
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+import rclpy
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.context import Context
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from ros_helpers import DEEP, TIMEOUT, Peer
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from thermo_comp.ros.waitloop import (
+    OTHERS_PERIOD_NS,
+    RawPublisher,
+    RCLError,
+    WaitLoop,
+    undeclared_overrides,
+)
+
+
+@pytest.fixture
+def node() -> Iterator[Node]:
+    context = Context()
+    rclpy.init(args=['--ros-args', '-p', 'mispelt:=1', '-p', 'known:=2'], context=context)
+    node = rclpy.create_node('looped', context=context)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+class Running:
+    """A loop in a thread; keeps what its raw subscription brings."""
+
+    def __init__(self, node: Node) -> None:
+        self.loop = WaitLoop(node)
+        self.raw = self.loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=2000))
+        self.messages: list[bytes] = []
+        self.received_ns: list[int] = []
+        self.news = threading.Condition()
+        self.thread = threading.Thread(target=self.loop.run, args=(self.take,), daemon=True)
+
+    def take(self) -> None:
+        messages, received_ns = self.raw.drain()
+        with self.news:
+            self.messages += messages
+            self.received_ns += received_ns
+            self.news.notify_all()
+
+    def wait_for(self, condition: Any) -> None:
+        with self.news:
+            assert self.news.wait_for(condition, TIMEOUT)
+
+    def __enter__(self) -> Running:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.loop.stop()
+        self.thread.join(TIMEOUT)
+        assert not self.thread.is_alive()
+        self.loop.close()
+
+
+def test_rclpy_still_has_what_is_used_beyond_its_documented_api() -> None:
+    methods = {
+        'WaitSet': (
+            'clear_entities',
+            'add_subscription',
+            'add_guard_condition',
+            'add_timer',
+            'add_client',
+            'add_service',
+            'wait',
+            'is_ready',
+            'get_ready_entities',
+        ),
+        'Subscription': ('take_message', 'pointer'),
+        'Publisher': ('publish_raw',),
+    }
+    for kind, names in methods.items():
+        missing = [n for n in names if not hasattr(getattr(rclpy_implementation, kind), n)]
+        assert not missing, f'rclpy._rclpy.{kind} has lost {missing}'
+    assert issubclass(rclpy_implementation.RCLError, RuntimeError)
+    assert issubclass(RCLError, Exception)
+
+
+def test_overrides_that_no_parameter_takes_are_named(node: Node) -> None:
+    node.declare_parameter('known', 1)
+    assert undeclared_overrides(node) == ['mispelt']
+
+
+def test_messages_come_serialized_in_order_with_their_time(node: Node, peer: Peer) -> None:
+    with Running(node) as running:
+        publisher = peer.publisher(Vector3Stamped, 'samples')
+        for k in range(500):
+            message = Vector3Stamped()
+            message.vector.x = float(k)
+            publisher.publish(message)
+        running.wait_for(lambda: len(running.messages) == 500)
+    values = [deserialize_message(data, Vector3Stamped).vector.x for data in running.messages]
+    assert values == [float(k) for k in range(500)]
+    # The times order what comes on several subscriptions, so they must be there and rise.
+    assert running.received_ns == sorted(running.received_ns)
+    assert running.received_ns[0] > 0
+
+
+def test_one_drain_takes_what_waits_and_leaves_nothing(node: Node, peer: Peer) -> None:
+    loop = WaitLoop(node)
+    raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=2000))
+    publisher = peer.publisher(Vector3Stamped, 'samples')
+    for _ in range(100):
+        publisher.publish(Vector3Stamped())
+    taken: list[bytes] = []
+    peer.poll(lambda: taken.extend(raw.drain()[0]) or len(taken) == 100, '100 messages')
+    assert raw.drain() == ([], [])
+    loop.close()
+
+
+def test_raw_publisher_sends_the_bytes(node: Node, peer: Peer) -> None:
+    heard = peer.listen(Vector3Stamped, 'copies', raw=True)
+    publisher = node.create_publisher(Vector3Stamped, 'copies', DEEP)
+    peer.poll(publisher.get_subscription_count, 'the match')
+    data = serialize_message(Vector3Stamped())
+    RawPublisher(publisher).publish(data)
+    peer.wait_for(lambda: heard)
+    assert heard[0] == data
+
+
+def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Peer) -> None:
+    ticks: list[int] = []
+    heard: list[bool] = []
+    running = Running(node)
+    node.create_timer(0.01, lambda: ticks.append(len(running.messages)))
+    node.create_subscription(Bool, 'ordinary', lambda m: heard.append(m.data), 10)
+    node.create_service(Trigger, 'ask', lambda _, answer: answer)
+    with running:
+        publisher = peer.publisher(Vector3Stamped, 'samples')
+        ordinary = peer.publisher(Bool, 'ordinary')
+        stop = threading.Event()
+
+        def flood() -> None:
+            while not stop.wait(0.0005):
+                publisher.publish(Vector3Stamped())
+
+        flooding = threading.Thread(target=flood, daemon=True)
+        flooding.start()
+        try:
+            ordinary.publish(Bool(data=True))
+            peer.call(Trigger, 'ask', Trigger.Request())
+            running.wait_for(lambda: len(ticks) > 3 and heard and len(running.messages) > 100)
+        finally:
+            stop.set()
+            flooding.join(TIMEOUT)
+    assert OTHERS_PERIOD_NS <= 50_000_000
+
+
+def test_raw_subscriptions_are_never_the_executors(node: Node, peer: Peer) -> None:
+    # The executor would take a message, and the sample would be lost.
+    node.create_timer(0.001, lambda: None)
+    with Running(node) as running:
+        publisher = peer.publisher(Vector3Stamped, 'samples')
+        for _ in range(300):
+            publisher.publish(Vector3Stamped())
+        running.wait_for(lambda: len(running.messages) == 300)
+
+
+def test_stops_from_another_thread_and_at_shutdown(node: Node) -> None:
+    with Running(node) as running:
+        running.loop.stop()
+        running.thread.join(TIMEOUT)
+        assert not running.thread.is_alive()
+
+
+def test_stops_when_the_context_is_shut_down(node: Node) -> None:
+    with Running(node) as running:
+        node.context.shutdown()
+        running.thread.join(TIMEOUT)
+        assert not running.thread.is_alive()
+
+
+def test_a_subscription_can_go_while_the_loop_runs(node: Node, peer: Peer) -> None:
+    running = Running(node)
+    other = running.loop.subscribe(Vector3Stamped, 'others', DEEP)
+
+    def drop(_: Any, answer: Any) -> Any:
+        running.loop.unsubscribe(other)
+        return answer
+
+    node.create_service(Trigger, 'drop', drop)
+    with running:
+        publisher = peer.publisher(Vector3Stamped, 'samples')
+        publisher.publish(Vector3Stamped())
+        peer.call(Trigger, 'drop', Trigger.Request())
+        publisher.publish(Vector3Stamped())
+        running.wait_for(lambda: len(running.messages) == 2)
+    assert all(one.topic != 'others' for one in node.subscriptions)
+
+
+def test_quality_of_service_is_open_to_overrides(node: Node) -> None:
+    loop = WaitLoop(node)
+    loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=7))
+    depth = node.get_parameter('qos_overrides./samples.subscription.depth')
+    assert depth.value == 7
+    reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')
+    assert ReliabilityPolicy[reliability.value.upper()] is ReliabilityPolicy.RELIABLE
+    loop.close()
