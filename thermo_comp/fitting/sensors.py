@@ -242,4 +242,6 @@ def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
     noise = float(np.median([one.rate_sd for one in courses]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
-    return float(np.clip(clean * lag_s, *_RIPPLE_RANGE_C))
+    # A ripple within the noise of the rates is not seen: then the usual one may be there.
+    hidden = min(usual, 3.0 * noise * lag_s)
+    return float(np.clip(max(clean * lag_s, hidden), *_RIPPLE_RANGE_C))
