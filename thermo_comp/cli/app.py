@@ -17,7 +17,7 @@ import typer
 
 from .. import __version__
 from ..errors import ThermoCompError
-from . import convert, evaluate, fit, info, output, play, replay, report, simulate, view
+from . import convert, demo, evaluate, fit, info, output, play, replay, report, simulate, view
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
@@ -63,6 +63,7 @@ app.command()(report.report)
 app.command()(view.view)
 app.command()(convert.convert)
 app.command()(simulate.simulate)
+app.command()(demo.demo)
 
 
 def main(arguments: list[str] | None = None) -> None:

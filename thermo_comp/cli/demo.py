@@ -1,0 +1,295 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp demo``: the main job on the sample bags, end to end, over real DDS.
+
+Fit on nine bags; the tenth is played onto live topics, compensated by the node in a process of
+its own, and recorded from its output. What comes out is held against the offline run, bit for
+bit, and against gravity.
+
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..errors import ThermoCompError
+from . import options
+from .output import Cell, Output, micro_g
+from .play import require_ros
+
+if TYPE_CHECKING:
+    from ..calibration import Calibration
+    from ..evaluation import Evaluation
+
+_GRAVITY = 9.80665
+_NAMESPACE = '/thermo_comp_demo'
+_SAMPLES, _OUTPUT = 'accel/counts', 'imu/data_raw'
+_PATIENCE_S = 30.0
+# Two hours in eight seconds.
+_RATE = 1000.0
+_DEPTH = 20_000
+
+# Column headings and the models behind them: one set for all temperatures; the paper's two sets
+# (static linear, dynamic quadratic); what the fit chooses, which is what the node runs.
+_MODELS = {'one set': 'quadratic', 'two sets': 'golovach', 'node': 'auto'}
+
+
+@dataclass(frozen=True)
+class _Played:
+    """
+    What went through the node.
+
+    """
+
+    n_in: int
+    n_out: int
+    n_flags: int
+    wall_s: float
+    bag_s: float
+
+
+def demo(
+    bags: Annotated[
+        Path | None, typer.Option(help='Folder of the sample bags.', metavar='DIR')
+    ] = None,
+    output: Annotated[
+        Path, typer.Option('--out', '-o', help='Folder for what the demo makes.', metavar='DIR')
+    ] = Path('out'),
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Run the main job on the sample bags: fit, play, compensate, compare.
+
+    The bag that the fit has not seen goes through the real path: player,
+    DDS, the node in a process of its own, DDS, recorder.
+
+    Example:
+      thermo_comp demo --out out
+
+    """
+    require_ros()
+    out = Output(as_json, quiet)
+    folder = _sample_bags(bags)
+    output.mkdir(parents=True, exist_ok=True)
+    held_out, recorded = folder / 'held_out.mcap', output / 'out.mcap'
+    fit_bags = sorted((folder / 'fit').glob('*.mcap'))
+
+    calibrations = _fit(out, fit_bags, output)
+    out.line(f'fitted {output / "unit.yaml"} from {len(fit_bags)} bags of {folder / "fit"}')
+    with out.progress('playing', total=1.0) as done:
+        played = _play(held_out, output / 'unit.yaml', recorded, output / 'node.log', done)
+    out.line(
+        f'played {held_out} through the node: {played.bag_s / 60.0:.0f} min in '
+        f'{played.wall_s:.1f} s, {played.bag_s / played.wall_s:.0f} times real time'
+    )
+    out.line(
+        f'messages in {played.n_in}, messages out {played.n_out}; '
+        f'regime flags {played.n_flags}; recorded {recorded}'
+    )
+    is_same = _equals_offline(recorded, held_out, calibrations['node'])
+    out.line(f'node = offline replay, bit for bit: {"yes" if is_same else "NO"}')
+    result = _judge(held_out, calibrations)
+    out.line()
+    _say(out, result, calibrations['node'].provenance.model)
+    with out.progress('drawing'):
+        page, figure = _draw(held_out, calibrations['node'], output)
+    out.line(f'\nfigure {figure}, certificate {page}')
+    out.json(
+        {
+            'messages_in': played.n_in,
+            'messages_out': played.n_out,
+            'is_equal_to_offline': is_same,
+            'bag_s': played.bag_s,
+            'wall_s': played.wall_s,
+            'statistics_m_s2': result.statistics,
+            'recorded': recorded,
+            'figure': figure,
+        }
+    )
+    if not is_same or played.n_out != played.n_in:
+        raise ThermoCompError('the node lost messages or differs from the offline replay')
+
+
+def _sample_bags(given: Path | None) -> Path:
+    """
+    Find the sample bags: where the user says, here, or in the source tree.
+
+    """
+    places = [given] if given else [Path('bags'), Path(__file__).parents[2] / 'bags']
+    for place in places:
+        if (place / 'held_out.mcap').is_file():
+            return place
+    raise ThermoCompError(
+        f'no sample bags in {places[0]}: run it in a clone of the repository, or give --bags'
+    )
+
+
+def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
+    """
+    Fit the three calibrations that are compared, and write the one for the node.
+
+    """
+    from ..calibration_file import save_calibration
+    from ..fit_sources import fit_sources
+    from ..fitting import FitOptions, fit
+
+    sources, _ = fit_sources(bags)
+    calibrations = {}
+    with out.progress('fitting', total=len(_MODELS)) as done:
+        for before, (name, model) in enumerate(_MODELS.items()):
+            result = fit(sources, FitOptions(gravity=_GRAVITY, model=model))
+            calibrations[name] = result.calibration
+            done(before + 1)
+    for name, file in (('node', 'unit.yaml'), ('one set', 'one_set.yaml')):
+        save_calibration(calibrations[name], output / file)
+    return calibrations
+
+
+def _play(
+    bag: Path, calibration: Path, recorded: Path, log: Path, done: Callable[[float], None]
+) -> _Played:
+    """
+    Send the bag through the node and record what comes out.
+
+    """
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    from ..recording import inspect_recording
+    from ..ros.player import play
+    from ..ros.recorder import Recorder
+
+    info = inspect_recording(bag)
+    ros_args = ['-r', f'__ns:={_NAMESPACE}']
+    with (
+        Recorder(recorded, ros_args=ros_args, overwrite=True) as recorder,
+        _node(calibration, log) as node,
+    ):
+        if not recorder.wait_for_publishers(_PATIENCE_S):
+            raise ThermoCompError(f'the node did not start{_last_words(node, log)}')
+        report = play(bag, rate=_RATE, ros_args=ros_args, progress=done)
+        n_in = report.n_messages[f'{_NAMESPACE}/{_SAMPLES}']
+        recorder.wait_until(lambda counts: counts[_OUTPUT] >= n_in, _PATIENCE_S)
+        counts = recorder.counts
+    return _Played(
+        n_in=n_in,
+        n_out=counts[_OUTPUT],
+        n_flags=counts['regime/dynamic'],
+        wall_s=report.duration_s,
+        bag_s=(info.end_ns - info.start_ns) * 1e-9,
+    )
+
+
+@contextmanager
+def _node(calibration: Path, log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """
+    Run the node in a process of its own, as its console script would.
+
+    """
+    command = [
+        *(sys.executable, '-c', 'from thermo_comp.ros.node import main; raise SystemExit(main())'),
+        *('--ros-args', '-r', f'__ns:={_NAMESPACE}', '-p', f'calibration_file:={calibration}'),
+    ]
+    # A sensor's samples are best effort and come at the sensor's pace. These come a thousand times
+    # faster, and none may be lost: reliable, and with room for all of them in every queue.
+    for topic, end in (
+        (_SAMPLES, 'subscription'),
+        ('temperature/board', 'subscription'),
+        ('temperature/case', 'subscription'),
+        (_OUTPUT, 'publisher'),
+    ):
+        policies = f'qos_overrides.{_NAMESPACE}/{topic}.{end}'
+        command += ['-p', f'{policies}.depth:={_DEPTH}', '-p', f'{policies}.reliability:=reliable']
+    with log.open('wb') as file:
+        process = subprocess.Popen(  # noqa: S603  our own interpreter and words
+            command, stdout=file, stderr=subprocess.STDOUT
+        )
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout=_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+def _last_words(node: subprocess.Popen[bytes], log: Path) -> str:
+    if node.poll() is None:
+        return f' within {_PATIENCE_S:g} s'
+    lines = log.read_text(errors='replace').strip().splitlines()
+    return f': {lines[-1]}' if lines else ''
+
+
+def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool:
+    """
+    Compare the node's recorded output with the offline run, bit for bit.
+
+    """
+    import numpy as np
+
+    from ..compensator import Compensator
+    from ..recording import Topics, open_recording, read_recording
+    from ..replay import corrected_blocks
+
+    live = read_recording(recorded, Topics(imu=_OUTPUT), 'imu', require=['accel']).columns
+    with open_recording(bag) as reader:
+        items = [
+            item.corrected for item in corrected_blocks(Compensator(calibration), reader.blocks())
+        ]
+    return (
+        live.imu is not None
+        and np.array_equal(np.concatenate([i.stamp_ns for i in items]), live.accel_stamp_ns)
+        and np.array_equal(np.concatenate([i.specific_force for i in items]), live.accel)
+        and np.array_equal(
+            np.concatenate([i.covariance for i in items]), live.imu.linear_acceleration_covariance
+        )
+    )
+
+
+def _judge(bag: Path, calibrations: dict[str, Calibration]) -> Evaluation:
+    from ..evaluation import evaluate
+
+    judged = ['node', *(name for name in calibrations if name != 'node')]
+    return evaluate(bag, [(name, calibrations[name]) for name in judged], gravity=_GRAVITY)
+
+
+def _say(out: Output, result: Evaluation, model: str) -> None:
+    from ..evaluation import RAW
+
+    columns = [RAW, *_MODELS]
+    rows: list[tuple[Cell, ...]] = []
+    for section in ('static', 'dynamic', 'all'):
+        statistics = [result.statistics[name][section].micro_g for name in columns]
+        cells = [f'{micro_g(one.rms):>4} / {micro_g(one.peak):>4}' for one in statistics]
+        rows.append((section, statistics[0].n, *cells))
+    out.table(
+        ('section', 'windows', *columns),
+        rows,
+        title=f'|g| error in ug over {result.window_s:g} s, RMS / max',
+    )
+    out.line('one set: one quadratic for all; two sets: static linear, dynamic quadratic, as in')
+    out.line(f'the paper; node: the two sets that the fit chose on held-out sections, {model}')
+
+
+def _draw(bag: Path, calibration: Calibration, output: Path) -> tuple[Path, Path]:
+    """
+    Write the certificate and its figures; return the page and the figure of |g|.
+
+    """
+    from ..report import evidence_of_bags, open_bag, write_report
+
+    page, figures = output / 'report.html', output / 'figures'
+    evidence = evidence_of_bags([open_bag(bag)], calibration, gravity=_GRAVITY)
+    write_report(evidence, page, figures=figures)
+    return page, next(figures.glob('*gravity.png'))
