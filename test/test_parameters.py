@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+One table gives the parameters their types, ranges, checks and documentation.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import FrozenInstanceError, fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from thermo_comp.ros import parameters
+from thermo_comp.ros.node import CompensationNode
+from thermo_comp.ros.parameters import NodeConfig, ParameterError
+from thermo_comp.status import CompensatorConfig
+
+
+@contextmanager
+def bare_node(*overrides: str) -> Iterator[Node]:
+    args = [word for override in overrides for word in ('-p', override)]
+    context = Context()
+    rclpy.init(args=['--ros-args', *args], context=context)
+    node = rclpy.create_node('thermo_comp', context=context)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
+def test_defaults_are_the_compensators() -> None:
+    with bare_node() as node:
+        config = parameters.declare(node)
+    assert config == NodeConfig()
+    assert config.compensator_config() == CompensatorConfig()
+
+
+def test_the_snapshot_is_frozen() -> None:
+    with pytest.raises(FrozenInstanceError):
+        NodeConfig().serial = 'other'  # type: ignore[misc]
+
+
+def test_every_parameter_is_described() -> None:
+    with bare_node() as node:
+        parameters.declare(node)
+        for entry in fields(NodeConfig):
+            found = node.describe_parameter(entry.name)
+            assert found.description == entry.metadata['description']
+            assert not found.read_only
+            is_number = isinstance(entry.default, float)
+            kind = Parameter.Type.DOUBLE if is_number else Parameter.Type.STRING
+            assert found.type == kind.value
+            assert bool(found.floating_point_range) == is_number
+    assert parameters.descriptor('input').additional_constraints == 'one of: counts, imu'
+
+
+def test_overrides_arrive_and_whole_numbers_are_numbers() -> None:
+    # WHY: rclpy refuses `-p transition_time:=5` for a float parameter, with a traceback.
+    with bare_node('transition_time:=5', 'serial:=unit42', 'case_timeout:=2.5') as node:
+        config = parameters.declare(node)
+        assert node.get_parameter('transition_time').value == 5.0
+    assert config == NodeConfig(transition_time=5.0, serial='unit42', case_timeout=2.5)
+    assert isinstance(config.transition_time, float)
+
+
+@pytest.mark.parametrize(
+    ('override', 'text'),
+    [
+        (
+            'transition_time:=-1.0',
+            'parameter `transition_time` must be between 0 and 3600, got -1',
+        ),
+        ('transition_time:=fast', "parameter `transition_time` must be a number, got 'fast'"),
+        ('transition_time:=true', 'parameter `transition_time` must be a number, got True'),
+        ('transition_time:=.nan', 'parameter `transition_time` must be between 0 and 3600'),
+        ('temperature_timeout:=0', 'parameter `temperature_timeout` must be between 0.1'),
+        ('input:=both', "parameter `input` must be one of counts, imu, got 'both'"),
+        # A serial that looks like a number would lose its zeros; the user is told to quote it.
+        ('serial:=0042', 'parameter `serial` must be a string, got .*quote it'),
+    ],
+)
+def test_a_bad_override_is_refused_with_its_name_rule_and_value(override: str, text: str) -> None:
+    with bare_node(override) as node, pytest.raises(ParameterError, match=text):
+        parameters.declare(node)
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'text'),
+    [
+        ('diagnostics_period', 0.0, 'must be between 0.01 and 60, got 0'),
+        ('frame_id', 3, 'must be a string, got 3'),
+        ('input', 'gyro', 'must be one of counts, imu'),
+    ],
+)
+def test_an_update_is_refused_as_a_whole(name: str, value: Any, text: str) -> None:
+    changes = [Parameter('serial', value='other'), Parameter(name, value=value)]
+    with pytest.raises(ParameterError, match=text):
+        parameters.updated(NodeConfig(), changes)
+
+
+def test_an_update_passes_over_parameters_of_others() -> None:
+    changes = [Parameter('use_sim_time', value=True), Parameter('frame_id', value='imu_link')]
+    assert parameters.updated(NodeConfig(), changes) == NodeConfig(frame_id='imu_link')
+
+
+def test_only_whole_numbers_for_float_parameters_are_turned_into_floats() -> None:
+    changes = [
+        Parameter('transition_time', value=5),
+        Parameter('serial', value=5),
+        Parameter('use_sim_time', value=True),
+        Parameter('unknown', value=5),
+    ]
+    found = parameters.coerce(changes)
+    assert [one.value for one in found] == [5.0, 5, True, 5]
+    assert [one.type_ for one in found] == [
+        Parameter.Type.DOUBLE,
+        Parameter.Type.INTEGER,
+        Parameter.Type.BOOL,
+        Parameter.Type.INTEGER,
+    ]
+
+
+def test_table_and_help_name_every_parameter() -> None:
+    table, text = parameters.parameters_table(), parameters.parameters_help()
+    for entry in fields(NodeConfig):
+        assert f'| `{entry.name}` |' in table
+        assert f'  {entry.name}:=' in text
+    assert table.count('\n') == 2 + len(fields(NodeConfig))
+
+
+def test_pages_hold_the_generated_table(root: Path) -> None:
+    table = parameters.parameters_table()
+    header = table.splitlines()[0]
+    pages = [root / 'README.md', *(root / 'docs').rglob('*.md')]
+    shown = [page for page in pages if header in page.read_text(encoding='utf-8')]
+    if not shown:
+        pytest.skip('no page shows the parameters')
+    for page in shown:
+        assert table in page.read_text(encoding='utf-8'), page
+
+
+def test_the_parameter_file_states_the_defaults(root: Path) -> None:
+    text = (root / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
+    # The QoS section stands in comments: names that are remapped would be overrides of nothing.
+    before, overrides_text = text.split('    # These are the defaults:\n    #\n')
+    stated = yaml.safe_load(before)['/**']['ros__parameters']
+    expected = {entry.name: entry.default for entry in fields(NodeConfig)}
+    del expected['calibration_file'], stated['calibration_file']
+    assert stated == expected
+    overrides = yaml.safe_load(overrides_text.replace('    # ', ''))['qos_overrides']
+    calibration = root / 'config' / 'calibration.example.yaml'
+    context = Context()
+    rclpy.init(args=['--ros-args', '-p', f'calibration_file:={calibration}'], context=context)
+    node = CompensationNode(context)
+    for topic, sides in overrides.items():
+        for side, policies in sides.items():
+            for policy, value in policies.items():
+                name = f'qos_overrides.{topic}.{side}.{policy}'
+                assert node.node.get_parameter(name).value == value, name
+    node.close()
+    context.try_shutdown()
