@@ -18,7 +18,7 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -29,9 +29,12 @@ from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.metrics import norm_residual, residual_statistics
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
+    DriftModel,
+    PartEffect,
     UnitModel,
     cyclogram_preset,
     positions,
+    simulate,
     simulate_blocks,
     unit_preset,
 )
@@ -61,13 +64,25 @@ class SimulatedBlock:
 
 
 def blocks(
-    unit: UnitModel, program: str, up: Array, seed: int, rate_hz: float
+    unit: UnitModel,
+    program: str,
+    up: Array,
+    seed: int,
+    rate_hz: float,
+    temperature_rate_hz: float | None = None,
 ) -> Iterator[SimulatedBlock]:
     """
     Stream one simulated bag.
 
     """
-    for run in simulate_blocks(unit, cyclogram_preset(program), up, rate_hz=rate_hz, seed=seed):
+    for run in simulate_blocks(
+        unit,
+        cyclogram_preset(program),
+        up,
+        rate_hz=rate_hz,
+        temperature_rate_hz=temperature_rate_hz,
+        seed=seed,
+    ):
         yield SimulatedBlock(
             run.accel_stamp_ns,
             run.counts.astype(np.float64),
@@ -194,24 +209,169 @@ def part_held_out(options: argparse.Namespace) -> None:
                 )
 
 
+def exact_unit(seed: int) -> UnitModel:
+    """
+    Make a unit whose drift is a quadratic of the board's temperature, and nothing else.
+
+    """
+    rng = np.random.default_rng(seed)
+
+    def axes(sd: float) -> tuple[float, float, float]:
+        x, y, z = rng.normal(0.0, sd, 3)
+        return float(x), float(y), float(z)
+
+    drift = PartEffect(
+        'board', bias=axes(5.0), bias_curvature=axes(0.05), scale=axes(40.0),
+        scale_curvature=axes(0.2),
+    )  # fmt: skip
+    return replace(unit_preset('thermostatted', seed), drift=DriftModel(parts=(drift,)))
+
+
+def bound(unit: UnitModel, program: str, directions: Array, window_s: float) -> Array:
+    """
+    Cramer-Rao bound of bias [counts] and ln K at the reference, shape (2, 3), as sd.
+
+    Written on its own: window means of counts with white noise, unknown attitudes (two angles
+    each), M, and a quadratic of the true board temperature per axis; differentiated numerically.
+
+    """
+    run = simulate(unit, cyclogram_preset(program), directions[0], rate_hz=1.0)
+    truth = run.truth
+    time_s = np.arange(window_s / 2.0, truth.grid_s[-1], window_s)
+    t = np.interp(time_s, truth.grid_s, truth.temperature('board')) - 20.0
+    powers = np.column_stack((np.ones_like(t), t, t * t))
+    K = np.array(unit.scale_factor)
+    sd = np.array(unit.noise_density) * 1e-6 * STANDARD_GRAVITY * K / np.sqrt(window_s)
+    n = len(directions)
+    effect = unit.drift.parts[0]
+    micro = 1e-6 * STANDARD_GRAVITY * K
+    start = np.concatenate(
+        (
+            np.column_stack((unit.bias_at_reference, effect.bias * micro,
+                             effect.bias_curvature * micro)).ravel(),
+            np.column_stack((np.ones(3), np.array(effect.scale) * 1e-6,
+                             np.array(effect.scale_curvature) * 1e-6)).ravel(),
+            np.linalg.inv(unit.M)[[1, 2, 2], [0, 0, 1]],
+            np.zeros(2 * n),
+        )
+    )  # fmt: skip
+    across = [np.linalg.svd(u[None])[2][1:] for u in directions]
+
+    def predicted(p: Array) -> Array:
+        A = np.eye(3)
+        A[1, 0], A[2, 0], A[2, 1] = p[18:21]
+        angles = p[21:].reshape(n, 2)
+        up = np.array([u + a @ e for u, a, e in zip(directions, angles, across, strict=True)])
+        force = STANDARD_GRAVITY * (up / np.linalg.norm(up, axis=1, keepdims=True)) @ A.T
+        bias = powers @ p[:9].reshape(3, 3).T
+        scale = K * (powers @ p[9:18].reshape(3, 3).T)
+        return ((bias + force[:, None, :] * scale) / sd).ravel()
+
+    columns = []
+    for j in range(len(start)):
+        # Steps of the size that the data could just tell, from the signal itself.
+        step = np.zeros(len(start))
+        step[j] = 1e-6 if j >= 9 else 1e-3
+        step[j] *= 1e-3 if j < 18 and j % 3 == 2 else 1e-1 if j < 18 and j % 3 == 1 else 1.0
+        columns.append((predicted(start + step) - predicted(start - step)) / (2.0 * step[j]))
+    jacobian = np.column_stack(columns)
+    norm = np.linalg.norm(jacobian, axis=0)
+    covariance = np.linalg.inv((jacobian / norm).T @ (jacobian / norm)) / np.outer(norm, norm)
+    sds = np.sqrt(np.diag(covariance))
+    return np.array([sds[0:9:3], sds[9:18:3]])
+
+
+def part_efficiency(options: argparse.Namespace) -> None:
+    """
+    Bias and scale at the reference against the Cramer-Rao bound.
+
+    """
+    print('| positions | units | bias: RMS error / bound | scale | 95 % intervals, bias | scale |')
+    print('|---|---|---|---|---|---|')
+    for n_positions in (18, 24):
+        ratios: list[Array] = []
+        claimed: list[Array] = []
+        for seed in range(1, options.units + 1):
+            unit = exact_unit(seed)
+            up = positions(n_positions, seed)
+            sources = [
+                FitSource(
+                    f'position-{number}',
+                    lambda unit=unit, one=one, number=number, seed=seed: blocks(
+                        unit, 'demo', one, 1000 * seed + number, 25.0, 0.5
+                    ),
+                )
+                for number, one in enumerate(up)
+            ]
+            settings = FitOptions(gravity=STANDARD_GRAVITY, model='quadratic')
+            calibration = fit(sources, settings).calibration
+            axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+            bias = np.array([axis.bias for axis in axes]) - unit.bias_at_reference
+            scale = np.log(np.array([axis.scale_factor for axis in axes]) / unit.scale_factor)
+            errors = np.array([bias, scale])
+            ratios.append(errors / bound(unit, 'demo', up, 60.0))
+            sets = calibration.static.axes()
+            at = sets[0].n_bias_parameters
+            sd = [[one.covariance[k][k] ** 0.5 for one in sets] for k in (0, at)]
+            claimed.append(errors / np.array(sd))
+        ratio = np.sqrt(np.mean(np.square(ratios), axis=(0, 2)))
+        inside = np.mean(np.abs(claimed) < 1.96, axis=(0, 2))
+        print(
+            f'| {n_positions} | {options.units} | {ratio[0]:.3f} | {ratio[1]:.3f} '
+            f'| {100 * inside[0]:.1f} % | {100 * inside[1]:.1f} % |',
+            flush=True,
+        )
+
+
+def part_restraint(options: argparse.Namespace) -> None:
+    """
+    Units without thermal memory: the chosen model against the true one.
+
+    """
+    print('| unit | seed | chosen | vector RMS, chosen | true model | ratio |')
+    print('|---|---|---|---|---|---|')
+    for seed in range(1, options.seeds + 1):
+        for name, unit, model in (
+            ('no drift', unit_preset('thermostatted', seed).without_drift(), 'constant'),
+            ('quadratic of the board', exact_unit(seed), 'quadratic'),
+        ):
+            found = []
+            for wanted in ('auto', model):
+                calibration = fitted(
+                    unit, options.positions, seed, options.rate_hz, wanted
+                ).calibration
+                if wanted == 'auto':
+                    chosen = calibration.provenance.model
+                found.append(held_out(calibration, unit, seed, options.rate_hz).vector_rms)
+            print(
+                f'| {name} | {seed} | {chosen} | {found[0]:.3f} | {found[1]:.3f} '
+                f'| {found[0] / found[1]:.3f} |',
+                flush=True,
+            )
+
+
 def main() -> int:
     """
     Run the parts asked for.
 
     """
-    parts = {'held-out': part_held_out}
+    parts = {
+        'held-out': part_held_out,
+        'restraint': part_restraint,
+        'efficiency': part_efficiency,
+    }
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument('parts', nargs='*', choices=[[], *parts], help='parts; all by default')
+    parser.add_argument('parts', nargs='*', help=f'all by default: {", ".join(parts)}')
     parser.add_argument('--seeds', type=int, default=5)
+    parser.add_argument('--units', type=int, default=100, help='Monte-Carlo units')
     parser.add_argument('--positions', type=int, default=18)
     parser.add_argument('--rate-hz', type=float, default=100.0)
     options = parser.parse_args()
-    for name, part in parts.items():
-        if not options.parts or name in options.parts:
-            print(f'\n### {name}\n')
-            part(options)
+    for name in options.parts or parts:
+        print(f'\n### {name}\n')
+        parts[name](options)
     return 0
 
 
