@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from ..evaluation import Evaluation
 
 _GRAVITY = 9.80665
-_NAMESPACE = '/thermo_comp_demo'
+# Its own, so that a demonstration hears no other one and disturbs no robot.
+_NAMESPACE = f'/thermo_comp_demo_{os.getpid()}'
 _SAMPLES, _OUTPUT = 'accel/counts', 'imu/data_raw'
 _PATIENCE_S = 30.0
 # Two hours in eight seconds.
