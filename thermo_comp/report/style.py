@@ -83,6 +83,7 @@ _RC: dict[str, Any] = {
     'text.parse_math': False,
     'text.usetex': False,
     'svg.fonttype': 'none',
+    'svg.hashsalt': 'thermo_comp',
     'path.simplify': True,
 }
 _PNG_DPI = 160

@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the small thermal tests that the report's tests look at: simulated, so that truth is known.
+
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from functools import cache
+from pathlib import Path
+
+from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit
+from thermo_comp.recording import BagWriter
+from thermo_comp.report import Evidence, evidence_of_fit, write_report
+from thermo_comp.simulation import (
+    STANDARD_GRAVITY,
+    SimulatedRun,
+    parse_cyclogram,
+    positions,
+    simulate,
+    unit_preset,
+)
+
+PROGRAM = '15 12min, 30@1.5 14min, 15@1.5 8min'
+RATE_HZ = 5.0
+N_POSITIONS = 9
+
+
+@cache
+def run(position: int = 0) -> SimulatedRun:
+    """
+    Run one position of a thermostatted unit through 54 minutes of ramps and soaks.
+
+    """
+    return simulate(
+        unit_preset('thermostatted', 1),
+        parse_cyclogram(PROGRAM),
+        positions(N_POSITIONS, 0)[position],
+        rate_hz=RATE_HZ,
+        seed=position,
+    )
+
+
+@cache
+def fitted() -> FitResult:
+    """
+    Fit all positions of that unit.
+
+    """
+    sources = []
+    for position in range(N_POSITIONS):
+        one = run(position)
+        block = ArrayBlock(
+            one.accel_stamp_ns,
+            one.counts.astype(float),
+            one.board_stamp_ns,
+            one.board,
+            one.case_stamp_ns,
+            one.case,
+        )
+        sources.append(
+            FitSource(
+                name=f'{position + 1:02d}.mcap',
+                blocks=lambda block=block: [block],
+                sha256=f'{position + 1:064x}',
+                serial='thermostatted-0001',
+            )
+        )
+    return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, model='golovach'))
+
+
+@cache
+def evidence() -> Evidence:
+    """
+    Gather what that fit has to show.
+
+    """
+    return evidence_of_fit(fitted(), program=PROGRAM)
+
+
+@cache
+def certificate() -> str:
+    """
+    Write the page of that fit; drawing takes seconds, so it is done once.
+
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / 'page.html'
+        write_report(evidence(), page)
+        return page.read_text(encoding='utf-8')
+
+
+def write_bag(path: Path, position: int = 0, **metadata: str) -> Path:
+    """
+    Write a position's run as a bag.
+
+    """
+    one = run(position)
+    facts = {
+        'serial': 'thermostatted-0001',
+        'truth': json.dumps({'profile': PROGRAM}),
+        **metadata,
+    }
+    with BagWriter(path, metadata=facts) as writer:
+        writer.write_temperature('temperature/board', one.board_stamp_ns, one.board)
+        writer.write_temperature('temperature/case', one.case_stamp_ns, one.case)
+        writer.write_counts('accel/counts', one.accel_stamp_ns, one.counts, 'imu_link')
+    return path

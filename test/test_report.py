@@ -1,0 +1,354 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Holds the certificate: what it says, that it says it truly, and that it needs and runs nothing.
+
+"""
+
+from __future__ import annotations
+
+import re
+import tracemalloc
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_helpers import PROGRAM, RATE_HZ, certificate, evidence, fitted, run, write_bag
+
+from thermo_comp import __version__
+from thermo_comp.compensator import Compensator
+from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.fitting.reduction import Readings
+from thermo_comp.metrics import MICRO_G
+from thermo_comp.recording import BagWriter
+from thermo_comp.regime import Regime
+from thermo_comp.report import (
+    Evidence,
+    evidence_of_bags,
+    evidence_of_fit,
+    judge,
+    open_bag,
+    write_report,
+)
+from thermo_comp.report.evidence import CHOSEN, ONE_SET, RAW
+from thermo_comp.report.plates import PLATES, png_files
+from thermo_comp.simulation import ideal_regime, parse_cyclogram
+
+VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
+
+
+class Page(HTMLParser):
+    """
+    Reads a page as a browser would: tags, their attributes, text.
+
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.source = text
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ''
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] != 'style':
+            self.text += data
+
+    def names(self) -> set[str]:
+        return {tag for tag, _ in self.tags}
+
+
+def page_of(evidence: Evidence, folder: Path, **keys: object) -> Page:
+    path = folder / 'report.html'
+    write_report(evidence, path, **keys)
+    return Page(path.read_text(encoding='utf-8'))
+
+
+def bare() -> Evidence:
+    """
+    Gather the least that makes a page: a calibration alone.
+
+    """
+    return evidence_of_bags([], fitted().calibration)
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory) -> Path:
+    return write_bag(tmp_path_factory.mktemp('report') / 'held_out.mcap')
+
+
+@pytest.fixture(scope='module')
+def page() -> Page:
+    return Page(certificate())
+
+
+def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
+    assert not page.open  # every tag is closed
+    for fact in (
+        'Unit thermostatted-0001',
+        evidence().calibration.provenance.created,
+        f'thermo_comp {__version__}',
+        '9.80665 m/s²',
+        f'{1:064x}',
+        f'{9:064x}',
+        'golovach (chosen)',
+        'after 600 s, m',
+        '12.7 m per µg',
+    ):
+        assert fact in page.text
+    for plate in PLATES:
+        assert plate.question in page.text
+
+
+def test_page_needs_no_network_and_runs_nothing(page):
+    assert not page.names() & {'script', 'img', 'link', 'iframe', 'object', 'embed', 'form'}
+    for tag, attributes in page.tags:
+        for name, value in attributes.items():
+            assert not name.startswith('on'), f'{tag} {name}'
+            # Only the parts of the page itself are referred to.
+            if name in ('href', 'src', 'xlink:href'):
+                assert value.startswith('#')
+    style = next(a['content'] for t, a in page.tags if t == 'meta' and 'http-equiv' in a)
+    assert "default-src 'none'" in style
+
+
+def test_page_has_each_id_once_and_refers_to_ids_it_has(page):
+    ids = [attributes['id'] for _, attributes in page.tags if 'id' in attributes]
+    assert len(set(ids)) == len(ids)
+    assert set(re.findall(r'(?:url\(|href=")#([^)"]*)', page.source)) <= set(ids)
+
+
+def test_statistics_are_those_of_the_fit():
+    # Second route: the fit's own table, made from its solutions by its own code.
+    for row in fitted().residuals:
+        for rung, theirs in ((RAW, row.raw), (CHOSEN, row.fitted)):
+            ours = evidence().statistics[rung][row.section]
+            assert ours.n == theirs.n
+            assert ours.rms == pytest.approx(theirs.rms, rel=1e-9)
+        # The comparison is fitted anew and ends within its convergence limit.
+        ours = evidence().statistics[ONE_SET][row.section].rms
+        assert ours == pytest.approx(row.one_set.rms, rel=0.02)
+
+
+def test_bag_with_calibration_shows_what_the_compensator_gives(bag):
+    calibration = fitted().calibration
+    found = evidence_of_bags([open_bag(bag)], calibration)
+    one = run(0)
+    compensator = Compensator(calibration)
+    readings = sorted(
+        [(int(s), 0, v) for s, v in zip(one.board_stamp_ns, one.board, strict=True)]
+        + [(int(s), 1, v) for s, v in zip(one.case_stamp_ns, one.case, strict=True)]
+    )
+    force = np.full((len(one.counts), 3), np.nan)
+    for i, (stamp, count) in enumerate(zip(one.accel_stamp_ns, one.counts, strict=True)):
+        while readings and readings[0][0] <= stamp:
+            reading = readings.pop(0)
+            (compensator.push_board, compensator.push_case)[reading[1]](reading[0], reading[2])
+        row = compensator.process(int(stamp), *map(float, count))
+        if row is not None:
+            force[i] = row[:3]
+    windows = found.windows
+    middle = np.rint(windows.time * RATE_HZ).astype(int)
+    inside = (middle > 30) & (middle < len(force) - 30)
+    theirs = np.array([force[m - 25 : m + 25].mean(axis=0) for m in middle[inside]])
+    ours = windows.forces[CHOSEN][inside]
+    # Windows and runs of 50 samples differ by a sample or two at their edges: at 5 Hz that is
+    # some 2 % of the scatter of single counts, 3e-3 m/s^2 each.
+    assert np.abs(ours - theirs).max() < 3e-4
+    assert found.statistics[CHOSEN]['all'].rms < found.statistics[RAW]['all'].rms / 2.0
+
+
+def test_bag_alone_shows_temperatures_derivatives_and_flag(bag, tmp_path):
+    found = evidence_of_bags([open_bag(bag)])
+    shown = found.shown
+    assert shown.cyclogram == parse_cyclogram(PROGRAM)
+    trace, truth = shown.trace, run(0).truth
+    # In the middle of the first ramp the case heats at the chamber's 1.5 K/min or a little less.
+    ramp = (trace.time > 17 * 60) & (trace.time < 21 * 60)
+    assert 1.0 < np.mean(trace.case_rate[ramp]) * 60.0 < 1.6
+    dynamic = np.zeros(len(truth.grid_s), bool)
+    for stretch in trace.stretches:
+        inside = (truth.grid_s >= stretch.start) & (truth.grid_s < stretch.stop)
+        dynamic[inside] = stretch.regime == Regime.DYNAMIC
+    ideal = ideal_regime(run(0), 0.1)
+    known = truth.grid_s > 10 * 60
+    assert np.mean(dynamic[known] == ideal[known]) > 0.9
+    directions = [s.direction for s in trace.stretches if s.direction]
+    assert directions[0] == 1
+    assert directions[-1] == -1
+    page = page_of(found, tmp_path)
+    assert 'no calibration was judged' in page.text
+    assert PLATES[0].question in page.text
+    assert PLATES[1].question in page.text
+    assert PLATES[4].question not in page.text
+
+
+def test_calibration_alone_makes_a_page(tmp_path):
+    page = page_of(bare(), tmp_path)
+    assert 'no recording was judged' in page.text
+    assert '01.mcap' in page.text
+    assert f'{1:064x}' in page.text
+
+
+def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
+    # WHY: a certificate is opened in a browser, and a bag is written by anybody.
+    # WHAT: names, serials, notes and hashes stay text, in the page and in its drawings.
+    evil = '<script>alert("x")</script>'
+    bag = write_bag(tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", serial=evil)
+    calibration = fitted().calibration
+    provenance = replace(
+        calibration.provenance,
+        created=evil,
+        tool_version=evil,
+        model=evil,
+        notes=(evil,),
+        sources=(replace(calibration.provenance.sources[0], name=evil, sha256=evil),),
+    )
+    calibration = replace(
+        calibration, unit=replace(calibration.unit, serial=evil), provenance=provenance
+    )
+    found = evidence_of_bags([open_bag(bag)], calibration)
+    page = page_of(found, tmp_path)
+    assert page.text.count(evil) >= 6
+    assert '$\\frac{.mcap' in page.text
+    assert not page.names() & {'script', 'img'}
+    assert not any(name.startswith('on') for _, attributes in page.tags for name in attributes)
+
+
+@pytest.mark.parametrize('truth', ['', '[', '3', '{"profile": 3}', '{"profile": "rm -rf"}'])
+def test_strange_truth_in_a_bag_is_no_program(tmp_path, truth):
+    found = evidence_of_bags([open_bag(write_bag(tmp_path / 'a.mcap', truth=truth))])
+    assert found.shown.cyclogram is None
+
+
+def test_hours_of_bag_stay_a_small_page(tmp_path):
+    # A day of readings at 2 Hz, and of windows at rest: hundreds of them to a pixel.
+    shown, windows = evidence().shown, evidence().windows
+    time = np.arange(0.0, 86400.0, 0.5)
+    value = 20.0 + 15.0 * np.sin(time / 9000.0) + np.random.default_rng(1).normal(size=len(time))
+    readings = Readings(shown.start_ns + (time * 1e9).astype(np.int64), value, len(time))
+    rows = np.resize(np.arange(len(windows)), 8640)
+    force = {name: part[rows] for name, part in windows.forces.items()}
+    long = replace(
+        evidence(),
+        shown=replace(shown, board=readings, case=readings),
+        bags=tuple(replace(one, duration_s=86400.0) for one in evidence().bags),
+        windows=replace(
+            windows,
+            bag=np.zeros(8640, np.int64),
+            position=np.zeros(8640, np.int64),
+            time=np.arange(8640) * 10.0,
+            mean=windows.mean[rows],
+            board=windows.board[rows],
+            is_dynamic=windows.is_dynamic[rows],
+            forces=force,
+        ),
+    )
+    write_report(long, tmp_path / 'long.html')
+    assert (tmp_path / 'long.html').stat().st_size < 2_000_000
+
+
+def test_bag_is_read_in_bounded_memory(tmp_path):
+    one = run(0)
+    n_times = 20
+    with BagWriter(tmp_path / 'long.mcap') as writer:
+        writer.write_temperature('temperature/board', one.board_stamp_ns, one.board)
+        for k in range(n_times):
+            step = round(k * 1e9 / RATE_HZ / n_times)
+            writer.write_counts('accel/counts', one.accel_stamp_ns + step, one.counts)
+    tracemalloc.start()
+    try:
+        opened = open_bag(tmp_path / 'long.mcap')
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert opened.reduced.n_samples == n_times * len(one.counts)
+    # All columns of this bag would be 32 bytes a sample and more; blocks are a part of that.
+    assert peak < 64 * opened.reduced.n_samples
+
+
+def test_figures_as_png(tmp_path):
+    files = png_files(evidence())
+    assert list(files) == [f'{i}_{plate.name}.png' for i, plate in enumerate(PLATES, 1)]
+    assert all(content.startswith(b'\x89PNG') for content in files.values())
+    folder = tmp_path / 'new' / 'figures'
+    write_report(bare(), tmp_path / 'page.html', figures=folder)
+    assert [path.name for path in folder.iterdir()] == ['1_functions.png']
+
+
+def test_page_is_written_atomically(tmp_path):
+    target = tmp_path / 'page.html'
+    target.write_text('old')
+    with pytest.raises(OSError, match='missing'):
+        write_report(bare(), tmp_path / 'missing' / 'page.html')
+    folder = tmp_path / 'figures'
+    folder.write_text('in the way')
+    with pytest.raises(OSError, match='figures'):
+        write_report(bare(), target, figures=folder)
+    assert target.read_text() == 'old'
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']
+
+
+def test_verdicts(bag):
+    assert judge(evidence()).level in ('good', 'reserved')
+    calibration = fitted().calibration
+    opened = [open_bag(bag)]
+    # A bias wrong by 5 mg on every axis makes |g| worse than no thermal correction at all.
+    axes = calibration.axes
+    wrong = replace(
+        calibration,
+        axes=replace(
+            axes,
+            x=replace(axes.x, bias=axes.x.bias + 5e3 * MICRO_G * axes.x.scale_factor),
+        ),
+    )
+    verdict = judge(evidence_of_bags(opened, wrong))
+    assert verdict.level == 'poor'
+    assert any('another unit' in text for text in verdict.reservations)
+    narrow = {
+        name: replace(getattr(calibration, name), temperature_range_c=(19.0, 22.0))
+        for name in ('static', 'dynamic')
+    }
+    verdict = judge(evidence_of_bags(opened, replace(calibration, **narrow)))
+    assert any('outside the calibrated 19.0 to 22.0' in t for t in verdict.reservations)
+
+
+def test_another_units_calibration_is_refused(bag):
+    calibration = fitted().calibration
+    other = replace(calibration, unit=replace(calibration.unit, serial='other'))
+    with pytest.raises(CalibrationError, match='other'):
+        evidence_of_bags([open_bag(bag)], other)
+    assert evidence_of_bags([open_bag(bag)], other, serial='').serial == 'other'
+
+
+def test_refusals(bag, tmp_path):
+    with pytest.raises(RecordingError, match='no such file'):
+        open_bag(tmp_path / 'none.mcap')
+    with pytest.raises(ValueError, match='cyclogram step 1'):
+        evidence_of_bags([open_bag(bag)], program='warm')
+    with pytest.raises(ValueError, match='cyclogram step 1'):
+        evidence_of_fit(fitted(), program='warm')
+    with pytest.raises(RecordingError, match='no such file'):
+        evidence_of_fit(fitted(), paths=[tmp_path / 'none.mcap'])
+
+
+def test_command(cli, bag, tmp_path):
+    page = tmp_path / 'page.html'
+    shown = cli('report', bag, '-o', page, '--figures', tmp_path)
+    assert 'no calibration was judged' in shown.stdout
+    assert '<svg' in page.read_text()
+    assert (tmp_path / '1_temperatures.png').exists()

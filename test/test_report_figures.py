@@ -1,0 +1,195 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Holds the figures: legible without colour, with units, and true to the numbers behind them.
+
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from builders import axis_set
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.artist import Artist
+from matplotlib.colors import to_rgb
+from matplotlib.patches import StepPatch
+from report_helpers import evidence, run
+
+from thermo_comp.calibration import AxisReference
+from thermo_comp.fitting.reduction import Readings
+from thermo_comp.metrics import MICRO_G
+from thermo_comp.regime import DetectorSettings, Regime
+from thermo_comp.report.decimate import thin
+from thermo_comp.report.figures_residual import draw_gravity, draw_histograms, draw_residuals
+from thermo_comp.report.figures_thermal import draw_dynamics, draw_temperatures
+from thermo_comp.report.figures_unit import (
+    bias_curve,
+    draw_functions,
+    draw_positions,
+    equal_area,
+    scale_curve,
+)
+from thermo_comp.report.inertial import position_error, schuler_peak
+from thermo_comp.report.plates import PLATES
+from thermo_comp.report.style import NARROW, WIDE, drawing, svg
+from thermo_comp.report.trace import thermal_trace
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(1, 20))
+@settings(max_examples=60, deadline=None)
+def test_thinning_loses_no_extreme(values, n_bins):
+    time = np.arange(len(values), dtype=float)
+    value = np.array(values)
+    thin_time, thin_value = thin(time, value, n_bins)
+    assert len(thin_time) <= max(3 * n_bins, 2 * n_bins + 1, 1)
+    assert np.all(np.diff(thin_time) >= 0.0)
+    # Every kept point is one of the series, and the extremes of each stretch are kept.
+    assert np.array_equal(thin_value, value[thin_time.astype(int)])
+    edges = np.linspace(0.0, max(time[-1], 1e-9), n_bins + 1)
+    stretch = np.clip(np.searchsorted(edges, time, side='right') - 1, 0, n_bins - 1)
+    kept = np.clip(np.searchsorted(edges, thin_time, side='right') - 1, 0, n_bins - 1)
+    for number in np.unique(stretch):
+        inside, left = value[stretch == number], thin_value[kept == number]
+        # A point on an edge may fall to either side of it by rounding.
+        if len(left):
+            assert left.max() >= np.sort(inside)[-2:].min() or len(inside) < 3
+    assert thin_value.max() == value.max()
+    assert thin_value.min() == value.min()
+
+
+def test_thinning_keeps_gaps_and_refuses_no_bins():
+    time = np.arange(1000.0)
+    value = np.where((time > 300) & (time < 600), np.nan, time)
+    thin_time, thin_value = thin(time, value, 20)
+    (gap,) = np.flatnonzero(np.isnan(thin_value))
+    assert thin_time[gap - 1] == 300
+    assert thin_time[gap + 1] == 600
+    with pytest.raises(ValueError, match='`n_bins` must be at least 1'):
+        thin(time, value, 0)
+
+
+def test_bias_and_scale_curves_by_hand():
+    # Two counts of level, 0.3 counts/K and 0.01 counts/K^2 at t = 10 K: 3 + 1 counts over delta
+    # 0.5; scale 300 counts per m/s^2. Variances 4, 0.01, 1e-6 give sqrt(4 + 1 + 0.01) counts.
+    rows = []
+    variances = [4.0, 0.01, 1e-6, 0.0, 0.0, 1e-12, 4e-14, 0.0, 0.0]
+    for i, variance in enumerate(variances):
+        rows.append((0.0,) * i + (variance,))
+    one = axis_set((0.0, 0.3, 0.01), (1.0, 7e-5), delta=0.5, covariance=tuple(rows))
+    t = np.array([0.0, 10.0])
+    value, sd = bias_curve(one, AxisReference(300.0, 7.0), t)
+    count = 1.0 / 300.0 / MICRO_G
+    assert value == pytest.approx([0.5 * count, 4.5 * count])
+    assert sd == pytest.approx([2.0 * count, np.sqrt(5.01) * count])
+    value, sd = scale_curve(one, t)
+    assert value == pytest.approx([0.0, 700.0])
+    # sqrt(1e-12 + 100 * 4e-14) is 2.236e-6.
+    assert sd == pytest.approx([1.0, np.sqrt(5.0)])
+    # A negative scale factor turns the sign of what a bias in counts means.
+    turned, _ = bias_curve(one, AxisReference(-300.0, 7.0), t)
+    assert turned == pytest.approx([-0.5 * count, -4.5 * count])
+    assert bias_curve(axis_set((0.0, 0.3)), AxisReference(300.0, 7.0), t)[1] is None
+
+
+def test_metres_of_a_navigator_by_hand():
+    # 1 mg for 60 s: 9.80665e-3 * 1800 m; one micro-g at Schuler's frequency: 2 R 1e-6.
+    assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
+    assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
+
+
+def test_map_of_the_sphere_keeps_areas():
+    assert equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
+    assert equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
+    # The cap above 45 degrees is 1 - sin 45 of a hemisphere, so is its disc of the unit disc.
+    x, y = equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
+    assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
+
+
+def test_trace_covers_the_bag_without_a_gap():
+    one = run(0)
+    board = Readings(one.board_stamp_ns, one.board, len(one.board))
+    case = Readings(one.case_stamp_ns, one.case, len(one.case))
+    span = int(one.accel_stamp_ns[0]), int(one.accel_stamp_ns[-1])
+    trace, _ = thermal_trace(board, case, span, DetectorSettings())
+    stretches = trace.stretches
+    assert stretches[0].regime == Regime.UNKNOWN
+    assert stretches[0].start == 0.0
+    assert stretches[-1].stop == pytest.approx((span[1] - span[0]) * 1e-9)
+    for before, after in pairwise(stretches):
+        assert before.stop == after.start
+        assert (before.regime, before.direction) != (after.regime, after.direction)
+
+
+def test_trace_without_a_case_sensor_follows_the_board():
+    one = run(0)
+    board = Readings(one.board_stamp_ns, one.board, len(one.board))
+    none = Readings(one.case_stamp_ns[:0], one.case[:0], 0)
+    span = int(one.accel_stamp_ns[0]), int(one.accel_stamp_ns[-1])
+    trace, states = thermal_trace(
+        board, none, span, DetectorSettings(), query_ns=np.array([span[0] - 10**12, span[1]])
+    )
+    assert not trace.is_case_leading
+    assert not np.isfinite(trace.case_rate).any()
+    assert any(stretch.regime == Regime.DYNAMIC for stretch in trace.stretches)
+    # Before the first reading nothing is known.
+    assert np.isnan(states[0][0])
+    assert states[0][1] == pytest.approx(one.board[-1], abs=0.1)
+
+
+def look(line: Artist) -> tuple[object, ...]:
+    """
+    Give what a reader without colours tells lines apart by: dashes, marker, darkness.
+
+    """
+    if isinstance(line, StepPatch):
+        dashes, colour, marker = line.get_linestyle(), line.get_edgecolor(), ''
+    else:
+        dashes, colour = line._unscaled_dash_pattern, line.get_color()
+        marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
+    darkness = round(float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))), 1)
+    return str(dashes), marker, darkness
+
+
+@pytest.mark.parametrize('sheet', [WIDE, NARROW], ids=['wide', 'narrow'])
+@pytest.mark.parametrize(
+    'draw',
+    [
+        draw_temperatures,
+        draw_dynamics,
+        draw_residuals,
+        draw_gravity,
+        draw_histograms,
+        draw_functions,
+        draw_positions,
+    ],
+)
+def test_figures_are_legible_in_black_and_white(draw, sheet):
+    with drawing():
+        figure = draw(evidence(), sheet)
+        svg(figure, 'a', 'b')  # lays it out
+        for axes in figure.axes:
+            looks = [look(line) for line in axes.get_legend_handles_labels()[0]]
+            assert len(set(looks)) == len(looks)
+            # Whatever is drawn over time or temperature carries a unit.
+            if axes.axison and axes.get_ylabel():
+                assert any(
+                    unit in axes.get_ylabel()
+                    for unit in ('°C', 'K/min', 'µg', 'ppm', 'counts', '%', 'm/s²', 'position')
+                )
+
+
+def test_every_figure_asks_a_question():
+    for plate in PLATES:
+        assert plate.question.endswith('?')
+        assert plate.reading(evidence()).endswith('.')
+
+
+def test_label_of_a_drawing_is_escaped():
+    with drawing():
+        text = svg(draw_temperatures(evidence(), NARROW), 'x', '"><script>')
+    assert '<script>' not in text
+    assert 'aria-label="&quot;&gt;&lt;script&gt;"' in text

@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Holds the live view: it follows its files, survives bad ones, and answers to nobody else.
+
+"""
+
+from __future__ import annotations
+
+import http.client
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+from report_helpers import certificate, fitted, write_bag
+
+from thermo_comp.calibration_file import save_calibration
+from thermo_comp.report.live import LiveReport, LiveServer
+
+TIMEOUT_S = 60.0
+
+
+@contextmanager
+def served(report: LiveReport) -> Iterator[LiveServer]:
+    server = LiveServer(report)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(TIMEOUT_S)
+
+
+def save(path: Path, note: str) -> Path:
+    calibration = fitted().calibration
+    provenance = replace(calibration.provenance, notes=(note,))
+    save_calibration(replace(calibration, provenance=provenance), path)
+    return path
+
+
+@pytest.fixture
+def unit(tmp_path) -> Path:
+    return save(tmp_path / 'unit.yaml', 'first note')
+
+
+def get(url: str) -> str:
+    with urllib.request.urlopen(url, timeout=TIMEOUT_S) as answer:  # noqa: S310 - our own server
+        return answer.read().decode()
+
+
+def test_page_follows_the_file_and_outlives_a_bad_one(unit):
+    report = LiveReport(unit)
+    before = report.version()
+    assert report.version() == before
+    assert 'first note' in report.page()
+    save(unit, 'second note')
+    assert report.version() != before
+    assert 'second note' in report.page()
+    good = unit.read_text()
+    unit.write_text(good.replace('gravity_m_s2', 'levity_m_s2'))
+    page = report.page()
+    assert 'levity_m_s2' in page
+    assert 'The page below is older.' in page
+    assert 'second note' in page
+    unit.write_text(good)
+    assert 'older' not in report.page()
+
+
+def test_first_bad_file_makes_a_page_that_goes_on_asking(tmp_path):
+    bad = tmp_path / 'unit.yaml'
+    bad.write_text('format_version: <b>1</b>')
+    report = LiveReport(bad)
+    page = report.page()
+    assert 'Nothing to show yet' in page
+    assert 'fetch("version"' in page
+    assert '<b>1' not in page
+    bad.unlink()
+    assert 'No such file' in report.page()
+
+
+def test_bag_is_read_once_and_judged_again(unit, tmp_path):
+    # Without the drawing, which takes seconds: what is drawn is tested with the page.
+    bag = write_bag(tmp_path / 'held_out.mcap')
+    report = LiveReport(unit, [bag])
+    assert report._evidence().bags[0].name == 'held_out.mcap'
+    ((_, opened),) = report._opened.values()
+    save(unit, 'second note')
+    assert report._evidence().findings == ('second note',)
+    ((_, again),) = report._opened.values()
+    assert again is opened
+    bag.unlink()
+    write_bag(bag, 1)
+    report._evidence()
+    ((_, other),) = report._opened.values()
+    assert other is not opened
+
+
+def test_script_runs_by_the_page_s_own_leave_only(unit):
+    page = LiveReport(unit).page()
+    (nonce,) = {part.split('"')[0] for part in page.split('<script nonce="')[1:]}
+    assert f"script-src 'nonce-{nonce}'; connect-src 'self'" in page
+    assert page.count('<script') == 1
+
+
+def test_server_answers_its_own_names_only(unit):
+    with served(LiveReport(unit)) as server:
+        assert server.server_address[0] == '127.0.0.1'
+        assert get(f'{server.url}version') == server.report.version()
+        for path, host, status in (
+            ('/', f'127.0.0.1:{server.server_port}', 200),
+            ('/version', f'localhost:{server.server_port}', 200),
+            ('/', f'evil.example:{server.server_port}', 403),
+            ('/version', '127.0.0.1', 403),
+            ('/../unit.yaml', f'127.0.0.1:{server.server_port}', 404),
+        ):
+            connection = http.client.HTTPConnection('127.0.0.1', server.server_port)
+            connection.request('GET', path, headers={'Host': host})
+            answer = connection.getresponse()
+            answer.read()
+            assert answer.status == status
+            assert answer.headers['Cache-Control'] == 'no-store'
+            connection.close()
+
+
+class Watched(LiveReport):
+    """
+    Tells when the browser has come for the page, and for its version after that.
+
+    """
+
+    def __init__(self, calibration: Path) -> None:
+        super().__init__(calibration)
+        self.shown: list[str] = []
+        self.changed = threading.Condition()
+
+    def page(self) -> str:
+        page = super().page()
+        with self.changed:
+            self.shown.append('second' if 'second note' in page else 'first')
+            self.changed.notify_all()
+        return page
+
+    def wait_for(self, expected: list[str]) -> bool:
+        with self.changed:
+            return self.changed.wait_for(lambda: self.shown[-1:] == expected, TIMEOUT_S)
+
+
+def browser() -> str:
+    found = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+    if found is None:
+        pytest.skip('no Chromium here (Debian: apt install chromium)')
+    return found
+
+
+@contextmanager
+def browsing(url: str, profile: Path) -> Iterator[None]:
+    command = [
+        browser(),
+        '--headless',
+        '--no-sandbox',
+        '--disable-gpu',
+        '--no-first-run',
+        '--disable-background-networking',
+        '--disable-component-update',
+        '--disable-sync',
+        f'--user-data-dir={profile}',
+        '--remote-debugging-port=0',  # keeps it alive, on a port of its own
+        url,
+    ]
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        yield
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait(TIMEOUT_S)
+
+
+def test_browser_reloads_when_the_fit_runs_again(unit, tmp_path):
+    report = Watched(unit)
+    with served(report) as server, browsing(server.url, tmp_path / 'profile'):
+        assert report.wait_for(['first'])
+        save(unit, 'second note')
+        assert report.wait_for(['second'])
+
+
+def test_browser_draws_the_page_without_a_complaint(tmp_path):
+    page = tmp_path / 'page.html'
+    page.write_text(certificate(), encoding='utf-8')
+    finished = subprocess.run(
+        [
+            browser(),
+            '--headless',
+            '--no-sandbox',
+            '--disable-gpu',
+            '--no-first-run',
+            '--disable-background-networking',
+            '--disable-component-update',
+            '--disable-sync',
+            '--enable-logging=stderr',
+            f'--user-data-dir={tmp_path / "profile"}',
+            '--window-size=390,800',
+            f'--screenshot={tmp_path / "phone.png"}',
+            page.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=True,
+    )
+    assert 'CONSOLE' not in finished.stderr
+    assert (tmp_path / 'phone.png').stat().st_size > 10_000
+
+
+def test_command_serves_until_it_is_interrupted(unit):
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'thermo_comp', 'view', str(unit), '--port', '0'],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+    )
+    url = process.stdout.readline().split()[0]
+    assert 'Thermal calibration certificate' in get(url)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0
+    assert 'Traceback' not in errors
+
+
+def test_command_says_what_is_wrong(cli, unit, tmp_path):
+    assert 'no such file' in cli('view', tmp_path / 'none.yaml', code=1).stderr
+    with served(LiveReport(unit)) as server:
+        taken = cli('view', unit, '--port', str(server.server_port), code=1)
+    assert 'give another one with --port' in taken.stderr
