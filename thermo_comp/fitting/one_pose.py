@@ -45,7 +45,7 @@ SPAN_OF_ORDER = ((10.0, 1), (25.0, 2))
 _HIGHEST_ORDER = 3
 _STANDARD_GRAVITY = 9.80665
 # More windows than this cost time and tell nothing new of so few parameters.
-_MOST_WINDOWS = 200
+_MOST_WINDOWS = 400
 # A bump that is still in a still window is left out of the fit beyond this many robust sd.
 _OUTLIER_SDS = 5.0
 # One attitude: the directions of all still windows lie this close together.
@@ -181,14 +181,14 @@ class AlongGravity:
 
     def thermal_error(self, temperature: Array, extend: bool = False) -> Array:
         """
-        What ``|a|`` reads more than at T_ref, shape (n,) [input units].
+        Predict what ``|a|`` reads more than at T_ref, shape (n,) [input units].
 
         """
         return self.reading(temperature, extend) - self.coefficients[0]
 
     def thermal_error_sd(self, temperature: Array) -> Array:
         """
-        Standard deviation of `thermal_error` as a curve, shape (n,) [input units].
+        Predict the sd of `thermal_error` as a curve, shape (n,) [input units].
 
         """
         columns = self.columns(temperature)[:, 1:]
@@ -391,9 +391,9 @@ def fit_series(series: PoseSeries, options: PoseOptions) -> AlongGravity:
     still = series.select(series.is_still).coarsened(_MOST_WINDOWS)
     if not len(still.time):
         raise FitError('no still window in this part')
-    lower, upper = float(still.temperature.min()), float(still.temperature.max())
+    lower, upper = (float(f(still.temperature)) for f in (np.min, np.max))
     order = order_for(upper - lower) if options.order is None else options.order
-    reference = float(np.clip(options.reference_temperature, lower, upper))
+    reference = min(max(options.reference_temperature, lower), upper)
     columns = np.vander(still.temperature - reference, order + 1, increasing=True)
     norm = still.norm
     use = _inliers(columns, norm)
@@ -500,7 +500,7 @@ def _refuse_attitudes(bag: ReducedBag) -> None:
     apart = np.degrees(np.arccos(np.clip(up @ typical, -1.0, 1.0)))
     if apart.max() > _ONE_ATTITUDE_DEG:
         raise FitError(
-            f'{bag.source.name}: it rests in several attitudes, up to {apart.max():.0f} deg apart: '
+            f'{bag.source.name}: it rests in several attitudes, {np.max(apart):.0f} deg apart: '
             'this fit is for one; `thermo_comp fit` tells bias and scale apart'
         )
 

@@ -6,8 +6,9 @@ Owns the noise of a long rest: white noise and a level that wanders; least squar
 Residuals of a sensor at rest are not white: the level drifts by itself. Ordinary least squares
 takes that drift for a function of temperature and claims to know it far too well. Here the level
 is a stationary process of first order, ``cov(w(s), w(t)) = sd^2 exp(-|s - t| / tau)``, which for
-a long tau is a random walk; its sd, tau and the white noise come out of the data by restricted
-maximum likelihood [1]_, and the parameters by generalised least squares.
+a long tau is a random walk. Parameters come by generalised least squares under the likeliest sd
+and tau, by restricted likelihood [1]_. A rest of a few time constants leaves much doubt about its
+noise, so every other sd and tau, by its likelihood, widens the claimed uncertainty.
 
 References
 ----------
@@ -22,8 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize_scalar
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from ..errors import FitError
 
@@ -31,9 +31,11 @@ Array = npt.NDArray[np.float64]
 
 # Time constants are searched from two windows to this many spans: a random walk by then.
 _LONGEST_SPANS = 10.0
-_N_TIME_CONSTANTS = 8
-# Wander over white noise of a window, as a ratio of variances; its logarithm is searched.
-_LOG_RATIOS = (-9.0, 12.0)
+_N_TIME_CONSTANTS = 12
+# Wander over white noise of a window, as a ratio of variances.
+_RATIOS, _N_RATIOS = (1e-3, 1e3), 15
+# Guesses of the noise this much less likely than the best are dropped.
+_LEAST_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -74,30 +76,64 @@ class Noise:
 
 
 @dataclass(frozen=True)
+class Candidate:
+    """
+    The solution under one guess of the noise.
+
+    Parameters
+    ----------
+    weight : float
+        How likely the guess is; they sum to 1.
+    noise : Noise
+        The guess, its white noise estimated.
+    parameters : ndarray, shape (p,)
+        Estimates under it.
+    covariance : ndarray, shape (p, p)
+        Of the estimates.
+    gain : ndarray, shape (p, n)
+        What each datum moves each parameter by.
+
+    """
+
+    weight: float
+    noise: Noise
+    parameters: Array
+    covariance: Array
+    gain: Array
+
+
+@dataclass(frozen=True)
 class WanderFit:
     """
-    A generalised least squares solution.
+    Generalised least squares, in doubt about the noise.
 
     Parameters
     ----------
     parameters : ndarray, shape (p,)
         Estimates.
     covariance : ndarray, shape (p, p)
-        Of the estimates, the wander's share included.
-    noise : Noise
-        Under which they were made.
+        Of the estimates; the wander's share and the doubt about the noise included. The level's
+        own is that of the mean over all times, which a random walk has not: for the level as it
+        was during the data see `prediction_sd`.
     time : ndarray, shape (n,)
         Times of the data [s].
-    gain : ndarray, shape (p, n)
-        What each datum moves each parameter by.
+    candidates : tuple of Candidate
+        The guesses of the noise that count, the likeliest first.
 
     """
 
     parameters: Array
     covariance: Array
-    noise: Noise
     time: Array
-    gain: Array
+    candidates: tuple[Candidate, ...]
+
+    @property
+    def noise(self) -> Noise:
+        """
+        The likeliest noise.
+
+        """
+        return self.candidates[0].noise
 
     def prediction_sd(self, columns: Array, time: Array, count: Array) -> Array:
         """
@@ -118,16 +154,29 @@ class WanderFit:
             Standard deviation.
 
         """
-        noise = self.noise
-        shared = noise.wander(time, self.time) @ self.gain.T
-        variance = (
-            noise.wander_sd**2
-            + noise.white_sd**2 / count
-            - 2.0 * np.einsum('mp,mp->m', columns, shared)
-            + np.einsum('mp,pq,mq->m', columns, self.covariance, columns)
+        total = np.zeros(len(time))
+        for one in self.candidates:
+            shared = one.noise.wander(time, self.time) @ one.gain.T
+            white = one.noise.white_sd**2 / count
+            variance = (
+                one.noise.wander_sd**2
+                + white
+                - 2.0 * np.einsum('mp,mp->m', columns, shared)
+                + np.einsum('mp,pq,mq->m', columns, one.covariance, columns)
+            )
+            # Terms of a random walk nearly cancel: what is left is never below the white noise.
+            total += one.weight * np.maximum(variance, white)
+            total += one.weight * (columns @ (one.parameters - self.parameters)) ** 2
+        return np.asarray(np.sqrt(total))
+
+    def drift_sd(self, after_s: float) -> float:
+        """
+        How far the level is from itself after some time: sd of the difference.
+
+        """
+        return float(
+            np.sqrt(sum(one.weight * one.noise.drift_sd(after_s) ** 2 for one in self.candidates))
         )
-        # The first and third term nearly cancel for a random walk: never below the white noise.
-        return np.asarray(np.sqrt(np.maximum(variance, noise.white_sd**2 / count)))
 
 
 def fit_with_wander(columns: Array, data: Array, time: Array, count: Array) -> WanderFit:
@@ -162,55 +211,91 @@ def fit_with_wander(columns: Array, data: Array, time: Array, count: Array) -> W
     step = float(np.median(np.diff(time)))
     span = float(time[-1] - time[0])
     longest = max(_LONGEST_SPANS * span, 4.0 * step)
-    constants: list[float] = np.geomspace(2.0 * step, longest, _N_TIME_CONSTANTS).tolist()
-    apart = np.abs(time[:, None] - time[None, :])
-    relative = count / np.mean(count)
-    best: tuple[float, float, float] = (np.inf, 0.0, constants[0])
-    for constant in constants:
-        shape = np.exp(-apart / constant)
-
-        def cost(log_ratio: float, shape: Array = shape) -> float:
-            return _Solution(columns, data, shape, relative, float(np.exp(log_ratio))).cost
-
-        found = minimize_scalar(cost, bounds=_LOG_RATIOS, method='bounded', options={'xatol': 0.1})
-        if found.fun < best[0]:
-            best = (float(found.fun), float(np.exp(found.x)), constant)
-    _, ratio, constant = best
-    solution = _Solution(columns, data, np.exp(-apart / constant), relative, ratio)
-    noise = Noise(
-        white_sd=float(np.sqrt(solution.variance * np.mean(count))),
-        wander_sd=float(np.sqrt(solution.variance * ratio)),
-        time_constant_s=constant,
-    )
-    return WanderFit(
-        solution.parameters,
-        solution.variance * solution.inverse,
-        noise,
-        time,
-        solution.inverse @ solution.weighted.T,
-    )
+    found = [
+        solution
+        for constant in np.geomspace(2.0 * step, longest, _N_TIME_CONSTANTS).tolist()
+        for solution in _solutions(columns, data, time, count, constant, max(1.0, constant / span))
+    ]
+    cost = np.array([solution.cost for solution in found])
+    weight = np.exp(-0.5 * (cost - cost.min()))
+    weight = np.where(weight > _LEAST_WEIGHT, weight, 0.0)
+    weight /= weight.sum()
+    order = np.argsort(-weight)[: int(np.count_nonzero(weight))].tolist()
+    candidates = tuple(found[i].candidate(float(weight[i])) for i in order)
+    parameters = candidates[0].parameters
+    covariance = np.zeros((p, p))
+    for one in candidates:
+        off = one.parameters - parameters
+        covariance += one.weight * (one.covariance + np.outer(off, off))
+    return WanderFit(parameters, covariance, time, candidates)
 
 
+@dataclass(frozen=True)
 class _Solution:
     """
-    Least squares at one ratio of wander to white noise; `variance` is a mean window's white noise.
+    Least squares under one noise, and twice its negative log likelihood.
 
     """
 
-    def __init__(
-        self, columns: Array, data: Array, shape: Array, relative: Array, ratio: float
-    ) -> None:
-        n, p = columns.shape
-        covariance = ratio * shape
-        covariance[np.diag_indices(n)] += 1.0 / relative
-        factor = cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
-        self.weighted = cho_solve(factor, columns, check_finite=False)
-        normal = columns.T @ self.weighted
-        self.inverse = np.linalg.inv(normal)
-        self.parameters = self.inverse @ (self.weighted.T @ data)
-        left = data - columns @ self.parameters
-        self.variance = float(left @ cho_solve(factor, left, check_finite=False)) / (n - p)
-        log_determinant = 2.0 * float(np.sum(np.log(np.diag(factor[0]))))
-        self.cost = float(
-            (n - p) * np.log(self.variance) + log_determinant + np.linalg.slogdet(normal)[1]
+    noise: Noise
+    cost: float
+    parameters: Array
+    covariance: Array
+    gain: Array
+
+    def candidate(self, weight: float) -> Candidate:
+        return Candidate(weight, self.noise, self.parameters, self.covariance, self.gain)
+
+
+def _solutions(
+    columns: Array, data: Array, time: Array, count: Array, constant: float, scale: float
+) -> list[_Solution]:
+    """
+    Solve for one time constant and all ratios of wander to white noise.
+
+    A first-order process has a tridiagonal inverse covariance Q, so with the white noise's
+    inverse W all is done in n steps: ``(1 / W + ratio / Q)^-1 = W - W (W + Q / ratio)^-1 W``.
+    A random walk's level counts by its slope, not its size: `scale` keeps the range of slopes
+    where tau exceeds the span.
+
+    """
+    n, p = columns.shape
+    white = count / np.mean(count)
+    ago = np.diff(time) / constant
+    kept = np.exp(-ago)
+    fresh = -np.expm1(-2.0 * ago)
+    inverse = np.zeros((2, n))
+    inverse[0] = 1.0
+    inverse[0, 1:] += kept**2 / fresh
+    inverse[0, :-1] += kept**2 / fresh
+    inverse[1, :-1] = -kept / fresh
+    weighted_columns = white[:, None] * columns
+    result = []
+    for ratio in (scale * np.geomspace(*_RATIOS, _N_RATIOS)).tolist():
+        banded = inverse / ratio
+        banded[0] += white
+        factor = cholesky_banded(banded, lower=True, check_finite=False)
+        shared = cho_solve_banded((factor, True), weighted_columns, check_finite=False)
+        weighted = weighted_columns - white[:, None] * shared
+        normal = columns.T @ weighted
+        spread = np.linalg.inv(normal)
+        parameters = spread @ (weighted.T @ data)
+        left = white * (data - columns @ parameters)
+        again = cho_solve_banded((factor, True), left, check_finite=False)
+        variance = float(left @ ((data - columns @ parameters) - again)) / (n - p)
+        log_determinant = (
+            2.0 * np.sum(np.log(factor[0]))
+            + n * np.log(ratio)
+            + np.sum(np.log(fresh))
+            - np.sum(np.log(white))
         )
+        cost = (n - p) * np.log(variance) + log_determinant + np.linalg.slogdet(normal)[1]
+        noise = Noise(
+            white_sd=float(np.sqrt(variance * np.mean(count))),
+            wander_sd=float(np.sqrt(variance * ratio)),
+            time_constant_s=constant,
+        )
+        result.append(
+            _Solution(noise, float(cost), parameters, variance * spread, spread @ weighted.T)
+        )
+    return result

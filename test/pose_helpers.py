@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the simulated rests in one attitude that the tests of the partial fits are built on.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from thermo_comp.fitting.sources import ArrayBlock, FitSource
+
+GRAVITY = 9.80665
+MG = GRAVITY * 1e-3
+START_NS = 1_700_000_000_000_000_000
+
+
+@dataclass
+class Imu:
+    """The one column of a recording's Imu that a jump is checked against."""
+
+    angular_velocity: np.ndarray
+
+
+@dataclass(frozen=True)
+class ImuBlock(ArrayBlock):
+    """A block with a gyroscope, as a recording's is."""
+
+    imu: Imu | None = None
+
+
+@dataclass
+class Rest:
+    """
+    Samples of a sensor at rest: noise on `level`, a board that cools from `warm` by `fall`.
+
+    """
+
+    rng: np.random.Generator
+    duration_s: float = 600.0
+    rate_hz: float = 25.0
+    level: tuple[float, float, float] = (0.0, 0.0, GRAVITY)
+    sd: float = 3.0 * MG
+    warm: float = 35.0
+    fall: float = 20.0
+    pace_s: float = 200.0
+
+    def __post_init__(self) -> None:
+        n = round(self.duration_s * self.rate_hz)
+        self.time = np.arange(n) / self.rate_hz
+        self.accel = np.array(self.level) + self.sd * self.rng.standard_normal((n, 3))
+        self.gyro = 0.002 * self.rng.standard_normal((n, 3))
+        self.board_time = np.arange(0.0, self.duration_s, 0.5)
+
+    def temperature(self, time: np.ndarray) -> np.ndarray:
+        return self.warm - self.fall * (1.0 - np.exp(-time / self.pace_s))
+
+    def add(self, vector, from_s: float, to_s: float = np.inf) -> None:
+        rows = (self.time >= from_s) & (self.time < to_s)
+        self.accel[rows] += np.asarray(vector)
+
+    def source(self, n_blocks: int = 1, with_gyro: bool = False, name: str = 'rest') -> FitSource:
+        stamp_ns = START_NS + np.rint(self.time * 1e9).astype(np.int64)
+        board_ns = START_NS + np.rint(self.board_time * 1e9).astype(np.int64)
+        board = self.temperature(self.board_time) + 0.02 * np.random.default_rng(
+            7
+        ).standard_normal(len(self.board_time))
+        cuts = np.linspace(0, len(stamp_ns), n_blocks + 1).astype(int)
+        blocks = []
+        for first, last in pairwise(cuts.tolist()):
+            begin = stamp_ns[first] if first else 0
+            end = stamp_ns[last] if last < len(stamp_ns) else np.iinfo(np.int64).max
+            use = (board_ns >= begin) & (board_ns < end)
+            nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
+            block = ImuBlock(
+                stamp_ns[first:last],
+                self.accel[first:last],
+                board_ns[use],
+                board[use],
+                nothing_ns,
+                nothing,
+            )
+            if with_gyro:
+                block = replace(block, imu=Imu(self.gyro[first:last]))
+            blocks.append(block)
+        return FitSource(name, lambda: blocks)

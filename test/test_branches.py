@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Steps at rest: what jumped, when and by how much; what was only turned, moved or bumped.
+
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pose_helpers import GRAVITY, MG, Rest
+
+from thermo_comp.fitting.branches import find_branches
+from thermo_comp.fitting.reduction import reduce_source
+
+
+def look(rest, **keys):
+    source = rest.source(**keys)
+    bag = reduce_source(source, 0, window_s=10.0, cell_s=2.0, min_still_s=5.0, full_scale=None)
+    return find_branches(source, bag)
+
+
+def test_quiet_rest_is_one_branch(rng):
+    events, branches = look(Rest(rng))
+    assert events == ()
+    assert len(branches) == 1
+    assert branches[0].end_s - branches[0].start_s == pytest.approx(600.0, abs=10.0)
+
+
+@pytest.mark.parametrize('with_gyro', [False, True])
+def test_jump_along_gravity(rng, with_gyro):
+    rest = Rest(rng)
+    rest.add((2.0 * MG, 0.0, 20.0 * MG), from_s=301.0)
+    (event,), branches = look(rest, with_gyro=with_gyro)
+    assert event.kind == 'jump'
+    # Placed by the one sample that separates the levels.
+    assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
+    assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
+    # 10 s of 25 Hz on each side beside a free drift: sd 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; 4 sd.
+    np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
+    assert event.along / MG == pytest.approx(20.0, abs=2.2)
+    assert event.along_sd / MG == pytest.approx(0.54, rel=0.2)
+    # The board cools by 20 K exp(-t / 200) / 200 per second.
+    slope = -20.0 / 200.0 * np.exp(-301.0 / 200.0)
+    assert event.temperature_change == pytest.approx(slope / rest.rate_hz, rel=0.3)
+    assert [round(b.start_s) for b in branches][1:] == [301]
+    assert branches[0].end_s == branches[1].start_s == event.time
+
+
+def turned(rest, from_s, angle, with_rate):
+    rows = rest.time >= from_s
+    c, s = np.cos(angle), np.sin(angle)
+    rest.accel[rows] = rest.accel[rows] @ np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]]).T
+    if with_rate:
+        at = np.flatnonzero(rows)[0]
+        rest.gyro[at] += (angle * rest.rate_hz, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(('seen', 'kind'), [(True, 'turn'), (False, 'jump')])
+def test_turn_is_told_by_the_gyro(rng, seen, kind):
+    # 20 mrad in one sample: the norm stays, so only a gyro can tell.
+    rest = Rest(rng)
+    turned(rest, 250.0, 0.02, with_rate=seen)
+    (event,), _ = look(rest, with_gyro=True)
+    assert event.kind == kind
+    assert event.turn_needed == pytest.approx(0.02, abs=0.002)
+    # Noise of 2 s of rate: 2 mrad/s / 25 Hz * sqrt(50) = 0.6 mrad per axis.
+    assert event.turn_seen == pytest.approx(0.02 if seen else 0.0, abs=0.003)
+
+
+def test_turn_without_a_gyro_stays_open(rng):
+    rest = Rest(rng)
+    turned(rest, 250.0, 0.02, with_rate=False)
+    (event,), _ = look(rest)
+    assert event.kind == 'turn'
+    assert np.isnan(event.turn_seen)
+
+
+def test_handling_is_motion(rng):
+    rest = Rest(rng)
+    rows = (rest.time > 300.0) & (rest.time < 312.0)
+    rest.accel[rows] += 200.0 * MG * rng.standard_normal((rows.sum(), 3))
+    rest.add((50.0 * MG, 0.0, 0.0), from_s=306.0)
+    (event,), branches = look(rest)
+    assert event.kind == 'motion'
+    assert len(branches) == 2
+
+
+def test_bump_that_passes_is_no_event(rng):
+    rest = Rest(rng)
+    rest.add((0.0, 0.0, 40.0 * MG), from_s=300.0, to_s=302.0)
+    events, branches = look(rest)
+    assert events == ()
+    assert len(branches) == 1
+    assert len(branches[0].still) == 2
+
+
+def test_long_absence_ends_a_branch(rng):
+    rest = Rest(rng)
+    rows = (rest.time > 300.0) & (rest.time < 360.0)
+    rest.accel[rows] += GRAVITY * rng.standard_normal((rows.sum(), 3))
+    events, branches = look(rest)
+    assert events == ()
+    assert len(branches) == 2
+
+
+def test_cut_into_blocks_it_is_the_same(rng):
+    rest = Rest(rng)
+    rest.add((0.0, 5.0 * MG, 20.0 * MG), from_s=300.0)
+    assert look(rest) == look(rest, n_blocks=37)
+
+
+def test_drift_with_temperature_is_no_step(rng):
+    # 2 mg/K at up to 6 K/min.
+    rest = Rest(rng)
+    rest.accel[:, 2] += 2.0 * MG * (rest.temperature(rest.time) - 20.0)
+    events, _ = look(rest)
+    assert events == ()
