@@ -16,6 +16,7 @@ import gc
 import signal
 import sys
 import threading
+import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -56,7 +57,9 @@ FLAG_QOS = QoSProfile(
 )
 DIAGNOSTICS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
-#: While no samples come, readings this much older than the newest one take effect without them.
+#: After so long without samples [s] readings take effect without them, but for those not older
+#: than the newest by this: a sample that Fast DDS has to repeat can be 3 s late.
+IDLE_S = 5.0
 IDLE_NS = 1_000_000_000
 
 USAGE = """\
@@ -104,6 +107,7 @@ class CompensationNode:
         self._n_malformed = 0
         self._n_unpublished = 0
         self._level = b''
+        self._last_samples = time.monotonic()
         self._loop = WaitLoop(self.node)
         self._open_topics()
         self._reported = self._snapshot()
@@ -193,7 +197,6 @@ class CompensationNode:
         if self._readings:
             messages = self._relay_with_readings(messages, received_ns)
         self._relay(messages)
-        self._publish_flags()
 
     def _take_readings(
         self, subscription: RawSubscription, push: Callable[[int, float], None]
@@ -234,6 +237,7 @@ class CompensationNode:
                 if not self.node.context.ok():
                     raise
                 self._n_unpublished += 1
+        self._publish_flags()
 
     def _publish_flags(self) -> None:
         for _, is_dynamic in self._compensator.take_flags():
@@ -253,7 +257,9 @@ class CompensationNode:
 
         """
         now = self._snapshot()
-        if now.status.counters.n_in == self._reported.status.counters.n_in:
+        if now.status.counters.n_in != self._reported.status.counters.n_in:
+            self._last_samples = time.monotonic()
+        elif time.monotonic() - self._last_samples > IDLE_S:
             self._advance_without_samples()
             now = self._snapshot()
         array = build(self.node.get_name(), self._loaded, now, self._reported)

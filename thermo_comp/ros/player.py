@@ -46,7 +46,7 @@ TEMPERATURE_DEPTH = 10
 CLOCK_PERIOD = 0.01
 #: The longest nap, so that an interrupt is heeded [s].
 NAP = 0.1
-#: Time a best-effort subscriber is given to find the player; nothing tells when it has [s].
+#: Time the subscribers are given to find the player too; nothing tells when they have [s].
 SETTLING = 0.3
 #: How long a subscriber may leave a window unacknowledged [s].
 PATIENCE = 30.0
@@ -188,7 +188,7 @@ class _Player:
                 for end in self._node.get_subscriptions_info_by_topic(one.topic_name)
             )
         ]
-        if self._report.lossy and wait_s > 0.0:
+        if wait_s > 0.0:
             time.sleep(SETTLING)
         self._started = time.monotonic()
 

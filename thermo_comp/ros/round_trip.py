@@ -31,6 +31,7 @@ DISCOVERY_S = 30.0
 STOPPING_S = 10.0
 #: The recorder has everything when nothing came for this long [s].
 SILENCE_S = 3.0
+SETTLING_S = 0.5
 
 _INPUTS = ('accel/counts', 'imu/uncompensated', 'temperature/board', 'temperature/case')
 
@@ -197,6 +198,8 @@ def round_trip(
         played = play(bag, rate=rate, topics=topics, input=input, progress=progress)
         n_samples = max(played.n_messages.values())
         recorder.wait_until(lambda counts: counts['imu/data_raw'] >= n_samples, SILENCE_S)
+        # The last flags come behind the samples, and nobody knows how many they are.
+        recorder.wait_until(lambda _: False, SETTLING_S)
         if not node.is_alive:
             raise ThermoCompError(f'the node ended: {node.said}')
         return RoundTrip(played, recorder.counts)
