@@ -36,6 +36,7 @@ from thermo_comp.report.figures_unit import (
 from thermo_comp.report.inertial import position_error, schuler_peak
 from thermo_comp.report.plates import PLATES
 from thermo_comp.report.style import NARROW, WIDE, drawing, svg
+from thermo_comp.report.text import label_text, number
 from thermo_comp.report.trace import thermal_trace
 
 
@@ -52,8 +53,8 @@ def test_thinning_loses_no_extreme(values, n_bins):
     edges = np.linspace(0.0, max(time[-1], 1e-9), n_bins + 1)
     stretch = np.clip(np.searchsorted(edges, time, side='right') - 1, 0, n_bins - 1)
     kept = np.clip(np.searchsorted(edges, thin_time, side='right') - 1, 0, n_bins - 1)
-    for number in np.unique(stretch):
-        inside, left = value[stretch == number], thin_value[kept == number]
+    for one in np.unique(stretch):
+        inside, left = value[stretch == one], thin_value[kept == one]
         # A point on an edge may fall to either side of it by rounding.
         if len(left):
             assert left.max() >= np.sort(inside)[-2:].min() or len(inside) < 3
@@ -180,6 +181,20 @@ def test_figures_are_legible_in_black_and_white(draw, sheet):
                     unit in axes.get_ylabel()
                     for unit in ('°C', 'K/min', 'µg', 'ppm', 'counts', '%', 'm/s²', 'position')
                 )
+
+
+@pytest.mark.parametrize(
+    ('value', 'text'),
+    [(0.0, '0'), (1951.3, '1950'), (-0.0824, '−0.082'), (4.2e-5, '0.000'), (302.992252, '303'),
+     (9.99, '9.99'), (999.6, '1000'), (3.2e10, '3.20e+10'), (float('nan'), '–')],
+)  # fmt: skip
+def test_numbers_are_spelt_for_readers(value, text):
+    assert number(value) == text
+
+
+def test_names_of_others_fit_a_figure():
+    assert label_text('a\nb\x00c ') == 'a b c'
+    assert label_text('x' * 60) == 'x' * 39 + '…'
 
 
 def test_every_figure_asks_a_question():

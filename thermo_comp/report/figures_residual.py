@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from ..metrics import MICRO_G
 from .evidence import RAW, Evidence
@@ -31,6 +31,7 @@ from .style import (
     plot_thinned,
     time_unit,
 )
+from .text import number
 
 Array = npt.NDArray[np.float64]
 
@@ -136,7 +137,7 @@ def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
     for place, (label, values, line) in zip(places, parts, strict=False):
         axes = figure.add_subplot(place)
         _draw_signed(axes, values, line)
-        axes.set_title(f'{judged}, {label}: sd {float(values.std()):.3g} µg')
+        axes.set_title(f'{judged}, {label}: sd {number(float(values.std()))} µg')
     axes.set_xlabel('|g| − g, µg')
     right = figure.add_subplot(places[-1])
     low, high = _size_range(residuals)
@@ -149,7 +150,7 @@ def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
     right.set_ylim(0.0, None)
     right.set_xlabel('size of |g| − g, µg')
     right.set_ylabel('share of windows, %')
-    legend_above(right, sheet)
+    legend_above(right, sheet, share=1.0 if sheet.is_narrow else 0.5)
     return figure
 
 
@@ -178,6 +179,7 @@ def _draw_signed(axes: Axes, values: Array, line: Line) -> None:
     axes.set_xlim(-limit, limit)
     axes.set_ylim(0.0, None)
     axes.set_ylabel('windows, %')
+    axes.xaxis.set_major_locator(MaxNLocator(6))
     few_ticks(axes, 4)
 
 
@@ -202,7 +204,7 @@ def _rms_text(residual: Array, is_dynamic: npt.NDArray[np.bool_]) -> str:
     for label, rows in (('static', ~is_dynamic), ('dynamic', is_dynamic)):
         if rows.any():
             rms = float(np.sqrt(np.mean(residual[rows] ** 2))) / MICRO_G
-            parts.append(f'{label} {rms:.3g}')
+            parts.append(f'{label} {number(rms)}')
     return f'RMS {", ".join(parts)} µg'
 
 

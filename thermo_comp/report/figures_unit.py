@@ -26,6 +26,7 @@ from .style import (
     log_axis,
     new_figure,
 )
+from .text import number
 
 Array = npt.NDArray[np.float64]
 
@@ -68,7 +69,7 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
                 ends = {'marker': marker, 'markersize': 3.5, 'markevery': [0, -1]}
                 axes.plot(temperature, value, label=name, **line, **ends)
         for axes, name, unit in ((panels[0, i], 'bias', 'µg'), (panels[1, i], 'scale', 'ppm')):
-            band = f': ±{widest[axes]:.2g} {unit} at most' if axes in widest else ''
+            band = f': ±{number(widest[axes], 2)} {unit} at most' if axes in widest else ''
             axes.set_title(f'{name} {axis}{band}')
     for axes in panels.ravel():
         axes.axvline(calibration.reference_temperature_c, color=GREY, linewidth=0.8)
@@ -275,4 +276,4 @@ def _draw_dots(axes: Axes, evidence: Evidence, sheet: Sheet) -> None:
         axes.yaxis.set_major_locator(MaxNLocator(12, integer=True))
     axes.set_xlabel('RMS of |g| − g, µg')
     axes.set_ylabel('position')
-    legend_above(axes, sheet)
+    legend_above(axes, sheet, share=1.0 if sheet.is_narrow else 0.4)

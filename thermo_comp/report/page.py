@@ -12,7 +12,6 @@ anything.
 from __future__ import annotations
 
 import datetime as dt
-import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -23,6 +22,7 @@ from ..metrics import MICRO_G
 from .evidence import CHOSEN, SECTIONS, Evidence
 from .inertial import SCHULER_PEAK_PER_MICRO_G, TIMES_S, position_error, schuler_peak
 from .plates import DrawnPlate
+from .text import number
 from .verdict import Verdict
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
@@ -99,23 +99,6 @@ def render_page(
         '</body></html>\n',
     ]
     return '\n'.join(part for part in parts if part)
-
-
-def number(value: float, digits: int = 3) -> str:
-    """
-    Give a number in significant digits, with no more decimals than those.
-
-    """
-    if not math.isfinite(value):
-        return '–'
-    if value == 0.0:
-        return '0'
-    size = math.floor(math.log10(abs(value)))
-    if size > 8:
-        return f'{value:.{digits - 1}e}'
-    decimals = digits - 1 - size
-    text = f'{round(value, decimals):.{min(max(decimals, 0), digits)}f}'
-    return text.replace('-', '−')
 
 
 def _verdict(verdict: Verdict) -> str:

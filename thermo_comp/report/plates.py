@@ -16,7 +16,8 @@ from .evidence import Evidence
 from .figures_residual import draw_gravity, draw_histograms, draw_residuals
 from .figures_thermal import draw_dynamics, draw_temperatures
 from .figures_unit import draw_functions, draw_positions
-from .style import NARROW, WIDE, Sheet, drawing, label_text, png, svg
+from .style import NARROW, WIDE, Sheet, drawing, png, svg
+from .text import label_text
 
 _GREY = 'Grey: the time in which the flag says dynamic.'
 

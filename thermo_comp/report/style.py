@@ -243,15 +243,26 @@ def broken(time: Array, value: Array, position: IntArray) -> tuple[Array, Array]
     return np.insert(time, at, time[at - 1]), np.insert(value, at, np.nan)
 
 
-def legend_above(axes: Axes, sheet: Sheet, **keys: Any) -> None:
+def legend_above(axes: Axes, sheet: Sheet, *, share: float = 1.0, **keys: Any) -> None:
     """
     Put the legend above the axes, where it hides nothing, in as many columns as fit.
+
+    Parameters
+    ----------
+    axes : Axes
+        The axes.
+    sheet : Sheet
+        The paper.
+    share : float, optional
+        Part of its width that the axes have.
+    **keys
+        For the legend.
 
     """
     labels = axes.get_legend_handles_labels()[1]
     # An entry takes its label and a handle as wide as some eight letters.
     letters = 8 + max((len(label) for label in labels), default=0)
-    columns = max(1, int((50 if sheet.is_narrow else 100) / letters))
+    columns = max(1, int(share * (50 if sheet.is_narrow else 100) / letters))
     axes.legend(
         loc='lower left', bbox_to_anchor=(0.0, 1.01), ncols=min(columns, len(labels)), **keys
     )
@@ -276,12 +287,3 @@ def log_axis(axes: Axes, low: float, high: float) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     axes.xaxis.set_minor_formatter(FuncFormatter(lambda _value, _: ''))
-
-
-def label_text(value: str, limit: int = 40) -> str:
-    """
-    Make text that others wrote fit for a figure: one line, printable, not too long.
-
-    """
-    clean = ''.join(c if c.isprintable() else ' ' for c in value).strip()
-    return clean if len(clean) <= limit else f'{clean[: limit - 1]}…'

@@ -15,6 +15,7 @@ import numpy as np
 from ..calibration import Calibration
 from ..metrics import MICRO_G
 from .evidence import CHOSEN, RAW, Evidence
+from .text import number
 
 # A ramp slower than this says nothing of its direction.
 _SLOWEST_RAMP_K_MIN = 0.05
@@ -90,14 +91,14 @@ def judge(evidence: Evidence) -> Verdict:
         reservations += suspicions + _outside(evidence, calibration)
     before, after = statistics[RAW]['all'], statistics[CHOSEN]['all']
     left = ', '.join(
-        f'{statistics[CHOSEN][section].micro_g.rms:.3g} µg {section}'
+        f'{number(statistics[CHOSEN][section].micro_g.rms)} µg {section}'
         for section in ('static', 'dynamic')
         if statistics[CHOSEN][section].n
     )
     sentences = (
-        f'|g| at rest missed local gravity by {before.micro_g.rms:.3g} µg RMS without thermal '
-        f'correction and by {after.micro_g.rms:.3g} µg with it '
-        f'(largest {after.micro_g.peak:.3g} µg), over {after.n} windows in '
+        f'|g| at rest missed local gravity by {number(before.micro_g.rms)} µg RMS without thermal '
+        f'correction and by {number(after.micro_g.rms)} µg with it '
+        f'(largest {number(after.micro_g.peak)} µg), over {after.n} windows in '
         f'{_count(len(evidence.positions), "position")} and {_span(evidence)}.',
         *_record(evidence),
     )
@@ -134,8 +135,8 @@ def _of_fit(evidence: Evidence) -> list[str]:
             found.append(f'the bags hold nothing {name}: that set was not put to the test')
     if static.n and dynamic.n and dynamic.rms > max(_UNEVEN_RATIO * static.rms, _UNEVEN_LEAST):
         found.append(
-            f'the dynamic regime is {dynamic.rms / static.rms:.2g} times worse than the static '
-            'one: a model with memory or gradient terms may do better'
+            f'the dynamic regime is {number(dynamic.rms / static.rms, 2)} times worse than the '
+            'static one: a model with memory or gradient terms may do better'
         )
     return found
 
@@ -152,8 +153,8 @@ def _suspicions(evidence: Evidence, calibration: Calibration) -> list[str]:
             continue
         if now.rms > _SUSPICIOUS_RATIO * row.rms_m_s2 > 0.0:
             found.append(
-                f'{row.section}: {now.micro_g.rms:.3g} µg RMS, where the fit left '
-                f'{row.rms_m_s2 / MICRO_G:.3g}; another unit, or it has drifted: fit anew'
+                f'{row.section}: {number(now.micro_g.rms)} µg RMS, where the fit left '
+                f'{number(row.rms_m_s2 / MICRO_G)}; another unit, or it has drifted: fit anew'
             )
     return found
 
@@ -170,7 +171,7 @@ def _outside(evidence: Evidence, calibration: Calibration) -> list[str]:
         outside = float(np.mean((windows.board < lower) | (windows.board > upper)))
         if outside > 0.001:
             return [
-                f'{100.0 * outside:.2g} % of the windows lie outside the calibrated '
+                f'{number(100.0 * outside, 2)} % of the windows lie outside the calibrated '
                 f'{lower:.1f} to {upper:.1f} °C, where the functions are held'
             ]
     return []
@@ -195,8 +196,8 @@ def _record(evidence: Evidence) -> tuple[str, ...]:
 
 def _fitted_sentences(calibration: Calibration) -> tuple[str, ...]:
     rows = [
-        f'{row.rms_m_s2 / MICRO_G:.3g} µg RMS {row.section} '
-        f'({row.raw_rms_m_s2 / MICRO_G:.3g} without correction)'
+        f'{number(row.rms_m_s2 / MICRO_G)} µg RMS {row.section} '
+        f'({number(row.raw_rms_m_s2 / MICRO_G)} without correction)'
         for row in calibration.provenance.residuals
         if row.section != 'all'
     ]
