@@ -17,7 +17,20 @@ import typer
 
 from .. import __version__
 from ..errors import ThermoCompError
-from . import convert, demo, evaluate, fit, info, output, play, replay, report, simulate, view
+from . import (
+    convert,
+    demo,
+    evaluate,
+    fit,
+    info,
+    output,
+    partial,
+    play,
+    replay,
+    report,
+    simulate,
+    view,
+)
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
@@ -56,6 +69,7 @@ def _top(
 
 app.command()(fit.fit)
 app.command()(evaluate.evaluate)
+app.command()(partial.partial)
 app.command()(replay.replay)
 app.command()(play.play)
 app.command()(info.info)

@@ -299,7 +299,11 @@ def read_pose(source: FitSource, options: PoseOptions) -> Pose:
         raise FitError(
             f'{source.name}: no still interval of {options.min_still_s:g} s; the unit must rest'
         )
-    _refuse_attitudes(bag)
+    if not is_one_attitude(bag):
+        raise FitError(
+            f'{source.name}: it rests in several attitudes, {attitudes_apart(bag):.0f} deg apart: '
+            'this fit is for one; `thermo_comp fit` tells bias and scale apart'
+        )
     events, branches = find_branches(source, bag)
     detector = learn_detector([bag])
     series, history = pose_series(source, bag, branches, detector, options.samples)
@@ -469,6 +473,35 @@ def describe(event: Event, pose: Pose) -> str:
     return f'at {event.time:.1f} s the unit {what}: the reading changed by {size}'
 
 
+def attitudes_apart(bag: ReducedBag) -> float:
+    """
+    Largest angle between the longest still interval's direction and another's [deg].
+
+    Parameters
+    ----------
+    bag : ReducedBag
+        With at least one still interval.
+
+    Returns
+    -------
+    float
+        In the sensor's own axes.
+
+    """
+    means = np.array([np.average(i.mean, axis=0, weights=i.count) for i in bag.intervals])
+    up = means / np.linalg.norm(means, axis=1, keepdims=True)
+    longest = int(np.argmax([i.count.sum() for i in bag.intervals]))
+    return float(np.degrees(np.max(np.arccos(np.clip(up @ up[longest], -1.0, 1.0)))))
+
+
+def is_one_attitude(bag: ReducedBag) -> bool:
+    """
+    Whether all still intervals have one direction, but for what jumps and drift may do.
+
+    """
+    return attitudes_apart(bag) <= _ONE_ATTITUDE_DEG
+
+
 def _clipped(bag: ReducedBag, options: PoseOptions) -> ReducedBag:
     kept = []
     for interval in bag.intervals:
@@ -490,19 +523,6 @@ def _clipped(bag: ReducedBag, options: PoseOptions) -> ReducedBag:
                 )
             )
     return replace(bag, intervals=tuple(kept))
-
-
-def _refuse_attitudes(bag: ReducedBag) -> None:
-    means = np.array([np.average(i.mean, axis=0, weights=i.count) for i in bag.intervals])
-    up = means / np.linalg.norm(means, axis=1, keepdims=True)
-    length = np.array([i.count.sum() for i in bag.intervals])
-    typical = up[int(np.argmax(length))]
-    apart = np.degrees(np.arccos(np.clip(up @ typical, -1.0, 1.0)))
-    if apart.max() > _ONE_ATTITUDE_DEG:
-        raise FitError(
-            f'{bag.source.name}: it rests in several attitudes, {np.max(apart):.0f} deg apart: '
-            'this fit is for one; `thermo_comp fit` tells bias and scale apart'
-        )
 
 
 def _inliers(columns: Array, data: Array) -> BoolArray:
