@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from .plausibility import Fault, LeadWatch, SensorGuard
 from .regime import DetectorSettings, Regime, RegimeDetector
 from .thermometer import Thermometer
 
@@ -27,6 +28,8 @@ MEMORY_START_SD = 3.0
 MEMORY_SETTLED_SD = 0.05
 #: While the case sensor is lost the gradient is guessed from the board's rate, this well.
 LOST_GRADIENT_RELATIVE_SD = 0.5
+#: A regime that no sensor has watched for this part of a thermal lag is not known any more.
+UNWATCHED_SHARE = 0.25
 
 #: Layout of `ThermalTracker.sample`; the memory values follow as pairs (value, variance).
 (
@@ -54,6 +57,9 @@ class ThermalConfig:
         Age at which the case temperature counts as lost [s].
     board_lag_s : float
         Time constant of the board behind the case, for the gradient while the case is lost [s].
+    temperature_timeout_s : float
+        Age of the board temperature at which the unit counts as unmeasured: only after that does
+        a sensor that has taken an impossible step start anew [s].
 
     Raises
     ------
@@ -65,13 +71,14 @@ class ThermalConfig:
     transition_time_s: float = 30.0
     case_timeout_s: float = 30.0
     board_lag_s: float = 900.0
+    temperature_timeout_s: float = 60.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.transition_time_s < math.inf:
             raise ValueError(
                 f'`transition_time_s` must be zero or more, got {self.transition_time_s}'
             )
-        for name in ('case_timeout_s', 'board_lag_s'):
+        for name in ('case_timeout_s', 'board_lag_s', 'temperature_timeout_s'):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
 
@@ -135,13 +142,17 @@ class ThermalTracker:
         self.board = Thermometer(detector.board)
         self.case = Thermometer(detector.case)
         self.detector = RegimeDetector(detector)
+        self.board_guard = SensorGuard(self.board, self.case, self.config.board_lag_s)
+        self.case_guard = SensorGuard(self.case, self.board, 0.0)
+        self.lead = LeadWatch(self.case, self.board)
         self._clear()
 
     def _clear(self) -> None:
         #: Stamp of the newest reading that was used, None before the first.
         self.updated_ns: int | None = None
-        self._memory = [0.0] * len(self.memory_time_constants_s)
-        self._var_memory = [MEMORY_START_SD**2] * len(self.memory_time_constants_s)
+        self._decided_ns: int | None = None
+        self._is_doubted = False
+        self._forget_memory()
         self._weight = 0.0
         self._weight_ns = 0
         self._target = 0.0
@@ -154,6 +165,9 @@ class ThermalTracker:
         self.board.reset()
         self.case.reset()
         self.detector.reset()
+        self.board_guard.reset()
+        self.case_guard.reset()
+        self.lead.reset()
         self._clear()
 
     def reconfigure(self, config: ThermalConfig, stamp_ns: int | None) -> None:
@@ -165,6 +179,7 @@ class ThermalTracker:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self.config = config
+        self.board_guard.lag_s = config.board_lag_s
 
     def is_case_live(self, stamp_ns: int) -> bool:
         """
@@ -189,15 +204,28 @@ class ThermalTracker:
         -------
         bool
             Whether the reading was used; False for one that is not finite, not newer than the
-            last, or an outlier.
+            last, an outlier, or not plausible.
 
         """
-        before_ns = self.board.stamp_ns
-        before = self.board.temperature
-        if not self.board.update(stamp_ns, celsius):
+        board = self.board
+        if not self.board_guard.admits(stamp_ns, celsius):
+            self._is_doubted = True
+            if not self._starts_anew(
+                self.board_guard, stamp_ns, self.config.temperature_timeout_s
+            ):
+                return False
+            self._forget_memory()
+        before_ns, before = board.stamp_ns, board.temperature
+        n_restarts = board.n_restarts
+        if not board.update(stamp_ns, celsius):
             return False
         if before_ns is not None:
-            self._step_memory((stamp_ns - before_ns) * 1e-9, self.board.temperature - before)
+            self._remember(
+                (stamp_ns - before_ns) * 1e-9,
+                board.temperature - before,
+                board.n_restarts != n_restarts,
+            )
+        self.case_guard.watch_other()
         self._note(stamp_ns)
         if not self.is_case_live(stamp_ns):
             self._decide(stamp_ns, None)
@@ -220,24 +248,75 @@ class ThermalTracker:
             Whether the reading was used.
 
         """
+        if not self.case_guard.admits(stamp_ns, celsius):
+            self._is_doubted = True
+            if not self._starts_anew(self.case_guard, stamp_ns, self.config.case_timeout_s):
+                return False
         if not self.case.update(stamp_ns, celsius):
             return False
+        self.board_guard.watch_other()
         self._note(stamp_ns)
         self._decide(stamp_ns, self.case)
+        self.lead.update(self.detector.regime == Regime.STATIC)
+        return True
+
+    @staticmethod
+    def _starts_anew(guard: SensorGuard, stamp_ns: int, patience_s: float) -> bool:
+        """
+        Let a sensor begin again that has stayed where it cannot have come to for long enough.
+
+        """
+        sensor = guard.own
+        seen_ns = sensor.stamp_ns
+        if guard.fault != Fault.STEP or seen_ns is None:
+            return False
+        if (stamp_ns - seen_ns) * 1e-9 <= patience_s:
+            return False
+        sensor.reset()
+        guard.reset()
         return True
 
     def _note(self, stamp_ns: int) -> None:
         if self.updated_ns is None or stamp_ns > self.updated_ns:
             self.updated_ns = stamp_ns
+        self._is_doubted = (
+            self.board_guard.fault != Fault.NONE
+            or self.case_guard.fault != Fault.NONE
+            or self.lead.is_reversed
+        )
 
     def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
         board = self.board if self.board.stamp_ns is not None else None
+        decided_ns, self._decided_ns = self._decided_ns, stamp_ns
+        unwatched_s = max(UNWATCHED_SHARE * self.settings.case.lag_s, self.config.case_timeout_s)
+        if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > unwatched_s:
+            # Nobody has seen whether a ramp began or ended meanwhile.
+            self.detector.reset()
+            self.lead.reset()
         regime = self.detector.update(stamp_ns, case, board)
         target = 1.0 if regime == Regime.DYNAMIC else 0.0
         if target != self._target:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
             self._target = target
+
+    def _forget_memory(self) -> None:
+        n_lags = len(self.memory_time_constants_s)
+        self._memory = [0.0] * n_lags
+        self._var_memory = [MEMORY_START_SD**2] * n_lags
+
+    def _remember(self, dt: float, change: float, is_restart: bool) -> None:
+        """
+        Carry the memory over to the next reading; what nobody saw is doubt.
+
+        """
+        if is_restart and dt > self.settings.board.lag_s:
+            self._forget_memory()
+            return
+        self._step_memory(dt, change)
+        if is_restart:
+            # A sensor that stepped: was it wrong before, or is it wrong now?
+            self._var_memory = [variance + change * change for variance in self._var_memory]
 
     def _step_memory(self, dt: float, change: float) -> None:
         for k, tau in enumerate(self.memory_time_constants_s):
@@ -289,6 +368,12 @@ class ThermalTracker:
             var_gradient = (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2 + (
                 lag * lag * self.board.var_rate
             )
+        if self._is_doubted:
+            var_board += self.board_guard.doubt(stamp_ns)
+            var_gradient += self.case_guard.doubt(stamp_ns)
+            if self.lead.is_reversed:
+                # What is called the case may be the board.
+                var_board += gradient * gradient
         unknown = 1.0 if self.detector.regime == Regime.UNKNOWN else 0.0
         state = (board, var_board, rate, gradient, var_gradient, self.weight_at(stamp_ns), unknown)
         if not self._memory:

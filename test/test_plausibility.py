@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What no thermometer can say is not believed, and what one can say is never doubted.
+
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import count
+
+import numpy as np
+import pytest
+from builders import SECOND_NS
+
+from thermo_comp.plausibility import STILL_READINGS, Fault, still_readings
+from thermo_comp.regime import DetectorSettings, Regime
+from thermo_comp.simulation import ChamberRipple, cyclogram_preset, simulate, unit_preset
+from thermo_comp.thermal import GRADIENT, VAR_BOARD, VAR_GRADIENT, ThermalConfig, ThermalTracker
+from thermo_comp.thermometer import ThermometerSettings
+
+SENSORS = {
+    'continuous': ThermometerSettings(noise_sd_c=0.005),
+    'sixteenths': ThermometerSettings(noise_sd_c=0.005, quantum_c=0.0625),
+    'degrees': ThermometerSettings(noise_sd_c=0.02, quantum_c=1.0),
+}
+
+
+def tracker_of(sensor='continuous', memory=(), **config):
+    settings = SENSORS[sensor]
+    return ThermalTracker(
+        DetectorSettings(case=settings, board=settings), memory, ThermalConfig(**config)
+    )
+
+
+def soak(tracker, celsius=20.0, seconds=60, start_s=0):
+    """Feed both sensors once a second with a flicker, as live ones have it; return the end."""
+    for second in range(start_s, start_s + seconds):
+        flicker = 0.004 * (-1) ** second
+        tracker.board_reading(second * SECOND_NS, celsius + flicker)
+        tracker.case_reading(second * SECOND_NS, celsius - flicker)
+    return start_s + seconds
+
+
+def test_a_step_of_40_degrees_is_no_temperature():
+    """
+    WHY: a loose wire or a stuck bit reads 60 degC on a board that was at 20 degC a second ago.
+    WHAT: such readings are left out; the first good one after them counts at once.
+
+    """
+    tracker = tracker_of()
+    now = soak(tracker)
+    for second in range(now, now + 30):
+        assert not tracker.board_reading(second * SECOND_NS, 60.0 + 0.01 * second)
+        assert tracker.board_guard.fault == Fault.STEP
+        assert tracker.board_guard.step == pytest.approx(40.0, abs=1.0)
+    assert tracker.board.temperature == pytest.approx(20.0, abs=0.01)
+    assert tracker.board_reading((now + 30) * SECOND_NS, 20.01)
+    assert tracker.board_guard.fault == Fault.NONE
+
+
+def test_a_step_that_stays_is_a_new_beginning_after_the_time_out():
+    tracker = tracker_of(memory=(600.0,), temperature_timeout_s=20.0)
+    now = soak(tracker, seconds=4000)
+    assert tracker.state_at(now * SECOND_NS).is_settled
+    taken = [tracker.board_reading((now + k) * SECOND_NS, 60.0 + 0.01 * k) for k in range(30)]
+    # The last good reading came a second before: what is older than 20 s is 19 readings later.
+    assert taken == [False] * 20 + [True] * 10
+    state = tracker.state_at((now + 29) * SECOND_NS)
+    assert state.board == pytest.approx(60.2, abs=0.1)
+    assert not state.is_settled
+
+
+def test_what_a_sensor_says_first_may_be_wrong():
+    """
+    WHY: a DS18B20 says 85 degC before its first conversion.
+    WHAT: the true readings after it are not taken for an impossible step.
+
+    """
+    tracker = tracker_of()
+    tracker.board_reading(0, 85.0)
+    tracker.board_reading(SECOND_NS, 85.0)
+    taken = [tracker.board_reading(k * SECOND_NS, 20.0 + 0.001 * k) for k in range(2, 12)]
+    assert sum(taken) >= 6
+    assert tracker.board.temperature == pytest.approx(20.0, abs=0.1)
+
+
+@pytest.mark.parametrize('sensor', SENSORS)
+@pytest.mark.parametrize('frozen', ['board', 'case'])
+def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
+    tracker = tracker_of(sensor, board_lag_s=300.0)
+    quantum = SENSORS[sensor].quantum_c
+    rng = np.random.default_rng(5)
+
+    def read(celsius):
+        value = celsius + SENSORS[sensor].noise_sd_c * rng.standard_normal()
+        return quantum * round(value / quantum) if quantum else value
+
+    last, board, case = {}, 20.0, 20.0
+    for second in count():
+        case += 2.0 / 60.0 * (second > 300)
+        board += (case - board) / 300.0
+        values = {'board': read(board), 'case': read(case)}
+        if second > 250:
+            values[frozen] = last[frozen]
+        last = values
+        tracker.board_reading(second * SECOND_NS, values['board'])
+        tracker.case_reading(second * SECOND_NS, values['case'])
+        guard = getattr(tracker, f'{frozen}_guard')
+        if guard.fault == Fault.FROZEN:
+            break
+        assert second < 1200
+    other = tracker.case_guard if frozen == 'board' else tracker.board_guard
+    assert other.fault == Fault.NONE
+    seen = getattr(tracker, frozen)
+    # Until then the sensor was off by what the other told: some quanta and a kelvin; a case is
+    # told by a board that follows it, here 10 K behind.
+    lead = 10.0 if frozen == 'case' else 0.0
+    off = (board if frozen == 'board' else case) - seen.temperature
+    assert abs(off) < 4.0 * quantum + 2.0 + lead
+    state = tracker.sample(second * SECOND_NS)
+    assert math.sqrt(state[VAR_BOARD if frozen == 'board' else VAR_GRADIENT]) > 0.5
+    # Nothing it says counts until it says something else.
+    assert not getattr(tracker, f'{frozen}_reading')((second + 1) * SECOND_NS, last[frozen])
+    assert getattr(tracker, f'{frozen}_reading')((second + 2) * SECOND_NS, last[frozen] + 0.07)
+    assert guard.fault == Fault.NONE
+
+
+def test_two_sensors_that_stand_still_count_with_growing_doubt():
+    """
+    WHY: a driver that hangs may repeat both last readings; a bench supply may give constants.
+    WHAT: the samples go on, and the temperature's variance grows as a ramp might carry it away.
+
+    """
+    tracker = tracker_of()
+    for second in range(600):
+        assert tracker.board_reading(second * SECOND_NS, 20.0)
+        assert tracker.case_reading(second * SECOND_NS, 20.0)
+    assert tracker.board_guard.fault == tracker.case_guard.fault == Fault.STILL
+    # The fastest ramp it is made for, 3 K/min, for ten minutes.
+    sd = math.sqrt(tracker.sample(600 * SECOND_NS)[VAR_BOARD])
+    assert sd == pytest.approx(30.0, rel=1e-3)
+    assert tracker.board_reading(600 * SECOND_NS, 20.004)
+    assert math.sqrt(tracker.sample(600 * SECOND_NS)[VAR_BOARD]) < 0.01
+
+
+def test_a_standstill_within_the_quantum_is_no_fault():
+    tracker = tracker_of('sixteenths')
+    for second in range(3600):
+        tracker.board_reading(second * SECOND_NS, 20.0)
+        tracker.case_reading(second * SECOND_NS, 20.0)
+    assert tracker.board_guard.fault == tracker.case_guard.fault == Fault.NONE
+
+
+def test_readings_that_chance_may_repeat():
+    # Noise of half a quantum: the same reading again with 68 %, 54 times with 1e-9.
+    assert still_readings(ThermometerSettings(0.005, 0.01)) == 54
+    assert still_readings(ThermometerSettings(0.005, 0.0)) == STILL_READINGS
+
+
+@pytest.mark.parametrize('preset', ['thermostatted', 'bare-quartz', 'mems'])
+@pytest.mark.parametrize('sensor', SENSORS)
+@pytest.mark.parametrize('is_swapped', [False, True])
+def test_a_unit_in_its_chamber_is_never_doubted_and_swapped_topics_are(preset, sensor, is_swapped):
+    settings = SENSORS[sensor]
+    unit = unit_preset(preset, 1).with_thermometers(
+        noise_sd=settings.noise_sd_c, quantum=settings.quantum_c
+    )
+    run = simulate(
+        unit,
+        cyclogram_preset('fast'),
+        (0.0, 0.0, 1.0),
+        rate_hz=0.02,
+        ripple=ChamberRipple(),
+        seed=1,
+    )
+    tracker = tracker_of(sensor)
+    readings = [(int(s), 0, float(v)) for s, v in zip(run.board_stamp_ns, run.board, strict=True)]
+    readings += [(int(s), 1, float(v)) for s, v in zip(run.case_stamp_ns, run.case, strict=True)]
+    take = [tracker.board_reading, tracker.case_reading]
+    if is_swapped:
+        take.reverse()
+    was_reversed = False
+    for stamp_ns, kind, celsius in sorted(readings):
+        take[kind](stamp_ns, celsius)
+        was_reversed = was_reversed or tracker.lead.is_reversed
+        if not is_swapped:
+            assert tracker.board_guard.fault == Fault.NONE
+            assert tracker.case_guard.fault == Fault.NONE
+    if not is_swapped:
+        assert not was_reversed
+    elif (preset, sensor) != ('bare-quartz', 'degrees') and preset != 'mems':
+        # The lead of a board that follows within seconds does not reach over a kelvin.
+        assert was_reversed
+        flat = tracker.sample(tracker.updated_ns)
+        assert flat[VAR_BOARD] >= flat[GRADIENT] ** 2
+
+
+def test_a_regime_that_nobody_watched_is_unknown():
+    """
+    WHY: after ten minutes without readings a ramp may have begun or ended unseen.
+    WHAT: the regime is unknown again, and with it the covariance larger.
+
+    """
+    tracker = tracker_of()
+    now = soak(tracker, seconds=1500)
+    assert tracker.detector.regime == Regime.STATIC
+    soak(tracker, seconds=2, start_s=now + 600)
+    assert tracker.detector.regime == Regime.UNKNOWN
+
+
+def test_a_jump_of_the_clock_forgets_the_memory():
+    tracker = tracker_of(memory=(900.0,))
+    now = soak(tracker, seconds=6000)
+    assert tracker.state_at(now * SECOND_NS).is_settled
+    soak(tracker, seconds=2, start_s=now + 86400)
+    assert not tracker.state_at((now + 86402) * SECOND_NS).is_settled

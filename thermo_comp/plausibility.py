@@ -1,0 +1,301 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what physics says about a temperature reading before any estimator believes it.
+
+A board has a heat capacity, so its temperature takes no step. A thermometer has noise, so its
+readings do not stand still, least of all while the other thermometer moves. The case is nearer to
+the surroundings than the board, so it leads in a ramp. A sensor that breaks such a rule is
+doubted: its readings are left out, or the variance grows by what may be wrong with them.
+
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from math import erf, isfinite, log, nan, sqrt
+
+from .thermometer import Thermometer, ThermometerSettings
+
+#: No part changes by more than this at once [K] or in the long run [K/s]; quanta come on top.
+LARGEST_STEP = 3.0
+LARGEST_RATE = 0.2
+#: The rule of steps holds from so many readings on: what a sensor says first may be wrong.
+SETTLED_READINGS = 5
+
+#: Readings stand still when so many of them, over so long [s], are the same to the bit.
+STILL_READINGS = 20
+STILL_S = 10.0
+#: ... or when the declared noise makes it this unlikely.
+STILL_PROBABILITY = 1e-9
+#: How far [K] the other sensor must have moved meanwhile to call a sensor frozen that has noise
+#: of its own, and one whose quantum hides it.
+OTHER_MOVED = 0.3
+OTHER_MOVED_BEYOND_CELL = 0.7
+#: A frozen sensor may be off by any temperature it was made for, at most by this [K].
+LARGEST_DOUBT = 60.0
+
+#: A lead must be this large [K] and this part of the movement to be one ...
+LEAD_K = 0.5
+LEAD_SHARE = 0.15
+#: ... in so many readings running, while the slower of both moves at least at this part of the
+#: rate of the faster.
+LEAD_READINGS = 5
+LEAD_RATE_SHARE = 0.3
+_SIGMAS = 6.0
+
+
+class Fault(Enum):
+    """
+    What is wrong with a sensor; values are the words of the diagnostics.
+
+    """
+
+    NONE = 'none'
+    #: Its readings are the same to the bit for too long: they count, with a growing variance.
+    STILL = 'stands still'
+    #: The same while the other sensor moves: its readings do not count.
+    FROZEN = 'frozen'
+    #: A change that no part can make: its readings do not count.
+    STEP = 'jumped'
+
+
+class SensorGuard:
+    """
+    Judges one sensor's readings by its past and by the other sensor.
+
+    Parameters
+    ----------
+    own : Thermometer
+        The sensor's estimator; the guard only looks at it.
+    other : Thermometer
+        That of the other sensor.
+    lag_s : float
+        How slowly this sensor follows the other one [s]; 0 for the one that leads.
+
+    Attributes
+    ----------
+    own : Thermometer
+        The sensor's estimator.
+    fault : Fault
+        What is wrong at the moment.
+    step : float
+        Size of the last step that was not believed [K].
+
+    """
+
+    def __init__(self, own: Thermometer, other: Thermometer, lag_s: float) -> None:
+        self.own = own
+        self._other = other
+        self.lag_s = lag_s
+        settings = own.settings
+        self._quantum = settings.quantum_c
+        self._has_cells = settings.has_cells
+        self._n_still = still_readings(settings)
+        self._rate = settings.fastest_ramp_k_min / 60.0
+        self.reset()
+
+    def reset(self) -> None:
+        """
+        Forget the past.
+
+        """
+        self.fault = Fault.NONE
+        self.step = 0.0
+        self._n_same = 0
+        self._n_used = 0
+        self._other_then = nan
+        self._expected = 0.0
+        self._moved = 0.0
+        self._seen_ns: int | None = None
+
+    def admits(self, stamp_ns: int, celsius: float) -> bool:
+        """
+        Judge a reading before it is used.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp.
+        celsius : float
+            The reading [degC].
+
+        Returns
+        -------
+        bool
+            Whether the estimator may have it.
+
+        """
+        own = self.own
+        if own.stamp_ns is None or stamp_ns <= own.stamp_ns or not isfinite(celsius):
+            return True  # the first one, or one that the estimator itself rejects
+        if celsius == own.reading:
+            self._n_same += 1
+            self.fault = self._judge_still(stamp_ns)
+            return self.fault != Fault.FROZEN
+        self._begin()
+        age = (stamp_ns - own.stamp_ns) * 1e-9
+        if self._n_used >= SETTLED_READINGS:
+            expected, _, variance = own.at(stamp_ns)
+            step = celsius - expected
+            possible = LARGEST_STEP + 2.0 * self._quantum + LARGEST_RATE * age
+            if abs(step) > possible + _SIGMAS * sqrt(variance):
+                self.fault = Fault.STEP
+                self.step = step
+                return False
+        self.fault = Fault.NONE
+        self._n_used += 1
+        return True
+
+    def _begin(self) -> None:
+        """
+        Begin to watch for a standstill: the reading has just changed.
+
+        """
+        self._n_same = 0
+        self._other_then = self._other.temperature
+        self._expected = self._moved = 0.0
+        self._seen_ns = self._other.stamp_ns
+
+    def watch_other(self) -> None:
+        """
+        Note how the other sensor has moved since this one last changed; call after its readings.
+
+        """
+        now_ns = self._other.stamp_ns
+        moved = self._other.temperature - self._other_then
+        if now_ns is None or not isfinite(moved):
+            self._other_then = self._other.temperature
+            self._seen_ns = now_ns
+            return
+        if self.lag_s > 0.0:
+            dt = (now_ns - (self._seen_ns or now_ns)) * 1e-9
+            if dt > 0.0:
+                # First-order lag: what this sensor should have moved by now.
+                self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
+        else:
+            # The follower may come all the way to where this sensor stands, but not past it.
+            ahead = self.own.temperature - self._other_then
+            self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
+        self._seen_ns = now_ns
+        self._moved = max(self._moved, abs(moved))
+
+    def _judge_still(self, stamp_ns: int) -> Fault:
+        own, other = self.own, self._other
+        if own.changed_ns is None:
+            return Fault.NONE
+        margin = _SIGMAS * sqrt(other.var_temperature) + 2.0 * other.settings.quantum_c
+        if self._has_cells:
+            hidden = 2.0 * self._quantum + OTHER_MOVED_BEYOND_CELL + margin
+            is_frozen = self.fault == Fault.FROZEN or abs(self._expected) > hidden
+            return Fault.FROZEN if is_frozen else Fault.NONE
+        still_s = (stamp_ns - own.changed_ns) * 1e-9
+        if self._n_same < self._n_still or still_s < STILL_S:
+            return Fault.NONE
+        return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
+
+    def doubt(self, stamp_ns: int) -> float:
+        """
+        Return the variance that comes to the temperature's while the sensor stands still [K^2].
+
+        """
+        changed_ns = self.own.changed_ns
+        if changed_ns is None or self.fault in (Fault.NONE, Fault.STEP):
+            return 0.0
+        doubt: float = min(self._rate * max(stamp_ns - changed_ns, 0) * 1e-9, LARGEST_DOUBT)
+        return doubt * doubt
+
+
+def still_readings(settings: ThermometerSettings) -> int:
+    """
+    How many equal readings in a row are more than chance.
+
+    Parameters
+    ----------
+    settings : ThermometerSettings
+        The sensor; only one without cells has such a number.
+
+    Returns
+    -------
+    int
+        At least `STILL_READINGS`.
+
+    """
+    same = erf(settings.quantum_c / (2.0 * sqrt(2.0) * settings.noise_sd_c))
+    if not 0.0 < same < 1.0:
+        return STILL_READINGS
+    return max(STILL_READINGS, round(log(STILL_PROBABILITY) / log(same)))
+
+
+class LeadWatch:
+    """
+    Finds out which of two sensors leads in a ramp.
+
+    The movements since the last calm are compared while both sensors move in one direction. Heat
+    that comes from outside moves the case first; where the board leads, the two topics are
+    swapped, or the heat comes from inside, and in both cases the gradient terms do not hold.
+
+    Parameters
+    ----------
+    case, board : Thermometer
+        The estimators.
+
+    Attributes
+    ----------
+    is_reversed : bool
+        Whether the board has led in the last ramp that told.
+
+    """
+
+    def __init__(self, case: Thermometer, board: Thermometer) -> None:
+        self._case = case
+        self._board = board
+        quanta = case.settings.quantum_c + board.settings.quantum_c
+        self._margin = LEAD_K + 2.0 * quanta
+        self.reset()
+
+    def reset(self) -> None:
+        """
+        Forget the calm and the ramps.
+
+        """
+        self.is_reversed = False
+        self._calm: tuple[float, float] | None = None
+        self._n_for = self._n_against = 0
+
+    def update(self, is_static: bool) -> None:
+        """
+        Take both sensors' last estimates; call after a reading of the case.
+
+        """
+        case, board = self._case, self._board
+        if is_static:
+            self._calm = (case.temperature, board.temperature)
+            self._n_for = self._n_against = 0
+            return
+        if self._calm is None or not (case.is_ready and board.is_ready):
+            return
+        by_case, by_board = case.temperature - self._calm[0], board.temperature - self._calm[1]
+        direction = 1.0 if by_case + by_board > 0.0 else -1.0
+        case_rate, board_rate = direction * case.rate, direction * board.rate
+        slow, fast = min(case_rate, board_rate), max(case_rate, board_rate)
+        noise = _SIGMAS * sqrt(case.var_temperature + board.var_temperature)
+        largest = max(abs(by_case), abs(by_board))
+        lead = direction * (by_case - by_board)
+        is_telling = (
+            slow > LEAD_RATE_SHARE * fast
+            and abs(lead) > self._margin + noise
+            and abs(lead) > LEAD_SHARE * largest
+        )
+        if not is_telling:
+            return
+        if lead < 0.0:
+            self._n_for += 1
+            self._n_against = 0
+        else:
+            self._n_against += 1
+            self._n_for = 0
+        if self._n_for >= LEAD_READINGS:
+            self.is_reversed = True
+        elif self._n_against >= LEAD_READINGS:
+            self.is_reversed = False
