@@ -48,7 +48,7 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
     if windows is None or not residuals:
         raise ValueError('`evidence` has no residuals')
     rows = windows.bag == shown.index
-    height = 1.25 if sheet.is_narrow else 1.2
+    height = 1.25 if sheet.is_narrow else 1.05
     figure = new_figure(sheet, 0.5 + height * len(residuals))
     panels = np.atleast_1d(figure.subplots(len(residuals), sharex=True))
     shared = _shared_limit([r[rows] for rung, r in residuals.items() if rung != RAW])
@@ -93,7 +93,7 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
     sets = [[rungs[0], rungs[-1]] if corrected else rungs]
     if len(corrected) > 1:
         sets.append(corrected)
-    figure = new_figure(sheet, 0.5 + (2.1 if sheet.is_narrow else 1.9) * len(sets))
+    figure = new_figure(sheet, 0.4 + (2.1 if sheet.is_narrow else 1.6) * len(sets))
     panels = np.atleast_1d(figure.subplots(len(sets), sharex=True))
     for axes, drawn in zip(panels, sets, strict=True):
         shade_dynamic(axes, shown, unit)
@@ -166,7 +166,8 @@ def _by_regime(
 
 def _draw_signed(axes: Axes, values: Array, line: Line) -> None:
     limit = max(float(np.quantile(np.abs(values), 0.998)) * 1.1, 1e-3)
-    edges = np.linspace(-limit, limit, 33)
+    n_bins = int(np.clip(np.sqrt(len(values)), 9, 33))
+    edges = np.linspace(-limit, limit, n_bins + 1)
     share = np.histogram(values, edges)[0] / len(values) * 100.0
     axes.stairs(share, edges, fill=True, color='#CCCCCC')
     axes.stairs(share, edges, color='#666666', linewidth=0.7)

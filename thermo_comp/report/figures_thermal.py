@@ -75,7 +75,7 @@ def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
     """
     shown, facts = shown_bag(evidence)
     unit, name = time_unit(facts.duration_s)
-    figure = new_figure(sheet, 3.3 if sheet.is_narrow else 2.9)
+    figure = new_figure(sheet, 3.2 if sheet.is_narrow else 2.5)
     axes = figure.subplots()
     shade_dynamic(axes, shown, unit)
     if shown.cyclogram is not None:
@@ -105,7 +105,7 @@ def draw_dynamics(evidence: Evidence, sheet: Sheet) -> Figure:
     unit, name = time_unit(facts.duration_s)
     has_drift = evidence.windows is not None and bool(np.any(evidence.windows.bag == shown.index))
     ratios = ([1.5] if has_drift else []) + [1.3, 1.0, 0.75]
-    figure = new_figure(sheet, (1.55 if sheet.is_narrow else 1.35) * sum(ratios))
+    figure = new_figure(sheet, (1.5 if sheet.is_narrow else 1.15) * sum(ratios))
     panels = list(np.atleast_1d(figure.subplots(len(ratios), sharex=True, height_ratios=ratios)))
     if has_drift:
         _draw_drift(panels[0], evidence, shown, sheet, unit)

@@ -26,6 +26,8 @@ from .text import number
 from .verdict import Verdict
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+# A table of at most so many rows is not torn apart in print.
+_SHORT = 16
 _STYLE = Path(__file__).with_name('page.css')
 _WORDS = {
     'good': 'Verdict: holds',
@@ -169,9 +171,10 @@ def _table(
         f'<tr{" class=chosen" if i < len(chosen) and chosen[i] else ""}>{cells(row, "td")}</tr>'
         for i, row in enumerate(rows)
     )
+    kind = 'scroll short' if len(rows) <= _SHORT else 'scroll'
     note = f'<p class="note">{escape(caption)}</p>' if caption else ''
     return (
-        f'{note}<div class="scroll"><table><thead><tr>{cells(headings, "th")}</tr></thead>'
+        f'{note}<div class="{kind}"><table><thead><tr>{cells(headings, "th")}</tr></thead>'
         f'<tbody>{body}</tbody></table></div>'
     )
 
@@ -269,12 +272,12 @@ def _axes(calibration: Calibration | None) -> str:
             f'bias, {unit}',
             'bias, µg',
             'noise, µg/√Hz',
-            'M',
-            '',
-            '',
+            'M₁',
+            'M₂',
+            'M₃',
         ),
         rows,
-        caption='M takes the sensitivity axes to the output frame.',
+        caption='M, here by its columns, takes the sensitivity axes to the output frame.',
     )
 
 
@@ -282,7 +285,10 @@ def _terms(calibration: Calibration | None) -> str:
     if calibration is None:
         return ''
     rows = []
-    for regime, part in zip(('static', 'dynamic'), calibration.regime_sets(), strict=True):
+    parts = dict(zip(('static', 'dynamic'), calibration.regime_sets(), strict=True))
+    if calibration.static == calibration.dynamic:
+        parts = {'both': calibration.static}
+    for regime, part in parts.items():
         for axis, one, reference in zip(
             AXES,
             part.axes(),

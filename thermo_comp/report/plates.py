@@ -198,12 +198,12 @@ def _histograms(_evidence: Evidence) -> str:
     )
 
 
-def _positions(evidence: Evidence) -> str:
+def _positions(_evidence: Evidence) -> str:
     return (
-        f'Direction of the specific force in the unit’s frame in {len(evidence.positions)} '
-        'positions, in an equal-area map of both halves of the sphere, seen from +z; the inner '
-        'circle is 45° of elevation. Beside it, where gravity is known, what is left in each '
-        'position: one that stands out was moved, or is not of this unit.'
+        'Direction of the specific force in the unit’s frame, position by position, in an '
+        'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° of '
+        'elevation. Beside it, where gravity is known, what is left in each position: one that '
+        'stands out was moved, or is not of this unit.'
     )
 
 
