@@ -8,6 +8,7 @@ Owns window tables with known truth for the tests of the fit, without samples or
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +44,7 @@ class Truth:
     noise_sd: float = 0.01
 
 
+@cache
 def history(step_s: float = 2.0, board_lag_s: float = 600.0) -> ThermalHistory:
     """
     One bag's thermal state: the board follows the program's air with one lag.
@@ -69,15 +71,20 @@ def lagged(temperature: Array, step_s: float, tau_s: float) -> Array:
     First-order lag by fine Euler steps: the slow road, on purpose not the fit's formula.
 
     """
-    n = 40
-    result = np.empty_like(temperature)
+    return np.array(_lagged(tuple(temperature.tolist()), step_s, tau_s))
+
+
+@cache
+def _lagged(temperature: tuple[float, ...], step_s: float, tau_s: float) -> list[float]:
+    n = 20
+    result = []
     state = temperature[0]
-    result[0] = state
+    result.append(state)
     for i in range(1, len(temperature)):
         for k in range(n):
             drive = temperature[i - 1] + (temperature[i] - temperature[i - 1]) * (k + 0.5) / n
             state += (drive - state) * step_s / n / tau_s
-        result[i] = state
+        result.append(state)
     return result
 
 

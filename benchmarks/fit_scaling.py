@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the cost of a fit: time and peak memory over the number of bags, and against reading alone.
+
+Bags of four hours are simulated once, written to disk, and then read, and fitted, by processes of
+their own, so that each peak is that process' alone.
+
+    python benchmarks/fit_scaling.py --bags 6 12 24 --rate-hz 100
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from thermo_comp.simulation import (
+    STANDARD_GRAVITY,
+    cyclogram_preset,
+    positions,
+    simulate_blocks,
+    unit_preset,
+)
+
+
+def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
+    """
+    Simulate the chamber program once per position, straight into bags.
+
+    """
+    from thermo_comp.recording import BagWriter
+
+    unit = unit_preset('thermostatted', 1)
+    paths = []
+    for number, up in enumerate(positions(n_bags, 1)):
+        path = folder / f'position-{number:02d}.mcap'
+        with BagWriter(path, metadata={'serial': unit.serial}) as bag:
+            program = cyclogram_preset('chamber')
+            for run in simulate_blocks(unit, program, up, rate_hz=rate_hz, seed=number):
+                counts = run.counts.astype(np.float64)
+                bag.write_counts('accel/counts', run.accel_stamp_ns, counts, 'accel_link')
+                bag.write_temperature('temperature/board', run.board_stamp_ns, run.board)
+                bag.write_temperature('temperature/case', run.case_stamp_ns, run.case)
+                bag.flush()
+        paths.append(path)
+    return paths
+
+
+def measure(task: str, paths: list[Path]) -> dict[str, float]:
+    """
+    Run one task in a process of its own.
+
+    """
+    done = subprocess.run(
+        [sys.executable, __file__, '--task', task, *map(str, paths)],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    return dict(json.loads(done.stdout))
+
+
+def run_task(task: str, paths: list[Path]) -> dict[str, float]:
+    """
+    Read the bags, or fit them, and say what it took.
+
+    """
+    from thermo_comp.fit_sources import fit_sources
+    from thermo_comp.fitting import FitOptions, fit
+
+    sources, _ = fit_sources(paths)
+    began = time.perf_counter()
+    n_samples = 0
+    if task == 'read':
+        for source in sources:
+            for block in source.blocks():
+                n_samples += len(block.accel_stamp_ns)
+    else:
+        result = fit(sources, FitOptions(gravity=STANDARD_GRAVITY))
+        n_samples = sum(bag.n_samples for bag in result.bags)
+    return {
+        'seconds': time.perf_counter() - began,
+        'peak_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        'n_samples': n_samples,
+    }
+
+
+def main() -> int:
+    """
+    Write, read, fit, print.
+
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument('paths', nargs='*', type=Path, help=argparse.SUPPRESS)
+    parser.add_argument('--task', choices=['read', 'fit'], help=argparse.SUPPRESS)
+    parser.add_argument('--bags', type=int, nargs='+', default=[6, 12, 24])
+    parser.add_argument('--rate-hz', type=float, default=100.0)
+    options = parser.parse_args()
+    if options.task:
+        print(json.dumps(run_task(options.task, options.paths)))
+        return 0
+    print('| bags of 4 h | samples | read s | fit s | fit / read | peak read MB | peak fit MB |')
+    print('|---|---|---|---|---|---|---|')
+    with tempfile.TemporaryDirectory() as folder:
+        paths = write_bags(Path(folder), max(options.bags), options.rate_hz)
+        for n in options.bags:
+            read, fitted = measure('read', paths[:n]), measure('fit', paths[:n])
+            print(
+                f'| {n} | {fitted["n_samples"] / 1e6:.1f} M | {read["seconds"]:.1f} '
+                f'| {fitted["seconds"]:.1f} | {fitted["seconds"] / read["seconds"]:.1f} '
+                f'| {read["peak_mb"]:.0f} | {fitted["peak_mb"]:.0f} |',
+                flush=True,
+            )
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,255 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reduction of samples: cells, still intervals, windows, readings; gravity; what sensors show.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import ArrayBlock, FitSource, normal_gravity, resolve_gravity
+from thermo_comp.fitting.reduction import Readings, ReducedBag, reduce_source
+from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
+from thermo_comp.fitting.stillness import CellAccumulator, still_intervals
+from thermo_comp.regime import DetectorSettings
+from thermo_comp.thermometer import ThermometerSettings
+
+START_NS = 1_700_000_000_123_456_789
+RATE_HZ = 100
+
+
+def stamps(n: int, rate_hz: float = RATE_HZ) -> np.ndarray:
+    return START_NS + np.round(np.arange(n) * 1e9 / rate_hz).astype(np.int64)
+
+
+def block(accel: np.ndarray, seconds: float | None = None) -> ArrayBlock:
+    n = len(accel)
+    seconds = n / RATE_HZ if seconds is None else seconds
+    readings = stamps(int(seconds) + 1, 1.0)
+    celsius = np.full(len(readings), 20.0)
+    return ArrayBlock(stamps(n), accel, readings, celsius, readings, celsius + 1.0)
+
+
+def split(whole: ArrayBlock, n_parts: int) -> list[ArrayBlock]:
+    accel = np.array_split(np.arange(len(whole.accel)), n_parts)
+    board = np.array_split(np.arange(len(whole.board)), n_parts)
+    return [
+        ArrayBlock(
+            whole.accel_stamp_ns[a], whole.accel[a],
+            whole.board_stamp_ns[b], whole.board[b],
+            whole.case_stamp_ns[b], whole.case[b],
+        )
+        for a, b in zip(accel, board, strict=True)
+    ]  # fmt: skip
+
+
+def reduced(blocks: Iterable[ArrayBlock], **options: float | None) -> ReducedBag:
+    kept = list(blocks)
+    settings = {'window_s': 10.0, 'cell_s': 0.5, 'min_still_s': 3.0, 'full_scale': 32767.0}
+    return reduce_source(FitSource('bag', lambda: kept), 0, **{**settings, **options})
+
+
+def still(rng: np.random.Generator, seconds: float, level: tuple[float, ...]) -> np.ndarray:
+    return np.array(level) + 0.3 * rng.standard_normal((int(seconds * RATE_HZ), 3))
+
+
+def test_chunks_do_not_matter(rng: np.random.Generator) -> None:
+    whole = block(np.rint(still(rng, 61.0, (10.0, -3000.0, 50.0))))
+    one = reduced([whole])
+    for n_parts in (2, 7, 50):
+        other = reduced(split(whole, n_parts))
+        for a, b in zip(one.intervals, other.intervals, strict=True):
+            np.testing.assert_array_equal(a.count, b.count)
+            # The same sums in another order of addition: only rounding differs.
+            np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
+            np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
+        np.testing.assert_array_equal(one.board.value, other.board.value)
+
+
+def test_windows_are_means_of_their_samples(rng: np.random.Generator) -> None:
+    samples = still(rng, 60.0, (0.0, 0.0, 3000.0))
+    (interval,) = reduced([block(samples)]).intervals
+    assert interval.count.sum() == len(samples)
+    assert len(interval.time) == 6
+    # Half-second cells of 50 samples: a window is 20 cells.
+    np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
+    assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
+    np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
+
+
+def test_positions_in_one_bag_are_told_apart(rng: np.random.Generator) -> None:
+    turn = np.linspace((0.0, 0.0, 3000.0), (3000.0, 0.0, 0.0), 3 * RATE_HZ)
+    turn += 40.0 * rng.standard_normal(turn.shape)
+    accel = np.vstack(
+        (still(rng, 40.0, (0.0, 0.0, 3000.0)), turn, still(rng, 30.0, (3000.0, 0.0, 0.0)))
+    )
+    first, second = reduced([block(accel)]).intervals
+    np.testing.assert_allclose(first.mean[0], (0.0, 0.0, 3000.0), atol=0.1)
+    np.testing.assert_allclose(second.mean[-1], (3000.0, 0.0, 0.0), atol=0.1)
+    # At most two cells are given up on either side of the motion.
+    assert (first.end_ns - first.start_ns) * 1e-9 == pytest.approx(40.0, abs=1.6)
+    assert (second.end_ns - second.start_ns) * 1e-9 == pytest.approx(30.0, abs=1.6)
+
+
+def test_vibration_is_cut_out(rng: np.random.Generator) -> None:
+    accel = still(rng, 60.0, (0.0, 0.0, 3000.0))
+    accel[2000:2300] += 5.0 * rng.standard_normal((300, 3))
+    first, second = reduced([block(accel)]).intervals
+    assert first.time[-1] < 20.0
+    assert second.time[0] > 23.0
+
+
+def test_a_knock_starts_a_new_position(rng: np.random.Generator) -> None:
+    # The attitude shifts by 1 count of 3000 without any vibration: 300 urad, a step of 20 sd of
+    # a cell mean.
+    accel = still(rng, 60.0, (0.0, 0.0, 3000.0))
+    accel[3000:] += (1.0, 0.0, 0.0)
+    assert len(reduced([block(accel)]).intervals) == 2
+
+
+def test_a_drift_is_no_motion(rng: np.random.Generator) -> None:
+    # 100 ppm/K at 3 K/min: 0.015 counts per second, some 0.02 sd of a cell mean per cell.
+    accel = still(rng, 300.0, (0.0, 0.0, 3000.0))
+    accel[:, 2] += 0.015 * np.arange(len(accel)) / RATE_HZ
+    assert len(reduced([block(accel)]).intervals) == 1
+
+
+def test_bad_samples_are_counted_and_left_out(rng: np.random.Generator) -> None:
+    accel = still(rng, 30.0, (0.0, 0.0, 3000.0))
+    accel[10, 1] = np.nan
+    accel[20, 2] = 32767.0
+    bag = reduced([block(accel)])
+    assert (bag.n_samples, bag.n_dropped, bag.n_saturated) == (3000, 1, 1)
+    assert sum(interval.count.sum() for interval in bag.intervals) == 2998
+
+
+def test_stamps_that_do_not_rise_are_left_out(rng: np.random.Generator) -> None:
+    whole = block(still(rng, 30.0, (0.0, 0.0, 3000.0)))
+    again = split(whole, 3)
+    bag = reduced([again[0], again[1], again[1], again[2]])
+    assert bag.n_dropped == 1000
+    assert bag.intervals[0].count.sum() == 3000
+
+
+def test_time_origin_does_not_matter(rng: np.random.Generator) -> None:
+    samples = still(rng, 30.0, (0.0, 0.0, 3000.0))
+    results = []
+    for origin in (0, 1_900_000_000_000_000_000):
+        cells = CellAccumulator(0.5, None)
+        cells.add(np.arange(3000, dtype=np.int64) * 10_000_000 + origin, samples)
+        results.append(cells.finish())
+    np.testing.assert_array_equal(results[0].mean, results[1].mean)
+    np.testing.assert_array_equal(results[0].time, results[1].time)
+
+
+def test_nothing_gives_nothing() -> None:
+    cells = CellAccumulator(0.5, None).finish()
+    assert still_intervals(cells, 3.0) == []
+
+
+def test_slow_samples_get_longer_cells(rng: np.random.Generator) -> None:
+    cells = CellAccumulator(0.5, None)
+    cells.add(stamps(640, 10.0), rng.standard_normal((640, 3)))
+    # 32 samples at 10 Hz.
+    assert cells.finish().cell_s == pytest.approx(3.2)
+
+
+def test_fast_readings_are_averaged(rng: np.random.Generator) -> None:
+    n = 60 * RATE_HZ
+    celsius = 20.0 + 0.1 * rng.standard_normal(n)
+    whole = ArrayBlock(
+        stamps(n), still(rng, 60.0, (0.0, 0.0, 3000.0)),
+        stamps(n), celsius, stamps(n), celsius,
+    )  # fmt: skip
+    board = reduced([whole]).board
+    assert board.n_read == n
+    assert len(board.value) <= n / 19
+    assert board.value.mean() == pytest.approx(celsius.mean(), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('latitude', 'height', 'expected'),
+    # Published for WGS 84: the equator, the pole, 45 degrees.
+    [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
+)
+def test_normal_gravity_of_the_tables(latitude: float, height: float, expected: float) -> None:
+    assert normal_gravity(latitude, height) == pytest.approx(expected, abs=1e-8)
+    assert normal_gravity(-latitude, height) == normal_gravity(latitude, height)
+
+
+def test_gravity_falls_with_height() -> None:
+    # The free-air gradient is 0.3086 mGal/m, and falls by 0.02 % per km.
+    fall = normal_gravity(50.0, 0.0) - normal_gravity(50.0, 1000.0)
+    assert fall == pytest.approx(3.086e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize(('latitude', 'height'), [(91.0, 0.0), (np.nan, 0.0), (0.0, 2e4)])
+def test_impossible_places_are_refused(latitude: float, height: float) -> None:
+    with pytest.raises(ValueError, match=r'`(latitude_deg|height_m)` must be within'):
+        normal_gravity(latitude, height)
+
+
+def test_gravity_is_never_guessed() -> None:
+    assert resolve_gravity(9.81, None, None) == 9.81
+    assert resolve_gravity(None, 50.0, 100.0) == normal_gravity(50.0, 100.0)
+    with pytest.raises(FitError, match='local gravity is needed'):
+        resolve_gravity(None, 50.0, None)
+    with pytest.raises(FitError, match='not found on Earth'):
+        resolve_gravity(98.1, None, None)
+
+
+def course(quantum: float, noise: float, rng: np.random.Generator) -> Readings:
+    # Soak, ramp of 1 K/min through a lag of 300 s, soak: 1 Hz for three hours.
+    time = np.arange(0.0, 10800.0)
+    air = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
+    celsius = np.empty_like(air)
+    celsius[0] = air[0]
+    for i in range(1, len(air)):
+        celsius[i] = celsius[i - 1] + (air[i] - celsius[i - 1]) / 300.0
+    celsius += noise * rng.standard_normal(len(time))
+    if quantum:
+        celsius = np.round(celsius / quantum) * quantum
+    return Readings(stamps(len(time), 1.0), celsius, len(time))
+
+
+@pytest.mark.parametrize(('quantum', 'noise'), [(0.0, 0.005), (0.0, 0.05), (0.0625, 0.005)])
+def test_a_thermometer_is_known_from_its_readings(
+    quantum: float, noise: float, rng: np.random.Generator
+) -> None:
+    found = learn_thermometer([course(quantum, noise, rng)], ThermometerSettings())
+    assert found.quantum_c == pytest.approx(quantum, rel=1e-6)
+    # Noise below a tenth of the quantum cannot be seen; that tenth is taken.
+    assert found.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
+    # An onset through the lag, seen through means of a minute: known to a third.
+    assert found.lag_s == pytest.approx(300.0, rel=0.35)
+    assert found.fastest_ramp_k_min >= 1.0
+
+
+def test_whole_degrees_are_seen() -> None:
+    assert quantum_of(np.repeat([20.0, 21.0, 22.0, 24.0], 100)) == 1.0
+    assert quantum_of(np.full(100, 20.0)) == 0.0
+
+
+def test_no_readings_keep_the_defaults() -> None:
+    empty = Readings(np.zeros(0, dtype=np.int64), np.zeros(0), 0)
+    base = DetectorSettings()
+    assert learn_thermometer([empty], base.board) == base.board
+
+
+def test_a_slow_ramp_is_not_to_be_missed(rng: np.random.Generator) -> None:
+    n = 9 * 3600
+    time = np.arange(0.0, n)
+    celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
+    celsius = celsius + 0.005 * rng.standard_normal(n)
+    readings = Readings(stamps(n, 1.0), celsius, n)
+    bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
+    slow = learn_detector([ReducedBag(**{**vars(bag), 'board': readings, 'case': readings})])
+    # The ramp is 0.15 K/min: seven tenths of it.
+    assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
+    assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5

@@ -1,0 +1,377 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Choice of the model, sets and ranges of a calibration, verdict: on tables of known truth.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fitting_truth import GRAVITY, Truth, history, table_of, without_memory
+
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import FitOptions
+from thermo_comp.fitting.evidence import (
+    corrected,
+    inflation,
+    reference_constants,
+    residual_rows,
+    slow_error,
+)
+from thermo_comp.fitting.model import ModelSpec, normalised, polynomial
+from thermo_comp.fitting.regression import Freedom, regress
+from thermo_comp.fitting.selection import (
+    N_FOLDS,
+    Selector,
+    fit_model,
+    fold_numbers,
+    function_shape,
+    golovach_spec,
+    model_spec,
+)
+from thermo_comp.fitting.solution import regressors
+from thermo_comp.fitting.start import constant_calibration, position_means
+from thermo_comp.fitting.table import WindowTable
+from thermo_comp.fitting.verdict import (
+    Finding,
+    can_tell_misalignment,
+    distinct_directions,
+    enforce,
+    geometry,
+    judge_result,
+    judge_table,
+)
+from thermo_comp.functions import CubicSpline, Exponential
+from thermo_comp.metrics import MICRO_G
+from thermo_comp.simulation import positions
+
+
+def selector_of(table: WindowTable) -> Selector:
+    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=True)
+    freedom = Freedom(time_constant_range_s=(60.0, 6000.0))
+    return Selector(table, GRAVITY, constant, freedom, lambda _name: None)
+
+
+def test_memory_is_found_where_there_is_memory(rng: np.random.Generator) -> None:
+    table, _ = table_of(replace(Truth(), noise_sd=0.002), 9, rng, window_s=200.0)
+    selector = selector_of(table)
+    assert selector.choose() == 'quadratic+memory2'
+    found = selector.try_model(model_spec('quadratic+memory2', table)).outcome.solution
+    # Lags of 400 and 2500 s from noisy windows: to some per cent.
+    np.testing.assert_allclose(found.time_constants_s, [400.0, 2500.0], rtol=0.1)
+    listed = {candidate.name: candidate for candidate in selector.table_of('quadratic+memory2')}
+    assert listed['quadratic+memory2'].is_chosen
+    # Without memory the ramps' errors stay: held out many times worse.
+    assert listed['quadratic'].held_out_rms > 5.0 * listed['quadratic+memory2'].held_out_rms
+    assert listed['quadratic+memory2'].bic < listed['quadratic'].bic
+    assert 'golovach' in listed
+
+
+@pytest.mark.parametrize(('power', 'expected'), [(0, 'constant'), (1, 'linear'), (2, 'quadratic')])
+def test_the_simplest_that_does_is_taken(
+    power: int, expected: str, rng: np.random.Generator
+) -> None:
+    kept = np.arange(1, 3) <= power
+    truth = without_memory(Truth())
+    truth = replace(
+        truth, bias_curve=truth.bias_curve * kept, scale_curve=truth.scale_curve * kept
+    )
+    table, _ = table_of(truth, 9, rng, window_s=300.0)
+    assert selector_of(table).choose() == expected
+
+
+def test_folds_are_whole_stretches_and_spare_the_first(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 6, rng, window_s=60.0)
+    folds = fold_numbers(table)
+    assert set(folds) <= {-1, *range(N_FOLDS)}
+    for bag in range(6):
+        rows = table.bag == bag
+        for section in np.unique(table.section[rows]):
+            assert len(set(folds[rows & (table.section == section)])) == 1
+        assert (folds[rows][table.section[rows] == 0] == -1).all()
+
+
+def test_sections_follow_the_program() -> None:
+    thermal = history()
+    sections = thermal.sections()
+    # The program: soak, up, soak, down, soak, up. The reversal of a ramp is a border within two
+    # minutes of its own window and the case's none.
+    for border_s in (1200.0, 3000.0, 5400.0, 9000.0, 11400.0):
+        near = np.abs(thermal.time - border_s) < 180.0
+        assert len(set(sections[near])) == 2, border_s
+    assert (np.diff(sections) >= 0).all()
+
+
+@pytest.mark.parametrize('name', ['quartic', 'linear+magic', 'linear@static', 'linear+memory3'])
+def test_unknown_models_are_refused(name: str, rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 6, rng, window_s=600.0)
+    with pytest.raises(FitError, match='is not known: give auto, golovach'):
+        model_spec(name, table)
+
+
+@pytest.mark.parametrize(
+    'name',
+    ['golovach', 'cubic+gradient+memory1', 'spline+rate', 'linear+gradient@dynamic',
+     'exponential+memory2'],
+)  # fmt: skip
+def test_sets_say_what_the_model_says(name: str, rng: np.random.Generator) -> None:
+    # The calibration's two sets, blended by hand with the flag's weight, must give the bias and
+    # the scale that the regression's columns give, for any parameters.
+    table, _ = table_of(Truth(), 3, rng, window_s=300.0, thermal=history(step_s=10.0))
+    table = replace(table, weight=rng.uniform(0.0, 1.0, len(table.weight)))
+    spec = model_spec(name, table)
+    tau = np.array([300.0, 2000.0])[: spec.n_lags]
+    columns = regressors(table, spec, tau, np.zeros((3, spec.n_lags)))
+    bias = rng.normal(size=spec.n_columns('bias')) * 1e-2
+    scale = 1000.0 * np.concatenate(([1.0], rng.normal(size=spec.n_columns('scale') - 1) * 1e-5))
+    memory = table.memory(tau).value
+    sets = [spec.axis_set(regime, bias, scale, None, 0.0) for regime in ('static', 'dynamic')]
+    parts = []
+    for one in sets:
+        terms = [table.gradient, table.rate, *memory.T]
+        on_bias = [one.gradient.bias, one.rate.bias, *one.memory.bias]
+        on_scale = [one.gradient.scale, one.rate.scale, *one.memory.scale]
+        parts.append(
+            (
+                bias[0] + one.delta + one.bias_function.value(table.t)
+                + sum(c * x for c, x in zip(on_bias, terms, strict=True)),
+                1000.0 * (one.scale_function.value(table.t)
+                + sum(c * x for c, x in zip(on_scale, terms, strict=True))),
+            )
+        )  # fmt: skip
+    w = table.weight
+    for number, expected in enumerate((columns.bias @ bias, columns.scale @ scale)):
+        blended = (1.0 - w) * parts[0][number] + w * parts[1][number]
+        # The same sums in another order.
+        np.testing.assert_allclose(blended, expected, rtol=1e-11, atol=1e-11)
+
+
+def test_covariance_of_a_set_is_that_of_its_parameters(rng: np.random.Generator) -> None:
+    spec = golovach_spec()
+    n = spec.n_columns('bias') + spec.n_columns('scale')
+    root = rng.normal(size=(n, n)) * 1e-3
+    covariance = root @ root.T
+    dynamic = spec.axis_set('dynamic', np.zeros(spec.n_columns('bias')),
+                            np.eye(1, spec.n_columns('scale'))[0], covariance, 0.0)  # fmt: skip
+    # Columns: level, static slope, delta, dynamic t and t^2, then the scale's.
+    level = covariance[0, 0] + covariance[2, 2] + 2.0 * covariance[0, 2]
+    assert dynamic.covariance[0][0] == pytest.approx(level, rel=1e-12)
+    assert dynamic.covariance[1][1] == pytest.approx(covariance[3, 3], rel=1e-12)
+    # Gradient and rate are not in this model: no variance.
+    assert dynamic.covariance[3][3] == dynamic.covariance[4][4] == 0.0
+
+
+def test_shapes_hold_the_reference() -> None:
+    spline = CubicSpline((-10.0, 0.0, 15.0), (0.0, 0.0, 0.0))
+    for shape in (spline, Exponential(0.0, (0.0,), (15.0,)), polynomial(2)):
+        for at_reference in (0.0, 1.0):
+            free = np.arange(1.0, 1.0 + shape.n_free)
+            found = normalised(shape, free, at_reference)
+            assert found.value(0.0) == pytest.approx(at_reference, abs=1e-12)
+            change = sum(f * b for f, b in zip(free, shape.basis(7.0), strict=True))
+            assert found.value(7.0) == pytest.approx(at_reference + change, rel=1e-12)
+
+
+def test_a_spline_has_the_reference_among_its_knots(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 3, rng, window_s=300.0, thermal=history(step_s=10.0))
+    assert 0.0 in function_shape('spline', table).knots_k
+    above = replace(table, t=table.t - table.t.min() + 5.0)
+    assert function_shape('spline', above).knots_k[0] == 0.0
+
+
+def test_slow_error_is_told_from_noise(rng: np.random.Generator) -> None:
+    truth = without_memory(Truth())
+    table, _ = table_of(truth, 12, rng, window_s=30.0)
+    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=True)
+    outcome = fit_model(table, ModelSpec('q', polynomial(2)), GRAVITY, constant, Freedom())
+    noise = truth.noise_sd / 1000.0
+    # White noise alone: the split leaves a tenth of it at most, from 5000 windows.
+    assert slow_error(table, outcome).max() < 0.15 * noise
+    # White residuals need no inflation; 13 blocks a position give it to 15 %.
+    assert inflation(table, outcome).max() < 1.3
+    wave = 2.0 * truth.noise_sd * np.sin(table.time / 500.0)
+    slow = replace(outcome, residual=outcome.residual + wave[:, None])
+    np.testing.assert_allclose(slow_error(table, slow), 2.0 * noise / np.sqrt(2.0), rtol=0.15)
+    assert inflation(table, slow).min() > 5.0
+
+
+def test_constants_are_those_of_still_air(rng: np.random.Generator) -> None:
+    # A board that heats itself is 2 K above the case in still air. A gradient model puts part of
+    # the level into the gradient's coefficient; the constants that are reported do not care.
+    thermal = history()
+    thermal = replace(thermal, gradient=thermal.gradient - 2.0)
+    truth = without_memory(Truth())
+    table, _ = table_of(truth, 12, rng, window_s=120.0, thermal=thermal)
+    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=True)
+    spec = model_spec('quadratic+gradient', table)
+    found = fit_model(table, spec, GRAVITY, constant, Freedom()).solution
+    bias, scale = reference_constants(table, found)
+    # Five times the claimed sd of some 1e-3 counts and 1e-4 counts per m/s^2.
+    np.testing.assert_allclose(bias, truth.bias, atol=5e-3)
+    np.testing.assert_allclose(scale, truth.scale, atol=5e-4)
+
+
+def test_residuals_fall_from_raw_to_fitted(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 12, rng, window_s=60.0)
+    selector = selector_of(table)
+    fitted = selector.try_model(model_spec('quadratic+memory2', table)).outcome.solution
+    one_set = selector.try_model(model_spec('quadratic', table)).outcome.solution
+    for row in residual_rows(table, fitted, one_set):
+        assert row.fitted.rms < row.one_set.rms < row.raw.rms
+    # What is left is the noise of one axis: 0.01 counts of 1000 per m/s^2.
+    assert residual_rows(table, fitted, one_set)[2].fitted.rms == pytest.approx(1e-5, rel=0.05)
+    force = corrected(table, fitted)
+    assert force.shape == table.mean.shape
+
+
+def findings_of(table: WindowTable, up: np.ndarray, **options: bool) -> dict[str, Finding]:
+    wanted = {'with_misalignment': True, 'has_case': True, **options}
+    return {finding.name: finding for finding in judge_table(table, up, **wanted)}
+
+
+@pytest.fixture
+def good(rng: np.random.Generator) -> tuple[WindowTable, np.ndarray]:
+    return table_of(Truth(), 18, rng, window_s=300.0)
+
+
+def test_a_good_test_passes(good: tuple[WindowTable, np.ndarray]) -> None:
+    found = findings_of(*good)
+    assert {finding.level for finding in found.values()} == {'good'}
+
+
+def test_a_small_span_is_refused(good: tuple[WindowTable, np.ndarray]) -> None:
+    table, up = good
+    for factor, level in ((0.1, 'refusal'), (0.5, 'advice')):
+        finding = findings_of(replace(table, t=factor * table.t), up)['span']
+        assert finding.level == level
+        assert 'need 10 (25 advised)' in finding.message
+
+
+def test_no_ramp_and_one_direction_are_seen(good: tuple[WindowTable, np.ndarray]) -> None:
+    table, up = good
+    assert findings_of(replace(table, rate=0.0 * table.rate), up)['ramps'].level == 'refusal'
+    heating = findings_of(replace(table, rate=np.abs(table.rate)), up)
+    assert 'only heating was seen' in heating['directions'].message
+    always = findings_of(replace(table, weight=np.ones_like(table.weight)), up)
+    assert 'only 0 % of the windows are static' in always['soak'].message
+
+
+def test_exchanged_sensors_are_seen(good: tuple[WindowTable, np.ndarray]) -> None:
+    table, up = good
+    finding = findings_of(replace(table, gradient=-table.gradient), up)['swapped']
+    assert finding.level == 'refusal'
+    assert 'are the two sensors exchanged?' in finding.message
+
+
+def test_a_missing_case_is_said(good: tuple[WindowTable, np.ndarray]) -> None:
+    assert findings_of(*good, has_case=False)['case'].level == 'advice'
+
+
+def test_six_faces_tell_no_misalignment(good: tuple[WindowTable, np.ndarray]) -> None:
+    table, _ = good
+    faces = np.vstack((np.eye(3), -np.eye(3)))
+    assert not can_tell_misalignment(faces)
+    assert findings_of(table, faces)['misalignment'].level == 'refusal'
+    assert findings_of(table, faces, with_misalignment=False)['positions'].level == 'advice'
+    # The same face again, two degrees off, is no new position.
+    tilted = faces + 0.03
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
+    assert not can_tell_misalignment(np.vstack((faces, tilted)))
+
+
+def test_too_few_and_badly_spread_positions_are_refused(
+    good: tuple[WindowTable, np.ndarray],
+) -> None:
+    table, up = good
+    assert '5 distinct positions, need 6' in findings_of(table, up[:5])['positions'].message
+    flat = np.column_stack((np.cos(np.arange(12.0)), np.sin(np.arange(12.0)), np.zeros(12)))
+    assert findings_of(table, flat)['geometry'].level == 'refusal'
+    assert geometry(flat, with_misalignment=True) == np.inf
+
+
+def test_geometry_is_the_scatter_of_the_parameters(rng: np.random.Generator) -> None:
+    # By Monte Carlo: least squares of pure norm noise on the nine parameters.
+    up = positions(12, 5)
+    x, y, z = up.T
+    jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))
+    noise = rng.standard_normal((4000, 12))
+    scatter = (noise @ np.linalg.pinv(jacobian).T).std(axis=0).max()
+    # 4000 draws know a standard deviation to 1.1 %.
+    assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
+
+
+def test_refusals_stop_and_may_be_allowed() -> None:
+    refusal = Finding('span', 'refusal', 'temperature span 3.0 degC')
+    with pytest.raises(
+        FitError, match=r'temperature span 3.0 degC \(override with --allow span\)'
+    ):
+        enforce([refusal], FitOptions(gravity=9.81))
+    (allowed,) = enforce([refusal], FitOptions(gravity=9.81, allow=('span',)))
+    assert (allowed.level, allowed.message) == ('advice', 'allowed: temperature span 3.0 degC')
+
+
+def test_a_drift_that_temperature_does_not_explain_is_said(rng: np.random.Generator) -> None:
+    table, _ = table_of(without_memory(Truth()), 12, rng, window_s=60.0)
+    # A jump of the sensor at half time, in every bag, upwards or downwards.
+    jump = np.where(table.time > 6300.0, 5.0, 0.0) * (-1.0) ** table.bag
+    jumped = replace(table, mean=table.mean + jump[:, None])
+    constant = constant_calibration(position_means(jumped), GRAVITY, with_misalignment=True)
+    spec = ModelSpec('quadratic', polynomial(2))
+    outcome = fit_model(jumped, spec, GRAVITY, constant, Freedom())
+    rows = residual_rows(jumped, outcome.solution, outcome.solution)
+    options = FitOptions(gravity=GRAVITY)
+    found = judge_result(outcome.solution, rows, slow_error(jumped, outcome), options)
+    assert 'temperature does not explain' in next(f.message for f in found if f.name == 'misfit')
+    # The jump is some 500 ug; the statement holds its size.
+    assert slow_error(jumped, outcome).max() > 100.0 * MICRO_G
+
+
+def test_data_without_drift_look_compensated(rng: np.random.Generator) -> None:
+    truth = without_memory(Truth())
+    truth = replace(truth, bias_curve=np.zeros((3, 2)), scale_curve=np.zeros((3, 2)))
+    table, _ = table_of(truth, 12, rng, window_s=60.0)
+    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=True)
+    outcome = fit_model(table, ModelSpec('c', polynomial(0)), GRAVITY, constant, Freedom())
+    rows = residual_rows(table, outcome.solution, outcome.solution)
+    found = judge_result(
+        outcome.solution, rows, slow_error(table, outcome), FitOptions(gravity=GRAVITY)
+    )
+    assert any('already compensated?' in finding.message for finding in found)
+
+
+def test_scale_factors_far_from_one_are_said(rng: np.random.Generator) -> None:
+    table, _ = table_of(without_memory(Truth()), 12, rng, window_s=300.0)
+    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=True)
+    outcome = fit_model(table, ModelSpec('q', polynomial(2)), GRAVITY, constant, Freedom())
+    rows = residual_rows(table, outcome.solution, outcome.solution)
+    options = FitOptions(gravity=GRAVITY, input='m/s^2')
+    found = judge_result(outcome.solution, rows, slow_error(table, outcome), options)
+    assert any(f.name == 'units' and 'expected near 1' in f.message for f in found)
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'gravity': -1.0}, '`gravity` must be positive, got -1.0'),
+        ({'window_s': 0.0}, '`window_s` must be positive, got 0.0'),
+        ({'full_scale': -5.0}, '`full_scale` must be positive, got -5.0'),
+        ({'cell_s': 20.0}, r'`cell_s` must not exceed `window_s` \(10.0\), got 20.0'),
+        ({'input': 'g'}, "`input` must be 'counts' or 'm/s"),
+    ],
+)
+def test_options_out_of_range_are_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FitOptions(**{'gravity': 9.81, **change})
+
+
+def test_held_lags_stay(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 9, rng, window_s=300.0)
+    trial = selector_of(table).try_model(model_spec('quadratic+memory2', table))
+    state = replace(trial.outcome.solution, time_constants_s=np.array([500.0, 2000.0]))
+    again = regress(table, state, Freedom(lags=False)).solution
+    np.testing.assert_array_equal(again.time_constants_s, [500.0, 2000.0])
