@@ -219,7 +219,7 @@ def test_a_torn_directory_says_which_file(tmp_path: Path) -> None:
     assert 'no message is' in str(info.truncated)
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=500, deadline=None)
 @given(
     data=st.data(),
     compression=st.sampled_from(['none', 'lz4', 'zstd', 'unchunked']),
@@ -244,7 +244,7 @@ def test_changed_bytes_are_an_error_or_harmless(
             assert len(found.columns) <= 24
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(content=st.binary(max_size=300), has_magic=st.booleans())
 def test_any_bytes_are_an_error_or_an_empty_bag(content: bytes, has_magic: bool) -> None:
     magic = b'\x89MCAP0\r\n' + b'\x01' + struct.pack('<Q', 8) + bytes(8)
@@ -479,6 +479,21 @@ def test_two_topics_that_fit_are_ambiguous(tmp_path: Path) -> None:
         open_recording(path)
     with open_recording(path, Topics(counts='b/accel/counts'), require=('accel',)) as reader:
         assert reader.topics == {'accel': '/b/accel/counts'}
+
+
+def test_names_from_a_bag_cannot_forge_lines(tmp_path: Path) -> None:
+    """
+    WHY: a topic's name is whatever stands in the file; an error is one line of a terminal.
+
+    """
+    path = tmp_path / 'bag.mcap'
+    with BagWriter(path) as bag:
+        for row in range(30):
+            bag.write_bool(f'a\nb\x1b[31m{row:02}' + 'x' * 1000, [1], [True])
+    with pytest.raises(RecordingError, match=r'/a\\nb\\x1b\[31m00x.* and 10 more; name') as caught:
+        open_recording(path)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 3000
 
 
 def test_torn_bags_of_other_storages_are_one_line(tmp_path: Path) -> None:

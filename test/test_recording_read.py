@@ -7,8 +7,10 @@ Reading: any bag that another tool wrote gives the columns of its messages in a 
 
 from __future__ import annotations
 
+import gc
 import shutil
 import tempfile
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,7 @@ from recording_helpers import (
     write_rosbag2,
 )
 
+from thermo_comp.errors import RecordingError
 from thermo_comp.recording import (
     Recording,
     Topics,
@@ -79,7 +82,7 @@ def read(path: Path) -> Recording:
     return read_recording(path, require=())
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     messages=bags(),
     chunk_size=st.sampled_from([1, 150, 400, 1000, 5000, 1 << 20]),
@@ -316,10 +319,45 @@ def test_a_topic_is_found_under_its_namespace(tmp_path: Path) -> None:
         assert reader.topics == {'accel': ACCEL, 'board': BOARD, 'case': CASE}
 
 
-def test_reading_twice_gives_the_same_and_an_early_stop_leaves_no_thread(tmp_path: Path) -> None:
+def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('thermo_comp.recording.assemble.BLOCK_MESSAGES', 100)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
-        first = next(iter(reader.blocks()))
+        first = next(iter(reader.blocks()))  # given up before its end
         again = next(iter(reader.blocks()))
     assert first.accel.tobytes() == again.accel.tobytes()
+
+
+def test_a_closed_recording_gives_nothing(tmp_path: Path) -> None:
+    write_mcap(tmp_path / 'bag.mcap', regular_messages())
+    write_rosbag1(tmp_path / 'bag.bag', regular_messages())
+    for name in ('bag.mcap', 'bag.bag'):
+        with open_recording(tmp_path / name) as reader:
+            pass
+        reader.close()  # once more does no harm
+        with pytest.raises(RecordingError, match=rf'{name}: the recording is closed'):
+            next(reader.blocks())
+
+
+def test_readers_that_are_given_up_leave_no_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """
+    WHY: a generator given up is closed by the garbage collector wherever that happens to run;
+    one that then waited for its threads stopped the process for good. PROMISE: threads belong to
+    the open recording and end with it.
+
+    """
+    monkeypatch.setattr('thermo_comp.recording.assemble.BLOCK_MESSAGES', 10)
+    path = tmp_path / 'bag.mcap'
+    write_mcap(path, regular_messages(400), chunk_size=500)
+    before = threading.active_count()
+    for _ in range(20):
+        with open_recording(path) as reader:
+            loop: list[object] = [reader.blocks()]
+            next(loop[0])  # type: ignore[call-overload]
+            loop.append(loop)  # a cycle: only the collector can close the generator
+    del loop
+    gc.collect()
+    assert threading.active_count() == before

@@ -16,7 +16,7 @@ from ..errors import RecordingError
 from .assemble import Part, Rows
 from .columns import Ints, Role
 from .encode import stamped_payloads
-from .topics import TEMPERATURE
+from .topics import TEMPERATURE, shown
 from .walk import MESSAGE_HEAD_BYTES, Messages
 from .wire import Bytes, Encoding, Stamped, decode_stamped, frame_runs, gather, scatter
 
@@ -158,7 +158,7 @@ class Decoder:
         try:
             stamped = decode_stamped(data, start, size, feed.type, feed.encoding, n_wanted)
         except RecordingError as error:
-            raise RecordingError(error.message, topic=feed.topic) from error
+            raise RecordingError(error.message, topic=shown(feed.topic)) from error
         is_framed = role == 'accel' or (self._keep_raw and feed.encoding == 'ros1')
         frames = frame_runs(data, stamped) if is_framed else [(0, '')]
         raw = None

@@ -103,6 +103,8 @@ class ForeignSource:
             Damaged storage or messages.
 
         """
+        if self._reader is None:
+            raise RecordingError('the recording is closed', self.path)
         roles = {topic: role for role, topic in selection.items()}
         chosen = [c for c in self._connections if c.topic in roles]
         if not chosen:

@@ -30,6 +30,7 @@ from .decode import Decoder, Feed
 from .mcap_records import ChunkSpan, DamagedError
 from .survey import Survey
 from .sweep import in_log_order
+from .topics import shown
 from .walk import Messages
 from .wire import Bytes, Encoding
 
@@ -68,6 +69,8 @@ class McapSource:
         metadata: Mapping[str, str] | None = None,
         note: str | None = None,
     ) -> None:
+        self._is_closed = False
+        self._pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
         self._surveys: list[Survey] = []
         try:
             for file in files:
@@ -130,9 +133,11 @@ class McapSource:
 
         """
         n_ranks = 0
+        if self._is_closed:
+            raise RecordingError('the recording is closed', self._surveys[0].path)
         for survey in self._surveys:
             with _translated(survey.path):
-                for part in _read(survey, selection, raw):
+                for part in _read(self._pool, survey, selection, raw):
                     last = n_ranks
                     for rows in part.values():
                         rows.rank = rows.rank + n_ranks
@@ -145,12 +150,16 @@ class McapSource:
         Close the files.
 
         """
-        for survey in self._surveys:
-            survey.close()
-        self._surveys = []
+        if not self._is_closed:
+            self._is_closed = True
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            for survey in self._surveys:
+                survey.close()
 
 
-def _read(survey: Survey, selection: dict[Role, str], raw: bool) -> Iterator[Part]:
+def _read(
+    pool: ThreadPoolExecutor, survey: Survey, selection: dict[Role, str], raw: bool
+) -> Iterator[Part]:
     decoder = _decoder(survey, selection, raw)
     if decoder is None:
         return
@@ -163,7 +172,7 @@ def _read(survey: Survey, selection: dict[Role, str], raw: bool) -> Iterator[Par
         chunks[later].start_ns < chunks[earlier].end_ns or later < earlier
         for earlier, later in pairwise(order)
     )
-    loaded = _loaded(survey.handle, [chunks[row] for row in order])
+    loaded = _loaded(pool, survey.handle, [chunks[row] for row in order])
     if is_overlapping:
         yield from in_log_order(_placed(loaded, decoder, chunks, order))
     else:
@@ -184,12 +193,12 @@ def _decoder(survey: Survey, selection: dict[Role, str], raw: bool) -> Decoder |
             continue
         if channel.encoding not in {'cdr', 'ros1'}:
             raise RecordingError(
-                f'its messages are encoded as {channel.encoding!r}, expected cdr',
-                topic=channel.topic,
+                f'its messages are encoded as {shown(channel.encoding)!r}, expected cdr',
+                topic=shown(channel.topic),
             )
         feed = Feed(channel.topic, channel.type, cast(Encoding, channel.encoding))
         if feeds.setdefault(role, feed) != feed:
-            raise RecordingError('its messages have several encodings', topic=channel.topic)
+            raise RecordingError('its messages have several encodings', topic=shown(channel.topic))
         roles[number] = role
     return Decoder(feeds, roles, raw) if roles else None
 
@@ -231,17 +240,19 @@ def _check_times(span: ChunkSpan, messages: Messages) -> None:
 
 
 def _loaded(
-    handle: int, spans: Sequence[ChunkSpan]
+    pool: ThreadPoolExecutor, handle: int, spans: Sequence[ChunkSpan]
 ) -> Iterator[tuple[ChunkSpan, Bytes, Messages]]:
     """
-    Read and decompress ahead in threads; what they do needs no interpreter lock.
+    Read and decompress ahead in threads; most of what they do needs no interpreter lock.
+
+    The pool belongs to the source, not to this generator: a generator that is given up is closed
+    by the garbage collector, anywhere, where waiting for a thread may be a deadlock.
 
     """
     waiting: deque[tuple[ChunkSpan, Future[tuple[Bytes, Messages]]]] = deque()
     n_ahead = 0
     following = iter(spans)
     upcoming = next(following, None)
-    pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
     try:
         while waiting or upcoming is not None:
             while upcoming is not None and (
@@ -256,7 +267,8 @@ def _loaded(
             data, messages = future.result()
             yield span, data, messages
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        for _, future in waiting:
+            future.cancel()
 
 
 @contextmanager

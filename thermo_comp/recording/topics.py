@@ -29,6 +29,29 @@ _TYPES = {
 _OPTIONS = {key: f'--{key}-topic' for key in _TYPES}
 
 
+_MAX_LISTED = 20
+_MAX_SHOWN = 80
+
+
+def shown(name: str) -> str:
+    """
+    Make a name that comes from a bag fit for one line of text.
+
+    Parameters
+    ----------
+    name : str
+        Whatever stands in the bag.
+
+    Returns
+    -------
+    str
+        Without control characters, shortened.
+
+    """
+    short = name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...'
+    return ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in short)
+
+
 @dataclass(frozen=True, slots=True)
 class Selection:
     """
@@ -96,7 +119,7 @@ def select_topics(
         if present[name][1]:
             found[role] = name
         elif role in require:
-            raise RecordingError('the topic has no messages', path, name)
+            raise RecordingError('the topic has no messages', path, shown(name))
     return Selection(found, accel if 'accel' in found else None)
 
 
@@ -126,7 +149,8 @@ def _find(path: Path, present: Mapping[str, tuple[str, int]], wanted: str, key: 
     spaced = sorted(name for name in present if name.endswith('/' + bare))
     if len(spaced) > 1:
         raise RecordingError(
-            f'several topics end in it: {", ".join(spaced)}; choose one with {_OPTIONS[key]}',
+            f'several topics end in it: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
+            f'choose one with {_OPTIONS[key]}',
             path,
             wanted,
         )
@@ -135,7 +159,9 @@ def _find(path: Path, present: Mapping[str, tuple[str, int]], wanted: str, key: 
 
 def _check_type(path: Path, name: str, found: str, key: str) -> None:
     if found != _TYPES[key]:
-        raise RecordingError(f'the topic has type {found}, expected {_TYPES[key]}', path, name)
+        raise RecordingError(
+            f'the topic has type {shown(found)}, expected {_TYPES[key]}', path, shown(name)
+        )
 
 
 def _missing(
@@ -144,7 +170,10 @@ def _missing(
     topics: Topics,
     key: str | None,
 ) -> RecordingError:
-    listed = ', '.join(f'{name} ({kind})' for name, (kind, _) in sorted(present.items()))
+    names = sorted(present)[:_MAX_LISTED]
+    listed = ', '.join(f'{shown(name)} ({shown(present[name][0])})' for name in names)
+    if len(present) > len(names):
+        listed += f' and {len(present) - len(names)} more'
     if key is None:
         wanted = f'{topics.counts} or {topics.imu}'
         option = f'{_OPTIONS["counts"]} or {_OPTIONS["imu"]}'

@@ -1,0 +1,153 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Finding records: the walk over many at a time equals a walk one by one, whatever bytes there are.
+
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from thermo_comp.recording.mcap_records import DamagedError
+from thermo_comp.recording.walk import Messages, locate, walk
+
+MESSAGE, CHANNEL = 5, 4
+
+
+def message(channel: int, log_ns: int, content: bytes) -> bytes:
+    body = struct.pack('<HIQQ', channel, 0, log_ns, log_ns) + content
+    return struct.pack('<BQ', MESSAGE, len(body)) + body
+
+
+def other(content: bytes) -> bytes:
+    return struct.pack('<BQ', CHANNEL, len(content)) + content
+
+
+def one_by_one(data: bytes) -> tuple[list[tuple[int, int, int, int]], list[bytes], int]:
+    """
+    Walk in a plain loop: place, size, channel, log time of each message; other contents; the end.
+
+    """
+    at, messages, others = 0, [], []
+    while at + 9 <= len(data):
+        opcode, length = struct.unpack_from('<BQ', data, at)
+        if opcode == 0 or at + 9 + length > len(data) or (opcode == MESSAGE and length < 22):
+            break
+        if opcode == MESSAGE:
+            channel, _, log_ns, _ = struct.unpack_from('<HIQQ', data, at + 9)
+            messages.append((at, length - 22, channel, log_ns))
+        else:
+            others.append(data[at + 9 : at + 9 + length])
+        at += 9 + length
+    return messages, others, at
+
+
+def listed(messages: Messages) -> list[tuple[int, int, int, int]]:
+    columns = (messages.at, messages.size, messages.channel, messages.log_ns)
+    return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+#: Contents that look like records themselves, of the very lengths that are around.
+DECEITFUL = [
+    b'\x05' * 40,
+    message(1, 5, b'\x05' * 9),
+    (message(1, 7, b'') * 3)[:40],
+    struct.pack('<BQ', MESSAGE, 22 + 40) * 4,
+    bytes(40),
+]
+
+
+@st.composite
+def records(draw: st.DrawFn) -> bytes:
+    """
+    Long regular stretches with irregular ones between.
+
+    """
+    pieces: list[bytes] = []
+    for _ in range(draw(st.integers(1, 6))):
+        content = draw(st.sampled_from(DECEITFUL) | st.binary(max_size=60))
+        pattern = [
+            message(draw(st.integers(0, 9)), draw(st.integers(0, 2**63 - 1)), content),
+            message(draw(st.integers(0, 9)), 3, draw(st.binary(max_size=8))),
+        ]
+        if draw(st.booleans()):
+            pattern.append(other(draw(st.binary(max_size=20))))
+        for _ in range(draw(st.sampled_from([1, 3, 40, 120]))):
+            pieces += draw(st.permutations(pattern)) if draw(st.booleans()) else pattern
+    return b''.join(pieces)
+
+
+@settings(max_examples=120, deadline=None)
+@given(data=records(), cut=st.integers(0, 200), tail=st.binary(max_size=30))
+def test_a_walk_equals_the_plain_loop(data: bytes, cut: int, tail: bytes) -> None:
+    data = data[: len(data) - cut] + tail
+    wanted, wanted_others, wanted_end = one_by_one(data)
+    assume(all(log_ns < 2**63 for _, _, _, log_ns in wanted))
+    others: list[bytes] = []
+    messages, end, reason = walk(
+        np.frombuffer(data, np.uint8), lambda _, content: others.append(content)
+    )
+    assert listed(messages) == wanted
+    assert others == wanted_others
+    assert end == wanted_end
+    assert (reason == '') == (end == len(data))
+
+
+def index_of(entries: list[tuple[int, int, int, int]]) -> bytes:
+    pieces = []
+    for channel in sorted({entry[2] for entry in entries}):
+        rows = b''.join(
+            struct.pack('<QQ', log_ns, at) for at, _, own, log_ns in entries if own == channel
+        )
+        pieces.append(struct.pack('<BQHI', 7, len(rows) + 6, channel, len(rows)) + rows)
+    return b''.join(pieces)
+
+
+@settings(max_examples=120, deadline=None)
+@given(data=records(), drawn=st.data())
+def test_a_false_index_changes_nothing(data: bytes, drawn: st.DataObject) -> None:
+    """
+    WHY: offsets that point into payloads which look like records could give false samples.
+
+    """
+    wanted, wanted_others, _ = one_by_one(data)
+    places = drawn.draw(
+        st.lists(st.integers(0, len(data)) | st.sampled_from([e[0] for e in wanted]), max_size=20)
+    )
+    kept = drawn.draw(st.sampled_from([wanted, wanted[:-1], wanted[1:], []]))
+    index = index_of([*kept, *((at, 0, 1, 0) for at in places)])
+    others: list[bytes] = []
+    messages = locate(
+        np.frombuffer(data, np.uint8),
+        memoryview(index),
+        lambda _, content: others.append(content),
+    )
+    assert listed(messages) == wanted
+    assert others == wanted_others
+
+
+def test_what_is_no_sequence_of_records() -> None:
+    whole = message(1, 2, b'abc')
+
+    def located(data: bytes, index: bytes = b'') -> None:
+        locate(np.frombuffer(data, np.uint8), memoryview(index), lambda *_: None)
+
+    located(whole)
+    with pytest.raises(DamagedError, match='a record ends too early'):
+        located(whole[:-1])
+    with pytest.raises(DamagedError, match='a record ends too early'):
+        located(whole + b'\x05')
+    with pytest.raises(DamagedError, match='a record has the opcode 0'):
+        located(whole + bytes(9))
+    with pytest.raises(DamagedError, match='a message record has 21 bytes'):
+        located(struct.pack('<BQ', MESSAGE, 21) + bytes(21))
+    with pytest.raises(DamagedError, match='log time beyond the year 2262'):
+        located(message(1, 2**63, b''))
+    with pytest.raises(DamagedError, match='is not its message index'):
+        located(whole, whole)
