@@ -71,7 +71,7 @@ def demo(
     quiet: options.Quiet = False,
 ) -> None:
     """
-    Run the main job on the sample bags: fit, play, compensate, compare.
+    Run the main job on the sample bags, end to end.
 
     The bag that the fit has not seen goes through the real path: player,
     DDS, the node in a process of its own, DDS, recorder.
