@@ -21,13 +21,12 @@ from .fitting.one_pose import (
     BranchFit,
     Pose,
     PoseOptions,
-    attitudes_apart,
     fit_branches,
     fit_whole,
-    is_one_attitude,
     read_pose,
 )
 from .fitting.reduction import ReducedBag, reduce_source
+from .fitting.rests import ONE_ATTITUDE_DEG, attitudes_apart
 from .fitting.sources import FitSource
 from .fitting.triad import TriadFit, fit_triad
 from .recording import Block, Input, Topics, open_recording
@@ -154,10 +153,11 @@ def tell(
         min_still_s=_MIN_STILL_S,
         full_scale=options.full_scale,
     )
-    if bag.intervals and not is_one_attitude(bag):
+    apart = attitudes_apart([bag]) if bag.intervals else 0.0
+    if apart > ONE_ATTITUDE_DEG:
         if options.gravity is None:
             raise FitError(
-                f'{source.name}: it rests in attitudes {attitudes_apart(bag):.0f} deg apart; bias '
+                f'{source.name}: it rests in attitudes {apart:.0f} deg apart; bias '
                 'and scale need local gravity: give `--gravity`, or `--latitude` and `--height`'
             )
         return Partial(source.name, None, (), fit_triad(bag.intervals, options.gravity), bag)

@@ -85,9 +85,9 @@ def partial(
 
 
 def _say_pose(out: Output, result: Partial, pose: Pose) -> None:
-    from ..fitting.one_pose import describe
+    from ..fitting.rests import describe
 
-    events = [describe(event, pose) for event in pose.events]
+    events = [describe(event, pose.milli_g) for event in pose.events]
     for event in events:
         out.line(f'- {event}')
     out.line(

@@ -30,6 +30,7 @@ from .history import ThermalHistory, thermal_history
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .reduction import ReducedBag, reduce_source
 from .regression import Freedom, Outcome, regress
+from .rests import judge_rests
 from .selection import Candidate, Selector, model_spec
 from .sensors import learn_detector
 from .solution import Solution
@@ -205,6 +206,7 @@ def _fit_table(
     tell: Progress,
 ) -> FitResult:
     findings = list(enforce(judge_bags(bags, options), options))
+    findings += enforce(judge_rests(bags, options), options)
     constant, table_findings = first_guess(table, bags, options)
     findings += enforce(table_findings, options)
     with_misalignment = bool(np.any(constant.misalignment != np.eye(3)))

@@ -32,6 +32,7 @@ from .branches import Branch, Event, find_branches
 from .history import ThermalHistory
 from .pose_series import PoseSeries, pose_series
 from .reduction import ReducedBag, reduce_source
+from .rests import ONE_ATTITUDE_DEG, attitudes_apart, describe, milli_g
 from .sensors import learn_detector
 from .sources import FitSource
 from .wander import Noise, WanderFit, fit_with_wander
@@ -43,13 +44,10 @@ BoolArray = npt.NDArray[np.bool_]
 SPAN_NEEDED = 3.0
 SPAN_OF_ORDER = ((10.0, 1), (25.0, 2))
 _HIGHEST_ORDER = 3
-_STANDARD_GRAVITY = 9.80665
 # More windows than this cost time and tell nothing new of so few parameters.
 _MOST_WINDOWS = 400
 # A bump that is still in a still window is left out of the fit beyond this many robust sd.
 _OUTLIER_SDS = 5.0
-# One attitude: the directions of all still windows lie this close together.
-_ONE_ATTITUDE_DEG = 10.0
 _CELL_S, _WINDOW_S = 2.0, 10.0
 
 
@@ -255,9 +253,7 @@ class Pose:
         Input units of a thousandth of the reading at rest: of g for m/s^2.
 
         """
-        if self.options.input == 'm/s^2':
-            return _STANDARD_GRAVITY * 1e-3
-        return float(np.median(self.series.norm)) * 1e-3
+        return milli_g([self.bag], self.options.input)
 
 
 def read_pose(source: FitSource, options: PoseOptions) -> Pose:
@@ -299,9 +295,10 @@ def read_pose(source: FitSource, options: PoseOptions) -> Pose:
         raise FitError(
             f'{source.name}: no still interval of {options.min_still_s:g} s; the unit must rest'
         )
-    if not is_one_attitude(bag):
+    apart = attitudes_apart([bag])
+    if apart > ONE_ATTITUDE_DEG:
         raise FitError(
-            f'{source.name}: it rests in several attitudes, {attitudes_apart(bag):.0f} deg apart: '
+            f'{source.name}: it rests in several attitudes, {apart:.0f} deg apart: '
             'this fit is for one; `thermo_comp fit` tells bias and scale apart'
         )
     events, branches = find_branches(source, bag)
@@ -333,7 +330,7 @@ def fit_whole(pose: Pose) -> AlongGravity:
     """
     if pose.events:
         raise FitError(
-            f'{"; ".join(describe(event, pose) for event in pose.events)}: no function of '
+            f'{"; ".join(describe(event, pose.milli_g) for event in pose.events)}: no function of '
             'temperature fits the whole; fit the branches between them'
         )
     if len(pose.branches) > 1:
@@ -441,65 +438,6 @@ def order_for(span: float) -> int:
             'the level by itself would be taken for a function of temperature'
         )
     return next((order for limit, order in SPAN_OF_ORDER if span < limit), _HIGHEST_ORDER)
-
-
-def describe(event: Event, pose: Pose) -> str:
-    """
-    Say one step in words.
-
-    Parameters
-    ----------
-    event : Event
-        The step.
-    pose : Pose
-        Gives the unit.
-
-    Returns
-    -------
-    str
-        Time, size, and what it is.
-
-    """
-    mg = pose.milli_g
-    vector = ', '.join(f'{v / mg:+.1f}' for v in event.step)
-    size = f'{event.along / mg:+.1f} mg along gravity ({vector}) within {event.duration_s:.2g} s'
-    if event.kind == 'jump':
-        kelvin = abs(event.temperature_change)
-        return (
-            f'at {event.time:.1f} s the sensor jumped by {size}, without motion, while its '
-            f'temperature changed by {kelvin:.1g} K: not a function of temperature'
-        )
-    what = 'may have been turned or jumped' if event.kind == 'turn' else 'was moved'
-    return f'at {event.time:.1f} s the unit {what}: the reading changed by {size}'
-
-
-def attitudes_apart(bag: ReducedBag) -> float:
-    """
-    Largest angle between the longest still interval's direction and another's [deg].
-
-    Parameters
-    ----------
-    bag : ReducedBag
-        With at least one still interval.
-
-    Returns
-    -------
-    float
-        In the sensor's own axes.
-
-    """
-    means = np.array([np.average(i.mean, axis=0, weights=i.count) for i in bag.intervals])
-    up = means / np.linalg.norm(means, axis=1, keepdims=True)
-    longest = int(np.argmax([i.count.sum() for i in bag.intervals]))
-    return float(np.degrees(np.max(np.arccos(np.clip(up @ up[longest], -1.0, 1.0)))))
-
-
-def is_one_attitude(bag: ReducedBag) -> bool:
-    """
-    Whether all still intervals have one direction, but for what jumps and drift may do.
-
-    """
-    return attitudes_apart(bag) <= _ONE_ATTITUDE_DEG
 
 
 def _clipped(bag: ReducedBag, options: PoseOptions) -> ReducedBag:

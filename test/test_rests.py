@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The full fit looks at its rests: a jump in any bag stops it, one attitude does, motion does not.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pose_helpers import GRAVITY, MG, Rest
+
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.rests import attitudes_apart, describe, find_jumps, judge_rests
+from thermo_comp.simulation import positions
+
+OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
+
+
+def reduced(source):
+    return reduce_source(source, 0, window_s=10.0, cell_s=2.0, min_still_s=5.0, full_scale=None)
+
+
+def bags(rng, n=9, jump_in=None, size=20.0):
+    result = []
+    for number, up in enumerate(positions(n, 3)):
+        rest = Rest(rng, level=tuple(GRAVITY * up))
+        if number == jump_in:
+            rest.add(size * MG * up, from_s=300.0)
+        result.append(rest.source(name=f'bag{number}'))
+    return result
+
+
+def test_jump_in_one_bag_stops_the_fit(rng):
+    sources = bags(rng, jump_in=4)
+    with pytest.raises(FitError, match=r'bag4: at 300.0 s the sensor jumped by \+') as refused:
+        fit(sources, OPTIONS)
+    assert 'not a function of temperature' in str(refused.value)
+    assert '--allow jump' in str(refused.value)
+    allowed = fit(sources, replace(OPTIONS, allow=('jump', 'positions', 'ramps')))
+    assert any(finding.name == 'jump' for finding in allowed.findings)
+
+
+def test_good_bags_pass(rng):
+    assert judge_rests([reduced(source) for source in bags(rng, n=6)], OPTIONS) == []
+
+
+def test_one_attitude_stops_the_fit(rng):
+    with pytest.raises(FitError, match=r'one attitude only .* `thermo_comp partial`'):
+        fit([Rest(rng).source()], OPTIONS)
+
+
+def test_turning_is_no_jump(rng):
+    rest = Rest(rng)
+    rest.accel[rest.time > 300.0] = rest.accel[rest.time > 300.0][:, [1, 2, 0]]
+    bag = reduced(rest.source())
+    assert find_jumps(bag) == ()
+    assert attitudes_apart([bag]) == pytest.approx(90.0, abs=0.5)
+
+
+def test_bag_without_neighbours_is_not_read_again(rng):
+    n_passes = 0
+    source = Rest(rng).source()
+
+    def blocks():
+        nonlocal n_passes
+        n_passes += 1
+        return source.blocks()
+
+    bag = reduced(replace(source, blocks=blocks))
+    assert len(bag.intervals) == 1
+    assert find_jumps(bag) == ()
+    assert n_passes == 1
+
+
+def test_steps_are_said_in_words(rng):
+    rest = Rest(rng)
+    rest.add((0.0, 0.0, 20.0 * MG), from_s=300.0)
+    (jump,) = find_jumps(reduced(rest.source()))
+    assert 'jumped by +' in describe(jump, MG)
+    assert 'may have been turned or jumped' in describe(replace(jump, kind='turn'), MG)
+    assert 'was moved' in describe(replace(jump, kind='motion'), MG)
+    assert np.isnan(jump.turn_seen)

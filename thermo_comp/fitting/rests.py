@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the judgement of the rests: a sensor that jumped, and bags that show one attitude only.
+
+Both end in the same place where nobody looks for them: in residuals that no temperature explains.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from .branches import Event, find_branches
+from .options import FitOptions
+from .reduction import ReducedBag, StillInterval
+from .verdict import Finding
+
+Array = npt.NDArray[np.float64]
+
+#: One attitude: the directions of all still intervals lie this close together.
+ONE_ATTITUDE_DEG = 10.0
+# Neighbours this close in time and direction may be one rest with a step in it.
+_NEAR_S, _NEAR_DEG = 30.0, 10.0
+_STANDARD_GRAVITY = 9.80665
+
+
+def attitudes_apart(bags: Sequence[ReducedBag]) -> float:
+    """
+    Largest angle between the longest still interval's direction and another's [deg].
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        With at least one still interval in all.
+
+    Returns
+    -------
+    float
+        In the sensor's own axes.
+
+    """
+    intervals = [interval for bag in bags for interval in bag.intervals]
+    up = _directions(intervals)
+    longest = int(np.argmax([interval.count.sum() for interval in intervals]))
+    return float(np.degrees(np.max(np.arccos(np.clip(up @ up[longest], -1.0, 1.0)))))
+
+
+def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
+    """
+    Find where a sensor jumped at rest; streams the bag again only where that may be.
+
+    Parameters
+    ----------
+    bag : ReducedBag
+        The bag.
+
+    Returns
+    -------
+    tuple of Event
+        Those of kind ``jump``.
+
+    """
+    if len(bag.intervals) < 2:
+        return ()
+    up = _directions(bag.intervals)
+    close = np.einsum('ij,ij->i', up[1:], up[:-1]) > np.cos(np.radians(_NEAR_DEG))
+    short = [
+        after.start_ns - before.end_ns <= _NEAR_S * 1e9
+        for before, after in pairwise(bag.intervals)
+    ]
+    if not np.any(close & np.array(short)):
+        return ()
+    return tuple(event for event in find_branches(bag.source, bag)[0] if event.kind == 'jump')
+
+
+def judge_rests(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding]:
+    """
+    Judge whether the sensor kept still where the unit did, and whether it was ever turned.
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        The bags.
+    options : FitOptions
+        The unit of the samples.
+
+    Returns
+    -------
+    list of Finding
+        Refusals.
+
+    """
+    findings = []
+    jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
+    if jumps:
+        per_mg = milli_g(bags, options.input)
+        said = '; '.join(f'{bag.source.name}: {describe(event, per_mg)}' for bag, event in jumps)
+        findings.append(
+            Finding('jump', 'refusal', f'{said}: leave out such a bag, or cut it at the jump')
+        )
+    apart = attitudes_apart(bags)
+    if apart <= ONE_ATTITUDE_DEG:
+        findings.append(
+            Finding(
+                'attitude',
+                'refusal',
+                f'one attitude only (all rests within {apart:.1f} deg): bias and scale of the '
+                'axes cannot be told apart; `thermo_comp partial` gives the drift along gravity',
+            )
+        )
+    return findings
+
+
+def milli_g(bags: Sequence[ReducedBag], kind: str) -> float:
+    """
+    Input units of a thousandth of g: of the typical reading at rest, for counts.
+
+    """
+    if kind == 'm/s^2':
+        return _STANDARD_GRAVITY * 1e-3
+    means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
+    return float(np.median(np.linalg.norm(means, axis=1))) * 1e-3
+
+
+def describe(event: Event, per_mg: float) -> str:
+    """
+    Say one step in words.
+
+    Parameters
+    ----------
+    event : Event
+        The step.
+    per_mg : float
+        Input units of a thousandth of g.
+
+    Returns
+    -------
+    str
+        Time, size, and what it is.
+
+    """
+    vector = ', '.join(f'{v / per_mg:+.3g}' for v in event.step)
+    along = f'{event.along / per_mg:+.3g} mg along gravity'
+    size = f'{along} ({vector}) within {event.duration_s:.2g} s'
+    if event.kind == 'jump':
+        kelvin = abs(event.temperature_change)
+        return (
+            f'at {event.time:.1f} s the sensor jumped by {size}, without motion, while its '
+            f'temperature changed by {kelvin:.1g} K: not a function of temperature'
+        )
+    what = 'may have been turned or jumped' if event.kind == 'turn' else 'was moved'
+    return f'at {event.time:.1f} s the unit {what}: the reading changed by {size}'
+
+
+def _directions(intervals: Sequence[StillInterval]) -> Array:
+    means = np.array([np.average(i.mean, axis=0, weights=i.count) for i in intervals])
+    return np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True))
