@@ -62,10 +62,11 @@ class Peer:
             self._executor.spin()
 
     def close(self) -> None:
-        self._executor.shutdown()
-        self._thread.join(TIMEOUT)
-        self.node.destroy_node()
         self.context.try_shutdown()
+        self._thread.join(TIMEOUT)
+        assert not self._thread.is_alive()
+        self._executor.shutdown()
+        self.node.destroy_node()
 
     def listen(
         self, kind: Any, topic: str, qos: QoSProfile = DEEP, raw: bool = False
@@ -98,6 +99,19 @@ class Peer:
         publisher = self.node.create_publisher(kind, topic, qos)
         self.poll(publisher.get_subscription_count, f'a subscriber to {topic}')
         return publisher
+
+    def join(self, node: CompensationNode) -> None:
+        """Wait until both ends of every topic know each other: nothing sent is lost from then."""
+        topics = {one.topic_name for one in self.node.subscriptions}
+        outputs = [one for one in node.node.publishers if one.topic_name in topics]
+        self.poll(
+            lambda: (
+                all(one.get_publisher_count() for one in node.node.subscriptions)
+                and all(one.get_publisher_count() for one in self.node.subscriptions)
+                and all(one.get_subscription_count() for one in outputs)
+            ),
+            'the match of all topics',
+        )
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         client = self.node.create_client(kind, name)
@@ -138,7 +152,6 @@ class Driver:
     def __init__(
         self, peer: Peer, kind: Any = Vector3Stamped, topic: str = 'accel/counts'
     ) -> None:
-        self._peer = peer
         self._samples = peer.publisher(kind, topic)
         self._board = peer.publisher(Temperature, 'temperature/board')
         self._case = peer.publisher(Temperature, 'temperature/case')
@@ -148,9 +161,6 @@ class Driver:
         if case is not None:
             self._case.publish(stamped(Temperature(temperature=case), stamp_ns))
 
-    def board_only(self, stamp_ns: int, celsius: float) -> None:
-        self._board.publish(stamped(Temperature(temperature=celsius), stamp_ns))
-
     def counts(self, stamp_ns: int, x: float, y: float, z: float, frame_id: str = 'imu') -> None:
         message = stamped(Vector3Stamped(), stamp_ns, frame_id)
         message.vector.x, message.vector.y, message.vector.z = x, y, z
@@ -158,6 +168,18 @@ class Driver:
 
     def imu(self, message: Imu) -> None:
         self._samples.publish(message)
+
+
+def drive(
+    peer: Peer, node: CompensationNode, kind: Any = Vector3Stamped, topic: str = 'accel/counts'
+) -> Driver:
+    """
+    Connect drivers to a node of this process.
+
+    """
+    driver = Driver(peer, kind, topic)
+    peer.join(node)
+    return driver
 
 
 @contextlib.contextmanager

@@ -222,7 +222,12 @@ def test_a_subscription_can_go_while_the_loop_runs(node: Node, peer: Peer) -> No
 
 def test_quality_of_service_is_open_to_overrides(node: Node) -> None:
     loop = WaitLoop(node)
-    loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=7))
+    node.declare_parameter('qos_overrides./others.subscription.depth', 3)
+    qos = QoSProfile(depth=7)
+    loop.subscribe(Vector3Stamped, 'samples', qos)
+    loop.subscribe(Vector3Stamped, 'others', qos)
+    # rclpy writes an override into the profile it is given: another user must not see it.
+    assert qos.depth == 7
     depth = node.get_parameter('qos_overrides./samples.subscription.depth')
     assert depth.value == 7
     reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')

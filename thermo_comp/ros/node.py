@@ -19,6 +19,7 @@ import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
+from copy import copy
 from typing import Any
 
 import rclpy
@@ -121,8 +122,14 @@ class CompensationNode:
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         self._log = self.node.get_logger()
+        inputs = tuple(
+            f'qos_overrides.{self.node.resolve_topic_name(topic)}.'
+            for _, topic in _INPUTS.values()
+        )
         for name in undeclared_overrides(self.node):
-            self._log.warning(f'there is no parameter `{name}`, it has no effect')
+            # The input that is not open may be opened later, with these.
+            if not name.startswith(inputs):
+                self._log.warning(f'there is no parameter `{name}`, it has no effect')
         self._say_calibration()
 
     def run(self) -> None:
@@ -161,7 +168,7 @@ class CompensationNode:
             ]
             self._imu, self._flag, self._diagnostics = (
                 self.node.create_publisher(
-                    message_type, topic, qos, qos_overriding_options=overridable
+                    message_type, topic, copy(qos), qos_overriding_options=overridable
                 )
                 for message_type, topic, qos in (
                     (Imu, 'imu/data_raw', OUTPUT_QOS),

@@ -35,18 +35,6 @@ SETTLING_S = 0.5
 
 _INPUTS = ('accel/counts', 'imu/uncompensated', 'temperature/board', 'temperature/case')
 
-#: ROS arguments that make the node lose nothing, at the price of latency when it falls behind.
-LOSSLESS: tuple[str, ...] = tuple(
-    argument
-    for override in (
-        *(f'/{topic}.subscription.reliability:=reliable' for topic in _INPUTS),
-        *(f'/{topic}.subscription.history:=keep_all' for topic in _INPUTS),
-        '/imu/data_raw.publisher.history:=keep_all',
-        '/regime/dynamic.publisher.depth:=1000',
-    )
-    for argument in ('-p', f'qos_overrides.{override}')
-)
-
 
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
@@ -144,6 +132,34 @@ class NodeProcess:
             return self.process.wait()
 
 
+def lossless(namespace: str = '') -> list[str]:
+    """
+    Give the ROS arguments under which the node loses nothing, at the price of latency.
+
+    Parameters
+    ----------
+    namespace : str, optional
+        Of the node, such as ``/imu0``.
+
+    Returns
+    -------
+    list of str
+        To be put behind ``--ros-args``.
+
+    """
+    overrides = [
+        *(f'{topic}.subscription.reliability:=reliable' for topic in _INPUTS),
+        *(f'{topic}.subscription.history:=keep_all' for topic in _INPUTS),
+        'imu/data_raw.publisher.history:=keep_all',
+        'regime/dynamic.publisher.depth:=1000',
+    ]
+    return [
+        argument
+        for override in overrides
+        for argument in ('-p', f'qos_overrides.{namespace}/{override}')
+    ]
+
+
 def round_trip(
     bag: str | Path,
     calibration: str | Path,
@@ -153,6 +169,7 @@ def round_trip(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     node_args: Sequence[str] = (),
+    namespace: str | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> RoundTrip:
@@ -174,7 +191,9 @@ def round_trip(
     input : {'auto', 'counts', 'imu'}, optional
         Which accelerometer topic of the bag is played.
     node_args : sequence of str, optional
-        Further ROS arguments of the node, beside `LOSSLESS`.
+        Further ROS arguments of the node, such as its parameters.
+    namespace : str, optional
+        Where all this happens; one of its own, which no other node hears, if not given.
     overwrite : bool, optional
         Replace an output that is there.
     progress : callable, optional
@@ -191,11 +210,18 @@ def round_trip(
         If a bag can't be read or written, or the node did not start or did not last.
 
     """
-    arguments = ('-p', f'calibration_file:={calibration}', *LOSSLESS, *node_args)
-    with NodeProcess(*arguments) as node, Recorder(output, overwrite=overwrite) as recorder:
+    namespace = f'/round_trip_{os.getpid()}' if namespace is None else namespace
+    ros_args = ['-r', f'__ns:={namespace}'] if namespace else []
+    arguments = [*ros_args, *lossless(namespace), '-p', f'calibration_file:={calibration}']
+    with (
+        NodeProcess(*arguments, *node_args) as node,
+        Recorder(output, ros_args=ros_args, overwrite=overwrite) as recorder,
+    ):
         if not recorder.wait_for_publishers(DISCOVERY_S, lambda: node.is_alive):
             raise ThermoCompError(node.said or 'the node was not found')
-        played = play(bag, rate=rate, topics=topics, input=input, progress=progress)
+        played = play(
+            bag, rate=rate, topics=topics, input=input, ros_args=ros_args, progress=progress
+        )
         n_samples = max(played.n_messages.values())
         recorder.wait_until(lambda counts: counts['imu/data_raw'] >= n_samples, SILENCE_S)
         # The last flags come behind the samples, and nobody knows how many they are.

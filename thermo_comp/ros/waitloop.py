@@ -22,6 +22,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -188,7 +189,7 @@ class WaitLoop:
             message_type,
             topic,
             _never_called,
-            qos,
+            copy(qos),  # rclpy writes the overrides into it
             raw=True,
             callback_group=self._reserved,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),

@@ -1,0 +1,311 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The node on real DDS: what goes in, what comes out, and what it says about itself.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from builders import calibration, rich_calibration
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_helpers import (
+    DEEP,
+    SECOND_NS,
+    Peer,
+    drive,
+    node_in_thread,
+    stamp_of,
+    stamped,
+)
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Bool
+
+from thermo_comp.calibration import Calibration, Unit
+from thermo_comp.calibration_file import save_calibration
+from thermo_comp.compensator import Compensator
+from thermo_comp.ros.round_trip import lossless
+
+START_NS = 1_767_225_600 * SECOND_NS
+CYCLE_NS = 10_000_000
+BEST_EFFORT = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+IMU_UNIT = Unit('T-1', 'm/s^2', 160.0, 0.01)
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Callable[..., list[str]]:
+    """Write a calibration and give the ROS arguments of a node that runs it."""
+
+    def save(of: Calibration, *overrides: str) -> list[str]:
+        path = tmp_path / 'unit.yaml'
+        save_calibration(of, path)
+        words = [f'calibration_file:={path}', 'diagnostics_period:=0.05', *overrides]
+        return [word for override in words for word in ('-p', override)]
+
+    return save
+
+
+def diagnosis(peer: Peer) -> Callable[[Callable[[DiagnosticStatus, dict[str, str]], Any]], Any]:
+    """Wait for diagnostics that fulfil a condition; answer with status and values."""
+    heard = peer.listen(DiagnosticArray, '/diagnostics')
+
+    def wait(condition: Callable[[DiagnosticStatus, dict[str, str]], Any]) -> Any:
+        found = []
+
+        def look() -> bool:
+            for array in heard:
+                values = {one.key: one.value for one in array.status[0].values}
+                if condition(array.status[0], values):
+                    found.append((array, array.status[0], values))
+                    return True
+            return False
+
+        peer.wait_for(look, f'the diagnosis among {[a.status[0].message for a in heard][-3:]}')
+        heard.clear()
+        return found[0]
+
+    return wait
+
+
+def test_publishes_the_compensators_values_under_the_inputs_stamps(
+    peer: Peer, saved: Callable[..., list[str]]
+) -> None:
+    unit = rich_calibration()
+    with node_in_thread(*saved(unit)) as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        driver = drive(peer, node)
+        compensator = Compensator(unit)
+        expected = []
+        for k in range(300):
+            stamp_ns = START_NS + k * CYCLE_NS + 123
+            if k % 10 == 0:
+                driver.temperatures(stamp_ns - 50, 20.0 + 0.001 * k, 21.0 + 0.002 * k)
+                compensator.push_board(stamp_ns - 50, 20.0 + 0.001 * k)
+                compensator.push_case(stamp_ns - 50, 21.0 + 0.002 * k)
+            driver.counts(stamp_ns, 100.0 + k, -5.0 * k, 2900.0, frame_id='accel_link')
+            expected.append((stamp_ns, compensator.process(stamp_ns, 100.0 + k, -5.0 * k, 2900.0)))
+        peer.wait_for(lambda: len(heard) == 300, '300 samples')
+    for imu, (stamp_ns, values) in zip(heard, expected, strict=True):
+        assert stamp_of(imu) == stamp_ns
+        assert imu.header.frame_id == 'accel_link'
+        force = imu.linear_acceleration
+        assert (force.x, force.y, force.z) == values[:3]
+        c00, c01, c02, c11, c12, c22 = values[3:]
+        full = [c00, c01, c02, c01, c11, c12, c02, c12, c22]
+        assert imu.linear_acceleration_covariance.tolist() == full
+        assert imu.orientation_covariance[0] == imu.angular_velocity_covariance[0] == -1.0
+
+
+def test_a_reading_that_comes_late_counts_from_the_next_sample(
+    peer: Peer, saved: Callable[..., list[str]]
+) -> None:
+    # WHY: the node takes all samples that wait before it takes the readings between them.
+    # WHAT: order of arrival decides, as in a bag; a reading never reaches back.
+    unit = rich_calibration()
+    with node_in_thread(*saved(unit), *lossless()) as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        driver = drive(peer, node)
+        compensator = Compensator(unit)
+        expected = []
+        for k in range(2000):
+            stamp_ns = START_NS + k * CYCLE_NS
+            driver.counts(stamp_ns, 100.0, -50.0, 2900.0)
+            expected.append(compensator.process(stamp_ns, 100.0, -50.0, 2900.0))
+            if k % 7 == 0:
+                # Stamped three samples before the one that it follows.
+                late = stamp_ns - 3 * CYCLE_NS
+                driver.temperatures(late, 20.0 + 0.01 * k, 22.0 + 0.01 * k)
+                compensator.push_board(late, 20.0 + 0.01 * k)
+                compensator.push_case(late, 22.0 + 0.01 * k)
+        expected = [values for values in expected if values is not None]
+        peer.wait_for(lambda: len(heard) == len(expected), f'{len(expected)} samples')
+    found = [(m.linear_acceleration.x, m.linear_acceleration.y) for m in heard]
+    assert found == [values[:2] for values in expected]
+
+
+def test_imu_input_with_frame_and_switch_of_the_input(
+    peer: Peer, saved: Callable[..., list[str]]
+) -> None:
+    unit = replace(calibration(), unit=IMU_UNIT)
+    with node_in_thread(*saved(unit, 'input:=imu', 'frame_id:=body')) as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        driver = drive(peer, node, Imu, 'imu/uncompensated')
+        driver.temperatures(START_NS, 20.0, 20.0)
+        sent = stamped(Imu(), START_NS + 1, 'sensor')
+        sent.angular_velocity.y = 0.125
+        sent.orientation.x = 0.5
+        sent.orientation_covariance[0] = 7.0
+        sent.linear_acceleration.z = 3000.0 / 300.0 * 12.0
+        driver.imu(sent)
+        peer.wait_for(lambda: heard, 'the sample')
+        assert heard[0].header.frame_id == 'body'
+        assert heard[0].angular_velocity == sent.angular_velocity
+        assert heard[0].orientation == sent.orientation
+        assert heard[0].orientation_covariance.tolist() == sent.orientation_covariance.tolist()
+        assert heard[0].linear_acceleration.z == pytest.approx(0.4, rel=1e-12)
+        # A unit in m/s^2 may come as vectors too; the node changes over while it runs.
+        assert peer.set_atomically(input='counts', frame_id='').successful
+        vectors = peer.publisher(Vector3Stamped, 'accel/counts')
+        peer.join(node)
+        message = stamped(Vector3Stamped(), START_NS + 2, 'vector')
+        message.vector.x = 150.0
+        vectors.publish(message)
+        peer.wait_for(lambda: len(heard) == 2, 'the vector')
+        assert heard[1].header.frame_id == 'vector'
+        assert heard[1].linear_acceleration.x == pytest.approx(0.5, rel=1e-12)
+
+
+def test_flag_is_latched_and_not_there_while_unknown(
+    peer: Peer, saved: Callable[..., list[str]]
+) -> None:
+    with node_in_thread(*saved(calibration()), *lossless()) as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        flags = peer.listen(Bool, 'regime/dynamic')
+        wait = diagnosis(peer)
+        driver = drive(peer, node)
+        driver.temperatures(START_NS, 20.0, 20.0)
+        driver.counts(START_NS + 1, 1.0, 2.0, 3.0)
+        _, status, values = wait(lambda _, values: values['samples out'] == '1')
+        assert (status.level, values['regime']) == (DiagnosticStatus.OK, 'unknown')
+        assert not flags
+        n = 0
+        while not flags and n < 4000:
+            # Two minutes of data at a time, until the detector has seen enough of the soak.
+            for _ in range(120):
+                n += 1
+                driver.temperatures(START_NS + n * SECOND_NS, 20.0, 20.0)
+                driver.counts(START_NS + n * SECOND_NS, 1.0, 2.0, 3.0)
+            peer.wait_for(lambda n=n: len(heard) == n + 1, 'the samples')
+        peer.wait_for(lambda: flags, 'the flag')
+        assert not flags[-1].data
+        late = peer.listen(Bool, 'regime/dynamic', LATCHED)
+        peer.wait_for(lambda: late, 'the latched flag')
+        assert not late[0].data
+
+
+def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[str]]) -> None:
+    wait = diagnosis(peer)
+    with node_in_thread(*saved(calibration())) as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        array, status, _ = wait(lambda s, _: 'no board temperature' in s.message)
+        assert status.level == DiagnosticStatus.ERROR
+        assert status.name == 'thermo_comp: compensation'
+        assert status.hardware_id == 'T-1'
+        assert stamp_of(array) == 0
+        driver = drive(peer, node)
+        stamp_ns = START_NS
+        driver.temperatures(stamp_ns, 20.0, 20.0)
+        nan = float('nan')
+        bad = [(nan, 0.0, 0.0), (32767.0, 0.0, 0.0), (0.0, -32768.0, 0.0), (1.0, 2.0, 3.0)]
+        for x, y, z in bad:
+            stamp_ns += CYCLE_NS
+            driver.counts(stamp_ns, x, y, z)
+        array, status, values = wait(lambda _, values: values['saturated'] == '2')
+        assert status.level == DiagnosticStatus.ERROR
+        assert '2 samples saturated (+-32767), dropped' in status.message
+        assert '1 samples not finite, dropped' in status.message
+        assert (values['samples in'], values['samples out']) == ('4', '1')
+        assert stamp_of(array) == stamp_ns
+        assert [m.linear_acceleration.x for m in heard] == [1.0 / 300.0]
+        # It is an error while it lasts, and no longer.
+        wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
+        driver.temperatures(stamp_ns, 40.0, 40.0)
+        driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
+        # An old stamp by more than a second is another time; a little old is disorder.
+        driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
+        _, status, _ = wait(lambda s, _: 'out of order' in s.message)
+        driver.counts(START_NS - 10 * SECOND_NS, 1.0, 2.0, 3.0)
+        wait(lambda s, _: '1 jumps of time backwards' in s.message)
+
+
+def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]) -> None:
+    wait = diagnosis(peer)
+    with node_in_thread(
+        *saved(calibration(), 'temperature_timeout:=20', 'case_timeout:=10')
+    ) as node:
+        driver = drive(peer, node)
+        # 50 degC: 15 K above the calibrated range.
+        for k in range(5):
+            driver.temperatures(START_NS + k * SECOND_NS, 50.0, 50.0)
+            driver.counts(START_NS + k * SECOND_NS, 1.0, 2.0, 3.0)
+        _, status, values = wait(lambda _, values: values['samples out'] == '5')
+        assert 'board temperature +15' in status.message
+        assert 'calibrated range, held at its edge' in status.message
+        assert float(values['temperature excess [K]']) == pytest.approx(15.0, abs=0.1)
+        assert values['board temperature [degC]'].startswith('50.0')
+        assert float(values['sd x [m/s^2]']) > 0.0
+        driver.temperatures(START_NS + 15 * SECOND_NS, 50.0)
+        driver.counts(START_NS + 15 * SECOND_NS, 1.0, 2.0, 3.0)
+        _, status, _ = wait(lambda s, _: 'case temperature lost' in s.message)
+        driver.counts(START_NS + 30 * SECOND_NS, 1.0, 2.0, 3.0)
+        wait(lambda s, _: 'board temperature 15.0 s old, held' in s.message)
+        driver.counts(START_NS + 40 * SECOND_NS, 1.0, 2.0, 3.0)
+        _, status, values = wait(lambda s, _: '25.0 s old, nothing is published' in s.message)
+        assert status.level == DiagnosticStatus.ERROR
+        assert values['stale'] == '1'
+
+
+def test_sample_rate_is_held_against_the_calibrated_one(
+    peer: Peer, saved: Callable[..., list[str]]
+) -> None:
+    wait = diagnosis(peer)
+    with node_in_thread(*saved(calibration())) as node:
+        driver = drive(peer, node)
+        driver.temperatures(START_NS, 20.0, 20.0)
+        # The unit's cycle is 10 ms; these come every 20 ms of their own time.
+        for k in range(50):
+            driver.counts(START_NS + 2 * k * CYCLE_NS, 1.0, 2.0, 3.0)
+        wait(lambda _, values: values['samples in'] == '50')
+        for k in range(50, 100):
+            driver.counts(START_NS + 2 * k * CYCLE_NS, 1.0, 2.0, 3.0)
+        _, _, values = wait(lambda s, _: 'calibrated for 100' in s.message)
+        assert float(values['sample rate [Hz]']) == pytest.approx(50.0, rel=0.1)
+
+
+@pytest.mark.parametrize('qos', [DEEP, BEST_EFFORT], ids=['reliable', 'best effort'])
+def test_any_reader_and_any_driver_match(
+    peer: Peer, saved: Callable[..., list[str]], qos: QoSProfile
+) -> None:
+    with node_in_thread(*saved(calibration())) as node:
+        heard = peer.listen(Imu, 'imu/data_raw', qos)
+        samples = peer.publisher(Vector3Stamped, 'accel/counts', qos)
+        driver = drive(peer, node)
+        driver.temperatures(START_NS, 20.0)
+        # Best effort: what is sent before both ends know each other is lost, and so is repeated.
+        stamps = iter(range(START_NS, START_NS + 1000 * CYCLE_NS, CYCLE_NS))
+        peer.poll(
+            lambda: samples.publish(stamped(Vector3Stamped(), next(stamps))) or heard, 'a sample'
+        )
+
+
+def test_namespace_and_remapping(peer: Peer, saved: Callable[..., list[str]]) -> None:
+    args = ['-r', '__ns:=/imu0', '-r', 'accel/counts:=/adc/raw', '-r', 'imu/data_raw:=imu/clean']
+    with node_in_thread(*saved(calibration()), *args) as node:
+        topics = dict(node.node.get_topic_names_and_types())
+        assert {'/adc/raw', '/imu0/imu/clean', '/imu0/temperature/board', '/diagnostics'} <= set(
+            topics
+        )
+        assert '/accel/counts' not in topics
+        names = {name for name, _ in node.node.get_service_names_and_types()}
+        assert '/imu0/thermo_comp/set_parameters' in names
