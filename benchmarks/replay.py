@@ -1,0 +1,263 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the measurement of the offline run: reading, compensating and writing a bag, in one run.
+
+Ours is the library as `thermo_comp replay` uses it. The peer is what one would write with
+rosbags: read and deserialize each message, correct it with the same compensator one by one,
+serialize and write it. All bags hold 400 Hz of counts and two temperatures at 1 Hz.
+
+    python benchmarks/replay.py --hours 24        # the day: read, compensate, linear in length
+    python benchmarks/replay.py --gigabytes 10    # peak memory of a replay of a large bag
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from thermo_comp.calibration_file import load_calibration
+from thermo_comp.compensator import Compensator
+from thermo_comp.recording import BagWriter, open_recording
+from thermo_comp.replay import replay
+
+START_NS = 1_700_000_000_000_000_000
+RATE_HZ = 400
+CALIBRATION = Path(__file__).resolve().parent.parent / 'config' / 'calibration.example.yaml'
+BLOCK = 100 * RATE_HZ
+
+
+def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
+    """
+    Write n counts messages and the temperatures beside them.
+
+    """
+    rng = np.random.default_rng(1)
+    noise = np.round(rng.normal(0.0, 8.0, (BLOCK, 3)))
+    with BagWriter(path, compression=compression) as bag:
+        for begin in range(0, n, BLOCK):
+            index = np.arange(begin, min(begin + BLOCK, n))
+            stamp_ns = START_NS + index * (1_000_000_000 // RATE_HZ)
+            counts = np.array([20.0, -300.0, 2900.0]) + np.roll(noise, begin // 7, axis=0)
+            slow = stamp_ns[index % RATE_HZ == 0]
+            celsius = 20.0 + 12.0 * np.sin((slow - START_NS) * 1e-9 / 3600.0)
+            celsius += rng.normal(0.0, 0.005, len(slow))
+            bag.write_temperature('temperature/board', slow, celsius)
+            bag.write_temperature('temperature/case', slow, celsius + 0.4)
+            bag.write_counts('accel/counts', stamp_ns, counts[: len(index)], 'accel_link')
+            bag.flush()
+
+
+def read(path: Path) -> int:
+    """
+    Read to columns, block by block.
+
+    """
+    with open_recording(path) as reader:
+        return sum(len(block) for block in reader.blocks())
+
+
+def read_and_compensate(path: Path) -> int:
+    """
+    Read to columns and correct.
+
+    """
+    compensator = Compensator(load_calibration(CALIBRATION))
+    with open_recording(path) as reader:
+        return sum(len(compensator.process_block(block).index) for block in reader.blocks())
+
+
+def compensate(path: Path) -> tuple[int, float]:
+    """
+    Correct columns that are in memory; return how many and the seconds that it alone took.
+
+    """
+    compensator = Compensator(load_calibration(CALIBRATION))
+    spent = 0.0
+    n = 0
+    with open_recording(path) as reader:
+        for block in reader.blocks():
+            begin = time.perf_counter()
+            n += len(compensator.process_block(block).index)
+            spent += time.perf_counter() - begin
+    return n, spent
+
+
+def ours(path: Path, output: Path) -> int:
+    """
+    Replay as the command does.
+
+    """
+    return replay(path, load_calibration(CALIBRATION), output, overwrite=True).counters.n_out
+
+
+def rosbags_pipeline(path: Path, output: Path) -> int:
+    """
+    Do the same message by message with rosbags.
+
+    """
+    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    imu_type = store.types['sensor_msgs/msg/Imu']
+    quaternion = store.types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    vector = store.types['geometry_msgs/msg/Vector3']
+    zero, unknown = vector(0.0, 0.0, 0.0), np.array([-1.0, *[0.0] * 8])
+    compensator = Compensator(load_calibration(CALIBRATION))
+    n = 0
+    with (
+        Reader(path) as reader,
+        Writer(output, version=9, storage_plugin=StoragePlugin.MCAP) as writer,
+    ):
+        out = writer.add_connection('/imu/data_raw', imu_type.__msgtype__, typestore=store)
+        for connection, log_ns, data in reader.messages():
+            message = store.deserialize_cdr(data, connection.msgtype)
+            stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            if connection.topic == '/temperature/board':
+                compensator.push_board(stamp_ns, message.temperature)
+            elif connection.topic == '/temperature/case':
+                compensator.push_case(stamp_ns, message.temperature)
+            else:
+                v = message.vector
+                row = compensator.process(stamp_ns, v.x, v.y, v.z)
+                if row is None:
+                    continue
+                x, y, z, xx, xy, xz, yy, yz, zz = row
+                imu = imu_type(
+                    message.header,
+                    quaternion,
+                    unknown,
+                    zero,
+                    unknown,
+                    vector(x, y, z),
+                    np.array([xx, xy, xz, xy, yy, yz, xz, yz, zz]),
+                )
+                writer.write(out, log_ns, store.serialize_cdr(imu, imu_type.__msgtype__))
+                n += 1
+    return n
+
+
+def seconds(run: Callable[[], object], repeats: int = 1) -> float:
+    """
+    Measure the best wall time of some repeats.
+
+    """
+    best = float('inf')
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        run()
+        best = min(best, time.perf_counter() - begin)
+    return best
+
+
+def pipelines(folder: Path, n: int, repeats: int) -> None:
+    """
+    Compare the whole way, bag to bag, in samples per second.
+
+    """
+    path, output = folder / 'in.mcap', folder / 'out'
+    n_peer = n // 20
+    peer = folder / 'peer.mcap'
+    write_bag(path, n)
+    write_bag(peer, n_peer)
+    mine = n / seconds(lambda: ours(path, output), repeats)
+    theirs = n_peer / seconds(lambda: rosbags_pipeline(peer, folder / 'rosbags'))
+    print('bag to bag         samples/s')
+    print(f'rosbags pipeline  {theirs:10.0f}')
+    print(f'thermo_comp       {mine:10.0f}   {mine / theirs:.1f} x')
+    path.unlink()
+
+
+def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
+    """
+    Measure reading, reading and compensating, and how they grow with the length.
+
+    """
+    print(f'{compression}: hours   samples  read s  read+comp s  ratio  compensation alone M/s')
+    lengths, times = [], []
+    for share in (0.25, 0.5, 1.0):
+        n = int(hours * share * 3600) * RATE_HZ
+        path = folder / 'day.mcap'
+        write_bag(path, n, compression)
+        reading = seconds(lambda path=path: read(path), repeats)
+        both = seconds(lambda path=path: read_and_compensate(path), repeats)
+        n_out, alone = compensate(path)
+        assert n_out == n
+        print(
+            f'{"":5} {hours * share:7.1f} {n:9d} {reading:7.2f} {both:12.2f} {both / reading:6.2f}'
+            f' {n / alone / 1e6:8.1f}'
+        )
+        lengths.append(n)
+        times.append(both)
+        path.unlink()
+    slope = np.polyfit(np.log(lengths), np.log(times), 1)[0]
+    print(f'time grows as samples^{slope:.2f}')
+
+
+def memory(folder: Path, gigabytes: float) -> None:
+    """
+    Replay a large bag in a process of its own and report its peak memory.
+
+    """
+    path, output = folder / 'large.mcap', folder / 'large_out.mcap'
+    per_sample = 105  # bytes of one counts message in an uncompressed MCAP, roughly
+    write_bag(path, int(gigabytes * 1e9 / per_sample), 'none')
+    size = path.stat().st_size
+    code = (
+        'import resource, sys; sys.path.insert(0, sys.argv[3]); import replay as r;'
+        'from pathlib import Path; n = r.ours(Path(sys.argv[1]), Path(sys.argv[2]));'
+        'print(n, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)'
+    )
+    here = str(Path(__file__).resolve().parent)
+    begin = time.perf_counter()
+    result = subprocess.run(
+        [sys.executable, '-c', code, path, output, here],
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    n, peak = result.stdout.split()
+    spent = time.perf_counter() - begin
+    print(f'{size / 1e9:.1f} GB, {n} samples: peak {peak} MB, {spent:.0f} s')
+
+
+def main() -> None:
+    """
+    Measure and print.
+
+    """
+    parser = argparse.ArgumentParser(description='The offline run against its peers.')
+    parser.add_argument('--samples', type=int, default=1_000_000, help='of the pipelines')
+    parser.add_argument('--hours', type=float, default=2.0, help='of the day')
+    parser.add_argument('--compression', default='zstd', choices=('none', 'lz4', 'zstd'))
+    parser.add_argument('--gigabytes', type=float, default=0.0, help='of the large bag')
+    parser.add_argument('--repeats', type=int, default=2)
+    options = parser.parse_args()
+    print(
+        f'{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, '
+        f'numpy {np.__version__}'
+    )
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        pipelines(folder, options.samples, options.repeats)
+        day(folder, options.hours, options.compression, options.repeats)
+        if options.gigabytes:
+            memory(folder, options.gigabytes)
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f'peak memory of this process {peak_mb:.0f} MB')
+
+
+if __name__ == '__main__':
+    main()
