@@ -37,12 +37,13 @@ _POLL_MS = 1000
 # A client that keeps a connection open without a word is let go after this [s].
 _CLIENT_TIMEOUT_S = 30.0
 _SCRIPT = """
-const shown = "%s";
+const shown = "%s", title = document.title;
 setInterval(async () => {
   try {
     const answer = await fetch("version", {cache: "no-store"});
     if (answer.ok && await answer.text() !== shown) location.reload();
-  } catch (error) { document.title = "(not served any more) " + document.title.slice(-60); }
+    document.title = title;
+  } catch (error) { document.title = "(not served any more) " + title; }
 }, %d);
 """
 
