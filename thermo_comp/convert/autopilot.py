@@ -158,7 +158,7 @@ def _thinned(readings: Readings) -> Readings | None:
 
 
 def _refuse_noiseless(path: str, rows: ImuRows) -> None:
-    use = np.isfinite(rows.accel).all(axis=1)
+    use = np.asarray(np.all(np.isfinite(rows.accel), axis=1))
     stamp_ns, accel = rows.stamp_ns[use], rows.accel[use]
     newer = np.concatenate(([True], np.diff(stamp_ns) > 0)) if len(stamp_ns) else use[:0]
     if find_stillness(stamp_ns[newer], accel[newer]).noise == 0.0:

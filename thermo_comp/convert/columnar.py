@@ -121,7 +121,8 @@ def _stamps(table: Table, columns: ColumnMap) -> IntArray:
     rate = columns.stamp.rate_hz or 1.0
     start_ns = round(columns.stamp.start_s * 1e9)
     # Each stamp from its own number, so that no rounding adds up.
-    return start_ns + np.rint(np.arange(len(table.line)) * (1e9 / rate)).astype(np.int64)
+    steps = np.rint(np.arange(len(table.line)) * (1e9 / rate))
+    return np.asarray(start_ns + steps.astype(np.int64))
 
 
 def _readings(

@@ -259,9 +259,10 @@ def write_log(
     rises = np.concatenate(([True], stamp_ns[1:] > newest[:-1]))
     back = np.concatenate(([False], stamp_ns[1:] < stamp_ns[:-1]))
     repeat = np.concatenate(([False], stamp_ns[1:] == stamp_ns[:-1]))
-    clipped = np.zeros(len(accel), dtype=np.bool_)
+    clipped: BoolArray = np.zeros(len(accel), dtype=np.bool_)
     if log.clip is not None:
-        clipped = ((accel <= log.clip[0]) | (accel >= log.clip[1])).any(axis=1)
+        beyond = (accel <= log.clip[0]) | (accel >= log.clip[1])
+        clipped = np.asarray(np.any(beyond, axis=1))
     stillness = find_stillness(stamp_ns[rises], accel[rises])
     _refuse_wrong_units(log, stillness)
 

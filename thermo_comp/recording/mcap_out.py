@@ -182,7 +182,7 @@ class McapFile:
         self._put_chunk(stretch, *future.result())
 
     def _pack(self, data: Bytes) -> tuple[bytes | memoryview, int]:
-        return self._compress(data), zlib.crc32(data)
+        return self._compress(data), zlib.crc32(data.data)
 
     def finish(self, custom: Mapping[str, str]) -> FileSummary:
         """

@@ -60,14 +60,14 @@ def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
         raise DamagedError(f'unknown compression {compression!r}, expected zstd, lz4 or none')
     if len(data) != size:
         raise DamagedError(f'{len(data)} bytes after decompression, expected {size}')
-    if checksum and zlib.crc32(data) != checksum:
+    if checksum and zlib.crc32(data.data) != checksum:
         raise DamagedError('the checksum does not fit the content')
     return data
 
 
 def _unpack_zstd(packed: Bytes, size: int) -> Bytes:
     data = np.empty(size, np.uint8)
-    view = memoryview(data)
+    view = data.data
     try:
         with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(
             packed.data, read_across_frames=True

@@ -231,7 +231,7 @@ class Attitude:
         envelope = self.handling.vibration * np.sin(math.pi * part) ** 2
         for i, rng in enumerate(vibration):
             force[handled, i] += envelope * rng.standard_normal(len(handled))
-        return force
+        return np.asarray(force)
 
 
 def _turn(

@@ -193,7 +193,7 @@ class ThermalNetwork:
 
         """
         A, b, p = self.system()
-        return np.linalg.solve(A, -b * air - p)[: len(self.nodes)]
+        return np.asarray(np.linalg.solve(A, -b * air - p)[: len(self.nodes)], dtype=np.float64)
 
     def air_for(self, node: str, temperature: float) -> float:
         """

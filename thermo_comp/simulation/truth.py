@@ -129,8 +129,7 @@ class SimulatedRun:
         """
         converter = self.truth.unit.converter
         at_rail = (self.counts <= converter.low) | (self.counts >= converter.high)
-        result: NDArray[np.bool_] = at_rail.any(axis=1)
-        return result
+        return np.asarray(np.any(at_rail, axis=1))
 
 
 def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> NDArray[np.bool_]:
