@@ -14,7 +14,7 @@ VERSION = re.search(
 # On Ubuntu 24.04 apt already satisfies every floor but those of pydantic, rosbags and mcap.
 INSTALL = [
     'numpy>=1.26',
-    'pydantic>=2.5',
+    'pydantic>=2.6',
     'PyYAML>=6.0',
     'scipy>=1.11',
     'typer>=0.9',
