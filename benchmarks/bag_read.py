@@ -6,6 +6,7 @@ Owns the measurement of reading: bag to columns, ours against rosbags and mcap i
 All read the same counts and temperatures (400 Hz and 2 x 10 Hz) from the same files. `rosbags`
 reads and deserializes each message; `mcap` reads each message and does not decode it at all.
 Rates are counts messages per second of wall time, best of the repeats; what matters are ratios.
+Ours uses two threads beside its own, so on a busy machine compare the CPU times.
 
     python benchmarks/bag_read.py --samples 1000000
 
@@ -23,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -103,40 +105,48 @@ def read_mcap(path: Path) -> int:
     return n
 
 
-def rate(read: Callable[[Path], int], path: Path, n: int, repeats: int) -> float:
+def timed(read: Callable[[Path], int], path: Path, n: int) -> tuple[float, float]:
     """
-    Measure messages per second, best of some repeats.
+    Measure wall and CPU time of one reading, per message.
 
     """
-    best = float('inf')
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        found = read(path)
-        best = min(best, time.perf_counter() - begin)
-        assert found == n, f'{found} messages read, {n} written'
-    return n / best
+    wall, cpu = time.perf_counter(), time.process_time()
+    found = read(path)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    assert found == n, f'{found} messages read, {n} written'
+    return wall / n, cpu / n
 
 
 def measure(
     folder: Path, n: int, n_peers: int, repeats: int, chunk_bytes: int
-) -> Iterator[dict[str, float | str]]:
+) -> Iterator[dict[str, Any]]:
     """
-    Yield one row of results per compression.
+    Yield one row of results per compression; all readers take turns, the best of each counts.
 
     """
     for compression in COMPRESSIONS:
         ours, peers = folder / f'{compression}.mcap', folder / f'{compression}_peers.mcap'
         write_bag(ours, n, compression, chunk_bytes)
         write_bag(peers, n_peers, compression, chunk_bytes)
-        row: dict[str, float | str] = {
+        readers = {
+            'rosbags': (read_rosbags, peers, n_peers),
+            'mcap': (read_mcap, peers, n_peers),
+            'blocks': (read_ours_blocks, ours, n),
+            'whole': (read_ours_whole, ours, n),
+        }
+        times = {name: (float('inf'), float('inf')) for name in readers}
+        for _ in range(repeats):
+            for name, (read, path, count) in readers.items():
+                wall, cpu = timed(read, path, count)
+                times[name] = (min(times[name][0], wall), min(times[name][1], cpu))
+        yield {
             'compression': compression,
             'bytes_per_message': ours.stat().st_size / n,
-            'rosbags': rate(read_rosbags, peers, n_peers, repeats),
-            'mcap': rate(read_mcap, peers, n_peers, repeats),
-            'blocks': rate(read_ours_blocks, ours, n, repeats),
-            'whole': rate(read_ours_whole, ours, n, repeats),
+            'rates': {name: 1.0 / wall for name, (wall, _) in times.items()},
+            'cpu_s_per_message': {name: cpu for name, (_, cpu) in times.items()},
+            'blocks_to_rosbags': times['rosbags'][0] / times['blocks'][0],
+            'blocks_to_rosbags_cpu': times['rosbags'][1] / times['blocks'][1],
         }
-        yield row
         ours.unlink()
         peers.unlink()
 
@@ -171,13 +181,13 @@ def main() -> None:
         print()
         return
     print(f'{machine}; {options.samples} samples, chunks of {options.chunk_bytes} bytes')
-    print('compression  B/msg  rosbags M/s  mcap M/s  blocks M/s  whole M/s   blocks/rosbags')
+    print('             bytes      million messages per second       ours (blocks) to rosbags')
+    print('compression  /msg  rosbags   mcap  blocks   whole        wall time   CPU time')
     for row in rows:
-        rates = [float(row[key]) for key in ('rosbags', 'mcap', 'blocks', 'whole')]
+        million = ''.join(f'{rate / 1e6:8.2f}' for rate in row['rates'].values())
         print(
-            f'{row["compression"]:11}  {float(row["bytes_per_message"]):5.1f}'
-            f'  {rates[0] / 1e6:11.3f}  {rates[1] / 1e6:8.3f}  {rates[2] / 1e6:10.2f}'
-            f'  {rates[3] / 1e6:9.2f}   {rates[2] / rates[0]:10.1f} x'
+            f'{row["compression"]:11}{row["bytes_per_message"]:6.1f}{million}'
+            f'{row["blocks_to_rosbags"]:14.1f} x{row["blocks_to_rosbags_cpu"]:9.1f} x'
         )
 
 

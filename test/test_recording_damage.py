@@ -8,6 +8,7 @@ clear error; nothing crashes, hangs or takes memory that the file does not justi
 
 from __future__ import annotations
 
+import os
 import resource
 import struct
 import tempfile
@@ -340,7 +341,7 @@ def test_false_times_of_a_chunk_are_found(tmp_path: Path) -> None:
     start, end = struct.unpack_from('<QQ', content, position + 9)
     changed = content.replace(struct.pack('<QQ', start, end), struct.pack('<QQ', start + 5, end))
     path.write_bytes(changed)
-    with pytest.raises(RecordingError, match='outside the time span it claims'):
+    with pytest.raises(RecordingError, match='outside the time it claims'):
         read(path)
 
 
@@ -402,6 +403,9 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
             open_recording(path)
 
     refused(tmp_path / 'nowhere', 'nowhere: no such file or directory')
+    refused(tmp_path / ('x' * 300), 'cannot be opened: File name too long')
+    os.mkfifo(tmp_path / 'pipe.mcap')
+    refused(tmp_path / 'pipe.mcap', 'not a bag: neither a file nor a directory')
     (tmp_path / 'notes.txt').write_text('hello')
     refused(tmp_path / 'notes.txt', r'not a bag: expected a directory, \.mcap, \.db3 or \.bag')
     (tmp_path / 'text.mcap').write_text('hello, this is no bag at all')

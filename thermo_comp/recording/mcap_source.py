@@ -37,6 +37,7 @@ from .wire import Bytes, Encoding
 _N_LOADERS = 2
 _N_AHEAD = 3
 _AHEAD_BYTES = 1 << 26
+_GROUP_BYTES = 1 << 20
 #: Places of one chunk are below this, so a chunk's number times it plus a place is unique.
 _PLACES = 1 << 32
 
@@ -172,15 +173,31 @@ def _read(
         chunks[later].start_ns < chunks[earlier].end_ns or later < earlier
         for earlier, later in pairwise(order)
     )
-    loaded = _loaded(pool, survey.handle, [chunks[row] for row in order])
+    ordered = [chunks[row] for row in order]
     if is_overlapping:
-        yield from in_log_order(_placed(loaded, decoder, chunks, order))
+        loaded = _loaded(pool, survey.handle, [[span] for span in ordered])
+        yield from in_log_order(_placed(loaded, decoder, ordered, order))
     else:
-        for span, data, messages in loaded:
-            _check_times(span, messages)
+        for data, messages in _loaded(pool, survey.handle, _grouped(ordered)):
             part = decoder.part(data, messages, None)
             if part:
                 yield part
+
+
+def _grouped(spans: Sequence[ChunkSpan]) -> list[list[ChunkSpan]]:
+    """
+    Put small chunks together: array passes and threads are for many messages at a time.
+
+    """
+    groups: list[list[ChunkSpan]] = []
+    size = _GROUP_BYTES
+    for span in spans:
+        if size + span.size > _GROUP_BYTES:
+            groups.append([])
+            size = 0
+        groups[-1].append(span)
+        size += span.size
+    return groups
 
 
 def _decoder(survey: Survey, selection: dict[Role, str], raw: bool) -> Decoder | None:
@@ -218,30 +235,19 @@ def _in_file_order(survey: Survey, decoder: Decoder) -> Iterator[Part]:
 
 
 def _placed(
-    loaded: Iterator[tuple[ChunkSpan, Bytes, Messages]],
+    loaded: Iterator[tuple[Bytes, Messages]],
     decoder: Decoder,
-    chunks: list[ChunkSpan],
+    ordered: list[ChunkSpan],
     order: list[int],
 ) -> Iterator[tuple[Part, int | None]]:
-    following = [*(chunks[row].start_ns for row in order[1:]), None]
-    for (span, data, messages), row, next_ns in zip(loaded, order, following, strict=True):
-        _check_times(span, messages)
+    following = [*(span.start_ns for span in ordered[1:]), None]
+    for (data, messages), row, next_ns in zip(loaded, order, following, strict=True):
         yield decoder.part(data, messages, row * _PLACES), next_ns
 
 
-def _check_times(span: ChunkSpan, messages: Messages) -> None:
-    if len(messages.log_ns) and not (
-        span.start_ns <= int(np.min(messages.log_ns))
-        and int(np.max(messages.log_ns)) <= span.end_ns
-    ):
-        raise DamagedError(
-            f'chunk at byte {span.position}: its messages are outside the time span it claims'
-        )
-
-
 def _loaded(
-    pool: ThreadPoolExecutor, handle: int, spans: Sequence[ChunkSpan]
-) -> Iterator[tuple[ChunkSpan, Bytes, Messages]]:
+    pool: ThreadPoolExecutor, handle: int, groups: Sequence[list[ChunkSpan]]
+) -> Iterator[tuple[Bytes, Messages]]:
     """
     Read and decompress ahead in threads; most of what they do needs no interpreter lock.
 
@@ -249,26 +255,52 @@ def _loaded(
     by the garbage collector, anywhere, where waiting for a thread may be a deadlock.
 
     """
-    waiting: deque[tuple[ChunkSpan, Future[tuple[Bytes, Messages]]]] = deque()
+    waiting: deque[tuple[int, Future[tuple[Bytes, Messages]]]] = deque()
     n_ahead = 0
-    following = iter(spans)
+    following = iter(groups)
     upcoming = next(following, None)
     try:
         while waiting or upcoming is not None:
-            while upcoming is not None and (
-                not waiting
-                or (len(waiting) < _N_AHEAD and n_ahead + upcoming.size <= _AHEAD_BYTES)
-            ):
-                waiting.append((upcoming, pool.submit(load_chunk, handle, upcoming, _ignore)))
-                n_ahead += upcoming.size
+            while upcoming is not None:
+                size = sum(span.size for span in upcoming)
+                if waiting and (len(waiting) == _N_AHEAD or n_ahead + size > _AHEAD_BYTES):
+                    break
+                waiting.append((size, pool.submit(_load, handle, upcoming)))
+                n_ahead += size
                 upcoming = next(following, None)
-            span, future = waiting.popleft()
-            n_ahead -= span.size
-            data, messages = future.result()
-            yield span, data, messages
+            size, future = waiting.popleft()
+            n_ahead -= size
+            yield future.result()
     finally:
         for _, future in waiting:
             future.cancel()
+
+
+def _load(handle: int, spans: list[ChunkSpan]) -> tuple[Bytes, Messages]:
+    """
+    Read chunks that follow each other in log time as if they were one.
+
+    """
+    pieces: list[tuple[Bytes, Messages]] = []
+    for span in spans:
+        data, messages = load_chunk(handle, span, _ignore)
+        if len(messages.log_ns) and not (
+            span.start_ns <= int(np.min(messages.log_ns))
+            and int(np.max(messages.log_ns)) <= span.end_ns
+        ):
+            raise DamagedError(
+                f'chunk at byte {span.position}: its messages are outside the time it claims'
+            )
+        pieces.append((data, messages))
+    if len(pieces) == 1:
+        return pieces[0]
+    begins = np.cumsum([0, *(len(data) for data, _ in pieces)])
+    return np.concatenate([data for data, _ in pieces]), Messages(
+        np.concatenate([m.at + begin for (_, m), begin in zip(pieces, begins, strict=False)]),
+        np.concatenate([m.size for _, m in pieces]),
+        np.concatenate([m.channel for _, m in pieces]),
+        np.concatenate([m.log_ns for _, m in pieces]),
+    )
 
 
 @contextmanager

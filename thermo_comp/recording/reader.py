@@ -181,7 +181,10 @@ def open_recording(
 
     """
     path = Path(path)
-    source = _open_source(path)
+    try:
+        source = _open_source(path)
+    except OSError as error:
+        raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
     try:
         return RecordingReader(path, source, topics or Topics(), input, require)
     except BaseException:
