@@ -5,6 +5,7 @@ Owns the fit: bags of a thermal test -> still positions -> regression -> calibra
 
 """
 
+from .assessment import Assessment, AssessmentRow, AxisShift, assess
 from .evidence import PositionReport, ResidualRow
 from .fit import FitResult, fit
 from .gravity import normal_gravity, resolve_gravity
@@ -15,6 +16,9 @@ from .verdict import Finding
 
 __all__ = [
     'ArrayBlock',
+    'Assessment',
+    'AssessmentRow',
+    'AxisShift',
     'Candidate',
     'Finding',
     'FitOptions',
@@ -23,6 +27,7 @@ __all__ = [
     'PositionReport',
     'ResidualRow',
     'SourceBlock',
+    'assess',
     'fit',
     'normal_gravity',
     'resolve_gravity',

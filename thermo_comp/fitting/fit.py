@@ -124,6 +124,7 @@ def fit(
 
     """
     tell = progress or _no_progress
+    check_serial(sources, options)
     bags = reduce_sources(sources, options, tell)
     detector = options.detector or learn_detector(bags)
     histories = []
@@ -215,7 +216,7 @@ def _fit_table(
         misalignment=with_misalignment,
         time_constant_range_s=(2.0 * options.window_s, max(longest / 2.0, 4.0 * options.window_s)),
     )
-    coarse = table.coarsened(max(options.selection_window_s, options.window_s))
+    coarse = table.coarsened(_selection_window(table, options))
     n_tried = 0
 
     def trying(_name: str) -> None:
@@ -251,6 +252,16 @@ def _fit_table(
         table=table,
         bags=tuple(bags),
     )
+
+
+def _selection_window(table: WindowTable, options: FitOptions) -> float:
+    """
+    Length of the windows that candidates are compared on: some twenty of them per position.
+
+    """
+    spans = [float(np.ptp(table.time[rows])) for rows in table.position_slices()]
+    wanted = min(options.selection_window_s, float(np.median(spans)) / 20.0)
+    return max(wanted, options.window_s)
 
 
 def first_guess(
@@ -328,11 +339,36 @@ def board_lag(table: WindowTable) -> float:
     return lag if 1.0 <= lag <= 1e5 else _USUAL_BOARD_LAG_S
 
 
-def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
-    serials = {bag.source.serial for bag in bags if bag.source.serial}
+def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
+    """
+    Find the unit's serial.
+
+    Parameters
+    ----------
+    sources : sequence of FitSource
+        The bags.
+    options : FitOptions
+        Its serial wins.
+
+    Returns
+    -------
+    str
+        The serial; ``unknown`` when nothing says it.
+
+    Raises
+    ------
+    FitError
+        If the bags name different units and the user none.
+
+    """
+    serials = {source.serial for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         raise FitError(f'the bags are of different units: {", ".join(sorted(serials))}')
-    serial = options.serial or (serials.pop() if serials else 'unknown')
+    return options.serial or (serials.pop() if serials else 'unknown')
+
+
+def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
+    serial = check_serial([bag.source for bag in bags], options)
     full_scale = options.full_scale
     if full_scale is None and options.input == 'counts':
         full_scale = COUNTS_FULL_SCALE

@@ -36,8 +36,6 @@ BoolArray = npt.NDArray[np.bool_]
 _SECTION_HALF_WIDTH_S = 60.0
 _SECTION_RATE = 0.05 / 60.0
 
-_GRID_COLUMNS = (BOARD, VAR_BOARD, RATE, GRADIENT, WEIGHT, UNKNOWN)
-
 
 @dataclass(frozen=True)
 class ThermalHistory:
@@ -144,6 +142,40 @@ def thermal_history(
 
     """
     tracker = ThermalTracker(detector, (), config)
+    start_s, states = thermal_states(bag, tracker, step_s)
+    return ThermalHistory(
+        start_s=start_s,
+        step_s=step_s,
+        board=states[:, BOARD],
+        var_board=states[:, VAR_BOARD],
+        rate=states[:, RATE],
+        gradient=states[:, GRADIENT],
+        weight=states[:, WEIGHT],
+        is_unknown=states[:, UNKNOWN] > 0.5,
+    )
+
+
+def thermal_states(bag: ReducedBag, tracker: ThermalTracker, step_s: float) -> tuple[float, Array]:
+    """
+    Drive a tracker with a bag's readings and sample it on a grid.
+
+    Parameters
+    ----------
+    bag : ReducedBag
+        The bag, with board readings.
+    tracker : ThermalTracker
+        A fresh one.
+    step_s : float
+        Grid step [s].
+
+    Returns
+    -------
+    start_s : float
+        Time of the first grid point since the bag's first sample [s].
+    states : ndarray, shape (n, width)
+        `ThermalTracker.sample` at each grid point.
+
+    """
     stamps = np.concatenate((bag.board.stamp_ns, bag.case.stamp_ns))
     values = np.concatenate((bag.board.value, bag.case.value))
     is_case = np.concatenate(
@@ -156,23 +188,13 @@ def thermal_history(
     grid = np.arange(begin, max(bag.end_ns, begin) + step_ns, step_ns)
     # Readings up to and including a grid stamp come first, as they do online.
     due = np.searchsorted(stamps, grid, side='right')
-    rows = np.empty((len(grid), len(_GRID_COLUMNS)))
+    rows = []
     reading = 0
     stamp_list, value_list, case_list = stamps.tolist(), values.tolist(), is_case.tolist()
-    for i, (stamp, stop) in enumerate(zip(grid.tolist(), due.tolist(), strict=True)):
+    for stamp, stop in zip(grid.tolist(), due.tolist(), strict=True):
         while reading < stop:
             take = tracker.case_reading if case_list[reading] else tracker.board_reading
             take(stamp_list[reading], value_list[reading])
             reading += 1
-        state = tracker.sample(stamp)
-        rows[i] = [state[column] for column in _GRID_COLUMNS]
-    return ThermalHistory(
-        start_s=(begin - bag.start_ns) * 1e-9,
-        step_s=step_s,
-        board=rows[:, 0],
-        var_board=rows[:, 1],
-        rate=rows[:, 2],
-        gradient=rows[:, 3],
-        weight=rows[:, 4],
-        is_unknown=rows[:, 5] > 0.5,
-    )
+        rows.append(tracker.sample(stamp))
+    return (begin - bag.start_ns) * 1e-9, np.array(rows)

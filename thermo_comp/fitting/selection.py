@@ -191,6 +191,7 @@ def function_shape(name: str, table: WindowTable) -> TemperatureFunction:
     if name == 'exponential':
         return Exponential(0.0, (0.0,), (_E_FOLDS_K[3],))
     lower, upper = float(np.min(table.t)), float(np.max(table.t))
+    upper = max(upper, lower + 1.0)
     knots = np.linspace(lower, upper, _N_SPLINE_KNOTS)
     # The reference is a knot: the one nearest moves there, or the outermost when it lies outside.
     nearest = int(np.argmin(np.abs(knots)))
