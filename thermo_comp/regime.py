@@ -26,11 +26,11 @@ from math import acos, inf, isnan, log, nan, pi, sqrt
 
 from .thermometer import Thermometer, ThermometerSettings
 
-BEND_SHARES = (1.5, 15.0)  # accelerations the two filters are tuned to / the smallest onset
+BEND_SHARES = (1.0, 10.0)  # accelerations the two filters are tuned to / the smallest onset
 SETTLING = 5.0  # memories until a filter's noise is the formula's
-EDGE_SIGMAS = 6.0  # edges that far apart are never crossed by noise
+HOLD_LAGS = 0.75  # the shortest dynamic state, in lags of the leading sensor
 SURE_SIGMAS = (
-    1.0  # of "the rate is below": in a calm the variance is mostly that of what may begin
+    0.5  # of "the rate is below": in a calm the variance is mostly that of what may begin
 )
 OBVIOUS_SIGMAS = 5.0  # confidence of "the rate is above"
 OBVIOUS_SHARE = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
@@ -145,6 +145,7 @@ class RegimeDetector:
         self._stamp_ns: int | None = None
         self._calm_ns: int | None = None
         self._held_until_ns: int | None = None
+        self._is_grown = False
         self._case_onset.reset()
         self._board_onset.reset()
         self._case_calm.reset()
@@ -176,12 +177,16 @@ class RegimeDetector:
         if self._stamp_ns is not None and stamp_ns - self._stamp_ns > self._forget_ns:
             self.reset()
         self._stamp_ns = stamp_ns
-        departure = onset.update(stamp_ns, lead, self.regime == Regime.STATIC)
+        departure = onset.update(stamp_ns, lead, self.regime, self._is_grown)
         if not lead.is_ready:
             return self.regime
 
         is_calm = self._case_calm.update(stamp_ns, case)
         is_calm = self._board_calm.update(stamp_ns, board) and is_calm
+        if self.regime == Regime.DYNAMIC and not self._is_grown:
+            # An onset is seen before the rate is large: until then only its own end ends it.
+            self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
+            is_calm = is_calm and onset.is_back()
         if not is_calm:
             self._calm_ns = None
         elif self._calm_ns is None:
@@ -193,7 +198,9 @@ class RegimeDetector:
             elif not is_calm:
                 speed = OBVIOUS_SHARE * self._relaxed_rate
                 direction = _obvious(lead, speed)
-                if direction or (board is not None and board.is_ready and _obvious(board, speed)):
+                if direction == 0 and board is not None and board.is_ready:
+                    direction = _obvious(board, speed)
+                if direction:
                     self._open(stamp_ns, direction, lead)
         else:
             direction = _obvious(lead, onset.ripple_rate)
@@ -215,8 +222,9 @@ class RegimeDetector:
         self.regime = Regime.DYNAMIC
         self.direction = direction
         self.switched_ns = stamp_ns
-        # An onset is seen before the rate is large: give the ramp a quarter of its lag to show.
-        hold_ns = max(self._dwell_ns, round(0.25e9 * lead.settings.lag_s))
+        self._is_grown = False
+        # An onset is seen long before the rate has grown: give the ramp time to show.
+        hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
         self._held_until_ns = stamp_ns + hold_ns
 
 
@@ -224,9 +232,9 @@ class _OnsetTest:
     """
     Has the rate of one sensor left the baseline of the soak?
 
-    A continuous sensor is watched by two linear filters of temperature and rate with different
-    memories. One with cells is watched through its thermometer, and by the time that two edges
-    crossed in the same direction lie apart.
+    Two linear filters of temperature and rate with different memories watch the readings. Where
+    the cells are so wide that noise cannot cross one, the time between two edges crossed in the
+    same direction gives the mean rate between them, sharply, and takes the filters' place.
 
     """
 
@@ -247,7 +255,7 @@ class _OnsetTest:
         self._edge_noise = sensor.noise_sd_c * sqrt(2.0)
         self._quantum = sensor.quantum_c
         self._has_cells = sensor.has_cells
-        self._by_edges = sensor.quantum_c > EDGE_SIGMAS * self._edge_noise
+        self._by_edges = sensor.has_wide_cells
         self.reset()
 
     def reset(self) -> None:
@@ -274,7 +282,14 @@ class _OnsetTest:
         self._doubt = max(self.ripple_rate, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # edges that were crossed before the soak tell of the ramp
 
-    def update(self, stamp_ns: int, sensor: Thermometer, is_static: bool) -> int:
+    def is_back(self) -> bool:
+        """
+        Whether the rate is within a ripple of the baseline again.
+
+        """
+        return abs(self._rate - self._baseline) < self.ripple_rate + self._doubt
+
+    def update(self, stamp_ns: int, sensor: Thermometer, regime: Regime, is_grown: bool) -> int:
         """
         Take the sensor's last reading; return the sign of the departure, 0 = none.
 
@@ -285,6 +300,9 @@ class _OnsetTest:
             return 0
         dt = (stamp_ns - stamp) * 1e-9
         if dt <= 0.0:
+            return 0
+        if dt > self._baseline_s:
+            self._start(stamp_ns, sensor)
             return 0
         self._stamp_ns = stamp_ns
         self._age_s += dt
@@ -298,11 +316,16 @@ class _OnsetTest:
             departure = self._watch_edges(stamp_ns, sensor, low, high)
         else:
             departure = self._watch_filters(sensor.measured, sensor.measured_variance, low, high)
-        if not is_static or self._age_s < self._settled_s:
+        if self._age_s < self._settled_s:
+            self.settle(sensor)
             return 0
-        if departure == 0 and not self._by_edges:
-            self._follow(self._rate, dt)
-        return departure
+        if regime == Regime.STATIC:
+            if not departure and not self._by_edges:
+                self._follow(self._rate, dt)
+            return departure
+        if regime == Regime.DYNAMIC and not is_grown:
+            self._follow(self._rate, 0.25 * dt)
+        return 0
 
     def _follow(self, rate: float, dt: float) -> None:
         """
@@ -430,18 +453,19 @@ class _CalmTest:
             self._stamp_ns = None
             return False
         rate = sensor.rate
+        doubt = sqrt(sensor.var_rate)
+        relaxed = self._relaxed
         stamp = self._stamp_ns
         self._stamp_ns = stamp_ns
-        if stamp is None:
-            self._mean = rate
+        if stamp is None or doubt > relaxed:
+            self._mean = rate  # not known well enough to have a past
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)
         changed = sensor.changed_ns
         if self._still_ns and changed is not None and stamp_ns - changed > self._still_ns:
             return True
-        relaxed = self._relaxed
-        room = relaxed - SURE_SIGMAS * sqrt(sensor.var_rate)
+        room = relaxed - SURE_SIGMAS * doubt
         return -room < rate < room and abs(3.0 * rate - 2.0 * self._mean) < self._ahead
 
 

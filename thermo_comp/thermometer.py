@@ -35,8 +35,9 @@ OUTLIER_LIMITS = 5.0  # ... and beyond this many limits not at all ...
 RESTART_READINGS = 4  # ... unless that many in a row lie on one side
 SOAK_S = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
 QUIET_SHARE = 5e-3  # quiet acceleration wander / bending one, of a sensor without cells
-CELL_SHARE = 0.2  # the same where cells hide slow changes
-CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells
+CELL_SHARE = 0.2  # the same where wide cells hide slow changes
+CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells ...
+WIDE_CELL_SIGMAS = 8.5  # ... that noise never crosses: six sds of a difference
 HORIZON_INTERVALS = 5.0  # extrapolation is linear up to here, then held
 NOISE_MEMORY = 200.0  # readings over which the innovations judge the declared noise
 
@@ -89,6 +90,14 @@ class ThermometerSettings:
 
         """
         return self.quantum_c > CELL_SIGMAS * self.noise_sd_c
+
+    @property
+    def has_wide_cells(self) -> bool:
+        """
+        Whether a cell is so wide that noise alone never carries a reading across it.
+
+        """
+        return self.quantum_c > WIDE_CELL_SIGMAS * self.noise_sd_c
 
 
 class Thermometer:
@@ -144,7 +153,7 @@ class Thermometer:
         self._rate_sd = settings.fastest_ramp_k_min / 60.0
         self._bend = self._rate_sd / settings.lag_s
         self._bending_power = 2.0 * self._bend * self._bend / settings.lag_s
-        share = CELL_SHARE if self._has_cells else QUIET_SHARE
+        share = CELL_SHARE if settings.has_wide_cells else QUIET_SHARE
         self._quiet_power = self._bending_power * share * share
         self.reset()
 
