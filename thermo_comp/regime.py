@@ -29,9 +29,8 @@ from .thermometer import Thermometer, ThermometerSettings
 BEND_SHARES = (1.0, 10.0)  # accelerations the two filters are tuned to / the smallest onset
 SETTLING = 5.0  # memories until a filter's noise is the formula's
 HOLD_LAGS = 0.75  # the shortest dynamic state, in lags of the leading sensor
-SURE_SIGMAS = (
-    0.5  # of "the rate is below": in a calm the variance is mostly that of what may begin
-)
+# "The rate is below": the variance in a calm is mostly that of what may begin, so half a sd.
+SURE_SIGMAS = 0.5
 OBVIOUS_SIGMAS = 5.0  # confidence of "the rate is above"
 OBVIOUS_SHARE = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
 
@@ -306,7 +305,7 @@ class _OnsetTest:
             return 0
         self._stamp_ns = stamp_ns
         self._age_s += dt
-        if dt != self._dt:
+        if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
         baseline = self._baseline
         ripple = self.ripple_rate + self._doubt
@@ -315,7 +314,9 @@ class _OnsetTest:
         if self._by_edges:
             departure = self._watch_edges(stamp_ns, sensor, low, high)
         else:
-            departure = self._watch_filters(sensor.measured, sensor.measured_variance, low, high)
+            departure = self._watch_filters(
+                dt, sensor.measured, sensor.measured_variance, low, high
+            )
         if self._age_s < self._settled_s:
             self.settle(sensor)
             return 0
@@ -346,9 +347,10 @@ class _OnsetTest:
         self._edge_ns = stamp_ns
         self._reading = sensor.reading
 
-    def _watch_filters(self, measured: float, variance: float, low: float, high: float) -> int:
+    def _watch_filters(
+        self, dt: float, measured: float, variance: float, low: float, high: float
+    ) -> int:
         departure = 0
-        dt = self._dt
         filters = self._filters
         for k in (1, 0):
             power = self._powers[k]
