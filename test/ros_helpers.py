@@ -41,6 +41,11 @@ def stamp_of(message: Any) -> int:
     return message.header.stamp.sec * SECOND_NS + message.header.stamp.nanosec
 
 
+def standing(k: int) -> tuple[float, float, float]:
+    """Give counts of a unit of 300 per m/s^2 that stands: |f| is g, and no two are equal."""
+    return 30.0 + k % 3, -20.0 + k % 2, 2941.0 + k % 5
+
+
 class Peer:
     """
     A node with a thread of its own; everything received wakes `wait_for`.

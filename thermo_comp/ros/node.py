@@ -363,7 +363,11 @@ def main(args: list[str] | None = None) -> int:
 
     """
     args = sys.argv if args is None else args
-    extra = remove_ros_args(args)[1:]
+    try:
+        extra = remove_ros_args(args)[1:]
+    except RuntimeError as error:
+        print(f'thermo_comp_node: {error}', file=sys.stderr)
+        return 2
     if extra:
         is_help = extra[0] in {'-h', '--help'}
         problem = '' if is_help else f'thermo_comp_node: unknown argument {extra[0]!r}\n'
@@ -380,10 +384,6 @@ def main(args: list[str] | None = None) -> int:
     signal.signal(signal.SIGINT, interrupt)
     try:
         rclpy.init(args=args)
-    except RuntimeError as error:
-        print(f'thermo_comp_node: {error}', file=sys.stderr)
-        return 2
-    try:
         _serve(is_running)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

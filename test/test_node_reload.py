@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The node as a process: its calibration changes while samples flow, through the real services.
+
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from builders import axis_set, calibration, regime_set
+from rcl_interfaces.srv import GetParameters
+from ros_helpers import SECOND_NS, TIMEOUT, Driver, Peer, stamp_of, standing
+from sensor_msgs.msg import Imu
+
+from thermo_comp.calibration import Axes, AxisReference, Unit
+from thermo_comp.calibration_file import dump_calibration, save_calibration
+from thermo_comp.ros.round_trip import NodeProcess, lossless
+
+START_NS = 1_767_225_600 * SECOND_NS
+CYCLE_NS = 10_000_000
+K = 300.0
+
+
+def of_bias(counts: float, **keys: Any) -> Any:
+    """Make a calibration that can be told by what it takes off the x axis."""
+    axes = Axes(AxisReference(K, counts), AxisReference(K, 0.0), AxisReference(K, 0.0))
+    return calibration(axes=axes, **keys)
+
+
+class Flow:
+    """Publishes the counts of a unit that stands, and hears what becomes of them."""
+
+    def __init__(self, peer: Peer) -> None:
+        self._peer = peer
+        self.heard = peer.listen(Imu, 'imu/data_raw')
+        self._driver = Driver(peer)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self.n_sent = 0
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.001):
+            stamp_ns = START_NS + self.n_sent * CYCLE_NS
+            if self.n_sent % 10 == 0:
+                self._driver.temperatures(stamp_ns, 20.0, 20.0)
+            self._driver.counts(stamp_ns, *standing(self.n_sent))
+            self.n_sent += 1
+
+    def more(self, n: int = 100) -> int:
+        """Wait for further samples; return how many there are."""
+        wanted = len(self.heard) + n
+        self._peer.wait_for(lambda: len(self.heard) >= wanted, f'{n} more samples')
+        return len(self.heard)
+
+    def bias(self, index: int) -> float:
+        message = self.heard[index]
+        raw = standing((stamp_of(message) - START_NS) // CYCLE_NS)[0]
+        return round(raw - K * message.linear_acceleration.x, 6)
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join(TIMEOUT)
+        last = START_NS + (self.n_sent - 1) * CYCLE_NS
+        self._peer.wait_for(lambda: stamp_of(self.heard[-1]) == last, 'the last sample')
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
+    first, second, third = (tmp_path / f'{name}.yaml' for name in ('first', 'second', 'third'))
+    save_calibration(of_bias(1.0), first)
+    save_calibration(of_bias(2.0), second)
+    broken = tmp_path / 'broken.yaml'
+    text = dump_calibration(of_bias(77.0))
+    broken.write_text(text.replace('bias: 77.0', 'bias: .nan', 1))
+    with NodeProcess(*lossless(), '-p', f'calibration_file:={first}') as node:
+        flow = Flow(peer)
+        before = flow.more()
+        assert flow.bias(before - 1) == 1.0
+
+        # Another file: applied when the answer comes, between two samples.
+        assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
+        flow.more()
+
+        # Broken: refused with path, key and reason; the running calibration stays.
+        (result,) = peer.set_parameters(calibration_file=str(broken))
+        assert not result.successful
+        assert str(broken) in result.reason
+        assert 'axes.x.bias' in result.reason
+        assert 'nan' in result.reason.lower()
+        flow.more()
+        assert peer.call(
+            GetParameters,
+            'thermo_comp/get_parameters',
+            GetParameters.Request(names=['calibration_file']),
+        ).values[0].string_value == str(second)
+
+        # Together with others: all or none.
+        result = peer.set_atomically(transition_time=5, calibration_file=str(broken))
+        assert not result.successful
+        result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
+        assert 'none: cannot be read: No such file' in result.reason
+        names = ['transition_time', 'frame_id']
+        request = GetParameters.Request(names=names)
+        values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
+        assert values[0].double_value == 30.0
+        assert flow.bias(flow.more() - 1) == 2.0
+
+        # The same name again reads the file again; a whole number is a number.
+        save_calibration(of_bias(3.0), second)
+        result = peer.set_atomically(transition_time=5, calibration_file=str(second))
+        assert result.successful, result.reason
+        values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
+        assert values[0].double_value == 5.0
+
+        # Another unit's file, where the unit was named; a serial that the file is not for.
+        save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
+        (result,) = peer.set_parameters(serial='T-9')
+        assert "unit.serial: must be 'T-9'" in result.reason
+        assert peer.set_parameters(serial='T-1')[0].successful
+        (result,) = peer.set_parameters(calibration_file=str(third))
+        assert "unit.serial: must be 'T-1' (parameter `serial`), got 'T-2'" in result.reason
+        (result,) = peer.set_parameters(input='imu')
+        assert "unit.input: must be 'm/s^2'" in result.reason
+        flow.more()
+        flow.stop()
+        assert node.is_alive, node.said
+        assert node.stop() == 0
+        assert 'Traceback' not in node.said
+
+    # None lost, none twice, in order, from the first one on.
+    stamps = [stamp_of(message) for message in flow.heard]
+    assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
+    # One calibration after the other, and each sample under exactly one of them.
+    biases = [flow.bias(index) for index in range(len(stamps))]
+    changes = [b for a, b in pairwise(biases) if a != b]
+    assert (biases[0], changes) == (1.0, [2.0, 3.0])
+
+
+def test_a_reload_keeps_the_thermal_state(peer: Peer, tmp_path: Path) -> None:
+    # WHY: a new calibration of the same sensors must not make the node blind for minutes.
+    bias = regime_set(*[axis_set(bias=(0.0, 10.0))] * 3)
+    plain, biased = tmp_path / 'plain.yaml', tmp_path / 'biased.yaml'
+    save_calibration(of_bias(1.0), plain)
+    save_calibration(of_bias(1.0, static=bias, dynamic=bias), biased)
+    with NodeProcess(*lossless(), '-p', f'calibration_file:={plain}'):
+        flow = Flow(peer)
+        flow.more(50)
+        assert peer.set_parameters(calibration_file=str(biased))[0].successful
+        assert peer.set_parameters(calibration_file=str(plain))[0].successful
+        flow.more(50)
+        flow.stop()
+    stamps = [stamp_of(message) for message in flow.heard]
+    assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
+    # At 20 degC, the reference, the bias function is 0 whatever its slope.
+    assert {flow.bias(index) for index in range(len(stamps))} == {1.0}

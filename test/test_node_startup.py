@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The node as a process: bad start-ups end at once with one clear line, good ones end cleanly.
+
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from builders import calibration
+from ros_helpers import TIMEOUT, Peer
+
+from thermo_comp.calibration_file import dump_calibration, save_calibration
+from thermo_comp.ros.node import main
+from thermo_comp.ros.round_trip import NodeProcess
+
+
+def arguments(*overrides: str) -> list[str]:
+    words = [word for override in overrides for word in ('-p', override)]
+    return ['thermo_comp_node', '--ros-args', *words]
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    path = tmp_path / 'unit.yaml'
+    save_calibration(calibration(), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ('overrides', 'text'),
+    [
+        ([], 'parameter `calibration_file` is not set; start with --ros-args -p calibration_f'),
+        (['calibration_file:={tmp}/none.yaml'], '/none.yaml: cannot be read: No such file or dir'),
+        (['calibration_file:={tmp}'], 'cannot be read: '),
+        (['calibration_file:={tmp}/nan.yaml'], '/nan.yaml: axes.x.bias: '),
+        (['calibration_file:={tmp}/text.yaml'], '/text.yaml: expected a mapping'),
+        (['calibration_file:={unit}', 'serial:=T-2'], "unit.serial: must be 'T-2' (parameter"),
+        (['calibration_file:={unit}', 'input:=imu'], "unit.input: must be 'm/s^2'"),
+        (['calibration_file:={unit}', 'input:=gyro'], '`input` must be one of counts, imu'),
+        (['calibration_file:={unit}', 'transition_time:=-1'], '`transition_time` must be between'),
+        (
+            [
+                'calibration_file:={unit}',
+                'qos_overrides./accel/counts.subscription.reliability:=good',
+            ],
+            'a topic cannot be opened: ',
+        ),
+    ],
+)
+def test_bad_start(
+    overrides: list[str],
+    text: str,
+    unit: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / 'text.yaml').write_text('just words')
+    nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)
+    (tmp_path / 'nan.yaml').write_text(nan)
+    code = main(arguments(*(one.format(tmp=tmp_path, unit=unit) for one in overrides)))
+    said = capfd.readouterr()
+    assert code == 1
+    assert said.out == ''
+    (line,) = said.err.splitlines()
+    assert line.startswith('thermo_comp_node: ')
+    assert text in line
+
+
+def test_bad_start_as_a_process_is_one_line_too(tmp_path: Path) -> None:
+    finished = subprocess.run(
+        [sys.executable, '-m', 'thermo_comp.ros.node', *arguments('calibration_file:=none')[1:]],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT,
+        check=False,
+    )
+    assert finished.returncode == 1
+    assert finished.stderr == (
+        'thermo_comp_node: none: cannot be read: No such file or directory\n'
+    )
+
+
+def test_usage(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(['thermo_comp_node', '--help']) == 0
+    assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
+    assert main(['thermo_comp_node', 'unit.yaml']) == 2
+    assert "unknown argument 'unit.yaml'" in capfd.readouterr().err
+
+
+def test_unreadable_ros_arguments(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(['thermo_comp_node', '--ros-args', '--params-file', '/none.yaml']) == 2
+    said = capfd.readouterr().err
+    assert 'thermo_comp_node: ' in said
+    assert 'Traceback' not in said
+
+
+def test_misspelt_parameters_are_said(unit: Path) -> None:
+    peer = Peer()
+    overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
+    overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
+    with NodeProcess(*overrides) as node:
+        # It answers, so it is up, and has said what it has to say.
+        assert peer.describe('transition_time')[0].description
+        assert 'there is no parameter `transition_tme`, it has no effect' in node.said
+        assert node.said.count('there is no parameter') == 1
+    peer.close()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_cleanly(unit: Path, number: int) -> None:
+    peer = Peer()
+    with NodeProcess('-p', f'calibration_file:={unit}') as node:
+        assert peer.describe('serial')[0].description
+        assert node.stop(number) == 0
+        assert 'Traceback' not in node.said
+    peer.close()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_start_up_ends_it_cleanly_too(unit: Path, number: int) -> None:
+    # Caught while the node is being built: as soon as the middleware has a thread.
+    with NodeProcess('-p', f'calibration_file:={unit}') as node:
+        tasks = Path(f'/proc/{node.process.pid}/task')
+        deadline = time.monotonic() + TIMEOUT
+        while not any('dds.' in name(task) for task in tasks.iterdir()):
+            assert time.monotonic() < deadline
+        assert node.stop(number) == 0
+        assert 'Traceback' not in node.said
+
+
+def name(task: Path) -> str:
+    try:
+        return (task / 'comm').read_text()
+    except OSError:
+        return ''
