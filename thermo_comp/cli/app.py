@@ -21,6 +21,7 @@ from . import (
     convert,
     demo,
     evaluate,
+    exchange,
     fit,
     info,
     output,
@@ -76,6 +77,8 @@ app.command()(info.info)
 app.command()(report.report)
 app.command()(view.view)
 app.command()(convert.convert)
+app.command()(exchange.export)
+app.command('import')(exchange.import_)
 app.command()(simulate.simulate)
 app.command()(demo.demo)
 

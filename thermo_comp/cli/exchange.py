@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp export`` and ``import``: a calibration to and from an autopilot's parameters.
+
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import CalibrationError
+from . import options
+from .output import Output
+
+# Bytes; all parameters of a vehicle are some 60 kB.
+_LIMIT = 4 << 20
+
+
+class Autopilot(str, Enum):
+    """
+    Whose parameters.
+
+    """
+
+    px4 = 'px4'
+    ardupilot = 'ardupilot'
+
+
+def export(
+    path: Annotated[Path, typer.Argument(help='Calibration of the unit.', metavar='YAML')],
+    to: Annotated[Autopilot, typer.Option('--to', help='Whose parameters to write.')],
+    output: Annotated[Path, typer.Option('--output', '-o', help='Parameter file to write.')],
+    number: Annotated[
+        int | None,
+        typer.Option(help='Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1).'),
+    ] = None,
+    device_id: Annotated[
+        int, typer.Option(help="PX4's id of the sensor (TC_An_ID), which it matches by.")
+    ] = 0,
+    up: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help='Direction of +g in the sensor frame, at which the drift of the scale is folded '
+            'into the offset.',
+            metavar='X Y Z',
+        ),
+    ] = None,
+    force: options.Force = False,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Write a calibration as parameters of PX4 or ArduPilot.
+
+    Both keep a cubic of temperature per axis' offset and nothing else. What
+    the calibration holds beyond that is lost, and said with what it costs.
+
+    Example:
+      thermo_comp export unit42.yaml --to px4 -o unit42.params
+      thermo_comp export unit42.yaml --to ardupilot --up 0 0 1 -o unit42.parm
+
+    """
+    from ..calibration_file import load_calibration
+    from ..exchange import export_ardupilot, export_px4
+    from ..files import write_atomically
+
+    out = Output(as_json, quiet)
+    if device_id and to is not Autopilot.px4:
+        raise options.usage('--device-id is for PX4')
+    options.refuse_existing(output, force)
+    calibration = load_calibration(path)
+    try:
+        if to is Autopilot.px4:
+            instance = 0 if number is None else number
+            result = export_px4(calibration, instance=instance, device_id=device_id, up=up)
+        else:
+            result = export_ardupilot(calibration, imu=1 if number is None else number, up=up)
+    except ValueError as mistake:
+        raise options.usage(str(mistake)) from mistake
+    write_atomically(output, result.text.encode())
+    out.line(f'{output}: parameters of {to.value} for unit {calibration.unit.serial}')
+    for note in result.notes:
+        out.line(f'- {note}')
+    out.json(
+        {
+            'output': output,
+            'autopilot': to.value,
+            'serial': calibration.unit.serial,
+            'notes': result.notes,
+        }
+    )
+
+
+def import_(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help='Parameters as QGroundControl, Mission Planner or MAVProxy save them.',
+            metavar='FILE',
+        ),
+    ],
+    output: Annotated[Path, typer.Option('--output', '-o', help='Calibration to write (YAML).')],
+    serial: Annotated[str, typer.Option(help='Serial to give the unit.')],
+    number: Annotated[
+        int | None, typer.Option(help='Which set, where there are several (TC_A0, INS_TCAL1).')
+    ] = None,
+    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = 9.80665,
+    rate_hz: Annotated[float, typer.Option(help='Samples per second of the unit.', min=0.1)] = 200,
+    full_scale_g: Annotated[float, typer.Option(help='Full scale in g.', min=0.1)] = 16.0,
+    noise_ug: Annotated[
+        float, typer.Option(help='Noise density in ug/sqrt(Hz); it sets the covariance.', min=0.01)
+    ] = 200.0,
+    force: options.Force = False,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Make a calibration of the thermal parameters of PX4 or ArduPilot.
+
+    The calibration is for a unit that reports m/s^2 (node: input:=imu), with
+    one set for both regimes: bias over temperature, and nothing else. Fit
+    bags of a thermal test to get the rest.
+
+    Example:
+      thermo_comp import autopilot.params --serial 42 -o unit42.yaml
+
+    """
+    from ..calibration_file import save_calibration
+    from ..exchange import import_parameters
+    from ..files import read_bounded
+    from ..metrics import MICRO_G
+
+    out = Output(as_json, quiet)
+    options.refuse_existing(output, force)
+    try:
+        calibration = import_parameters(
+            read_bounded(path, _LIMIT).decode('utf-8', errors='replace'),
+            serial=serial,
+            number=number,
+            gravity=gravity,
+            cycle_time_s=1.0 / rate_hz,
+            full_scale=full_scale_g * 1e6 * MICRO_G,
+            noise_density=noise_ug * MICRO_G,
+        )
+    except (CalibrationError, ValueError) as failure:
+        raise CalibrationError(str(failure), path=path) from failure
+    save_calibration(calibration, output)
+    lower, upper = calibration.static.temperature_range_c
+    source = calibration.provenance.model
+    out.line(f'{output}: unit {serial}, {source}, {lower:g} .. {upper:g} degC')
+    for note in calibration.provenance.notes:
+        out.line(f'- {note}')
+    out.json({'output': output, 'calibration': calibration})
