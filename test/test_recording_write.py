@@ -122,7 +122,9 @@ def test_rosbags_and_mcap_read_back_what_was_written(
             assert rosbag.message_count == len(wanted)
             assert {c.topic for c in rosbag.connections} == set(names)
             found = [(log_ns, names[c.topic]) for c, log_ns, _ in rosbag.messages()]
-        assert found == sorted(wanted, key=lambda entry: entry[0])
+        # At equal log times across chunks, versions of rosbags differ in what goes first.
+        assert [log_ns for log_ns, _ in found] == sorted(log_ns for log_ns, _ in wanted)
+        assert sorted(found) == sorted(wanted)
         if counts[-1] and len(counts) == 1:
             messages = {'c': [], 't': [], 'i': []}
             with AnyReader([path]) as rosbag_any:
