@@ -263,6 +263,7 @@ class _OnsetTest:
         self._filters: list[tuple[float, float, float, float, float]] = []
         self._dt = 0.0
         self._thresholds: list[float] = []
+        self._edge_margin = 0.0
         self._settled_s = 0.0
         self._age_s = 0.0
         self._rate = 0.0
@@ -389,7 +390,7 @@ class _OnsetTest:
             edge = 0.5 * (reading + before)
             apart = (stamp_ns - self._edge_ns) * 1e-9
             moved = edge - self._edge
-            sure = abs(moved) - sqrt(self._squared) * self._edge_noise
+            sure = abs(moved) - self._edge_margin
             if sure > 0.0 and sure > (high if moved > 0.0 else -low) * apart:
                 departure = 1 if moved > 0.0 else -1
             if departure == 0 and not isnan(moved):
@@ -409,10 +410,10 @@ class _OnsetTest:
         for power in self._powers:
             pace = dt * (power / (self._noise * dt)) ** 0.25
             correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
-            self._squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
-            self._thresholds.append(
-                self._squared * (1.0 if self._has_cells else 0.25 + 0.08 * min(pace, 1.0))
-            )
+            squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
+            noise_share = 1.0 if self._has_cells else 0.25 + 0.08 * min(pace, 1.0)
+            self._thresholds.append(squared * noise_share)
+        self._edge_margin = sqrt(squared) * self._edge_noise
         self._settled_s = SETTLING * (self._noise * dt / self._powers[0]) ** 0.25
 
 

@@ -1,0 +1,422 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The detector: early, quiet, never blind, in small; the long runs are in benchmarks/regime.py.
+
+All runs are seeded. A limit on a median of n delays holds with the benchmark's spread: the median
+of 24 scatters by about 0.3 of the delays' sd, 1 s at 1 mK and 3 s with coarse steps.
+
+"""
+
+import math
+
+import numpy as np
+import pytest
+from thermal_signals import (
+    BOARD_LAG_S,
+    LAG_S,
+    SECOND_NS,
+    detector_settings,
+    lagged,
+    lagged_twice,
+    read,
+    ripple,
+    switches,
+)
+
+from thermo_comp.regime import DetectorSettings, Regime, RegimeDetector, _OnsetTest
+from thermo_comp.thermometer import Thermometer, ThermometerSettings
+
+UNKNOWN, STATIC, DYNAMIC = Regime.UNKNOWN, Regime.STATIC, Regime.DYNAMIC
+SENSORS = {
+    '1 mK': (0.001, 0.0),
+    '10 mK': (0.01, 0.0),
+    '1 mK, 62.5 mK steps': (0.001, 0.0625),
+    '10 mK, 62.5 mK steps': (0.01, 0.0625),
+}
+
+
+def case_and_board(t, corners, lag=LAG_S, start=20.0):
+    return (
+        start + lagged(t, corners, lag),
+        start + 0.3 + lagged_twice(t, corners, lag, BOARD_LAG_S),
+    )
+
+
+def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
+    """
+    Run n ramps and return what switched after each began, and how many began static.
+
+    """
+    settings = detector_settings(noise, quantum, lag)
+    found, n_static = [], 0
+    for seed in range(n):
+        rng = np.random.default_rng([seed, 2])
+        t = np.arange(-soak_s, end_s, dt)
+        start = 20.0 + rng.uniform(-0.5, 0.5) * max(quantum, 0.1)
+        case, board = case_and_board(t, [(0.0, rng.choice([-1, 1]) * rate_k_min)], lag, start)
+        changes = switches(
+            settings, t, read(case, noise, quantum, rng), read(board, noise, quantum, rng)
+        )
+        before = [each for each in changes if each[0] < 0.0]
+        n_static += bool(before) and before[-1][1] == STATIC
+        found.append([each for each in changes if each[0] >= 0.0])
+    return found, n_static
+
+
+@pytest.fixture(scope='module')
+def headline():
+    """
+    Run the ramp that the requirement names: 0.5 K/min behind 15 min, read at 1 Hz.
+
+    """
+    return {name: onsets(*sensor, 0.5, LAG_S, 24, end_s=400.0) for name, sensor in SENSORS.items()}
+
+
+@pytest.mark.parametrize(
+    ('sensor', 'median_s', 'late_s'),
+    [
+        ('1 mK', 45.0, 90.0),
+        ('10 mK', 150.0, 180.0),
+        # Two edges must be crossed: with the second between 62.5 and 125 mK from the start the
+        # median cannot be below the time the case takes to move 94 mK, 146 s; of 24 runs it
+        # scatters by 4 s.
+        ('1 mK, 62.5 mK steps', 158.0, 180.0),
+        ('10 mK, 62.5 mK steps', 150.0, 180.0),
+    ],
+)
+def test_onset_is_early(headline, sensor, median_s, late_s):
+    found, n_static = headline[sensor]
+    assert n_static == 24
+    assert all(len(each) == 1 and each[0][1] == DYNAMIC for each in found)
+    delays = [each[0][0] for each in found]
+    assert np.median(delays) <= median_s
+    assert np.percentile(delays, 95) <= late_s
+
+
+@pytest.mark.parametrize(('sensor', 'threshold'), [('1 mK', 9.65), ('10 mK', 8.87)])
+def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
+    # The bound: Page's CUSUM that knows the ramp, the baseline and the noise; its thresholds (log
+    # likelihood ratios) for one false alarm in 50 h are those found in docs/regime.md.
+    noise = SENSORS[sensor][0]
+    rng = np.random.default_rng(4)
+    k = np.arange(1.0, 121.0)
+    signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
+    delays = []
+    for _ in range(40):
+        # onset known to the statistic is a lower bound on the CUSUM's delay, within a second
+        x = signature + rng.normal(0.0, noise, len(k))
+        ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
+        delays.append(k[np.argmax(ratio > threshold)])
+    ours = np.median([each[0][0] for each in headline[sensor][0]])
+    assert ours <= 2.0 * np.median(delays)
+
+
+@pytest.mark.parametrize('direction_of', SENSORS)
+def test_direction_is_that_of_the_ramp(headline, direction_of):
+    for seed, each in enumerate(headline[direction_of][0]):
+        rng = np.random.default_rng([seed, 2])
+        rng.uniform()
+        assert each[0][2] == rng.choice([-1, 1])
+
+
+@pytest.mark.parametrize(
+    ('noise', 'quantum', 'rate_k_min', 'lag', 'dt', 'end_s'),
+    [
+        (0.001, 0.0, 0.2, 1200.0, 1.0, 3600.0),
+        (0.01, 0.0, 0.2, 1200.0, 1.0, 3600.0),
+        (0.01, 0.0, 3.0, 180.0, 1.0, 1800.0),
+        (0.01, 0.0, 0.2, 900.0, 10.0, 6000.0),
+        (0.01, 0.0, 0.5, 900.0, 0.1, 900.0),
+        (0.001, 0.0625, 0.2, 1200.0, 1.0, 3600.0),
+        (0.01, 0.0625, 3.0, 300.0, 10.0, 3600.0),
+        (0.01, 1.0, 0.2, 900.0, 10.0, 7200.0),
+        (0.01, 1.0, 3.0, 180.0, 1.0, 2400.0),
+    ],
+)
+def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt, end_s):
+    found, _ = onsets(noise, quantum, rate_k_min, lag, 4, dt=dt, end_s=end_s, soak_s=2700.0)
+    for each in found:
+        assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
+        # the slowest: 1 K steps in a ramp of 0.2 K/min, two edges 5 min apart behind 15 min
+        assert each[-1][0] < 0.5 * end_s
+
+
+@pytest.mark.parametrize('sensor', SENSORS)
+def test_soaks_stay_static(sensor):
+    # 15 h of ripple and self-heating. At the required 0.05 switches an hour the expected number
+    # of openings is 0.4; more than 2 of them has a probability below 1 %. Found: none.
+    noise, quantum = SENSORS[sensor]
+    n_openings = 0
+    for seed in range(3):
+        rng = np.random.default_rng([seed, 3])
+        t = np.arange(0.0, 5.0 * 3600.0)
+        drift = 0.01 / 60.0 * 5400.0 * (1.0 - np.exp(-t / 5400.0))
+        case = 20.0 + rng.uniform(0.0, 0.1) + drift
+        swing = ripple(t, LAG_S, rng.uniform(180.0, 900.0), rng.uniform(0.0, 6.0))
+        changes = switches(
+            detector_settings(noise, quantum),
+            t,
+            read(case + swing, noise, quantum, rng),
+            read(case + 0.3, noise, quantum, rng),
+        )
+        assert changes[0][1] == STATIC
+        assert changes[0][0] < 2400.0
+        n_openings += sum(regime == DYNAMIC for _, regime, _ in changes)
+    assert n_openings <= 2
+
+
+def test_false_alarms_keep_to_the_setting():
+    # Noise alone and no ripple to hide behind, 20 alarms an hour allowed. Rice's formula counts
+    # crossings, and those of one filter come in bunches and with those of the other, so the
+    # formula is a bound: 100 h give at most 2000 departures, not in bunches; and it is not idle.
+    settings = detector_settings(0.01, false_alarms_per_hour=20.0, ripple_c=0.0)
+    test = _OnsetTest(settings, settings.case)
+    rng = np.random.default_rng(6)
+    n = 100 * 3600
+    sensor = Thermometer(settings.case)
+    sensor.update(0, 20.0)
+    sensor.update(1, 20.0)
+    sensor.measured_variance = 0.01**2
+    sensor.var_rate = 0.0
+    n_departures, quiet_from = 0, 0
+    for k, noise in enumerate(rng.normal(0.0, 0.01, n).tolist()):
+        sensor.measured = 20.0 + noise
+        if test.update((k + 1) * SECOND_NS, sensor, STATIC, is_grown=False) and k >= quiet_from:
+            n_departures += 1
+            quiet_from = k + 60
+    assert 100 < n_departures < 2000
+
+
+@pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
+def test_threshold_is_that_of_the_filters_noise(dt):
+    # Second route: the filter's steady gain from its Riccati equation, its noise and the
+    # correlation of neighbours from its impulse response, Rice's formula with those. The closed
+    # forms are first order in the pace, which is at most 0.3 here: within 4 %.
+    settings = detector_settings(0.01, ripple_c=0.0)
+    test = _OnsetTest(settings, settings.case)
+    test._tune(dt)
+    for threshold, power in zip(test._thresholds, test._powers, strict=True):
+        forward = np.array([[1.0, dt], [0.0, 1.0]])
+        wander = power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+        covariance = np.diag([1e-4, 1e-6])
+        for _ in range(3000):
+            ahead = forward @ covariance @ forward.T + wander
+            gain = ahead[:, 0] / (ahead[0, 0] + 1e-4)
+            covariance = ahead - np.outer(gain, ahead[0])
+        response = np.empty(4000)
+        x = gain
+        for k in range(4000):
+            response[k] = x[1]
+            x = forward @ x
+            x = x - gain * x[0]
+        noise = 1e-4 * np.sum(response**2)
+        correlation = np.sum(response[1:] * response[:-1]) / np.sum(response**2)
+        per_reading = math.acos(correlation) / (2.0 * math.pi)
+        allowed = 0.02 / 3600.0 / 4.0 * dt  # per reading, two filters, two signs
+        squared = 2.0 * math.log(per_reading / allowed)
+        assert threshold * covariance[1, 1] == pytest.approx(squared * noise, rel=0.04)
+
+
+def test_unknown_until_the_windows_are_filled():
+    settings = detector_settings(0.001)
+    detector = RegimeDetector(settings)
+    case, board = Thermometer(settings.case), Thermometer(settings.board)
+    assert detector.update(0, None, None) == UNKNOWN
+    for k in range(30):
+        board.update(k * SECOND_NS, 20.0)
+        case.update(k * SECOND_NS, 20.0)
+        assert detector.update(k * SECOND_NS, case, board) == UNKNOWN
+    assert (detector.direction, detector.switched_ns) == (0, None)
+
+
+def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=12000.0, **parts):
+    """
+    One run; `parts` may replace the case's or the board's readings by a function of (t, reading).
+
+    """
+    rng = np.random.default_rng(8)
+    t = np.arange(begin, end)
+    truths = dict(zip(('case', 'board'), case_and_board(t, corners, lag), strict=True))
+    readings = {name: read(truth, noise, quantum, rng) for name, truth in truths.items()}
+    for name, change in parts.items():
+        readings[name] = change(t, readings[name])
+    settings = detector_settings(noise, quantum, lag)
+    return switches(settings, t, readings['case'], readings['board'])
+
+
+def gone(t, readings):
+    return None
+
+
+RAMP = [(0.0, 0.5), (3600.0, 0.0)]
+
+
+def test_dynamic_ends_when_the_lag_has_died():
+    # The board's true rate falls below the relaxed 0.05 K/min some 50 min after the chamber's
+    # stop; then it needs the dwell of 60 s, and the noise of the rate a margin of 10 %.
+    changes = run_once(RAMP)
+    assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
+    t = np.arange(3600.0, 12000.0)
+    rate = 60.0 * np.gradient(lagged_twice(t, RAMP, LAG_S, BOARD_LAG_S), t)
+    relaxed_at = t[np.argmax(rate < 0.05)]
+    assert relaxed_at + 60.0 - 60.0 < changes[2][0] < relaxed_at + 60.0 + 120.0
+
+
+def test_the_relaxed_rate_moves_the_end():
+    rng = np.random.default_rng(8)
+    t = np.arange(-1800.0, 12000.0)
+    case, board = (read(each, 0.001, 0.0, rng) for each in case_and_board(t, RAMP))
+    ends = [
+        switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
+        for rate in (0.025, 0.05, 0.1)
+    ]
+    # the slower of two lags governs: half the rate, one more lag times ln 2
+    assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
+    assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
+
+
+TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
+
+
+@pytest.mark.parametrize('lost', [None, 'case', 'board'])
+@pytest.mark.parametrize('quantum', [0.0, 0.0625])
+def test_a_reversal_is_no_rest(lost, quantum):
+    # WHY: at the top of a triangle the rate passes through zero for minutes, and a coarse reading
+    # stands still.
+    # WHAT: one dynamic state from the first onset to the last relaxation.
+    parts = {lost: gone} if lost else {}
+    changes = run_once(TRIANGLE, quantum=quantum, end=20000.0, **parts)
+    assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
+
+
+def test_direction_follows_a_reversal():
+    settings = detector_settings(0.001)
+    case, board = Thermometer(settings.case), Thermometer(settings.board)
+    detector = RegimeDetector(settings)
+    rng = np.random.default_rng(8)
+    t = np.arange(-1800.0, 7200.0)
+    directions = {}
+    truths = case_and_board(t, TRIANGLE)
+    for k, (c, b) in enumerate(zip(*(read(x, 0.001, 0.0, rng) for x in truths), strict=True)):
+        stamp_ns = k * SECOND_NS
+        board.update(stamp_ns, float(b))
+        case.update(stamp_ns, float(c))
+        detector.update(stamp_ns, case, board)
+        directions[t[k]] = detector.direction
+    assert directions[-100.0] == 0
+    assert directions[600.0] == directions[3600.0] == 1
+    # the case turns lag * ln(2 - exp(-ramp / lag)) after the chamber: 616 s
+    turn = next(at for at in directions if at > 3600.0 and directions[at] == -1)
+    assert turn == pytest.approx(3600.0 + 616.0, abs=60.0)
+    assert directions[7199.0] == -1
+
+
+def test_a_start_in_a_ramp_is_dynamic():
+    changes = run_once([(-9000.0, 0.5), (1800.0, 0.0)])
+    assert [regime for _, regime, _ in changes] == [DYNAMIC, STATIC]
+    assert changes[0][0] < -1740.0
+    assert changes[0][2] == 1
+
+
+def test_a_lost_case_leaves_the_board():
+    # The board's second lag delays the onset; the end needs the board anyway.
+    whole, alone = run_once(RAMP), run_once(RAMP, case=gone)
+    assert [regime for _, regime, _ in alone] == [STATIC, DYNAMIC, STATIC]
+    assert whole[1][0] < alone[1][0] < 300.0
+    assert alone[2][0] == pytest.approx(whole[2][0], abs=60.0)
+
+
+def test_a_frozen_case_does_not_blind():
+    changes = run_once(RAMP, case=lambda t, x: np.where(t < 0.0, x, 20.0))
+    assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
+    assert changes[1][0] < 900.0
+
+
+def test_a_board_that_died_does_not_hold_the_dynamic_state():
+    settings = detector_settings(0.001)
+    case, board = Thermometer(settings.case), Thermometer(settings.board)
+    detector = RegimeDetector(settings)
+    t = np.arange(-1800.0, 12000.0)
+    truths = case_and_board(t, RAMP)
+    for k, (c, b) in enumerate(zip(*truths, strict=True)):
+        stamp_ns = k * SECOND_NS
+        if t[k] < 3600.0:
+            board.update(stamp_ns, float(b))
+        case.update(stamp_ns, float(c))
+        detector.update(stamp_ns, case, board)
+    assert detector.regime == STATIC
+
+
+def test_a_long_gap_voids_the_memory():
+    settings = detector_settings(0.001)
+    case, board = Thermometer(settings.case), Thermometer(settings.board)
+    detector = RegimeDetector(settings)
+    for k in [*range(600), *range(2200, 2210)]:
+        board.update(k * SECOND_NS, 20.0)
+        case.update(k * SECOND_NS, 20.0)
+        detector.update(k * SECOND_NS, case, board)
+        if k == 599:
+            assert detector.regime == STATIC
+    assert detector.regime == UNKNOWN
+
+
+def test_reset_is_a_fresh_start():
+    settings = detector_settings(0.001)
+    detector = RegimeDetector(settings)
+    for _ in range(2):
+        case, board = Thermometer(settings.case), Thermometer(settings.board)
+        regimes = []
+        for k in range(600):
+            board.update(k * SECOND_NS, 20.0)
+            case.update(k * SECOND_NS, 20.0)
+            regimes.append(detector.update(k * SECOND_NS, case, board))
+        assert regimes[0] == UNKNOWN
+        assert regimes[-1] == STATIC
+        assert detector.switched_ns == regimes.index(STATIC) * SECOND_NS
+        detector.reset()
+        assert (detector.regime, detector.direction, detector.switched_ns) == (UNKNOWN, 0, None)
+
+
+@pytest.mark.parametrize('quantum', [0.0, 0.0625])
+def test_cooling_is_heating_upside_down(quantum):
+    rng = np.random.default_rng(8)
+    t = np.arange(-1800.0, 9000.0)
+    settings = detector_settings(0.001, quantum)
+    case, board = (read(x, 0.001, quantum, rng) for x in case_and_board(t, RAMP, start=0.0))
+    up, down = switches(settings, t, case, board), switches(settings, t, -case, -board)
+    assert [(at, regime, -direction) for at, regime, direction in up] == down
+
+
+def test_switches_do_not_depend_on_the_origin_of_time():
+    # whole nanoseconds either way, so the same bits
+    rng = np.random.default_rng(8)
+    t = np.arange(0.0, 3000.0)
+    settings = detector_settings(0.001)
+    case, board = (read(x, 0.001, 0.0, rng) for x in case_and_board(t, [(1500.0, 0.5)]))
+    near, far = switches(settings, t, case, board), switches(settings, t + 1e6, case, board)
+    assert [(at + 1e6, *rest) for at, *rest in near] == [(at, *rest) for at, *rest in far]
+
+
+@pytest.mark.parametrize(
+    ('changes', 'text'),
+    [
+        ({'smallest_ramp_k_min': -0.2}, '`smallest_ramp_k_min` must be positive and finite'),
+        ({'false_alarms_per_hour': 0.0}, '`false_alarms_per_hour` must be positive and finite'),
+        ({'relaxed_rate_k_min': math.nan}, '`relaxed_rate_k_min` must be positive and finite'),
+        ({'ripple_c': -0.1}, '`ripple_c` must be zero or positive and finite, got -0.1'),
+        ({'dwell_s': math.inf}, '`dwell_s` must be zero or positive and finite, got inf'),
+        (
+            {'smallest_ramp_k_min': 0.06},
+            '`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / 1.5, got 0.05 and 0.06',
+        ),
+    ],
+)
+def test_settings_refuse_contradictions(changes, text):
+    with pytest.raises(ValueError, match=text):
+        DetectorSettings(**changes)
+
+
+def test_sensor_settings_are_checked_with_them():
+    with pytest.raises(ValueError, match='`noise_sd_c` must be positive and finite, got 0'):
+        DetectorSettings(case=ThermometerSettings(noise_sd_c=0.0))

@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Closed-form temperatures behind thermal lags, and sensors that read them, for the tests.
+
+"""
+
+import numpy as np
+
+from thermo_comp.regime import DetectorSettings, Regime, RegimeDetector
+from thermo_comp.thermometer import Thermometer, ThermometerSettings
+
+SECOND_NS = 1_000_000_000
+LAG_S = 900.0
+BOARD_LAG_S = 600.0
+
+
+def lagged(t, corners, lag):
+    """
+    Response of a first-order lag to a chamber whose rate [K/min] changes at corners [s].
+
+    """
+    out = np.zeros(len(t))
+    before = 0.0
+    for at, rate in corners:
+        x = np.maximum(t - at, 0.0)
+        out += (rate - before) / 60.0 * (x - lag * (1.0 - np.exp(-x / lag)))
+        before = rate
+    return out
+
+
+def lagged_twice(t, corners, lag, other):
+    """
+    Let two different lags in a row respond.
+
+    """
+    out = np.zeros(len(t))
+    before = 0.0
+    for at, rate in corners:
+        x = np.maximum(t - at, 0.0)
+        decay = lag**2 * np.exp(-x / lag) - other**2 * np.exp(-x / other)
+        out += (rate - before) / 60.0 * (x - lag - other + decay / (lag - other))
+        before = rate
+    return out
+
+
+def ripple(t, lag, period, phase=0.0, amplitude=0.1):
+    """
+    Let a lag respond to a chamber's control ripple.
+
+    """
+    omega = 2.0 * np.pi / period
+    return amplitude / np.hypot(1.0, omega * lag) * np.sin(omega * t + phase)
+
+
+def read(truth, noise, quantum, rng):
+    """
+    White noise, then rounding.
+
+    """
+    reading = truth + rng.normal(0.0, noise, len(truth))
+    return np.round(reading / quantum) * quantum if quantum else reading
+
+
+def detector_settings(noise, quantum=0.0, lag=LAG_S, **changes):
+    """
+    Shipped defaults for a unit of known lags and sensors.
+
+    """
+    return DetectorSettings(
+        case=ThermometerSettings(noise, quantum, lag_s=lag),
+        board=ThermometerSettings(noise, quantum, lag_s=lag + BOARD_LAG_S),
+        **changes,
+    )
+
+
+def switches(settings, t, case, board):
+    """
+    Return the times [s], regimes and directions at which the regime changes.
+
+    """
+    case_thermometer, board_thermometer = Thermometer(settings.case), Thermometer(settings.board)
+    detector = RegimeDetector(settings)
+    found = []
+    regime = Regime.UNKNOWN
+    nothing = [None] * len(t)
+    rows = zip(
+        np.round(t * 1e9).astype(np.int64).tolist(),
+        nothing if case is None else case.tolist(),
+        nothing if board is None else board.tolist(),
+        strict=True,
+    )
+    for stamp_ns, c, b in rows:
+        if b is not None:
+            board_thermometer.update(stamp_ns, b)
+        if c is not None and not case_thermometer.update(stamp_ns, c):
+            continue
+        now = detector.update(
+            stamp_ns,
+            None if case is None else case_thermometer,
+            None if board is None else board_thermometer,
+        )
+        if now != regime:
+            found.append((stamp_ns / 1e9, now, detector.direction))
+            regime = now
+    return found
