@@ -61,8 +61,9 @@ class Event:
         Change of the reading, per axis [input units].
     along, along_sd : float
         Change of the norm, that is, along the specific force, and its sd [input units].
-    temperature_change : float
-        What the board's temperature did within `duration_s` [K]; NaN where it is not known.
+    temperature_change, temperature_change_sd : float
+        Step of the board's readings at that time, beside a drift, and its sd [K]; NaN where too
+        few readings are near.
     turn_needed, turn_seen : float
         Angle by which the unit would have to turn for such a step, and what the gyroscope saw
         [rad]; NaN without one.
@@ -77,6 +78,7 @@ class Event:
     along: float
     along_sd: float
     temperature_change: float
+    temperature_change_sd: float
     turn_needed: float
     turn_seen: float
 
@@ -231,25 +233,40 @@ def _examine(
     is_no_turn = seen < _TURN_SHARE * needed or (
         abs(along) > _NORM_SHARE * size and abs(along) > _STEP_SDS * along_sd
     )
-    duration = float(near.time[at] - near.time[at - 1])
-    board = bag.board
-    begin, end = (
-        np.interp(t, (board.stamp_ns - bag.start_ns) * 1e-9, board.value)
-        for t in (near.time[0], near.time[-1])
-    )
+    warmed, warmed_sd = _temperature_step(bag, near.time[0], near.time[at], near.time[-1])
     x, y, z = step.tolist()
     return Event(
         kind='motion' if not is_quiet else ('jump' if is_no_turn else 'turn'),
         time=float(near.time[at]),
         stamp_ns=int(near.stamp_ns[at]),
-        duration_s=duration,
+        duration_s=float(near.time[at] - near.time[at - 1]),
         step=(x, y, z),
         along=along,
         along_sd=along_sd,
-        temperature_change=float(end - begin) / float(near.time[-1] - near.time[0]) * duration,
+        temperature_change=warmed,
+        temperature_change_sd=warmed_sd,
         turn_needed=needed,
         turn_seen=seen,
     )
+
+
+def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
+    """
+    Estimate what the board's readings did at a step, and the sd of that.
+
+    """
+    time = _seconds(bag.board.stamp_ns, bag.start_ns)
+    use = (time >= begin) & (time <= end)
+    time, value = time[use], bag.board.value[use]
+    if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
+        return np.nan, np.nan
+    jump = (time >= at).astype(np.float64)
+    columns = np.column_stack((_trend(time), jump))
+    parameters, *_ = np.linalg.lstsq(columns, value, rcond=None)
+    left = value - columns @ parameters
+    spread = float(left @ left) / max(len(value) - 3, 1)
+    covariance = np.linalg.inv(columns.T @ columns)
+    return float(parameters[2]), float(np.sqrt(spread * covariance[2, 2]))
 
 
 def _place_of_step(time: Array, accel: Array, quiet_sd: Array) -> int:

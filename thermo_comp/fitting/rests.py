@@ -148,10 +148,15 @@ def describe(event: Event, per_mg: float) -> str:
     along = f'{event.along / per_mg:+.3g} mg along gravity'
     size = f'{along} ({vector}) within {event.duration_s:.2g} s'
     if event.kind == 'jump':
-        kelvin = abs(event.temperature_change)
+        warmed = ''
+        if np.isfinite(event.temperature_change):
+            warmed = (
+                f', while its temperature changed by {event.temperature_change:+.2f} ± '
+                f'{event.temperature_change_sd:.2f} K'
+            )
         return (
-            f'at {event.time:.1f} s the sensor jumped by {size}, without motion, while its '
-            f'temperature changed by {kelvin:.1g} K: not a function of temperature'
+            f'at {event.time:.1f} s the sensor jumped by {size}, without motion{warmed}: not a '
+            'function of temperature'
         )
     what = 'may have been turned or jumped' if event.kind == 'turn' else 'was moved'
     return f'at {event.time:.1f} s the unit {what}: the reading changed by {size}'

@@ -1,0 +1,24 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the validation on recordings that other people made; `benchmarks/real_data.py` runs it.
+
+Nothing of the recordings is stored here: they are read from a folder beside the project, turned
+into bags in a temporary directory, and only numbers and plots are kept.
+
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def data_folder() -> Path:
+    """
+    Return where the recordings are looked for.
+
+    """
+    return Path(os.environ.get('THERMO_COMP_DATA', ROOT.parent / 'shared' / 'data'))
