@@ -38,6 +38,8 @@ class Traffic:
     n_unpublished: int = 0
     #: Messages that could not be read.
     n_malformed: int = 0
+    #: Regime flags published.
+    n_flags: int = 0
     #: Samples that took the slow way through rclpy's deserialization.
     n_fallback: int = 0
 

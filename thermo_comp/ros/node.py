@@ -107,6 +107,7 @@ class CompensationNode:
         self._newest_reading_ns: int | None = None
         self._n_malformed = 0
         self._n_unpublished = 0
+        self._n_flags = 0
         self._level = b''
         self._last_samples = time.monotonic()
         self._loop = WaitLoop(self.node)
@@ -249,11 +250,15 @@ class CompensationNode:
     def _publish_flags(self) -> None:
         for _, is_dynamic in self._compensator.take_flags():
             self._flag.publish(Bool(data=is_dynamic))
+            self._n_flags += 1
 
     def _snapshot(self) -> Snapshot:
         last, converter = self._converter.last_result, self._converter
         traffic = Traffic(
-            self._n_unpublished, self._n_malformed + converter.n_malformed, converter.n_fallback
+            n_unpublished=self._n_unpublished,
+            n_malformed=self._n_malformed + converter.n_malformed,
+            n_flags=self._n_flags,
+            n_fallback=converter.n_fallback,
         )
         variances = None if last is None else (last[3], last[6], last[8])
         return Snapshot(self._compensator.status, traffic, variances)

@@ -82,6 +82,7 @@ def play(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     ros_args: Sequence[str] = (),
+    throttle: Callable[[int], None] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> PlayReport:
     """
@@ -105,6 +106,8 @@ def play(
         Which accelerometer topic of the bag is played.
     ros_args : sequence of str, optional
         ROS arguments, such as ``['-r', '__ns:=/imu0']``.
+    throttle : callable, optional
+        Called with the number of samples sent after each `WINDOW`; may block for a while.
     progress : callable, optional
         Called with the fraction done, now and then.
 
@@ -132,7 +135,7 @@ def play(
     with open_recording(path, topics, input, require=required) as reader:
         rclpy.init(args=['--ros-args', *ros_args], context=context)
         try:
-            player = _Player(context, reader, rate, clock)
+            player = _Player(context, reader, rate, clock, throttle)
             player.wait_for_subscribers(wait_s)
             n_done = 0
             while n_loops == 0 or n_done < n_loops:
@@ -150,9 +153,15 @@ class _Player:
     """
 
     def __init__(
-        self, context: Context, reader: RecordingReader, rate: float, clock: bool
+        self,
+        context: Context,
+        reader: RecordingReader,
+        rate: float,
+        clock: bool,
+        throttle: Callable[[int], None] | None,
     ) -> None:
         self._reader = reader
+        self._throttle = throttle
         self._rate = rate
         self._node = rclpy.create_node(NODE_NAME, context=context)
         accel_type, accel_name = _ACCEL[reader.info.input or 'counts']
@@ -214,6 +223,8 @@ class _Player:
                 self._n_sent[role] += 1
                 if role == 'accel' and self._n_sent[role] % WINDOW == 0:
                     self._await_acknowledgement(role)
+                    if self._throttle is not None:
+                        self._throttle(self._n_sent[role])
             if progress is not None:
                 progress(min(1.0, (sum(self._n_sent.values()) - n_before) / max(1, self._total)))
 

@@ -21,6 +21,7 @@ from typing import Any
 import rclpy
 from rclpy.context import Context
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
@@ -32,8 +33,6 @@ NODE_NAME = 'thermo_comp_recorder'
 
 #: The node's outputs.
 OUTPUTS: Mapping[str, Any] = {'imu/data_raw': Imu, 'regime/dynamic': Bool}
-_TYPES = {Imu: 'sensor_msgs/msg/Imu', Bool: 'std_msgs/msg/Bool'}
-
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 _STAMP = Struct('<iI')
 
@@ -75,6 +74,7 @@ class Recorder:
         self._changed = threading.Condition()
         self._counts = dict.fromkeys(topics, 0)
         self._failure: RecordingError | None = None
+        self._newest: dict[str, bytes] = {}
         self._newest_ns = 0
         # Flags that came before any stamp.
         self._early: dict[str, list[bytes]] = {}
@@ -127,6 +127,24 @@ class Recorder:
         """
         with self._changed:
             return dict(self._counts)
+
+    def newest(self, name: str) -> Any | None:
+        """
+        Return the newest message of a topic.
+
+        Parameters
+        ----------
+        name : str
+            The relative topic name.
+
+        Returns
+        -------
+        message or None
+            None before there is any.
+
+        """
+        data = self._newest.get(name)
+        return None if data is None else deserialize_message(data, self._topics[name])
 
     def wait_for_publishers(
         self, timeout_s: float, while_true: Callable[[], bool] = lambda: True
@@ -192,20 +210,20 @@ class Recorder:
         Write what has arrived.
 
         """
-        new: dict[str, int] = {}
+        new: dict[str, list[bytes]] = {}
         for name, subscription in self._subscriptions.items():
             messages = self._early.pop(name, []) + subscription.drain()[0]
             times = [self._log_time(name, data) for data in messages]
             if not self._newest_ns:
                 self._early[name] = messages
             elif messages:
-                kind = _TYPES[self._topics[name]]
-                self._writer.write_raw(name, kind, times, messages)
-                new[name] = len(messages)
+                self._writer.write_raw(name, _type_name(self._topics[name]), times, messages)
+                new[name] = messages
         if new:
             with self._changed:
-                for name, count in new.items():
-                    self._counts[name] += count
+                for name, messages in new.items():
+                    self._counts[name] += len(messages)
+                    self._newest[name] = messages[-1]
                 self._changed.notify_all()
 
     def _log_time(self, name: str, data: bytes) -> int:
@@ -213,6 +231,10 @@ class Recorder:
             sec, nanosec = _STAMP.unpack_from(data, 4)
             self._newest_ns = sec * 1_000_000_000 + nanosec
         return self._newest_ns
+
+
+def _type_name(message_type: Any) -> str:
+    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
 
 
 def record(

@@ -4,8 +4,9 @@
 Owns the round trip: bag -> player -> DDS -> node process -> DDS -> recorder -> bag, without loss.
 
 Everything on the way is what runs on a robot; only the QoS differs, through the parameters made
-for that: subscriptions reliable and with no limit of depth, so that a reader that falls behind
-slows the player down instead of losing messages.
+for that: subscriptions reliable and without a limit of depth. And the player waits for what comes
+out of the node: a reliable reader that is full lets a sample be sent again, later than the
+temperatures behind it, and the order of arrival would no longer be that of the bag.
 
 """
 
@@ -16,23 +17,31 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from diagnostic_msgs.msg import DiagnosticArray
 
 from ..errors import ThermoCompError
 from ..recording import Input, Topics
 from .player import PlayReport, play
-from .recorder import Recorder
+from .recorder import OUTPUTS, Recorder
 
 #: How long node and recorder may take to find each other [s].
 DISCOVERY_S = 30.0
 #: How long the node may take to end [s].
 STOPPING_S = 10.0
-#: The recorder has everything when nothing came for this long [s].
-SILENCE_S = 3.0
-SETTLING_S = 0.5
+#: A message that Fast DDS has to repeat can be 3 s late; this is twice as long [s].
+COMPLETION_S = 6.0
+#: Samples that do not come out for this long were dropped by the node [s].
+DROPPED_S = 0.5
+#: Samples that the node may be behind the player.
+IN_FLIGHT = 1000
 
+_TOPICS = {**OUTPUTS, 'diagnostics': DiagnosticArray}
+_ACCOUNT = ('-p', 'diagnostics_period:=0.1')
 _INPUTS = ('accel/counts', 'imu/uncompensated', 'temperature/board', 'temperature/case')
 
 
@@ -46,11 +55,14 @@ class RoundTrip:
     played : PlayReport
     recorded : dict of str to int
         Messages recorded, by the relative topic name.
+    account : dict of str to str
+        The node's last diagnostics: samples in, out, dropped for which reason, and all the rest.
 
     """
 
     played: PlayReport
     recorded: dict[str, int]
+    account: dict[str, str]
 
 
 class NodeProcess:
@@ -213,19 +225,61 @@ def round_trip(
     namespace = f'/round_trip_{os.getpid()}' if namespace is None else namespace
     ros_args = ['-r', f'__ns:={namespace}'] if namespace else []
     arguments = [*ros_args, *lossless(namespace), '-p', f'calibration_file:={calibration}']
+    arguments += ['-r', f'/diagnostics:={namespace}/diagnostics', *_ACCOUNT]
     with (
         NodeProcess(*arguments, *node_args) as node,
-        Recorder(output, ros_args=ros_args, overwrite=overwrite) as recorder,
+        Recorder(output, topics=_TOPICS, ros_args=ros_args, overwrite=overwrite) as recorder,
     ):
         if not recorder.wait_for_publishers(DISCOVERY_S, lambda: node.is_alive):
             raise ThermoCompError(node.said or 'the node was not found')
         played = play(
-            bag, rate=rate, topics=topics, input=input, ros_args=ros_args, progress=progress
+            bag,
+            rate=rate,
+            topics=topics,
+            input=input,
+            ros_args=ros_args,
+            throttle=_Throttle(recorder),
+            progress=progress,
         )
-        n_samples = max(played.n_messages.values())
-        recorder.wait_until(lambda counts: counts['imu/data_raw'] >= n_samples, SILENCE_S)
-        # The last flags come behind the samples, and nobody knows how many they are.
-        recorder.wait_until(lambda _: False, SETTLING_S)
+        account = _wait_for_all(recorder, max(played.n_messages.values()))
         if not node.is_alive:
             raise ThermoCompError(f'the node ended: {node.said}')
-        return RoundTrip(played, recorder.counts)
+        return RoundTrip(played, recorder.counts, account)
+
+
+def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
+    """
+    Wait until the node has taken all samples and the recorder has all that the node published.
+
+    """
+    deadline = time.monotonic() + COMPLETION_S
+    account: dict[str, str] = {}
+
+    def is_complete(counts: Mapping[str, int]) -> bool:
+        diagnostics = recorder.newest('diagnostics')
+        if diagnostics is not None:
+            account.update((one.key, one.value) for one in diagnostics.status[0].values)
+        expected = [account.get(key, '') for key in ('samples in', 'samples out', 'flags')]
+        found = [n_sent, counts['imu/data_raw'], counts['regime/dynamic']]
+        return expected == [str(count) for count in found] or time.monotonic() > deadline
+
+    recorder.wait_until(is_complete, COMPLETION_S)
+    return account
+
+
+class _Throttle:
+    """
+    Makes the player wait for the recorder; what does not come at all counts as dropped.
+
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._n_dropped = 0
+
+    def __call__(self, n_sent: int) -> None:
+        def is_close(counts: Mapping[str, int]) -> bool:
+            return n_sent - self._n_dropped - counts['imu/data_raw'] <= IN_FLIGHT
+
+        if not self._recorder.wait_until(is_close, DROPPED_S):
+            self._n_dropped = n_sent - self._recorder.counts['imu/data_raw']

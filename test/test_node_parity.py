@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A bag played over DDS into the node and the offline replay of it give the same, bit for bit.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from builders import rich_calibration
+from rosbags.highlevel import AnyReader
+
+from thermo_comp.calibration import Calibration, Unit
+from thermo_comp.calibration_file import save_calibration
+from thermo_comp.errors import ThermoCompError
+from thermo_comp.recording import BagWriter, Block, ImuColumns, Topics, read_recording
+from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, replay
+from thermo_comp.ros.round_trip import round_trip
+
+TOPICS = Topics()
+START_NS = 1_767_225_600_000_000_000
+RATE_HZ = 10
+MINUTES = 30
+UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)
+
+
+def thermal_test(path: Path, imu: bool = False) -> int:
+    """
+    Write a soak, a ramp and a soak, with readings that come late; return the number of samples.
+
+    Late means: stamped before the samples that stand before them in the bag. Only a node that
+    respects the order of arrival, and no other order, does with them what the replay does.
+
+    """
+    rng = np.random.default_rng(11)
+    n = MINUTES * 60 * RATE_HZ
+    stamps = START_NS + np.arange(1, n + 1) * (1_000_000_000 // RATE_HZ)
+    seconds = np.arange(0.0, MINUTES * 60.0, 1.0)
+    case = np.interp(seconds, [0.0, 600.0, 1200.0], [15.0, 15.0, 25.0])
+    board = np.interp(seconds - 100.0, [0.0, 600.0, 1200.0], [16.0, 16.0, 26.0])
+    reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
+    # Around the sensitivity of `rich_calibration`: at rest, level, z up, with a little noise.
+    accel = np.array([5.0, -3.0, 310.0 * 9.80665]) + rng.integers(-4, 5, (n, 3))
+    with BagWriter(path) as writer:
+        for topic, values, late_ns in (
+            (TOPICS.board, board, 350_000_000),
+            (TOPICS.case, case, 1_250_000_000),
+        ):
+            noisy = values + 0.004 * rng.standard_normal(len(values))
+            late = late_ns * (rng.random(len(values)) < 0.3)
+            writer.write_temperature(topic, reading_ns, noisy, reading_ns + late)
+        if imu:
+            rest = ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
+            covariance = rest.linear_acceleration_covariance
+            force = accel / [300.0, -295.0, 310.0]
+            writer.write_imu(TOPICS.imu, stamps, force, covariance, 'imu_link', imu=rest)
+        else:
+            writer.write_counts(TOPICS.counts, stamps, accel, 'imu_link')
+    return n
+
+
+def output_of(path: Path) -> tuple[Block, list[bool]]:
+    """Read a corrected bag; the flags through a library that is not ours."""
+    with AnyReader([path]) as reader:
+        wanted = [c for c in reader.connections if c.topic.endswith(REGIME_TOPIC)]
+        flags = [
+            bool(reader.deserialize(data, connection.msgtype).data)
+            for connection, _, data in reader.messages(wanted)
+        ]
+    topics = Topics(imu=OUTPUT_TOPIC)
+    return read_recording(path, topics, 'imu', require=('accel',)).columns, flags
+
+
+def assert_same(live: Path, offline: Path) -> None:
+    (found, flags), (expected, expected_flags) = output_of(live), output_of(offline)
+    assert found.frame_id == expected.frame_id
+    assert found.accel_stamp_ns.tolist() == expected.accel_stamp_ns.tolist()
+    different = np.flatnonzero((found.accel != expected.accel).any(axis=1))
+    assert different.tolist() == []
+    assert found.imu is not None
+    assert expected.imu is not None
+    for name in ImuColumns.__dataclass_fields__:
+        assert getattr(found.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
+    # The k-th flag belongs to the k-th case reading: equal flags are equal switch times.
+    assert (len(flags), flags) == (len(expected_flags), expected_flags)
+    assert False in flags
+    assert True in flags
+
+
+def run(calibration: Calibration, bag: Path, folder: Path, *node_args: str, **keys: str) -> int:
+    save_calibration(calibration, folder / 'unit.yaml')
+    live, offline = folder / 'live.mcap', folder / 'offline.mcap'
+    account = round_trip(bag, folder / 'unit.yaml', live, node_args=node_args)
+    result = replay(bag, calibration, offline, **keys)
+    assert not account.played.unheard
+    assert not account.played.lossy
+    assert_same(live, offline)
+    assert account.recorded['imu/data_raw'] == result.counters.n_out
+    assert account.recorded['regime/dynamic'] == result.n_flags
+    return result.counters.n_out
+
+
+def test_counts(tmp_path: Path) -> None:
+    n = thermal_test(tmp_path / 'bag')
+    unit = replace(rich_calibration(), unit=UNIT)
+    # All but what comes before the first board temperature, which is not late by chance.
+    assert run(unit, tmp_path / 'bag', tmp_path) == n
+
+
+def test_imu_in_another_frame(tmp_path: Path) -> None:
+    thermal_test(tmp_path / 'bag.mcap', imu=True)
+    unit = replace(rich_calibration(), unit=replace(UNIT, input='m/s^2', full_scale=160.0))
+    axes = {axis: replace(getattr(unit.axes, axis), scale_factor=1.0, bias=0.0) for axis in 'xyz'}
+    unit = replace(unit, axes=replace(unit.axes, **axes))
+    args = ['-p', 'input:=imu', '-p', 'frame_id:=tilted']
+    assert run(unit, tmp_path / 'bag.mcap', tmp_path, *args, frame_id='tilted') > 0
+
+
+def test_a_node_that_does_not_start_is_reported_in_its_own_words(tmp_path: Path) -> None:
+    thermal_test(tmp_path / 'bag.mcap')
+    with pytest.raises(ThermoCompError, match=r'none.yaml: cannot be read: No such file'):
+        round_trip(tmp_path / 'bag.mcap', tmp_path / 'none.yaml', tmp_path / 'out.mcap')
+    assert not (tmp_path / 'out.mcap').exists()
