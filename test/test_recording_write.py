@@ -204,6 +204,18 @@ def test_the_directory_is_what_rosbag2_writes(tmp_path: Path) -> None:
     assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
 
 
+def test_a_bare_file_names_itself(tmp_path: Path) -> None:
+    """
+    WHY: it is written under another name first, and that one must not stand in its metadata.
+
+    """
+    small(tmp_path / 'bag.mcap')
+    with (tmp_path / 'bag.mcap').open('rb') as stream:
+        (metadata,) = make_reader(stream).iter_metadata()
+    content = yaml.safe_load(metadata.metadata['serialized_metadata'])
+    assert content['relative_file_paths'] == [content['files'][0]['path']] == ['bag.mcap']
+
+
 def test_an_imu_without_gyro_claims_none(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag.mcap') as bag:
         bag.write_imu('imu/data_raw', [START_NS], [[1.0, 2.0, 3.0]], np.eye(3).ravel(), 'link')

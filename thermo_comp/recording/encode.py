@@ -408,10 +408,10 @@ def as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
         raise ValueError(f'`{name}` must be one row of integers, got {times.dtype}')
     if n is not None and len(times) != n:
         raise ValueError(f'`{name}` must have {n} values, got {len(times)}')
-    times = times.astype(np.int64, copy=False)
-    if len(times) and int(np.min(times)) < 0:
-        raise ValueError(f'`{name}` must not be negative, got {int(np.min(times))}')
-    return times
+    checked: Ints = times.astype(np.int64, copy=False)
+    if len(checked) and int(np.min(checked)) < 0:
+        raise ValueError(f'`{name}` must not be negative, got {int(np.min(checked))}')
+    return checked
 
 
 def as_numbers(name: str, values: ArrayLike, n: int, width: int) -> Floats:

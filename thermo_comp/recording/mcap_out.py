@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import lz4.frame
 import numpy as np
@@ -49,6 +49,8 @@ MAGIC = b'\x89MCAP0\r\n'
 METADATA_NAME = 'thermo_comp'
 
 _MAX_PACKING = 2
+# Versions of mcap differ in which of its methods are typed.
+_new_builder: Callable[[], Any] = RecordBuilder
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 
@@ -226,7 +228,7 @@ class McapFile:
         self._at += len(data)
 
     def _put_record(self, record: McapRecord) -> None:
-        builder = RecordBuilder()
+        builder = _new_builder()
         record.write(builder)
         self._put(_taken(builder))
 
@@ -315,7 +317,7 @@ class McapFile:
             (Opcode.CHUNK_INDEX, list(self._chunks)),
             (Opcode.METADATA_INDEX, list(self._metadata_index)),
         ]
-        builder = RecordBuilder()
+        builder = _new_builder()
         offsets: list[SummaryOffset] = []
         for opcode, records in groups:
             group_start = builder.count
@@ -356,8 +358,8 @@ def _joined(stretches: list[Stretch]) -> Stretch:
     )
 
 
-def _taken(builder: RecordBuilder) -> bytes:
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+def _taken(builder: Any) -> bytes:
+    data: bytes = builder.end()
     return data
 
 
