@@ -104,7 +104,7 @@ def test_gradient_has_the_sign_of_the_ramp():
     for sign in (1.0, -1.0):
         compensator = Compensator(unit)
         warm(compensator, 20.0, 20.0 + sign * 2.0, until_s=300)
-        x = compensator.process(300 * SECOND_NS, 0.0, 0.0, 0.0)[0]
+        x = compensator.process(300 * SECOND_NS, 0.0, 0.0, 1.0)[0]
         assert x == pytest.approx(-sign * 30.0 * 2.0 / 300.0, rel=1e-6)
 
 
@@ -235,9 +235,9 @@ def test_unknown_regime_is_paid_for_in_the_covariance():
     unit = calibration(dynamic=regime_set(axis_set(delta=3.0)))
     compensator = Compensator(unit)
     warm(compensator, until_s=1)
-    early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 0.0)
+    early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 1.0)
     warm(compensator, until_s=1500, start_s=1)
-    late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 0.0)
+    late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0)
     noise = 1e-4**2 / 0.01
     # The sets disagree by 3 counts = 0.01 m/s^2 on x, by nothing on y.
     assert early[3] == pytest.approx(noise + 0.01**2, rel=1e-6)
@@ -247,15 +247,15 @@ def test_unknown_regime_is_paid_for_in_the_covariance():
 
 def test_nothing_goes_out_before_a_temperature_or_long_after_one():
     compensator = Compensator(calibration(), CompensatorConfig(temperature_timeout_s=20.0))
-    assert compensator.process(1, 0.0, 0.0, 0.0) is None
+    assert compensator.process(1, 0.0, 0.0, 1.0) is None
     compensator.push_board(2, 20.0)
-    assert compensator.process(3, 0.0, 0.0, 0.0) is not None
-    assert compensator.process(2 + 20 * SECOND_NS, 0.0, 0.0, 0.0) is not None
+    assert compensator.process(3, 0.0, 0.0, 1.0) is not None
+    assert compensator.process(2 + 20 * SECOND_NS, 0.0, 0.0, 1.0) is not None
     assert compensator.status.is_board_stale
-    assert compensator.process(3 + 20 * SECOND_NS, 0.0, 0.0, 0.0) is None
+    assert compensator.process(3 + 20 * SECOND_NS, 0.0, 0.0, 1.0) is None
     assert compensator.status.is_board_lost
     compensator.push_board(30 * SECOND_NS, 20.0)
-    assert compensator.process(30 * SECOND_NS, 0.0, 0.0, 0.0) is not None
+    assert compensator.process(30 * SECOND_NS, 0.0, 0.0, 1.0) is not None
     counters = compensator.counters
     assert (counters.n_out, counters.n_no_temperature, counters.n_stale) == (3, 1, 1)
 
@@ -263,26 +263,28 @@ def test_nothing_goes_out_before_a_temperature_or_long_after_one():
 def test_bad_samples_are_dropped_and_counted():
     compensator = Compensator(calibration())
     warm(compensator)
-    bad = [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 32767.0), (-32768.0, 0, 0)]
+    bad = [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 32767.0), (-32768.0, 0, 0), (0, 0, 0)]
     for k, sample in enumerate(bad):
         assert compensator.process(k + 1, *map(float, sample)) is None
-    assert compensator.process(4, 0.0, 0.0, 0.0) is None  # the stamp of the last one again
+    assert compensator.process(5, 0.0, 0.0, 1.0) is None  # the stamp of the last one again
     counters = compensator.counters
     assert (counters.n_not_finite, counters.n_saturated, counters.n_out_of_order) == (2, 2, 1)
-    assert counters.n_in == 5
+    # Three exact zeros are a dead wire.
+    assert counters.n_stuck == 1
+    assert counters.n_in == 6
 
 
 def test_time_that_jumps_back_starts_anew():
     compensator = Compensator(calibration())
     for lap in range(2):
         warm(compensator, until_s=1500)
-        assert compensator.process(1500 * SECOND_NS, 0.0, 0.0, 0.0) is not None
+        assert compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0) is not None
         assert compensator.counters.n_time_jumps == lap
         flags = compensator.take_flags()
         assert flags
         assert not any(value for _, value in flags)
         compensator.push_board(0, 20.0)
-        assert compensator.process(0, 0.0, 0.0, 0.0) is not None
+        assert compensator.process(0, 0.0, 0.0, 1.0) is not None
 
 
 def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
@@ -296,7 +298,9 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
 def test_switch_makes_no_step():
     # The sets differ by 5 counts = 17 mg; over 30 s at 100 Hz that is 5.7 ug a sample.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
-    compensator = Compensator(unit)
+    compensator = Compensator(
+        unit, CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+    )
     outputs = []
     for k in range(200_000):
         stamp = k * 10_000_000
@@ -304,7 +308,7 @@ def test_switch_makes_no_step():
             ramp = max(k / 100.0 - 1200.0, 0.0) / 60.0
             compensator.push_board(stamp, 20.0 + 0.3 * ramp)
             compensator.push_case(stamp, 20.0 + ramp)
-        outputs.append(compensator.process(stamp, 0.0, 0.0, 0.0)[0])
+        outputs.append(compensator.process(stamp, 0.0, 0.0, 1.0)[0])
     steps = np.abs(np.diff(outputs))
     assert outputs[0] == 0.0
     assert outputs[-1] == pytest.approx(-5.0 / 300.0)
@@ -314,18 +318,18 @@ def test_switch_makes_no_step():
 def test_swap_takes_effect_between_two_samples():
     compensator = Compensator(calibration())
     warm(compensator, until_s=5)
-    before = compensator.process(5 * SECOND_NS, 300.0, 0.0, 0.0)
+    before = compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0)
     compensator.swap(calibration(axes=Axes(*[AxisReference(150.0, 0.0)] * 3)))
-    after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 0.0)
+    after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert (before[0], after[0]) == (1.0, 2.0)
 
 
 def test_swap_to_another_detector_loses_no_sample():
     compensator = Compensator(calibration())
     warm(compensator, until_s=5)
-    assert compensator.process(5 * SECOND_NS, 300.0, 0.0, 0.0) is not None
+    assert compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0) is not None
     compensator.swap(rich_calibration())
-    row = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 0.0)
+    row = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert row is not None
     assert not compensator.status.state.is_settled
 
@@ -381,6 +385,9 @@ def test_covariance_is_the_scatter_of_calibrations_drawn_from_it(rng):
         ({'temperature_timeout_s': 0.0}, '`temperature_timeout_s` must be positive'),
         ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or more'),
         ({'case_timeout_s': math.inf}, '`case_timeout_s` must be positive'),
+        ({'stuck_timeout_s': -1.0}, '`stuck_timeout_s` must be zero or positive'),
+        ({'local_gravity_m_s2': math.nan}, '`local_gravity_m_s2` must be zero or positive'),
+        ({'gravity_tolerance_m_s2': -0.1}, '`gravity_tolerance_m_s2` must be zero or positive'),
     ],
 )
 def test_config_refusals(values, message):
@@ -398,15 +405,20 @@ def test_empty_block():
 
 def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
-    compensator = Compensator(unit, CompensatorConfig(transition_time_s=100.0))
+    compensator = Compensator(
+        unit,
+        CompensatorConfig(
+            transition_time_s=100.0, stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
+        ),
+    )
     warm(compensator, 20.0, until_s=1200)
     for k in range(1200, 1400):
         compensator.push_board(k * SECOND_NS, 20.0)
         compensator.push_case(k * SECOND_NS, 20.0 + (k - 1200) / 30.0)
     stamp = 1200 * SECOND_NS
-    while compensator.process(stamp, 0.0, 0.0, 0.0)[0] > -2.0 / 300.0:
+    while compensator.process(stamp, 0.0, 0.0, 1.0)[0] > -2.0 / 300.0:
         stamp += SECOND_NS // 10
-    before = compensator.process(stamp + 1, 0.0, 0.0, 0.0)[0]
+    before = compensator.process(stamp + 1, 0.0, 0.0, 1.0)[0]
     compensator.reconfigure(replace(compensator.config, transition_time_s=50.0))
-    after = compensator.process(stamp + 2, 0.0, 0.0, 0.0)[0]
+    after = compensator.process(stamp + 2, 0.0, 0.0, 1.0)[0]
     assert after == pytest.approx(before, abs=1e-9)

@@ -32,6 +32,7 @@ LAYERS = {
     'correction': 2,
     'batch': 2,
     'plausibility': 2,
+    'sample_guard': 2,
     'status': 2,
     'thermal': 2,
     'compensator': 2,

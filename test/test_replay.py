@@ -191,7 +191,9 @@ def test_time_outs_and_lost_temperatures_are_counted(tmp_path: Path) -> None:
     with BagWriter(bag) as writer:
         stamps = START_NS + np.arange(2000) * 100_000_000
         writer.write_temperature(TOPICS.board, [START_NS + 10 * SECOND_NS], [20.0])
-        writer.write_counts(TOPICS.counts, stamps, np.full((2000, 3), 1000.0))
+        # Some 1 g in all, and alive.
+        counts = 1700.0 + np.arange(2000)[:, None] % 2 + np.zeros(3)
+        writer.write_counts(TOPICS.counts, stamps, counts)
     result = replay(bag, rich_calibration(), tmp_path / 'out')
     # Nothing before the first reading at 10 s, nothing later than 60 s after the only one.
     assert result.counters.n_no_temperature == 100

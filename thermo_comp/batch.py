@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from .sample_guard import Mask
+
 if TYPE_CHECKING:
     from .compensator import Compensator
 
@@ -124,6 +126,11 @@ class _Segments:
     after: list[int]
     states: list[tuple[float, ...]]
     end_states: list[tuple[float, ...]]
+    #: Not the rest of one that the end of the block before has cut.
+    is_new: list[bool]
+    #: Held back because the samples come too fast; and what the rate adds to their noise.
+    is_too_fast: list[bool]
+    noise_excess: list[float]
 
 
 def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
@@ -131,6 +138,8 @@ def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlo
     Correct a block of samples; see `Compensator.process_block`.
 
     """
+    counters = compensator.counters
+    n_seen = counters.n_in - counters.n_out_of_order
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     before = np.maximum.accumulate(np.concatenate(([compensator.last_ns], stamps)))[:-1]
     in_order = stamps > before
@@ -144,7 +153,7 @@ def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlo
         index = np.flatnonzero(in_order)
         stamps = stamps[index]
         samples = np.asarray(block.accel, dtype=np.float64)[index]
-    segments = _run_thermal_side(compensator, block, stamps, in_order)
+    segments = _run_thermal_side(compensator, block, stamps, in_order, n_seen)
     if len(stamps):
         compensator.last_ns = int(stamps[-1])
     return _apply(compensator, segments, index, stamps, samples)
@@ -193,8 +202,9 @@ def _run_thermal_side(
     block: AccelBlock,
     stamps: Stamps,
     in_order: npt.NDArray[np.bool_],
+    n_seen: int,
 ) -> _Segments:
-    segments = _Segments([], [], [], [], [])
+    segments = _Segments([], [], [], [], [], [], [], [])
     n_samples = len(stamps)
     # A reading takes effect at the first sample that is not before it and that comes after it.
     kept_before = np.concatenate(([0], np.cumsum(in_order)))
@@ -233,19 +243,25 @@ def _run_thermal_side(
     position = 0
     for at, stamp_ns, kind, celsius in events:
         if at > position:
-            _add_segments(compensator, segments, stamps, position, min(at, n_samples))
+            stop = min(at, n_samples)
+            _add_segments(compensator, segments, stamps, position, stop, n_seen)
             position = at
         if at >= n_samples:
             (compensator.push_board, compensator.push_case)[kind](stamp_ns, celsius)
         else:
             compensator.apply_reading(stamp_ns, kind, celsius)
     if position < n_samples:
-        _add_segments(compensator, segments, stamps, position, n_samples)
+        _add_segments(compensator, segments, stamps, position, n_samples, n_seen)
     return segments
 
 
 def _add_segments(
-    compensator: Compensator, segments: _Segments, stamps: Stamps, first: int, after: int
+    compensator: Compensator,
+    segments: _Segments,
+    stamps: Stamps,
+    first: int,
+    after: int,
+    n_seen: int,
 ) -> None:
     """
     Add the segments of samples first..after, over which no reading takes effect.
@@ -269,6 +285,11 @@ def _add_segments(
             stop = after
         else:
             stop = first + int(np.searchsorted(stamps[first:after], end_ns, 'left'))
+        is_new = compensator.open_segment(start_ns, n_seen + first, int(stamps[first]))
+        segments.is_new.append(is_new)
+        is_too_fast = compensator.rate_refuses and (is_new or compensator.is_refusing)
+        segments.is_too_fast.append(is_too_fast)
+        segments.noise_excess.append(compensator.noise_excess)
         segments.start_ns.append(start_ns)
         segments.first.append(first)
         segments.after.append(stop)
@@ -293,8 +314,10 @@ def _apply(
     columns: list[npt.NDArray[Any]] = [np.array(segments.start_ns, dtype=np.int64)]
     for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
         columns += [bias, bias_end - bias, scale, scale_end - scale]
-    for axis in compensator.correction.variance(ends):
-        columns += axis
+    excess = np.array(segments.noise_excess)
+    correction = compensator.correction
+    for (a, b, c), noise in zip(correction.variance(ends), correction.noise, strict=True):
+        columns += (a + excess * noise, b, c)
     first = np.array(segments.first)
     counts = np.array(segments.after) - first
     n = int(counts.sum())
@@ -325,7 +348,8 @@ def _apply(
             )
         low, begin = high, end
     if source is not None:
-        index, stamps = index[source], stamps[source]
+        index, stamps, samples = index[source], stamps[source], samples[source]
+    _judge(compensator, segments, counts, stamps, samples, force, covariance, keep)
     if not keep.all():
         index, stamps = index[keep], stamps[keep]
         force, covariance = force[keep], covariance[keep]
@@ -363,7 +387,7 @@ def _correct(
         shape = (len(stamps),)
         spread = [np.repeat(column, counts) for column in columns]
     dt = (stamps.reshape(shape) - spread[0]) * 1e-9
-    _mark_bad(compensator, samples, keep)
+    _mark_bad(compensator.calibration.unit.full_scale, samples, keep)
     x, y, z = (
         _divide(samples[:, i].reshape(shape), spread[1 + 4 * i : 5 + 4 * i], dt) for i in range(3)
     )
@@ -390,16 +414,87 @@ def _correct(
     np.add(zx * cxz + zy * zy * vy + vz + xx * var_zx, y * y * var_zy, out=out[11])
 
 
-def _mark_bad(compensator: Compensator, samples: Floats, keep: npt.NDArray[np.bool_]) -> None:
-    full_scale = compensator.calibration.unit.full_scale
+def _mark_bad(full_scale: float, samples: Floats, keep: npt.NDArray[np.bool_]) -> None:
     # One look at the extremes settles the usual case; a NaN fails both comparisons.
     if -full_scale < np.min(samples) and np.max(samples) < full_scale:
         return
-    good = ((-full_scale < samples) & (samples < full_scale)).all(axis=1)
-    finite = np.isfinite(samples).all(axis=1)
-    compensator.counters.n_saturated += int(np.count_nonzero(~good & finite))
-    compensator.counters.n_not_finite += int(np.count_nonzero(~finite))
-    keep &= good
+    keep &= ((-full_scale < samples) & (samples < full_scale)).all(axis=1)
+
+
+def _judge(
+    compensator: Compensator,
+    segments: _Segments,
+    counts: npt.NDArray[np.int64],
+    stamps: Stamps,
+    samples: Floats,
+    force: Floats,
+    covariance: Floats,
+    keep: npt.NDArray[np.bool_],
+) -> None:
+    """
+    Leave out what the stream would not publish, and count why.
+
+    """
+    counters, gravity = compensator.counters, compensator.gravity
+    is_good = keep.copy()
+    is_stuck = _stuck(compensator, stamps, samples)
+    if is_stuck is not None:
+        keep &= ~is_stuck
+    begins = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    is_refuted: list[bool] = []
+    trace = compensator.noise_trace
+    firsts = zip(
+        begins.tolist(),
+        stamps[begins].tolist(),
+        keep[begins].tolist(),
+        segments.is_new,
+        segments.is_too_fast,
+        strict=True,
+    )
+    for row, stamp_ns, is_kept, is_new, is_fast in firsts:
+        if not is_new:
+            is_refuted.append(compensator.is_refusing and not is_fast)
+            continue
+        is_refuted.append(gravity.is_refuted and not is_fast)
+        if is_kept and not is_fast and gravity.wants(stamp_ns):
+            xx, xy, xz, _, yy, yz, _, _, zz = covariance[row].tolist()
+            x, y, z = force[row].tolist()
+            gravity.add(stamp_ns, (x, y, z), (xx, xy, xz, yy, yz, zz), trace)
+    compensator.is_refusing = segments.is_too_fast[-1] or is_refuted[-1]
+    # Every sample of a segment that is held back counts for that; the first one of a refuted
+    # segment has been looked at like any other.
+    is_fast_row = np.repeat(segments.is_too_fast, counts)
+    is_held_row = np.repeat(is_refuted, counts)
+    first = begins[np.array(is_refuted) & np.array(segments.is_new)]
+    is_held_row[first] = False
+    counters.n_too_fast += int(np.count_nonzero(is_fast_row))
+    counters.n_refuted += int(np.count_nonzero(is_held_row))
+    is_seen = ~(is_fast_row | is_held_row)
+    if not is_good.all():
+        is_bad = is_seen & ~is_good
+        n_not_finite = int(np.count_nonzero(~np.isfinite(samples[is_bad]).all(axis=1)))
+        counters.n_not_finite += n_not_finite
+        counters.n_saturated += int(np.count_nonzero(is_bad)) - n_not_finite
+    if is_stuck is not None:
+        counters.n_stuck += int(np.count_nonzero(is_seen & is_good & is_stuck))
+    keep &= is_seen
+    counters.n_refuted += int(np.count_nonzero(keep[first]))
+    keep[first] = False
+
+
+def _stuck(compensator: Compensator, stamps: Stamps, samples: Floats) -> Mask | None:
+    """
+    Find the samples that are not believed: too long the same, or three exact zeros.
+
+    """
+    if not compensator.stuck.is_on:
+        return None
+    found = compensator.stuck.find(stamps, samples)
+    is_zero = samples[:, 0] == 0.0
+    if is_zero.any():
+        is_zero &= (samples[:, 1] == 0.0) & (samples[:, 2] == 0.0)
+        found = is_zero if found is None else found | is_zero
+    return found
 
 
 def _divide(raw: Floats, line: list[npt.NDArray[Any]], dt: Floats) -> Floats:

@@ -12,6 +12,10 @@ A reading takes effect at the first sample whose stamp is not before its own and
 it; so the result depends on stamps and order of arrival, not on when the code happened to run,
 and a node that got everything in order publishes the bits that the offline replay writes.
 
+Each segment begins with a look at what the samples say of themselves: their rate, and, from the
+segment's first sample, |f| against gravity while the platform stands. So the checks cost nothing
+per sample, and a batch comes to the same verdicts.
+
 """
 
 from __future__ import annotations
@@ -23,7 +27,9 @@ from dataclasses import replace
 from .batch import SEGMENT_NS, TIME_JUMP_NS, AccelBlock, CompensatedBlock, process_block
 from .calibration import Calibration
 from .correction import Correction
+from .health import GravityMonitor
 from .regime import Regime
+from .sample_guard import RateWatch, StuckWatch
 from .status import CompensatorConfig, CompensatorStatus, Counters
 from .thermal import ThermalConfig, ThermalTracker
 
@@ -34,6 +40,9 @@ SHORTEST_STALE_S = 0.5
 
 #: Readings that wait for samples: more than this means that their clock is not the samples'.
 PENDING_LIMIT = 4096
+
+#: Samples this much faster than calibrated, relative, still have the calibrated noise.
+RATE_TOLERANCE = 0.1
 
 #: Later than any stamp, earlier than any stamp.
 _NEVER_NS = 1 << 62
@@ -62,6 +71,9 @@ class Compensator:
         self._pending: list[tuple[int, int, int, float]] = []
         self._n_pushed = 0
         self._flags: list[tuple[int, bool]] = []
+        self._n_applied = 0
+        self._segment_key: tuple[int, int] | None = None
+        self.stuck = StuckWatch(self.config.stuck_timeout_s)
         self._use(calibration)
         self.tracker = ThermalTracker(
             calibration.detector, calibration.memory_time_constants_s, self._thermal_config()
@@ -72,7 +84,16 @@ class Compensator:
     def _use(self, calibration: Calibration) -> None:
         self.calibration = calibration
         self.correction = Correction(calibration)
-        self._full_scale = calibration.unit.full_scale
+        self._full_scale = self._limit = calibration.unit.full_scale
+        self.rate = RateWatch(calibration.unit.cycle_time_s)
+        self.gravity = self._gravity_monitor()
+        # To the noise of one sample comes that of rounding to whole counts, twice 1/12 count^2
+        # where the converter carries the remainder on.
+        quantum = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
+        axes = calibration.axes
+        self.noise_trace = sum(self.correction.noise) + sum(
+            quantum / axis.scale_factor**2 for axis in (axes.x, axes.y, axes.z)
+        )
         M = calibration.misalignment
         sd = calibration.misalignment_sd
         self.misalignment = (M[1][0], M[2][0], M[2][1], *(value * value for value in sd))
@@ -82,6 +103,13 @@ class Compensator:
             self.config.transition_time_s,
             self.config.case_timeout_s,
             self.calibration.board_lag_s,
+            self.config.temperature_timeout_s,
+        )
+
+    def _gravity_monitor(self) -> GravityMonitor:
+        return GravityMonitor(
+            self.config.local_gravity_m_s2 or self.calibration.gravity_m_s2,
+            self.config.gravity_tolerance_m_s2,
         )
 
     def push_board(self, stamp_ns: int, celsius: float) -> None:
@@ -125,16 +153,23 @@ class Compensator:
             None where nothing must be published, with the reason counted in `counters`.
 
         """
-        if not self.last_ns < stamp_ns < self._event_ns and not self._advance(stamp_ns):
-            return None
+        if not self.last_ns < stamp_ns < self._event_ns:
+            return self._process_first(stamp_ns, x, y, z)
         self.last_ns = stamp_ns
-        full_scale = self._full_scale
-        if not (
-            -full_scale < x < full_scale
-            and -full_scale < y < full_scale
-            and -full_scale < z < full_scale
-        ):
+        stuck = self.stuck
+        run = stuck.run
+        is_stuck = False
+        if x == run[0] and y == run[1] and z == run[2]:
+            is_stuck = stuck.again(stamp_ns)
+        else:
+            stuck.run = (x, y, z, stamp_ns)
+            stuck.n_same = 0
+        limit = self._limit
+        if is_stuck or not (-limit < x < limit and -limit < y < limit and -limit < z < limit):
             self._count_bad(x, y, z)
+            return None
+        if not (x or y or z) and stuck.is_on:
+            self.counters.n_stuck += 1
             return None
         (
             (start_ns, bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1),
@@ -165,10 +200,48 @@ class Compensator:
         )
 
     def _count_bad(self, x: float, y: float, z: float) -> None:
-        if math.isfinite(x) and math.isfinite(y) and math.isfinite(z):
-            self.counters.n_saturated += 1
-        else:
+        full_scale = self._full_scale
+        if self.is_refusing:
+            if self.rate_refuses:
+                self.counters.n_too_fast += 1
+            else:
+                self.counters.n_refuted += 1
+        elif not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
             self.counters.n_not_finite += 1
+        elif max(abs(x), abs(y), abs(z)) < full_scale:
+            self.counters.n_stuck += 1
+        else:
+            self.counters.n_saturated += 1
+
+    def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
+        """
+        Correct the first sample after an event, which serves the checks, too.
+
+        """
+        key = self._segment_key
+        if not self._advance(stamp_ns):
+            return None
+        if self._segment_key == key:
+            return self.process(stamp_ns, x, y, z)
+        self.is_refusing = self.rate_refuses
+        row = self.process(stamp_ns, x, y, z)
+        if self.gravity.is_refuted and not self.rate_refuses:
+            # It still tells when the trust is restored.
+            self.is_refusing = True
+            if row is not None:
+                self.counters.n_out -= 1
+                self.counters.n_refuted += 1
+        if row is not None and self.gravity.wants(stamp_ns):
+            self.gravity.add(stamp_ns, row[:3], row[3:], self.noise_trace)
+        return None if self.is_refusing else row
+
+    @property
+    def rate_refuses(self) -> bool:
+        """
+        Whether samples are held back because they cannot be conversions of the calibrated cycle.
+
+        """
+        return self.rate.is_too_fast and self.calibration.unit.input == 'counts'
 
     def _advance(self, stamp_ns: int) -> bool:
         """
@@ -192,7 +265,10 @@ class Compensator:
         self._pending = [entry for entry in self._pending if entry[0] <= stamp_ns]
         heapq.heapify(self._pending)
         self.tracker.reset()
+        self.stuck.reset()
+        self.rate.reset()
         self.counters.n_time_jumps += 1
+        self.last_ns = stamp_ns - 1
         return True
 
     def apply_reading(self, stamp_ns: int, kind: int, celsius: float) -> None:
@@ -201,6 +277,7 @@ class Compensator:
 
         """
         counters = self.counters
+        self._n_applied += 1
         if kind == 0:
             if self.tracker.board_reading(stamp_ns, celsius):
                 counters.n_board += 1
@@ -237,10 +314,47 @@ class Compensator:
             return False
         # Segments count from the last reading, wherever the first sample in one may lie.
         start_ns = updated_ns + (stamp_ns - updated_ns) // SEGMENT_NS * SEGMENT_NS
+        counters = self.counters
+        self.open_segment(start_ns, counters.n_in - counters.n_out_of_order, stamp_ns)
         self._segment = (*self._evaluate(start_ns), self.misalignment)
         deadline_ns = board_ns + self.timeout_ns + 1
         self._event_ns = min(next_ns, start_ns + SEGMENT_NS, deadline_ns)
         return True
+
+    def open_segment(self, start_ns: int, n_seen: int, stamp_ns: int) -> bool:
+        """
+        Check the rate at a segment's first sample; False if the segment only goes on.
+
+        Parameters
+        ----------
+        start_ns : int
+            Where the segment begins.
+        n_seen : int
+            Samples in order that came before.
+        stamp_ns : int
+            Stamp of its first sample.
+
+        Returns
+        -------
+        bool
+            Whether it is a new segment, not one that a block's end has cut.
+
+        """
+        key = (self._n_applied, start_ns)
+        if key == self._segment_key:
+            return False
+        self._segment_key = key
+        self.rate.update(n_seen, stamp_ns)
+        return True
+
+    @property
+    def noise_excess(self) -> float:
+        """
+        What the rate adds to the noise of a sample, relative; density^2 / cycle is for the cycle.
+
+        """
+        excess = self.rate.ratio - 1.0
+        return excess if excess > RATE_TOLERANCE else 0.0
 
     def _evaluate(self, start_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         start = self.tracker.sample(start_ns)
@@ -251,7 +365,11 @@ class Compensator:
         ):
             linear += (bias, bias_end - bias, scale, scale_end - scale)
         variance = self.correction.variance(end)
-        return tuple(linear), tuple(value for axis in variance for value in axis)
+        excess = self.noise_excess
+        flat: list[float] = []
+        for (a, b, c), noise in zip(variance, self.correction.noise, strict=True):
+            flat += (a + excess * noise, b, c)
+        return tuple(linear), tuple(flat)
 
     def take_flags(self) -> list[tuple[int, bool]]:
         """
@@ -288,6 +406,18 @@ class Compensator:
         self._event_ns = _EVER_NS
         return result
 
+    @property
+    def is_refusing(self) -> bool:
+        """
+        Whether the samples of the present segment are held back.
+
+        """
+        return self._limit < 0.0
+
+    @is_refusing.setter
+    def is_refusing(self, value: bool) -> None:
+        self._limit = -1.0 if value else self._full_scale
+
     def take_pending(self) -> list[tuple[int, int, int, float]]:
         """
         Take the readings that no sample has reached: (stamp, kind, order, degC).
@@ -319,6 +449,7 @@ class Compensator:
             and calibration.memory_time_constants_s == self.calibration.memory_time_constants_s
         )
         self._use(calibration)
+        self._segment_key = None
         if same:
             self.tracker.reconfigure(self._thermal_config(), self._now())
         else:
@@ -345,7 +476,11 @@ class Compensator:
         Take over other settings between two samples.
 
         """
+        if config.stuck_timeout_s != self.config.stuck_timeout_s:
+            self.stuck = StuckWatch(config.stuck_timeout_s)
         self.config = config
+        self.gravity = self._gravity_monitor()
+        self._segment_key = None
         self.tracker.reconfigure(self._thermal_config(), self._now())
         self._event_ns = _EVER_NS
 
@@ -360,6 +495,9 @@ class Compensator:
         self.tracker.reset()
         self._pending.clear()
         self._flags.clear()
+        self.stuck.reset()
+        self.rate.reset()
+        self._segment_key = None
         self.last_ns = _EVER_NS
         self._event_ns = _EVER_NS
 
@@ -374,10 +512,24 @@ class Compensator:
         if stamp_ns is None:
             stamp_ns = tracker.updated_ns
         counters = replace(self.counters)
+        ahead_s = 0.0
+        if self._pending and stamp_ns is not None:
+            ahead_s = (max(entry[0] for entry in self._pending) - stamp_ns) * 1e-9
         board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
         if stamp_ns is None or board_ns is None:
             return CompensatorStatus(
-                counters, stamp_ns, None, math.inf, math.inf, True, True, True, 0.0, 0.0, 0.0
+                counters,
+                stamp_ns,
+                None,
+                math.inf,
+                math.inf,
+                True,
+                True,
+                True,
+                0.0,
+                0.0,
+                0.0,
+                pending_ahead_s=ahead_s,
             )
         board_age = (stamp_ns - board_ns) * 1e-9
         # Half the time-out at the latest, so that a warning always comes before the error.
@@ -404,4 +556,15 @@ class Compensator:
             regime_set.relative_excess(excess),
             excess.temperature,
             excess.rate * 60.0,
+            gradient_excess_k=excess.gradient,
+            board_fault=tracker.board_guard.fault,
+            case_fault=tracker.case_guard.fault,
+            board_step_k=tracker.board_guard.step,
+            case_step_k=tracker.case_guard.step,
+            is_lead_reversed=tracker.lead.is_reversed,
+            rate_ratio=self.rate.ratio,
+            is_too_fast=self.rate_refuses,
+            gravity=self.gravity.result,
+            is_refuted=self.gravity.is_refuted,
+            pending_ahead_s=ahead_s,
         )

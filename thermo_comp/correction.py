@@ -277,7 +277,8 @@ class Correction:
             axis.scale_factor
             for axis in (calibration.axes.x, calibration.axes.y, calibration.axes.z)
         )
-        self._noise = tuple(
+        #: Variance of the noise of one sample [m^2/s^4].
+        self.noise = tuple(
             density * density / calibration.unit.cycle_time_s
             for density in calibration.noise_density_m_s2_sqrt_hz
         )
@@ -336,7 +337,7 @@ class Correction:
         doubt = state[thermal.UNKNOWN] + weight * rest + relative * relative
         result = []
         for K, noise, axis_s, axis_d in zip(
-            self._K, self._noise, self.static.axes, self.dynamic.axes, strict=True
+            self._K, self.noise, self.static.axes, self.dynamic.axes, strict=True
         ):
             a_s, b_s, c_s = axis_s.variance(static, state, excess_s)
             a_d, b_d, c_d = axis_d.variance(dynamic, state, excess_d)

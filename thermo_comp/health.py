@@ -5,7 +5,8 @@ Owns the field check of a calibration: while the platform stands still, |f| must
 
 A calibration that has aged, or a unit that was exchanged, shows as a residual larger than its
 own uncertainty. Samples are gathered in windows of one second; a window counts as still when its
-scatter is that of the sensor and its mean that of the window before.
+scatter is that of the sensor and its mean that of the window before. A part of the samples
+serves as well as all of them; the window is longer where they are few.
 
 """
 
@@ -14,16 +15,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-#: Length of a window.
+#: Shortest window; it is longer where samples are few, up to the second figure.
 WINDOW_NS = 1_000_000_000
+LONGEST_WINDOW_NS = 30_000_000_000
+#: Samples closer than this to the last one need not be added.
+PROBE_NS = 90_000_000
 #: Fewer samples than this make no window.
-SMALLEST_WINDOW = 10
+SMALLEST_WINDOW = 5
 #: A still window scatters by at most this many times the noise of its samples...
 SCATTER_FACTOR = 3.0
-#: ... and its mean differs from the last one's by at most this [m/s^2]: half a milli-g.
+#: ... and its mean differs from the last one's by noise and this [m/s^2]: half a milli-g.
 LARGEST_CHANGE = 5e-3
 #: Still windows averaged into one residual, the older with falling weight.
 MEMORY_WINDOWS = 30.0
+#: So many still windows running refute a calibration; so many restore the trust in it.
+REFUTING_WINDOWS = 3
+RESTORING_WINDOWS = 2
+#: Beyond the tolerance, and beyond so many of its own standard deviations.
+REFUTING_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +68,13 @@ class GravityMonitor:
     ----------
     gravity : float
         Local gravity where the platform stands [m/s^2].
+    tolerance : float, optional
+        What |f| may miss it by before the calibration is refuted [m/s^2]; 0 = anything.
+
+    Attributes
+    ----------
+    is_refuted : bool
+        Whether the last still windows all missed gravity by more than the tolerance.
 
     Raises
     ------
@@ -67,11 +83,15 @@ class GravityMonitor:
 
     """
 
-    def __init__(self, gravity: float) -> None:
+    def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         if not 0.0 < gravity < math.inf:
             raise ValueError(f'`gravity` must be positive, got {gravity}')
         self.gravity = gravity
+        self._tolerance = tolerance or math.inf
+        self.is_refuted = False
+        self._n_against = self._n_for = 0
         self._window_ns: int | None = None
+        self._last_ns = 0
         self._clear_window()
         self._last_mean: tuple[float, float, float] | None = None
         self._residual = 0.0
@@ -85,6 +105,13 @@ class GravityMonitor:
         self._sum = [0.0, 0.0, 0.0]
         self._squares = 0.0
         self._origin = (0.0, 0.0, 0.0)
+
+    def wants(self, stamp_ns: int) -> bool:
+        """
+        Say whether a sample is far enough from the last one to tell something new.
+
+        """
+        return not 0 <= stamp_ns - self._last_ns < PROBE_NS
 
     def add(
         self,
@@ -109,10 +136,15 @@ class GravityMonitor:
 
         """
         start = self._window_ns
-        if start is None or not 0 <= stamp_ns - start < WINDOW_NS:
+        if (
+            start is None
+            or not 0 <= stamp_ns - start < LONGEST_WINDOW_NS
+            or not 0 <= stamp_ns - self._last_ns < 3 * WINDOW_NS
+        ):
             self._window_ns = start = stamp_ns
             self._clear_window()
             self._origin = force
+        self._last_ns = stamp_ns
         total = self._sum
         dx, dy, dz = (value - o for value, o in zip(force, self._origin, strict=True))
         total[0] += dx
@@ -134,10 +166,12 @@ class GravityMonitor:
         mean = tuple(o + s for o, s in zip(self._origin, shift, strict=True))
         scatter = (self._squares - n * sum(s * s for s in shift)) / (n - 1)
         last, self._last_mean = self._last_mean, (mean[0], mean[1], mean[2])
+        # Two means of n samples differ by noise, too: at most four standard deviations of it.
+        change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         self._is_still = (
             scatter <= SCATTER_FACTOR**2 * noise_variance
             and last is not None
-            and max(abs(a - b) for a, b in zip(mean, last, strict=True)) <= LARGEST_CHANGE
+            and max(abs(a - b) for a, b in zip(mean, last, strict=True)) <= change
         )
         if not self._is_still:
             return
@@ -153,12 +187,25 @@ class GravityMonitor:
         # The calibration's error is common to the samples of a window, their noise averages out.
         noise = noise_variance / 3.0
         variance = max(along - noise, 0.0) + noise / n
+        self._judge(abs(size - self.gravity), math.sqrt(variance))
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0
         gain = 1.0 / self._weight
         self._residual += gain * (size - self.gravity - self._residual)
         self._variance += gain * (variance - self._variance)
         self._n_windows += 1
+
+    def _judge(self, miss: float, sd: float) -> None:
+        if miss > self._tolerance + REFUTING_SIGMAS * sd:
+            self._n_against += 1
+            self._n_for = 0
+        else:
+            self._n_for += 1
+            self._n_against = 0
+        if self._n_against >= REFUTING_WINDOWS:
+            self.is_refuted = True
+        elif self._n_for >= RESTORING_WINDOWS:
+            self.is_refuted = False
 
     @property
     def result(self) -> GravityResidual | None:

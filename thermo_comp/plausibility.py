@@ -133,7 +133,8 @@ class SensorGuard:
             self._n_same += 1
             self.fault = self._judge_still(stamp_ns)
             return self.fault != Fault.FROZEN
-        self._begin()
+        self._n_same = 0
+        self._other_then = nan
         age = (stamp_ns - own.stamp_ns) * 1e-9
         if self._n_used >= SETTLED_READINGS:
             expected, _, variance = own.at(stamp_ns)
@@ -147,16 +148,6 @@ class SensorGuard:
         self._n_used += 1
         return True
 
-    def _begin(self) -> None:
-        """
-        Begin to watch for a standstill: the reading has just changed.
-
-        """
-        self._n_same = 0
-        self._other_then = self._other.temperature
-        self._expected = self._moved = 0.0
-        self._seen_ns = self._other.stamp_ns
-
     def watch_other(self) -> None:
         """
         Note how the other sensor has moved since this one last changed; call after its readings.
@@ -165,7 +156,9 @@ class SensorGuard:
         now_ns = self._other.stamp_ns
         moved = self._other.temperature - self._other_then
         if now_ns is None or not isfinite(moved):
+            # The first time since this sensor's reading changed.
             self._other_then = self._other.temperature
+            self._expected = self._moved = 0.0
             self._seen_ns = now_ns
             return
         if self.lag_s > 0.0:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from .health import GravityResidual
+from .plausibility import Fault
 from .thermal import ThermalConfig, ThermalState
 
 
@@ -26,6 +28,14 @@ class CompensatorConfig:
         Age of the board temperature at which nothing is published any more [s].
     case_timeout_s : float
         Age of the case temperature at which the regime falls back to the board sensor [s].
+    stuck_timeout_s : float
+        Time after which samples that are equal to the bit are not believed [s], and three exact
+        zeros never are; 0 = any sample is believed.
+    local_gravity_m_s2 : float
+        Gravity where the platform stands [m/s^2]; 0 = that of the calibration.
+    gravity_tolerance_m_s2 : float
+        Standing shows the calibration to be another unit's, or an axis to be reversed, where
+        |f| misses gravity by more than this: nothing is published then [m/s^2]; 0 = never.
 
     Raises
     ------
@@ -37,12 +47,18 @@ class CompensatorConfig:
     transition_time_s: float = 30.0
     temperature_timeout_s: float = 60.0
     case_timeout_s: float = 30.0
+    stuck_timeout_s: float = 2.0
+    local_gravity_m_s2: float = 0.0
+    gravity_tolerance_m_s2: float = 0.5
 
     def __post_init__(self) -> None:
         if not 0.0 < self.temperature_timeout_s < math.inf:
             raise ValueError(
                 f'`temperature_timeout_s` must be positive, got {self.temperature_timeout_s}'
             )
+        for name in ('stuck_timeout_s', 'local_gravity_m_s2', 'gravity_tolerance_m_s2'):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f'`{name}` must be zero or positive, got {getattr(self, name)}')
         ThermalConfig(self.transition_time_s, self.case_timeout_s)
 
 
@@ -59,6 +75,9 @@ class Counters:
     n_out_of_order: int = 0
     n_no_temperature: int = 0
     n_stale: int = 0
+    n_stuck: int = 0
+    n_too_fast: int = 0
+    n_refuted: int = 0
     n_board: int = 0
     n_board_rejected: int = 0
     n_case: int = 0
@@ -77,6 +96,9 @@ class Counters:
             + self.n_out_of_order
             + self.n_no_temperature
             + self.n_stale
+            + self.n_stuck
+            + self.n_too_fast
+            + self.n_refuted
         )
 
     @property
@@ -110,3 +132,21 @@ class CompensatorStatus:
     #: Board temperature beyond the calibrated range [K], signed; rate beyond [K/min].
     temperature_excess_k: float
     rate_excess_k_min: float
+    #: T_case - T_board beyond the calibrated range [K], signed.
+    gradient_excess_k: float = 0.0
+    #: What is wrong with the sensors' readings, and the size of a step that is not believed [K].
+    board_fault: Fault = Fault.NONE
+    case_fault: Fault = Fault.NONE
+    board_step_k: float = 0.0
+    case_step_k: float = 0.0
+    #: Whether the board has led the case in a ramp: the two topics are swapped, most likely.
+    is_lead_reversed: bool = False
+    #: Samples per calibrated cycle, and whether they are too many to be conversions.
+    rate_ratio: float = 1.0
+    is_too_fast: bool = False
+    #: |f| - g while the platform stands; None before it has stood.
+    gravity: GravityResidual | None = None
+    #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
+    is_refuted: bool = False
+    #: How far the stamps of the readings that wait are ahead of the samples' [s].
+    pending_ahead_s: float = 0.0

@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Samples that are none: stuck, zero, too fast, of another unit; stream = batch about all of them.
+
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from builders import GRAVITY, SECOND_NS, calibration, columns_from_events
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermo_comp.calibration import Axes, AxisReference, Unit
+from thermo_comp.compensator import Compensator, CompensatorConfig
+from thermo_comp.sample_guard import BURST_SAMPLES, LARGEST_RATE, STUCK_SAMPLES, RateWatch
+
+K = 300.0
+UP = (0.36, -0.48, 0.8)
+UNIQUE = [0, 1, 2, 4, 5, 8]
+
+
+def at_rest(rng, bias=0.0):
+    return tuple(float(round(K * GRAVITY * u + bias + rng.normal(0.0, 0.3))) for u in UP)
+
+
+def readings(second):
+    flicker = 0.004 * (-1) ** second
+    return [
+        ('board', second * SECOND_NS, 20.0 + flicker),
+        ('case', second * SECOND_NS, 20.0 - flicker),
+    ]
+
+
+def run(compensator, events):
+    """Feed events; return (published stamps, rows)."""
+    stamps, rows = [], []
+    for kind, stamp_ns, value in events:
+        if kind == 'accel':
+            row = compensator.process(stamp_ns, *value)
+            if row is not None:
+                stamps.append(stamp_ns)
+                rows.append(row)
+        else:
+            getattr(compensator, f'push_{kind}')(stamp_ns, value)
+    return stamps, rows
+
+
+def recording(n, rate_hz, sample, start_ns=0):
+    """Events of n samples, sample(k) giving the k-th, with both temperatures at 1 Hz."""
+    events = []
+    second = start_ns // SECOND_NS
+    for k in range(n):
+        stamp_ns = start_ns + round(k * 1e9 / rate_hz)
+        while second * SECOND_NS <= stamp_ns:
+            events += readings(second)
+            second += 1
+        events.append(('accel', stamp_ns, sample(k)))
+    return events
+
+
+def test_a_converter_that_stands_still_is_not_believed_for_long(rng):
+    compensator = Compensator(calibration())
+    stuck = (1060.0, -1400.0, 2354.0)  # 12 counts from where the live ones are
+    events = recording(1500, 100.0, lambda k: stuck if 200 <= k < 1200 else at_rest(rng))
+    stamps, _ = run(compensator, events)
+    # Two seconds of them go out: until then it may be chance.
+    assert compensator.counters.n_stuck == 1000 - 201
+    assert compensator.counters.n_out == 1500 - compensator.counters.n_stuck
+    # The first sample that differs is published at once.
+    assert 12 * SECOND_NS in stamps
+
+
+def test_few_equal_samples_are_chance_however_long_they_take(rng):
+    compensator = Compensator(calibration())
+    stuck = at_rest(rng)
+    run(compensator, recording(STUCK_SAMPLES, 1.0, lambda _: stuck))
+    assert compensator.counters.n_stuck == 0
+
+
+def test_noughts_are_no_measurement_from_the_first_on(rng):
+    compensator = Compensator(calibration())
+    run(compensator, recording(100, 100.0, lambda k: (0.0,) * 3 if k > 10 else at_rest(rng)))
+    assert compensator.counters.n_stuck == 89
+
+
+def test_a_user_may_believe_any_sample():
+    compensator = Compensator(
+        calibration(), CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+    )
+    run(compensator, recording(1000, 100.0, lambda _: (0.0, 0.0, 0.0)))
+    assert compensator.counters.n_out == 1000
+
+
+def test_counts_at_another_rate_are_of_another_scale(rng):
+    """
+    WHY: a count is charge per cycle; at 2 kHz a cycle holds a twentieth of that at 100 Hz.
+    WHAT: samples that come faster than conversions can are held back, and let go again later.
+
+    """
+    compensator = Compensator(calibration())
+    run(compensator, recording(500, 100.0, lambda _: at_rest(rng)))
+    twentieth = tuple(round(value / 20.0) for value in at_rest(rng))
+    fast = recording(
+        20_000,
+        2000.0,
+        lambda k: tuple(float(value + k % 2) for value in twentieth),
+        5 * SECOND_NS,
+    )
+    stamps, _ = run(compensator, fast)
+    assert compensator.status.is_too_fast
+    # Noticed at the first event after the surplus has passed 50 samples: within 1 s.
+    assert len(stamps) <= 2000
+    assert compensator.counters.n_too_fast == 20_000 - len(stamps)
+    after, _ = run(compensator, recording(500, 100.0, lambda _: at_rest(rng), 16 * SECOND_NS))
+    assert not compensator.status.is_too_fast
+    # The surplus is forgiven within a second or two.
+    assert after[-1] == 16 * SECOND_NS + 4_990_000_000
+    assert len(after) > 250
+
+
+def test_a_buffer_that_is_emptied_at_once_is_no_rate(rng):
+    compensator = Compensator(calibration())
+    events = []
+    for burst in range(60):
+        events += readings(burst) if burst % 2 == 0 else []
+        stamp_ns = burst * SECOND_NS // 2
+        events += [('accel', stamp_ns + 1000 * k, at_rest(rng)) for k in range(1, 51)]
+    run(compensator, events)
+    assert compensator.counters.n_too_fast == 0
+
+
+def test_an_acceleration_at_another_rate_has_another_noise(rng):
+    unit = calibration(
+        unit=Unit('T-1', 'm/s^2', 100.0, 0.01), axes=Axes(*[AxisReference(1.0, 0.0)] * 3)
+    )
+    compensator = Compensator(unit)
+    _, rows = run(
+        compensator,
+        recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
+    )
+    assert len(rows) == 8000
+    # Four times as fast: a quarter of the time to average in, four times the variance.
+    assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
+
+
+def test_a_reversed_axis_is_refused_when_the_platform_stands(rng):
+    """
+    WHY: with an axis wired the wrong way round every number is wrong, and looks like one.
+    WHAT: |f| misses gravity by twice the bias; nothing goes out until it is gravity again.
+
+    """
+    bias = 60.0  # 0.2 m/s^2
+    unit = calibration(axes=Axes(*[AxisReference(K, bias)] * 3))
+    config = CompensatorConfig(gravity_tolerance_m_s2=0.05)
+    compensator = Compensator(unit, config)
+
+    def sample(k):
+        x, y, z = at_rest(rng, bias)
+        return (x, y, -z) if 2000 <= k < 6000 else (x, y, z)
+
+    stamps, _ = run(compensator, recording(9000, 100.0, sample))
+    published = np.array(stamps) / SECOND_NS
+    # One probe a second, five to a window, three windows and those cut by the change: some 25 s.
+    assert not ((published > 46.0) & (published < 60.0)).any()
+    assert ((published > 76.0) & (published < 90.0)).any()
+    assert compensator.counters.n_refuted > 1400
+    assert not compensator.status.is_refuted
+    assert compensator.counters.n_in == 9000
+
+
+def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
+    for local, expected in ((0.0, 0.0), (GRAVITY + 2e-3, -2e-3)):
+        compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
+        run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
+        gravity = compensator.status.gravity
+        # 0.3 counts of noise, 0.29 of rounding: 1.4 mm/s^2 per probe, some 110 probes; and the
+        # fractions of a count that noise this small does not average out, a tenth of 0.5.
+        assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
+
+
+def test_a_long_excess_is_soon_forgiven():
+    watch = RateWatch(0.01)
+    for second in range(100):
+        watch.update(2000 * second, second * SECOND_NS)
+    assert watch.is_too_fast
+    for second in range(100, 103):
+        watch.update(2000 * 99 + 100 * (second - 99), second * SECOND_NS)
+    # Down from twice the allowance at (1.5 - 1) of 100 samples per second.
+    assert BURST_SAMPLES <= (LARGEST_RATE - 1.0) * 100 * 2
+    assert not watch.is_too_fast
+
+
+@st.composite
+def stretches(draw):
+    """Stretches of samples, each of one kind, with temperatures between them."""
+    events = []
+    stamp_ns = 0
+    k = 0
+    for _ in range(draw(st.integers(1, 6))):
+        kind = draw(st.sampled_from(['rest', 'stuck', 'zero', 'nan', 'full', 'reversed']))
+        n = draw(st.sampled_from([1, 49, 51, 120]))
+        step_ns = draw(st.sampled_from([1_000_000, 10_000_000, 40_000_000]))
+        every = draw(st.sampled_from([7, 30, 200]))
+        for _ in range(n):
+            if k % every == 0:
+                events.append(('board', stamp_ns, 20.0 + 0.001 * (k % 5)))
+                events.append(('case', stamp_ns, 20.0 - 0.001 * (k % 3)))
+            k += 1
+            stamp_ns += step_ns
+            sign = -1.0 if kind == 'reversed' else 1.0
+            value = {
+                'stuck': (1060.0, -1410.0, 2354.0),
+                'zero': (0.0, 0.0, 0.0),
+                'nan': (math.nan, 1.0, 2.0),
+                'full': (1.0, 40000.0, 2.0),
+            }.get(kind, (1060.0 + k % 2, -1410.0, sign * (2354.0 + 60.0 + k % 3)))
+            events.append(('accel', stamp_ns, value))
+        if draw(st.integers(0, 9)) == 0:
+            stamp_ns = max(0, stamp_ns - 5 * SECOND_NS)
+    return events
+
+
+@given(stretches(), st.sampled_from([1, 13, 64, 500]), st.sampled_from([0.0, 0.05, 1.0]))
+@settings(max_examples=60, deadline=None)
+def test_the_batch_refuses_what_the_stream_refuses(events, chunk, stuck_s):
+    config = CompensatorConfig(stuck_timeout_s=stuck_s, gravity_tolerance_m_s2=0.1)
+    unit = calibration(axes=Axes(*[AxisReference(K, 60.0)] * 3))
+    streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
+    stamps, rows = run(streamed, events)
+    blocks = [whole.process_block(columns_from_events(events))]
+    pieces = [
+        cut.process_block(columns_from_events(events[k : k + chunk]))
+        for k in range(0, len(events), chunk)
+    ]
+    for parts in (blocks, pieces):
+        assert np.concatenate([part.stamp_ns for part in parts]).tolist() == stamps
+        table = np.array(rows).reshape(-1, 9)
+        force = np.concatenate([part.specific_force for part in parts])
+        covariance = np.concatenate([part.covariance for part in parts])
+        np.testing.assert_array_equal(force, table[:, :3])
+        np.testing.assert_array_equal(covariance[:, UNIQUE], table[:, 3:])
+    assert streamed.counters == whole.counters == cut.counters
+    assert streamed.status == whole.status == cut.status

@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what physics says about raw samples before they are corrected: a converter that stands still,
+samples that come faster than conversions can.
+
+A converter with noise does not give the same three numbers to the bit for seconds, and three exact
+zeros are no measurement but a dead wire. A count is charge per conversion cycle, so samples that
+come at another rate are of another scale, whatever else they are.
+
+"""
+
+from __future__ import annotations
+
+from math import nan
+
+import numpy as np
+import numpy.typing as npt
+
+Mask = npt.NDArray[np.bool_]
+
+#: Fewer equal samples in a row than this are chance, however far they lie apart.
+STUCK_SAMPLES = 50
+#: Samples may come this many times as fast as the calibrated cycle in the long run ...
+LARGEST_RATE = 1.5
+#: ... with so many of them, or so many seconds' worth, at once (a driver that empties a buffer).
+BURST_SAMPLES = 50
+BURST_S = 0.25
+#: A rate is measured over so many seconds.
+_WINDOW_S = 1.0
+_NEVER_NS = 1 << 62
+
+
+class StuckWatch:
+    """
+    Counts equal samples in a row; one object serves the stream and the batch.
+
+    Parameters
+    ----------
+    timeout_s : float
+        Time after which equal samples are not believed [s]; 0 = never.
+
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self.limit_ns = round(timeout_s * 1e9) if timeout_s > 0.0 else _NEVER_NS
+        self.reset()
+
+    @property
+    def is_on(self) -> bool:
+        """
+        Whether anything is watched.
+
+        """
+        return self.limit_ns != _NEVER_NS
+
+    def reset(self) -> None:
+        """
+        Forget the last sample.
+
+        """
+        #: The sample that the run began with and its stamp.
+        self.run = (nan, nan, nan, 0)
+        #: How often it has come again.
+        self.n_same = 0
+
+    def again(self, stamp_ns: int) -> bool:
+        """
+        Count one more equal sample; say whether it is too many.
+
+        """
+        self.n_same += 1
+        return self.n_same >= STUCK_SAMPLES and stamp_ns - self.run[3] > self.limit_ns
+
+    def find(self, stamps: npt.NDArray[np.int64], samples: npt.NDArray[np.float64]) -> Mask | None:
+        """
+        Find the samples of a batch that the stream would call stuck.
+
+        Parameters
+        ----------
+        stamps : ndarray of int64, shape (n,)
+            At least one.
+        samples : ndarray, shape (n, 3)
+            The samples.
+
+        Returns
+        -------
+        ndarray of bool, shape (n,), or None
+            None where there are none.
+
+        """
+        x, y, z = samples.T
+        same = np.empty(len(stamps), dtype=bool)
+        same[0] = (x[0], y[0], z[0]) == self.run[:3]
+        np.equal(x[1:], x[:-1], out=same[1:])
+        same[1:] &= y[1:] == y[:-1]
+        same[1:] &= z[1:] == z[:-1]
+        found: Mask | None = None
+        row = np.arange(len(stamps))
+        changed = np.flatnonzero(~same)
+        if (
+            not len(changed)
+            or int(np.max(np.diff(changed, append=len(row)))) > STUCK_SAMPLES
+            or (self.n_same + int(changed[0]) >= STUCK_SAMPLES)
+        ):
+            begin = np.maximum.accumulate(np.where(same, -1, row))
+            n_same = np.where(begin < 0, row + 1 + self.n_same, row - begin)
+            since = np.where(begin < 0, self.run[3], stamps[begin])
+            found = same & (n_same >= STUCK_SAMPLES) & (stamps - since > self.limit_ns)
+            if not found.any():
+                found = None
+        if len(changed):
+            last = int(changed[-1])
+            self.run = (float(x[last]), float(y[last]), float(z[last]), int(stamps[last]))
+            self.n_same = len(row) - 1 - last
+        else:
+            self.n_same += len(row)
+        return found
+
+
+class RateWatch:
+    """
+    Compares the rate of the samples with the calibrated one, at the start of each segment.
+
+    Parameters
+    ----------
+    cycle_s : float
+        The calibrated conversion cycle [s].
+
+    Attributes
+    ----------
+    is_too_fast : bool
+        Whether more samples have come than conversions can make.
+    ratio : float
+        Samples per calibrated cycle over the last second or so.
+
+    """
+
+    def __init__(self, cycle_s: float) -> None:
+        self._cycle_s = cycle_s
+        self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
+        self.reset()
+
+    def reset(self) -> None:
+        """
+        Begin to count.
+
+        """
+        self.is_too_fast = False
+        self.ratio = 1.0
+        self._level = 0.0
+        self._last: tuple[int, int] | None = None
+        self._window = (0, 0)
+
+    def update(self, n_seen: int, stamp_ns: int) -> None:
+        """
+        Take the count of samples before a stamp.
+
+        Parameters
+        ----------
+        n_seen : int
+            Samples with other stamps so far.
+        stamp_ns : int
+            The stamp.
+
+        """
+        if self._last is None:
+            self._last = self._window = (n_seen, stamp_ns)
+            return
+        n, dt = n_seen - self._last[0], (stamp_ns - self._last[1]) * 1e-9
+        self._last = (n_seen, stamp_ns)
+        level = self._level + n - LARGEST_RATE * dt / self._cycle_s
+        # Twice the allowance at most, so that a long excess is soon forgiven.
+        self._level = min(max(level, 0.0), 2.0 * self._allowance)
+        self.is_too_fast = self._level > self._allowance
+        n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
+        if dt >= _WINDOW_S:
+            self.ratio = n * self._cycle_s / dt
+            self._window = (n_seen, stamp_ns)
