@@ -33,6 +33,7 @@ def bag(
     case: bool = True,
     serial: str = '',
     n: int = 600,
+    up: tuple[float, float, float] = (0.6, 0.0, 0.8),
 ) -> Path:
     """
     Write a minute of a resting unit with the topics asked for.
@@ -44,7 +45,7 @@ def bag(
             if wanted:
                 writer.write_temperature(topic, stamps[::10], np.full(len(stamps[::10]), 20.0))
         if counts:
-            writer.write_counts(TOPICS.counts, stamps, np.tile([1800.0, 0.0, 2400.0], (n, 1)))
+            writer.write_counts(TOPICS.counts, stamps, np.tile(3000.0 * np.array(up), (n, 1)))
     return path
 
 
@@ -227,9 +228,11 @@ class TestCalibrations:
 
 class TestFits:
     def test_too_few_positions(self, cli: Cli, tmp_path: Path) -> None:
-        paths = [bag(tmp_path / f'{i}.mcap') for i in range(2)]
+        paths = [bag(tmp_path / 'a.mcap'), bag(tmp_path / 'b.mcap', up=(0.0, 0.6, 0.8))]
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
         refused(cli, 1, r'2 still positions, need 6', 'fit', *paths, *arguments)
+        # One attitude is told apart, because there is something else to do with it.
+        refused(cli, 1, r'one attitude only.*thermo_comp partial', 'fit', paths[0], *arguments)
         assert not (tmp_path / 'new.yaml').exists()
 
     def test_gravity_of_another_planet(self, cli: Cli, tmp_path: Path) -> None:
