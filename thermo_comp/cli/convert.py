@@ -8,6 +8,7 @@ Owns ``thermo_comp convert``: other people's logs into bags.
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,12 +21,25 @@ if TYPE_CHECKING:
     from ..convert import ConversionReport, ForeignLog
     from ..convert.log import Finding
 
+_BAGS = {'.mcap', '.db3', '.bag'}
+
+
+class UnitChoice(str, Enum):
+    """
+    What a driver may publish as linear acceleration.
+
+    """
+
+    m_s2 = 'm/s^2'
+    g = 'g'
+    mg = 'mg'
+
 
 def convert(
     log: Annotated[
         Path,
         typer.Argument(
-            help='Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin).',
+            help='Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin), or bag.',
             metavar='FILE',
         ),
     ],
@@ -43,6 +57,16 @@ def convert(
     allow_compensated: Annotated[
         bool, typer.Option(help='Take an ArduPilot log corrected by INS_TCAL.')
     ] = False,
+    imu_topic: Annotated[str | None, typer.Option(help='Imu topic of a bag.')] = None,
+    board_topic: Annotated[
+        str | None, typer.Option(help='Temperature topic of a bag: the board.')
+    ] = None,
+    case_topic: Annotated[
+        str | None, typer.Option(help='Temperature topic of a bag: the case.')
+    ] = None,
+    unit: Annotated[
+        UnitChoice, typer.Option(help='What the Imu topic of a bag is in.')
+    ] = UnitChoice.m_s2,
     force: options.Force = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -53,7 +77,8 @@ def convert(
     A table needs a column map: which column is what, in which unit; what the
     sensor reads at rest must agree with it. config/columns has examples. Of a
     PX4 or ArduPilot log the IMU's own temperature becomes the board's, the
-    barometer's the case's.
+    barometer's the case's. Of a bag the thermometer beside the Imu topic
+    becomes the board's, one beside a barometer the case's.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -64,17 +89,42 @@ def convert(
 
     out = Output(as_json, quiet)
     options.refuse_existing(output, force)
-    read = _reader(log, columns, imu, baro, allow_compensated)
+    is_bag = log.is_dir() or log.suffix.lower() in _BAGS
+    if is_bag:
+        _refuse_for_bags(columns, imu, baro, allow_compensated)
+        read = _bag_reader(log, imu_topic, board_topic, case_topic, unit)
+    else:
+        if imu_topic or board_topic or case_topic or unit is not UnitChoice.m_s2:
+            raise options.usage('--*-topic and --unit are for bags')
+        read = _reader(log, columns, imu, baro, allow_compensated)
     with out.progress('converting', total=1.0) as done:
         report = write_log(read(), output, force, done)
     say(out, report)
+
+
+def _refuse_for_bags(
+    columns: Path | None, imu: int | None, baro: int | None, allow_compensated: bool
+) -> None:
+    if columns is not None or imu is not None or baro is not None or allow_compensated:
+        raise options.usage(
+            '--columns is for tables, --imu, --baro and --allow-compensated for logs; a bag has '
+            '--imu-topic, --board-topic and --case-topic'
+        )
+
+
+def _bag_reader(
+    log: Path, imu: str | None, board: str | None, case: str | None, unit: UnitChoice
+) -> Callable[[], ForeignLog]:
+    from ..convert import bag_log
+
+    return lambda: bag_log(log, imu, board, case, unit.value)
 
 
 def _reader(
     log: Path, columns: Path | None, imu: int | None, baro: int | None, allow_compensated: bool
 ) -> Callable[[], ForeignLog]:
     """
-    Tell the format by the file's name, and refuse options that it has no use for.
+    Tell the format of a table or log by its name, and refuse options that it has no use for.
 
     """
     from ..convert import dataflash_log, load_column_map, table_log, ulog_log

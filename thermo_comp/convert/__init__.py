@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way from other people's logs to bags: tables with a column map, PX4, ArduPilot.
+Owns the way from other people's logs to bags: tables with a column map, PX4, ArduPilot, bags.
 
 """
 
+from .bag import bag_log
 from .columnar import table_log
 from .columns import ColumnMap, load_column_map
 from .dataflash import dataflash_log
@@ -15,6 +16,7 @@ __all__ = [
     'ColumnMap',
     'ConversionReport',
     'ForeignLog',
+    'bag_log',
     'dataflash_log',
     'load_column_map',
     'table_log',

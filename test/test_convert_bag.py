@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Other people's bags: topics of any name, ROS 1 and 2, and units that are checked at rest.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recording_helpers import typestore
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+
+from thermo_comp.convert import bag_log, write_log
+from thermo_comp.convert.bag import find_topics
+from thermo_comp.errors import RecordingError
+from thermo_comp.recording import read_recording
+
+G = 9.80665
+N = 400
+START_NS = 1_600_000_000_000_000_000
+IMU, TEMPERATURE, PRESSURE = (
+    f'sensor_msgs/msg/{name}' for name in ('Imu', 'Temperature', 'FluidPressure')
+)
+NAMES = {'/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE}
+
+
+def messages(ros: int, rng, scale: float, names: dict[str, str]):
+    """Yield (topic, type, log_ns, message) of a driver at rest that publishes `scale` per g."""
+    types = typestore(ros).types
+    vector = types['geometry_msgs/msg/Vector3']
+
+    def header(stamp_ns):
+        stamp = types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 10**9))
+        return types['std_msgs/msg/Header'](*(() if ros == 2 else (7,)), stamp, 'mpu')
+
+    force = scale * (np.array([0.0, 0.1, 1.0]) + 0.003 * rng.standard_normal((N, 3)))
+    zeros = np.zeros(9)
+    for k in range(N):
+        now = START_NS + 10_000_000 * k
+        for topic, kind in names.items():
+            if kind == IMU:
+                attitude = types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+                body = (attitude, zeros, vector(0.01, 0.0, 0.5), zeros, vector(*force[k]), zeros)
+                yield topic, kind, now, types[kind](header(now), *body)
+            elif k % 50 == 0:
+                value = 100.0 * len(topic) + k / 50 if kind == PRESSURE else len(topic) + k / 50
+                yield topic, kind, now, types[kind](header(now), value, 0.0)
+
+
+def write_ros2(path: Path, rng, scale: float = G, names: dict[str, str] | None = None) -> Path:
+    names = names or NAMES
+    with Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        store = typestore(2)
+        links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in names.items()}
+        for topic, kind, log_ns, message in messages(2, rng, scale, names):
+            writer.write(links[topic], log_ns, store.serialize_cdr(message, kind))
+    return path
+
+
+def write_ros1(path: Path, rng) -> Path:
+    with Writer1(path) as writer:
+        store = typestore(1)
+        links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in NAMES.items()}
+        for topic, kind, log_ns, message in messages(1, rng, G, NAMES):
+            writer.write(links[topic], log_ns, store.serialize_ros1(message, kind))
+    return path
+
+
+@pytest.mark.parametrize('ros', [1, 2])
+def test_topics_of_any_name_become_ours(tmp_path, rng, ros):
+    path = write_ros1(tmp_path / 'old.bag', rng) if ros == 1 else write_ros2(tmp_path / 'new', rng)
+    report = write_log(bag_log(path), tmp_path / 'bag.mcap')
+    found = read_recording(tmp_path / 'bag.mcap')
+    assert report.accel_messages == N
+    np.testing.assert_array_equal(
+        found.columns.accel_stamp_ns, START_NS + 10_000_000 * np.arange(N)
+    )
+    np.testing.assert_allclose(found.columns.accel.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
+    np.testing.assert_array_equal(found.columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
+    # The thermometer in the Imu's namespace is the board's; temperatures begin at the name's
+    # length here.
+    np.testing.assert_array_equal(found.columns.board, len('/mpu/die') + np.arange(8))
+    np.testing.assert_array_equal(found.columns.case, len('/baro/air') + np.arange(8))
+    assert found.info.metadata['topic_board'] == '/mpu/die'
+
+
+def test_unit_is_checked_at_rest(tmp_path, rng):
+    path = write_ros2(tmp_path / 'g', rng, scale=1.0)
+    with pytest.raises(RecordingError, match=r'stated in m/s\^2, but .* looks like g'):
+        write_log(bag_log(path), tmp_path / 'bag.mcap')
+    write_log(bag_log(path, unit='g'), tmp_path / 'bag.mcap')
+    force = read_recording(tmp_path / 'bag.mcap').columns.accel
+    np.testing.assert_allclose(force.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
+
+
+def present(imu, temperature=(), pressure=()):
+    return {
+        **dict.fromkeys(imu, (IMU, 10)),
+        **dict.fromkeys(temperature, (TEMPERATURE, 10)),
+        **dict.fromkeys(pressure, (PRESSURE, 10)),
+    }
+
+
+@pytest.mark.parametrize(
+    ('temperature', 'pressure', 'board', 'case'),
+    [
+        ((), (), None, None),
+        (('/t',), (), '/t', None),
+        (('/imu/t', '/air'), (), '/imu/t', '/air'),
+        # The one beside the barometer is the case's, even alone.
+        (('/baro/t',), ('/baro/p',), None, '/baro/t'),
+        (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
+        (('/robot/imu/t', '/robot/baro/t'), ('/robot/baro/p',), '/robot/imu/t', '/robot/baro/t'),
+        (('/robot/baro/t',), ('/robot/baro/p',), None, '/robot/baro/t'),
+    ],
+)  # fmt: skip
+def test_neighbours_tell_the_thermometers(temperature, pressure, board, case):
+    imu = '/robot/imu/data' if temperature and temperature[0].startswith('/robot') else '/imu/data'
+    found = find_topics(Path('bag'), present([imu], temperature, pressure), None, None, None)
+    assert found == {'imu': imu, 'board': board, 'case': case}
+
+
+def test_what_neighbours_cannot_tell_is_asked():
+    path = Path('bag')
+    with pytest.raises(RecordingError, match=r'several topics may be the Imu.*--imu-topic'):
+        find_topics(path, present(['/a/data', '/b/data']), None, None, None)
+    with pytest.raises(RecordingError, match=r'several topics may be the board.*--board-topic'):
+        find_topics(path, present(['/imu/data'], ['/imu/t1', '/imu/t2']), None, None, None)
+    with pytest.raises(RecordingError, match='no Imu messages'):
+        find_topics(path, present([], ['/t']), None, None, None)
+    both = present(['/imu/data'], ['/imu/t1', '/imu/t2'])
+    chosen = find_topics(path, both, None, '/imu/t2', None)
+    assert chosen['board'] == '/imu/t2'
+    assert chosen['case'] == '/imu/t1'
+
+
+def test_command(tmp_path, rng, cli):
+    bag = write_ros2(tmp_path / 'bag', rng, scale=1.0)
+    refused = cli('convert', bag, '-o', tmp_path / 'out.mcap', code=1)
+    assert 'looks like g' in refused.stderr
+    finished = cli('convert', bag, '--unit', 'g', '-o', tmp_path / 'out.mcap')
+    assert f'{N:8} imu/uncompensated' in finished.stdout
+    wrong = cli('convert', bag, '--imu', '1', '-o', tmp_path / 'two.mcap', code=2)
+    assert '--imu-topic' in wrong.stderr
+    table = tmp_path / 'table.csv'
+    table.write_text('1,2,3\n')
+    wrong = cli('convert', table, '--unit', 'g', '-o', tmp_path / 'two.mcap', code=2)
+    assert 'are for bags' in wrong.stderr

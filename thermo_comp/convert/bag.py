@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns other people's bags: ROS 1 and 2 recordings whose topics and units are their own.
+
+Drivers call their topics as they like and not all of them publish m/s^2. The Imu topic is found
+by its type; a thermometer is told by its neighbours: beside the Imu it is the board's, beside a
+barometer (sensor_msgs/FluidPressure) the case's. What rests must read gravity in the stated unit.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from .. import __version__
+from ..errors import RecordingError
+from ..fit_sources import digest
+from ..recording import Topics, inspect_recording, read_recording
+from ..recording.columns import Role
+from .columns import STANDARD_GRAVITY
+from .log import ForeignLog, Readings
+from .units import Array, IntArray
+
+_IMU = 'sensor_msgs/msg/Imu'
+_TEMPERATURE = 'sensor_msgs/msg/Temperature'
+_PRESSURE = 'sensor_msgs/msg/FluidPressure'
+_FACTORS = {'m/s^2': 1.0, 'g': STANDARD_GRAVITY, 'mg': STANDARD_GRAVITY / 1000.0}
+
+Unit = Literal['m/s^2', 'g', 'mg']
+Present = Mapping[str, tuple[str, int]]
+
+
+def bag_log(
+    path: str | Path,
+    imu: str | None = None,
+    board: str | None = None,
+    case: str | None = None,
+    unit: Unit = 'm/s^2',
+) -> ForeignLog:
+    """
+    Read a bag with an Imu topic and its thermometers, whatever they are called.
+
+    Parameters
+    ----------
+    path : str or Path
+        A rosbag2 directory, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
+    imu, board, case : str or None, optional
+        Topics; None finds them by type and neighbourhood.
+    unit : {'m/s^2', 'g', 'mg'}, optional
+        What the driver publishes as linear acceleration.
+
+    Returns
+    -------
+    ForeignLog
+        Ready to be written as a bag with the usual topics and units.
+
+    Raises
+    ------
+    RecordingError
+        If the bag cannot be read, a topic is not there, or there are several to choose from.
+
+    """
+    path = Path(path)
+    found = find_topics(path, inspect_recording(path).topics, imu, board, case)
+    # A name that no topic has stands for a thermometer that is not there.
+    topics = Topics(
+        imu=found['imu'] or '', board=found['board'] or '/none', case=found['case'] or '/none'
+    )
+    needed: tuple[Role, ...] = ('accel',)
+    recording = read_recording(path, topics, 'imu', require=needed)
+    columns = recording.columns
+    serial = recording.info.metadata.get('serial')
+    return ForeignLog(
+        path=str(path),
+        input='imu',
+        unit=unit,
+        factor=_FACTORS[unit],
+        stamp_ns=columns.accel_stamp_ns,
+        accel=columns.accel,
+        gyro=None if columns.imu is None else columns.imu.angular_velocity,
+        board=_readings(columns.board_stamp_ns, columns.board),
+        case=_readings(columns.case_stamp_ns, columns.case),
+        line=np.arange(1, len(columns.accel_stamp_ns) + 1),
+        frame_id=columns.frame_id,
+        serial=serial or '',
+        metadata={
+            **{f'topic_{role}': name for role, name in found.items() if name},
+            'converted_from': path.name,
+            'converted_from_sha256': digest(path),
+            'converted_by': f'thermo_comp {__version__}',
+            **({'serial': serial} if serial else {}),
+        },
+    )
+
+
+def find_topics(
+    path: Path, present: Present, imu: str | None, board: str | None, case: str | None
+) -> dict[str, str | None]:
+    """
+    Tell the Imu, the board's and the case's thermometer among a bag's topics.
+
+    Parameters
+    ----------
+    path : Path
+        The bag, for the error's sake.
+    present : mapping of {str: (str, int)}
+        The bag's topics with their type and number of messages.
+    imu, board, case : str or None
+        What the user chose.
+
+    Returns
+    -------
+    dict
+        Keys ``imu``, ``board``, ``case``; None where there is no such thermometer.
+
+    Raises
+    ------
+    RecordingError
+        If there is no Imu topic, or several and none was chosen; or more thermometers than
+        neighbourhood can tell apart.
+
+    """
+    imu = imu or _only(path, _of_type(present, _IMU), 'Imu', '--imu-topic')
+    thermometers = [name for name in _of_type(present, _TEMPERATURE) if name not in (board, case)]
+    if case is None:
+        baros = _of_type(present, _PRESSURE)
+        nearer = [
+            name
+            for name in thermometers
+            if max((_common(name, baro) for baro in baros), default=0) > _common(name, imu)
+        ]
+        case = _most(path, nearer, 'case', '--case-topic')
+        thermometers = [name for name in thermometers if name != case]
+    if board is None:
+        beside = max((_common(name, imu) for name in thermometers), default=0)
+        nearest = [name for name in thermometers if _common(name, imu) == beside]
+        board = _most(path, nearest, 'board', '--board-topic')
+        thermometers = [name for name in thermometers if name != board]
+    if case is None:
+        case = _most(path, thermometers, 'case', '--case-topic')
+    return {'imu': imu, 'board': board, 'case': case}
+
+
+def _of_type(present: Present, kind: str) -> list[str]:
+    return sorted(name for name, (found, count) in present.items() if found == kind and count)
+
+
+def _common(one: str, other: str) -> int:
+    """
+    Count the leading name parts that two topics share, their last ones not counted.
+
+    """
+    shared = 0
+    parts = (name.strip('/').split('/')[:-1] for name in (one, other))
+    for a, b in zip(*parts, strict=False):
+        if a != b:
+            break
+        shared += 1
+    return shared
+
+
+def _only(path: Path, names: list[str], what: str, option: str) -> str:
+    if not names:
+        raise RecordingError(f'the bag holds no {what} messages', path=path)
+    found = _most(path, names, what, option)
+    return found or names[0]
+
+
+def _most(path: Path, names: list[str], what: str, option: str) -> str | None:
+    if len(names) > 1:
+        raise RecordingError(
+            f'several topics may be the {what}: {", ".join(names)}; choose one with {option}',
+            path=path,
+        )
+    return names[0] if names else None
+
+
+def _readings(stamp_ns: IntArray, celsius: Array) -> Readings | None:
+    use = np.isfinite(celsius)
+    return Readings(stamp_ns[use], celsius[use]) if use.any() else None
