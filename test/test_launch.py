@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The launch files name what exists: arguments, executables, parameters and topics.
+
+"""
+
+from __future__ import annotations
+
+import configparser
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
+OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
+BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
+
+# What the example says to packages of others, from their sources for Jazzy. A misspelt parameter
+# is silently ignored by their nodes, so the spelling is held here.
+OTHERS = {
+    ('tf2_ros', 'static_transform_publisher'): set(),
+    ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {
+        *('use_mag', 'world_frame', 'publish_tf', 'remove_gravity_vector', 'orientation_stddev'),
+    },
+    ('robot_localization', 'ekf_node'): {
+        *('frequency', 'two_d_mode', 'publish_tf', 'odom_frame', 'base_link_frame'),
+        *('world_frame', 'gravitational_acceleration', 'imu0', 'imu0_config'),
+        *('imu0_differential', 'imu0_relative', 'imu0_queue_size'),
+        'imu0_remove_gravitational_acceleration',
+    },
+}
+
+
+def parse(path: Path) -> ET.Element:
+    return ET.parse(path).getroot()  # noqa: S314 - our own file
+
+
+def declared(root: ET.Element) -> set[str]:
+    return {one.get('name', '') for one in root.findall('arg')}
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
+class TestEveryFile:
+    def test_variables_are_the_declared_arguments(self, path: Path) -> None:
+        root = parse(path)
+        text = re.sub(r'<!--.*?-->', '', path.read_text(), flags=re.DOTALL)
+        assert set(re.findall(r'\$\(var ([\w]+)\)', text)) == declared(root)
+
+    def test_arguments_read_well_in_show_args(self, path: Path) -> None:
+        for one in parse(path).findall('arg'):
+            assert one.get('description', '').endswith('.'), one.get('name')
+
+    def test_files_of_the_package_exist(self, path: Path) -> None:
+        found = re.findall(r'\$\(find-pkg-share thermo_comp\)/([^"]+)"', path.read_text())
+        assert found
+        for name in found:
+            assert (ROOT / name).is_file(), name
+
+    def test_the_example_in_its_head_gives_arguments_it_has(self, path: Path) -> None:
+        lines = re.findall(r'ros2 launch thermo_comp (\S+) (.*)', path.read_text())
+        assert lines
+        for name, arguments in lines:
+            assert name == path.name
+            assert set(re.findall(r'(\w+):=', arguments)) <= declared(parse(path))
+
+
+def test_our_node_s_executable_parameters_and_topics() -> None:
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    from dataclasses import fields
+
+    from thermo_comp.ros.parameters import NodeConfig
+
+    (node,) = parse(OURS).findall('node')
+    assert (node.get('pkg'), node.get('name')) == ('thermo_comp', 'thermo_comp')
+    scripts = re.findall(r"'(\w+) = thermo_comp", (ROOT / 'setup.py').read_text())
+    assert node.get('exec') in scripts
+    config = configparser.ConfigParser()
+    config.read(ROOT / 'setup.cfg')
+    assert config['install']['install_scripts'].endswith('lib/thermo_comp')
+    named = {one.get('name') for one in node.findall('param') if one.get('name')}
+    assert named <= {field.name for field in fields(NodeConfig)}
+    # A serial such as 0042 would otherwise arrive as a number.
+    assert all(one.get('type') == 'str' for one in node.findall('param') if one.get('name'))
+    source = (ROOT / 'thermo_comp' / 'ros' / 'node.py').read_text()
+    defaults = {one.get('name'): one.get('default') for one in parse(OURS).findall('arg')}
+    for remap in node.findall('remap'):
+        topic = remap.get('from')
+        assert f"'{topic}'" in source, topic
+        argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
+        assert argument is not None
+        assert defaults[argument[1]] == topic
+
+
+def test_the_example_gives_the_included_file_arguments_it_has() -> None:
+    (include,) = parse(BESIDE).findall('include')
+    assert include.get('file', '').endswith(OURS.name)
+    assert {one.get('name') for one in include.findall('arg')} <= declared(parse(OURS))
+
+
+def test_the_example_speaks_to_others_in_their_words() -> None:
+    nodes = {(one.get('pkg'), one.get('exec')): one for one in parse(BESIDE).findall('node')}
+    assert set(nodes) == set(OTHERS)
+    for key, node in nodes.items():
+        assert {one.get('name') for one in node.findall('param')} <= OTHERS[key]
+
+
+def test_the_example_s_frames_form_one_tree() -> None:
+    nodes = {one.get('exec'): one for one in parse(BESIDE).findall('node')}
+    madgwick, ekf = nodes['imu_filter_madgwick_node'], nodes['ekf_node']
+
+    def value(node: ET.Element, name: str) -> str:
+        (found,) = (one for one in node.findall('param') if one.get('name') == name)
+        return found.get('value', '')
+
+    # One parent per frame (REP 105): the filter's own transform stays off, the mounting is static.
+    assert value(madgwick, 'publish_tf') == 'false'
+    assert value(ekf, 'publish_tf') == 'true'
+    mounting = nodes['static_transform_publisher'].get('args', '')
+    assert f'--frame-id {value(ekf, "base_link_frame")}' in mounting
+    # Gravity is taken off exactly once.
+    assert value(madgwick, 'remove_gravity_vector') == 'false'
+    assert value(ekf, 'imu0_remove_gravitational_acceleration') == 'true'
+    used = value(ekf, 'imu0_config').split()
+    assert len(used) == 15
+    # No position, no speed, and no heading without a magnetometer.
+    assert [k for k, one in enumerate(used) if one == 'true'] == [3, 4, 9, 10, 11, 12, 13, 14]
+    assert float(value(madgwick, 'orientation_stddev')) > 0.0
