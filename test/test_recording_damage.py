@@ -276,6 +276,8 @@ def whole_file(*records: bytes) -> bytes:
 
 
 HUGE = 1 << 60
+#: A record of 100 bytes that means nothing.
+PADDING = b'\x0f' + struct.pack('<Q', 91) + bytes(91)
 
 
 @pytest.mark.parametrize(
@@ -310,6 +312,89 @@ def test_claims_are_not_believed(tmp_path: Path, record: bytes, reason: str) -> 
         read(path)
     # In KiB: no claim makes the reader take more than a whole ordinary chunk (64 MiB).
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+
+
+@pytest.mark.parametrize(
+    ('record', 'reason'),
+    [
+        (chunk_record(zstandard.compress(PADDING * 90), 'zstd', 5000), 'more than the 5000'),
+        (chunk_record(zstandard.compress(b'\x0f' + bytes(8)), 'zstd', 5000), '9 bytes after'),
+        (chunk_record(b'not zstd at all', 'zstd', 5000), 'decompression: zstd'),
+        (chunk_record(b'x', 'brotli', 5000), "unknown compression 'brotli'"),
+        (
+            chunk_record(b'\x0f' + struct.pack('<Q', 4991) + bytes(4991), '', 5000, 99),
+            'the checksum does not fit',
+        ),
+        (
+            chunk_record(b'\x05' + struct.pack('<Q', HUGE) + bytes(4991), '', 5000),
+            f'a record of {HUGE} bytes',
+        ),
+    ],
+)
+def test_claims_of_large_chunks_are_not_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: bytes, reason: str
+) -> None:
+    monkeypatch.setattr('thermo_comp.recording.survey.MAX_CHUNK_BYTES', 2000)
+    monkeypatch.setattr('thermo_comp.recording.chunk.WINDOW_BYTES', 1000)
+    path = tmp_path / 'bag.mcap'
+    path.write_bytes(whole_file(record))
+    with pytest.raises(RecordingError, match=reason):
+        read(path)
+
+
+def test_a_torn_file_of_large_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('thermo_comp.recording.survey.MAX_CHUNK_BYTES', 200)
+    monkeypatch.setattr('thermo_comp.recording.chunk.WINDOW_BYTES', 300)
+    path = tmp_path / 'bag.mcap'
+    for compression in ('none', 'zstd', 'lz4'):
+        content, position, length = small_bag(compression)
+        for cut in range(position - 100, position + length + 100, 11):
+            path.write_bytes(content[:cut])
+            recording = read(path)
+            assert recording.info.truncated is not None
+            n = recording.info.n_messages
+            assert_columns(recording.columns, regular_messages(24)[:n])
+
+
+def test_a_damaged_compressed_end_is_left_out(tmp_path: Path) -> None:
+    content, position, length = small_bag('zstd')
+    damaged = bytearray(content[: position + length])
+    damaged[position + length // 2] ^= 255
+    path = tmp_path / 'bag.mcap'
+    path.write_bytes(damaged)
+    recording = read(path)
+    assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
+    assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
+    # The same chunk torn as well: what its decompressor gives before the damage.
+    path.write_bytes(damaged[:-5])
+    assert 'ends inside a chunk' in str(read(path).info.truncated)
+
+
+def test_a_summary_that_is_nonsense(tmp_path: Path) -> None:
+    content = bytearray(small_bag('none')[0])
+    path = tmp_path / 'bag.mcap'
+    footer = len(content) - 37
+    (summary,) = struct.unpack_from('<Q', content, footer + 9)
+    for at in (summary, summary + 9):  # the first record's opcode; its schema's number and name
+        changed = bytearray(content)
+        changed[at : at + 8] = b'\xff' * 8
+        path.write_bytes(changed)
+        assert_columns(read(path).columns, regular_messages(24))
+    for claim in (1, HUGE):
+        struct.pack_into('<Q', content, footer + 9, claim)
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=f'puts the summary at byte {claim}'):
+            read(path)
+
+
+def test_small_records_are_small(tmp_path: Path) -> None:
+    path = tmp_path / 'bag.mcap'
+    large = bytes((1 << 22) + 1)
+    path.write_bytes(whole_file(struct.pack('<BQ', Opcode.METADATA, len(large)) + large))
+    assert read(path).info.metadata == {}
+    path.write_bytes(whole_file(struct.pack('<BQ', Opcode.SCHEMA, len(large)) + large))
+    with pytest.raises(RecordingError, match=f'has {len(large)} bytes'):
+        read(path)
 
 
 def test_a_wrong_message_index_is_only_a_hint(tmp_path: Path) -> None:
@@ -390,8 +475,32 @@ def test_messages_of_another_layout_are_named(tmp_path: Path, data: bytes, reaso
         read(path)
 
 
+def test_ros_1_messages_in_an_mcap_file(tmp_path: Path) -> None:
+    path = tmp_path / 'bag.mcap'
+    numbers = struct.pack('<3d', 1.5, -2.5, 3.5)
+    data = struct.pack('<IIII', 9, 12, 34, 4) + b'link' + numbers
+    path.write_bytes(
+        whole_file(declared('ros1', 'geometry_msgs/Vector3Stamped'), short_message(data))
+    )
+    with open_recording(path, require=('accel',)) as reader:
+        (block,) = reader.blocks(raw=True)
+    assert block.accel.tolist() == [[1.5, -2.5, 3.5]]
+    assert block.accel_stamp_ns.tolist() == [12 * 10**9 + 34]
+    assert block.frame_id == 'link'
+    # Given out raw, it is CDR like any other.
+    message = Message(ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
+    assert block.raw[0].data.tobytes() == serialize(message)
+
+
 def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
     path = tmp_path / 'bag.mcap'
+    both = declared() + declared('ros1').replace(
+        struct.pack('<HH', 1, 1), struct.pack('<HH', 2, 1)
+    )
+    message = Message(ACCEL, 1, 1, '', (1.0, 2.0, 3.0))
+    path.write_bytes(whole_file(both, short_message(serialize(message))))
+    with pytest.raises(RecordingError, match=f'{ACCEL}: its messages have several encodings'):
+        read(path)
     path.write_bytes(whole_file(declared('json'), short_message(b'{}')))
     with pytest.raises(RecordingError, match="encoded as 'json', expected cdr"):
         read(path)

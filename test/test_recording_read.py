@@ -235,6 +235,39 @@ def test_overlapping_chunks_of_single_topics_are_merged(tmp_path: Path) -> None:
     assert_columns(read(tmp_path / 'bag.mcap').columns, in_reading_order(by_topic))
 
 
+def test_too_many_overlapping_chunks_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('thermo_comp.recording.sweep._MAX_HELD', 300)
+    messages = regular_messages(200)
+    # Each chunk holds every 40th message, so all of them span the whole time.
+    combed = [message for begin in range(40) for message in messages[begin::40]]
+    write_mcap(tmp_path / 'bag.mcap', combed, chunk_size=400)
+    with pytest.raises(RecordingError, match=r'too many of its chunks overlap in time'):
+        read(tmp_path / 'bag.mcap')
+
+
+def test_raw_messages_of_overlapping_chunks_are_in_order_too(tmp_path: Path) -> None:
+    messages = regular_messages(60)
+    shuffled = [m for pair in zip(messages[1::2], messages[::2], strict=False) for m in pair]
+    for row, message in enumerate(messages):
+        message.frame_id = 'abc'[row % 3] * (1 + row % 5)
+    write_mcap(tmp_path / 'bag.mcap', shuffled, chunk_size=250)
+    with open_recording(tmp_path / 'bag.mcap') as reader:
+        blocks = list(reader.blocks(raw=True))
+    found = [
+        piece.tobytes()
+        for block in blocks
+        for raw in block.raw
+        if raw.topic == ACCEL
+        for piece in np.split(raw.data, raw.ends)[:-1]
+    ]
+    wanted = [m for m in sorted(shuffled, key=lambda m: m.log_ns) if m.topic == ACCEL]
+    assert found == [serialize(m) for m in wanted]
+    frames = [block.frame_id for block in blocks for _ in range(len(block))]
+    assert frames == [m.frame_id for m in wanted]
+
+
 def test_split_files_follow_each_other(tmp_path: Path) -> None:
     messages = regular_messages(90)
     write_rosbag2(tmp_path / 'bag', messages[:50])
