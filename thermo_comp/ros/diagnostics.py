@@ -16,12 +16,17 @@ from dataclasses import dataclass, fields, replace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from ..plausibility import Fault
 from ..regime import Regime
 from ..status import CompensatorStatus, Counters
 from .loading import LoadedCalibration
 
 #: A sample rate further from the calibrated one than this is worth a warning.
 RATE_TOLERANCE = 0.1
+#: Readings stamped this much ahead of the samples wait too long to be of one clock with them [s].
+AHEAD_S = 5.0
+#: |f| at rest may miss gravity by this many of its own standard deviations.
+GRAVITY_SIGMAS = 5.0
 
 _REGIMES = {Regime.UNKNOWN: 'unknown', Regime.STATIC: 'static', Regime.DYNAMIC: 'dynamic'}
 _DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
@@ -116,6 +121,16 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> lis
         )
     elif status.is_board_stale:
         found.append((warn, f'board temperature {status.board_age_s:.1f} s old, held'))
+    found += _sensor_findings(status)
+    if status.is_lead_reversed:
+        found.append(
+            (
+                error,
+                'the board leads the case in ramps: are temperature/board and temperature/case '
+                'swapped, or is it heated from inside?',
+            )
+        )
+    found += _sample_findings(status, new)
     if new.n_saturated:
         full_scale = loaded.calibration.unit.full_scale
         found.append((error, f'{new.n_saturated} samples saturated (+-{full_scale:g}), dropped'))
@@ -152,6 +167,72 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> lis
     return found
 
 
+def _sensor_findings(status: CompensatorStatus) -> list[tuple[int, str]]:
+    """
+    Say what is wrong with the thermometers themselves.
+
+    """
+    found = []
+    for name, fault, step in (
+        ('board', status.board_fault, status.board_step_k),
+        ('case', status.case_fault, status.case_step_k),
+    ):
+        if fault == Fault.STILL:
+            text = 'stands still to the bit, its uncertainty grows'
+        elif fault == Fault.FROZEN:
+            text = 'frozen: the other one moves; its readings are not used'
+        elif fault == Fault.STEP:
+            text = f'jumped by {step:+.2f} K; its readings are not used'
+        else:
+            continue
+        found.append((DiagnosticStatus.WARN[0], f'{name} temperature {text}'))
+    if status.pending_ahead_s > AHEAD_S:
+        found.append(
+            (
+                DiagnosticStatus.WARN[0],
+                f'temperatures are stamped {status.pending_ahead_s:.0f} s ahead of the samples',
+            )
+        )
+    if status.gradient_excess_k:
+        found.append(
+            (
+                DiagnosticStatus.WARN[0],
+                f'case minus board {status.gradient_excess_k:+.2f} K outside the calibrated '
+                'range, held at its edge',
+            )
+        )
+    return found
+
+
+def _sample_findings(status: CompensatorStatus, new: Counters) -> list[tuple[int, str]]:
+    """
+    Say what is wrong with the samples themselves, and with the calibration for them.
+
+    """
+    error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
+    found = []
+    if new.n_stuck:
+        found.append((error, f'{new.n_stuck} samples stuck or all zero, dropped'))
+    if new.n_too_fast:
+        found.append(
+            (error, f'{new.n_too_fast} samples too fast for their conversion cycle, dropped')
+        )
+    gravity = status.gravity
+    if gravity is not None:
+        figure = f'{gravity.residual:+.2e} +- {gravity.residual_sd:.1e} m/s^2'
+        if status.is_refuted:
+            found.append(
+                (
+                    error,
+                    f'|f| at rest misses gravity by {figure}: another unit, or an axis '
+                    'reversed? Nothing is published',
+                )
+            )
+        elif gravity.sigmas > GRAVITY_SIGMAS:
+            found.append((warn, f'|f| at rest misses gravity by {figure}: has the unit aged?'))
+    return found
+
+
 def _all_well(now: Snapshot) -> str:
     state = now.status.state
     if state is None or state.regime == Regime.UNKNOWN:
@@ -180,9 +261,19 @@ def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[
     values += [
         ('board age [s]', f'{status.board_age_s:.3f}'),
         ('case age [s]', f'{status.case_age_s:.3f}'),
+        ('board fault', status.board_fault.value),
+        ('case fault', status.case_fault.value),
+        ('gradient excess [K]', f'{status.gradient_excess_k:.3f}'),
         ('temperature excess [K]', f'{status.temperature_excess_k:.3f}'),
         ('rate excess [K/min]', f'{status.rate_excess_k_min:.3f}'),
     ]
+    if status.gravity is not None:
+        values += [
+            ('gravity residual [m/s^2]', f'{status.gravity.residual:.3e}'),
+            ('gravity residual sd [m/s^2]', f'{status.gravity.residual_sd:.3e}'),
+            ('gravity windows', str(status.gravity.n_windows)),
+            ('standing', str(status.gravity.is_still)),
+        ]
     if now.variances is not None:
         values += [
             (f'sd {axis} [m/s^2]', f'{math.sqrt(variance):.3e}')

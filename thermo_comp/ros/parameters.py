@@ -45,8 +45,10 @@ class NodeConfig:
     Attributes
     ----------
     calibration_file, serial, input, frame_id : str
-    transition_time, temperature_timeout, case_timeout, diagnostics_period : float
+    transition_time, temperature_timeout, case_timeout, stuck_timeout, diagnostics_period : float
         Seconds.
+    local_gravity, gravity_tolerance : float
+        Metres per second squared.
 
     """
 
@@ -79,6 +81,23 @@ class NodeConfig:
         'Age of the case temperature at which the board sensor decides the regime [s].',
         (0.1, 86400.0),
     )
+    stuck_timeout: float = _parameter(
+        _DEFAULTS.stuck_timeout_s,
+        'Time after which samples that are equal to the bit are not published [s]; three exact '
+        'zeros never are; 0 publishes any sample.',
+        (0.0, 3600.0),
+    )
+    local_gravity: float = _parameter(
+        _DEFAULTS.local_gravity_m_s2,
+        'Gravity at this place [m/s^2], for the check at rest; 0 takes that of the calibration.',
+        (0.0, 100.0),
+    )
+    gravity_tolerance: float = _parameter(
+        _DEFAULTS.gravity_tolerance_m_s2,
+        'Error of the magnitude at rest [m/s^2] at which publishing stops: another unit, a '
+        'reversed axis; 0 never stops.',
+        (0.0, 100.0),
+    )
     diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
 
     def compensator_config(self) -> CompensatorConfig:
@@ -90,6 +109,9 @@ class NodeConfig:
             transition_time_s=self.transition_time,
             temperature_timeout_s=self.temperature_timeout,
             case_timeout_s=self.case_timeout,
+            stuck_timeout_s=self.stuck_timeout,
+            local_gravity_m_s2=self.local_gravity,
+            gravity_tolerance_m_s2=self.gravity_tolerance,
         )
 
 

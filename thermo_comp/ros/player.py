@@ -46,6 +46,8 @@ TEMPERATURE_DEPTH = 10
 CLOCK_PERIOD = 0.01
 #: The longest nap, so that an interrupt is heeded [s].
 NAP = 0.1
+#: Time between two looks at what is acknowledged; that takes Fast DDS some 5 ms [s].
+ACKNOWLEDGEMENT_NAP = 0.0005
 #: Time the subscribers are given to find the player too; nothing tells when they have [s].
 SETTLING = 0.3
 #: How long a subscriber may leave a window unacknowledged [s].
@@ -265,11 +267,13 @@ class _Player:
     def _await_acknowledgement(self, role: Role) -> None:
         publisher = self._publishers[role]
         deadline = time.monotonic() + PATIENCE
-        while not publisher.wait_for_all_acked(Duration(seconds=NAP)):
+        # Asked again and again: waiting inside rclpy would keep this process's other threads out.
+        while not publisher.wait_for_all_acked(Duration()):
             if time.monotonic() > deadline:
                 raise ThermoCompError(
                     f'{publisher.topic_name}: a subscriber took nothing for {PATIENCE:g} s'
                 )
+            time.sleep(ACKNOWLEDGEMENT_NAP)
 
 
 def _qos(depth: int) -> QoSProfile:

@@ -75,7 +75,7 @@ class Recorder:
         self._counts = dict.fromkeys(topics, 0)
         self._failure: RecordingError | None = None
         self._newest: dict[str, bytes] = {}
-        self._newest_ns = 0
+        self._newest_ns: int | None = None
         # Flags that came before any stamp.
         self._early: dict[str, list[bytes]] = {}
 
@@ -214,7 +214,7 @@ class Recorder:
         for name, subscription in self._subscriptions.items():
             messages = self._early.pop(name, []) + subscription.drain()[0]
             times = [self._log_time(name, data) for data in messages]
-            if not self._newest_ns:
+            if self._newest_ns is None:
                 self._early[name] = messages
             elif messages:
                 self._writer.write_raw(name, _type_name(self._topics[name]), times, messages)
@@ -226,7 +226,7 @@ class Recorder:
                     self._newest[name] = messages[-1]
                 self._changed.notify_all()
 
-    def _log_time(self, name: str, data: bytes) -> int:
+    def _log_time(self, name: str, data: bytes) -> int | None:
         if self._topics[name] is not Bool:
             sec, nanosec = _STAMP.unpack_from(data, 4)
             self._newest_ns = sec * 1_000_000_000 + nanosec

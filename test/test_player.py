@@ -1,0 +1,325 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Player and recorder on real DDS: every message, byte for byte, in the order of the bag.
+
+"""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from ros_helpers import TIMEOUT, Peer, stamp_of
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.typesys import Stores, get_typestore
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, Temperature
+from std_msgs.msg import Bool
+
+from thermo_comp.errors import RecordingError, ThermoCompError
+from thermo_comp.recording import BagWriter, ImuColumns, Topics, read_recording
+from thermo_comp.ros import player
+from thermo_comp.ros.player import WINDOW, play
+from thermo_comp.ros.recorder import Recorder, record
+
+START_NS = 1_767_225_600_000_000_000
+CYCLE_NS = 2_500_000
+TOPICS = Topics()
+UNLIMITED = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+NAMES = ('accel/counts', 'temperature/board', 'temperature/case')
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+def bag_of(path: Path, n: int, rng: np.random.Generator) -> Path:
+    """Write n samples and a temperature of each sensor for every tenth."""
+    stamps = START_NS + np.arange(n) * CYCLE_NS
+    with BagWriter(path) as writer:
+        writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (n, 3)), 'imu_link')
+        for topic in (TOPICS.board, TOPICS.case):
+            writer.write_temperature(
+                topic, stamps[::10] - 7, rng.normal(20, 1, len(stamps[::10])), frame_id='ntc'
+            )
+    return path
+
+
+def messages_of(path: Path) -> list[bytes]:
+    with AnyReader([path]) as reader:
+        return [bytes(data) for _, _, data in reader.messages()]
+
+
+class Listener:
+    """Hears all of the player's topics, in order of arrival over all of them."""
+
+    def __init__(self, peer: Peer, prefix: str = '', qos: QoSProfile = UNLIMITED) -> None:
+        self.peer = peer
+        self.topics = {
+            name: peer.listen(kind, prefix + name, qos, raw=True)
+            for name, kind in zip(NAMES, (Vector3Stamped, Temperature, Temperature), strict=True)
+        }
+        self.clock = peer.listen(Clock, '/clock', QoSProfile(depth=100))
+
+    def wait_for(self, n: int) -> None:
+        self.peer.wait_for(lambda: sum(map(len, self.topics.values())) >= n, f'{n} messages')
+
+
+def by_topic(path: Path) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {name: [] for name in NAMES}
+    with AnyReader([path]) as reader:
+        for connection, _, data in reader.messages():
+            found[connection.topic.lstrip('/')].append(bytes(data))
+    return found
+
+
+@pytest.mark.parametrize('rate', [0.0, 20.0], ids=['as fast as taken', 'paced'])
+def test_every_message_arrives_byte_for_byte(
+    peer: Peer, tmp_path: Path, rng: np.random.Generator, rate: float
+) -> None:
+    bag = bag_of(tmp_path / 'bag', 4000, rng)
+    listener = Listener(peer)
+    progress: list[float] = []
+    report = play(bag, rate=rate, progress=progress.append)
+    # It has ended, so every reliable subscriber has got everything.
+    listener.wait_for(4800)
+    assert listener.topics == by_topic(bag)
+    assert report.n_messages == {
+        '/accel/counts': 4000,
+        '/temperature/board': 400,
+        '/temperature/case': 400,
+    }
+    assert (report.unheard, report.lossy) == ([], [])
+    assert progress[-1] == 1.0
+    times = [message.clock.sec * 10**9 + message.clock.nanosec for message in listener.clock]
+    assert times == sorted(times)
+    assert len(times) > 3
+    assert START_NS - 7 <= times[0] <= times[-1] <= START_NS + 4000 * CYCLE_NS
+
+
+SLOW_LISTENER = """
+import hashlib, rclpy
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+rclpy.init()
+node = rclpy.create_node('slow')
+digest, n = hashlib.sha256(), 0
+def hear(data):
+    global n
+    n += 1
+    digest.update(data)
+qos = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+node.create_subscription(Vector3Stamped, 'accel/counts', hear, qos, raw=True)
+while n < 12000:
+    rclpy.spin_once(node)
+print(digest.hexdigest())
+"""
+
+
+def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    # More than its middleware holds, which is 5000, and sent faster than an rclpy callback takes.
+    with BagWriter(tmp_path / 'bag.mcap') as writer:
+        stamps = START_NS + np.arange(12000) * CYCLE_NS
+        writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (12000, 3)), 'imu_link')
+    with subprocess.Popen(
+        [sys.executable, '-c', SLOW_LISTENER], stdout=subprocess.PIPE, text=True
+    ) as listener:
+        report = play(tmp_path / 'bag.mcap', rate=0.0, clock=False)
+        said, _ = listener.communicate(timeout=2 * TIMEOUT)
+    assert report.n_messages == {'/accel/counts': 12000}
+    expected = hashlib.sha256(b''.join(messages_of(tmp_path / 'bag.mcap'))).hexdigest()
+    assert said.strip() == expected
+
+
+def test_loops_namespace_and_throttle(
+    peer: Peer, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    bag = bag_of(tmp_path / 'bag', 3 * WINDOW, rng)
+    listener = Listener(peer, '/imu0/')
+    sent: list[int] = []
+    report = play(bag, rate=0.0, n_loops=2, ros_args=['-r', '__ns:=/imu0'], throttle=sent.append)
+    listener.wait_for(2 * 6 * WINDOW * 3 // 5)
+    counts = listener.topics['accel/counts']
+    assert len(counts) == 6 * WINDOW
+    assert counts[: 3 * WINDOW] == counts[3 * WINDOW :]
+    assert report.n_messages['/imu0/accel/counts'] == 6 * WINDOW
+    assert sent == [WINDOW * k for k in range(1, 7)]
+
+
+def test_says_who_does_not_listen_and_who_may_lose(
+    peer: Peer, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    bag = bag_of(tmp_path / 'bag', 20, rng)
+    best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    peer.listen(Temperature, 'temperature/case', best_effort)
+    report = play(bag, rate=0.0, wait_s=0.5)
+    assert report.unheard == ['/accel/counts', '/temperature/board']
+    assert report.lossy == ['/temperature/case']
+    # What nobody hears is sent all the same.
+    assert report.n_messages['/accel/counts'] == 20
+
+
+def test_imu_and_the_bags_own_names(peer: Peer, tmp_path: Path, rng: np.random.Generator) -> None:
+    stamps = START_NS + np.arange(300) * CYCLE_NS
+    rest = ImuColumns(*(rng.standard_normal((300, k)) for k in (4, 9, 3, 9, 9)))
+    with BagWriter(tmp_path / 'bag') as writer:
+        covariance = rest.linear_acceleration_covariance
+        force = rng.standard_normal((300, 3))
+        writer.write_imu('/drone/imu/raw', stamps, force, covariance, 'imu', imu=rest)
+    heard = peer.listen(Imu, 'imu/uncompensated', UNLIMITED, raw=True)
+    report = play(tmp_path / 'bag', rate=0.0, topics=Topics(imu='imu/raw'), input='imu')
+    peer.wait_for(lambda: len(heard) == 300, '300 samples')
+    assert heard == messages_of(tmp_path / 'bag')
+    assert list(report.n_messages) == ['/imu/uncompensated']
+
+
+def test_ros1_bags_are_played_in_cdr(peer: Peer, tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    header, stamp, vector, sample, reading, imu = (
+        store.types[name]
+        for name in (
+            'std_msgs/msg/Header',
+            'builtin_interfaces/msg/Time',
+            'geometry_msgs/msg/Vector3',
+            'geometry_msgs/msg/Vector3Stamped',
+            'sensor_msgs/msg/Temperature',
+            'sensor_msgs/msg/Imu',
+        )
+    )
+    del imu
+    path = tmp_path / 'old.bag'
+    with Writer1(path) as writer:
+        counts = writer.add_connection('/accel/counts', sample.__msgtype__, typestore=store)
+        board = writer.add_connection('/temperature/board', reading.__msgtype__, typestore=store)
+        for k in range(20):
+            head = header(k, stamp(5, k), 'imu_link')
+            for connection, message in (
+                (board, reading(header=head, temperature=20.0 + k, variance=0.0)),
+                (counts, sample(header=head, vector=vector(float(k), 2.0, 3.0))),
+            ):
+                data = store.serialize_ros1(message, message.__msgtype__)
+                writer.write(connection, 5 * 10**9 + k, data)
+    counts_heard = peer.listen(Vector3Stamped, 'accel/counts', UNLIMITED)
+    board_heard = peer.listen(Temperature, 'temperature/board', UNLIMITED)
+    play(path, rate=0.0)
+    peer.wait_for(lambda: len(counts_heard) == len(board_heard) == 20, 'all messages')
+    assert [message.vector.x for message in counts_heard] == [float(k) for k in range(20)]
+    assert {message.header.frame_id for message in counts_heard} == {'imu_link'}
+    assert [stamp_of(message) for message in counts_heard] == [5 * 10**9 + k for k in range(20)]
+    assert [message.temperature for message in board_heard] == [20.0 + k for k in range(20)]
+
+
+def test_refusals(tmp_path: Path, rng: np.random.Generator) -> None:
+    bag = bag_of(tmp_path / 'bag', 20, rng)
+    with pytest.raises(ValueError, match='`rate` must be zero or positive, got -1'):
+        play(bag, rate=-1.0)
+    with pytest.raises(ValueError, match='`n_loops` must be zero or positive, got -1'):
+        play(bag, n_loops=-1)
+    with pytest.raises(RecordingError, match='none'):
+        play(tmp_path / 'none')
+
+
+def test_a_subscriber_that_takes_nothing_is_not_waited_for_without_end(
+    peer: Peer, tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # It takes as many as its middleware holds, 5000, and then refuses.
+    with BagWriter(tmp_path / 'bag') as writer:
+        stamps = START_NS + np.arange(8000) * CYCLE_NS
+        writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (8000, 3)))
+    hold, held = threading.Event(), threading.Event()
+
+    def block(_: Any) -> None:
+        held.set()
+        hold.wait(TIMEOUT)
+
+    peer.node.create_subscription(Vector3Stamped, 'accel/counts', block, UNLIMITED)
+    monkeypatch.setattr(player, 'PATIENCE', 0.5)
+    try:
+        with pytest.raises(ThermoCompError, match='/accel/counts: a subscriber took nothing'):
+            play(tmp_path / 'bag', rate=0.0)
+        assert held.is_set()
+    finally:
+        hold.set()
+
+
+def test_recorder_keeps_every_message_under_its_stamp(peer: Peer, tmp_path: Path) -> None:
+    with Recorder(tmp_path / 'out') as recorder:
+        imu = peer.publisher(Imu, 'imu/data_raw')
+        flag = peer.publisher(Bool, 'regime/dynamic')
+        assert recorder.wait_for_publishers(TIMEOUT)
+        sent = []
+        for k in range(500):
+            message = Imu()
+            message.header.stamp.sec, message.header.stamp.nanosec = 7, k
+            message.linear_acceleration.x = float(k)
+            sent.append(message)
+            imu.publish(message)
+        assert recorder.wait_until(lambda counts: counts['imu/data_raw'] == 500, TIMEOUT)
+        flag.publish(Bool(data=True))
+        assert recorder.wait_until(lambda counts: counts['regime/dynamic'] == 1, TIMEOUT)
+        assert recorder.newest('regime/dynamic').data
+        assert recorder.counts == {'imu/data_raw': 500, 'regime/dynamic': 1}
+    with AnyReader([tmp_path / 'out']) as reader:
+        rows = [(c.topic, log_ns, bytes(data)) for c, log_ns, data in reader.messages()]
+    imus = [row for row in rows if row[0].endswith('imu/data_raw')]
+    assert [log_ns for _, log_ns, _ in imus] == [7 * 10**9 + k for k in range(500)]
+    assert [deserialize_message(data, Imu) for _, _, data in imus] == sent
+    # A flag has no stamp: it stands at the newest one before it.
+    (flagged,) = (row for row in rows if row not in imus)
+    assert flagged[1] == 7 * 10**9 + 499
+    assert deserialize_message(flagged[2], Bool).data
+    block = read_recording(tmp_path / 'out', Topics(imu='imu/data_raw'), 'imu', require=('accel',))
+    assert len(block.columns) == 500
+
+
+def test_record_ends_when_told_or_when_nothing_comes(peer: Peer, tmp_path: Path) -> None:
+    imu = peer.node.create_publisher(Imu, 'imu/data_raw', UNLIMITED)
+    stop = threading.Event()
+
+    def flood() -> None:
+        while not stop.wait(0.005):
+            imu.publish(Imu())
+
+    thread = threading.Thread(target=flood, daemon=True)
+    thread.start()
+    topics = {'imu/data_raw': Imu}
+    path = tmp_path / 'out.mcap'
+    counts = record(path, lambda counts: counts['imu/data_raw'] >= 20, topics=topics)
+    stop.set()
+    thread.join(TIMEOUT)
+    assert counts['imu/data_raw'] >= 20
+    silent = {'nobody/is/there': Imu}
+    quiet = record(tmp_path / 'no.mcap', lambda _: False, topics=silent, timeout_s=0.2)
+    assert quiet == {'nobody/is/there': 0}
+    with pytest.raises(RecordingError, match=r'out.mcap'):
+        record(path, lambda _: True, topics=topics)
+
+
+def test_a_recording_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    def fail() -> None:
+        with Recorder(tmp_path / 'out.mcap'):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert list(tmp_path.iterdir()) == []
