@@ -195,6 +195,40 @@ def test_other_files_are_refused(tmp_path, content):
         dataflash_log(path)
 
 
+@pytest.mark.parametrize(
+    ('columns', 'message'),
+    [
+        (NEW_IMU[1].replace('GH', 'EG'), 'format of IMU has a column twice'),
+        (NEW_IMU[1], 'format of IMU is longer than it says'),
+    ],
+)
+def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
+    log = DataflashWriter()
+    log.define('IMU', NEW_IMU[0], columns)
+    log.write('IMU', 1000, 0, *np.zeros(6), 0, 0, 30.0, 1, 1, 1000, 1000)
+    body = bytearray(log.body)
+    if 'longer' in message:
+        # The length in the second FMT message, which stands after the first one's 89 bytes.
+        body[89 + 4] -= 10
+    path = tmp_path / 'damaged.BIN'
+    path.write_bytes(body)
+    with pytest.raises(RecordingError, match=message):
+        dataflash_log(path)
+
+
+def test_absurd_stamps_are_no_stamps(tmp_path, rng):
+    path = tmp_path / 'jump.BIN'
+    write_new(path, rng)
+    body = bytearray(path.read_bytes())
+    # The first IMU message's time, all ones: half a million years.
+    at = body.index(b'\xa3\x95\x81') + 3
+    body[at : at + 8] = b'\xff' * 8
+    path.write_bytes(body)
+    report = write_log(dataflash_log(path), tmp_path / 'bag.mcap')
+    assert report.accel_messages == N - 1
+    assert report.non_numeric.count == 1
+
+
 def test_command(tmp_path, rng, cli):
     log = tmp_path / 'flight.BIN'
     write_new(log, rng)

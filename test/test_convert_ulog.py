@@ -203,6 +203,15 @@ def test_other_files_are_refused(tmp_path, content):
         ulog_log(path)
 
 
+def test_format_without_a_time_stamp_is_left_out(tmp_path):
+    log = UlogWriter('sensor_accel:float x;float y;float z;')
+    log.data(log.subscribe('sensor_accel', 0), struct.pack('<fff', 0.0, 0.0, 1.0))
+    path = tmp_path / 'damaged.ulg'
+    path.write_bytes(log.body)
+    with pytest.raises(RecordingError, match=r'not a ULog file|holds no IMU'):
+        ulog_log(path)
+
+
 def test_command(tmp_path, rng, cli):
     log = tmp_path / 'flight.ulg'
     write_two_imus(log, rng)

@@ -13,19 +13,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import RecordingError
 from .columnar import origin
 from .log import ForeignLog, Readings, thin
+from .table import NO_STAMP
 from .units import Array, BoolArray, IntArray, find_stillness
 
 T = TypeVar('T')
 
 # A thermometer that stands still says so this often, so that nobody takes it for lost.
 _HEARTBEAT_S = 10.0
+_CENTURY_US = 100 * 366 * 86400 * 10**6
 
 
 @dataclass(frozen=True)
@@ -130,6 +133,27 @@ def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = No
     )
 
 
+def stamps_ns(microseconds: npt.NDArray[Any]) -> IntArray:
+    """
+    Turn microseconds since the autopilot's start into stamps.
+
+    Parameters
+    ----------
+    microseconds : ndarray of int, shape (n,)
+        As logged.
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+        `NO_STAMP` where the number is no time: beyond a century, from a damaged file.
+
+    """
+    whole = np.asarray(microseconds)
+    size = whole.astype(np.float64)
+    is_time = (size >= 0.0) & (size < _CENTURY_US)
+    return np.where(is_time, np.where(is_time, whole, 0).astype(np.int64) * 1000, NO_STAMP)
+
+
 def _choose(found: Mapping[int, T], wanted: int | None, what: str, path: str) -> T:
     if not found:
         raise RecordingError(f'the log holds no {what}', path=path)
@@ -145,7 +169,7 @@ def _reported(readings: Readings) -> Readings:
     Leave out what no thermometer said: NaN, and the zeros of a sensor that has none.
 
     """
-    use: BoolArray = np.isfinite(readings.celsius)
+    use: BoolArray = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
     if not readings.celsius[use].any():
         use = np.zeros(len(use), dtype=np.bool_)
     return Readings(readings.stamp_ns[use], readings.celsius[use])

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
-from .autopilot import AutopilotLog, ImuRows, foreign_log
+from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
 from .log import ForeignLog, Readings
 from .units import Array, IntArray
 
@@ -127,10 +127,14 @@ def read_dataflash(path: str | Path) -> tuple[AutopilotLog, dict[str, float]]:
         baros: dict[int, Readings] = {}
         for name in sorted(reader.name_to_id):
             if re.fullmatch(r'IMU\d?', name):
-                imus.update(_imus(name, *_messages(reader, name)))
+                imus.update(_imus(name, *_messages(reader, name, path)))
             elif re.fullmatch(r'BARO|BAR\d', name):
-                baros.update(_baros(name, _messages(reader, name)[0]))
-        parameters = {str(key): float(value) for key, value in reader.params.items()}
+                baros.update(_baros(name, _messages(reader, name, path)[0]))
+        parameters = {
+            str(key): float(value)
+            for key, value in reader.params.items()
+            if isinstance(value, int | float)
+        }
     finally:
         reader.close()
     metadata = {}
@@ -139,7 +143,7 @@ def read_dataflash(path: str | Path) -> tuple[AutopilotLog, dict[str, float]]:
     return AutopilotLog(str(path), imus, baros, metadata), parameters
 
 
-def _messages(reader: Any, name: str) -> tuple[dict[str, npt.NDArray[Any]], int]:
+def _messages(reader: Any, name: str, path: Path) -> tuple[dict[str, npt.NDArray[Any]], int]:
     """
     Gather one message type: its columns, and how many of its messages the file ends inside of.
 
@@ -154,11 +158,15 @@ def _messages(reader: Any, name: str) -> tuple[dict[str, npt.NDArray[Any]], int]
         (title, _TYPES.get(code, f'S{size or 1}'))
         for title, (size, code) in zip(layout.columns, columns, strict=False)
     ]
+    titles = [title for title, _ in fields]
+    if len(set(titles)) < len(titles):
+        raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)
     kind = np.dtype(fields)
-    raw = np.frombuffer(reader.data_map, dtype=np.uint8)
+    if _HEADER_BYTES + kind.itemsize > layout.len:
+        raise RecordingError(f'damaged: the format of {name} is longer than it says', path=path)
+    raw = np.memmap(path, dtype=np.uint8, mode='r')
     span = np.arange(_HEADER_BYTES, _HEADER_BYTES + kind.itemsize)
     rows = np.ascontiguousarray(raw[whole[:, None] + span]).view(kind).ravel()
-    del raw
     scaled: dict[str, npt.NDArray[Any]] = {}
     for title, factor in zip(layout.columns, layout.msg_mults, strict=False):
         scaled[title] = rows[title] if factor is None else rows[title] * factor
@@ -167,9 +175,9 @@ def _messages(reader: Any, name: str) -> tuple[dict[str, npt.NDArray[Any]], int]
 
 def _stamps(columns: dict[str, npt.NDArray[Any]]) -> IntArray | None:
     if 'TimeUS' in columns:
-        return columns['TimeUS'].astype(np.int64) * 1000
+        return stamps_ns(columns['TimeUS'])
     if 'TimeMS' in columns:
-        return columns['TimeMS'].astype(np.int64) * 1_000_000
+        return stamps_ns(columns['TimeMS'].astype(np.uint64) * np.uint64(1000))
     return None
 
 

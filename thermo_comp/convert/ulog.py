@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
-from .autopilot import AutopilotLog, ImuRows, foreign_log
+from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
 from .log import ForeignLog, Readings
+from .table import NO_STAMP
 from .units import Array, IntArray
 
 _TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_baro')
@@ -94,7 +95,8 @@ def read_ulog(path: str | Path) -> AutopilotLog:
             raise RecordingError(f'not a ULog file ({failure})', path=path) from failure
     by_topic: dict[str, dict[int, Any]] = {topic: {} for topic in _TOPICS}
     for data in log.data_list:
-        if len(data.data['timestamp']):
+        # A damaged format may have lost its time stamp.
+        if len(data.data.get('timestamp', ())):
             by_topic[data.name][int(data.multi_id)] = data.data
     gyros = by_topic['sensor_gyro']
     return AutopilotLog(
@@ -126,7 +128,7 @@ def _imu(columns: dict[str, Any], gyro: dict[str, Any] | None) -> ImuRows:
 def _stamps(columns: dict[str, Any]) -> IntArray:
     # When the sample was taken, where the log says it; older logs only say when it was published.
     microseconds = columns.get('timestamp_sample', columns['timestamp'])
-    return np.asarray(microseconds, dtype=np.int64) * 1000
+    return stamps_ns(microseconds)
 
 
 def _column(columns: dict[str, Any], name: str) -> Array:
@@ -143,6 +145,8 @@ def _matched(stamp_ns: IntArray, gyro_ns: IntArray, gyro: Array) -> Array | None
     Interpolate the rate to the accelerometer's stamps; None where it was logged more sparsely.
 
     """
+    use = gyro_ns != NO_STAMP
+    gyro_ns, gyro = gyro_ns[use], gyro[use]
     if 2 * len(gyro_ns) < len(stamp_ns) or not np.isfinite(gyro).all():
         return None
     origin_ns = stamp_ns[0]
