@@ -79,8 +79,17 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
 | case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
 | temperature or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
+| a temperature that jumps as no part can | its readings are not used until they are possible again or the sensor has been lost |
+| a temperature that stands still while the other moves | its readings are not used: held, then lost |
+| both temperatures the same to the bit for 10 s | used, with a covariance that grows, WARN |
+| a board that leads the case in ramps (swapped topics) | larger covariance, ERROR |
+| counts the same to the bit for `stuck_timeout`, or all zero | dropped, counted, ERROR |
+| counts that come faster than their conversion cycle | dropped, counted, ERROR |
+| a magnitude at rest that misses gravity by `gravity_tolerance` | nothing is published, ERROR |
 | a stamp that repeats or goes back a little | dropped, counted |
 | a stamp that goes back by more than a second | the estimators start anew, said once |
+
+Every fault with its test: [faults](faults.md).
 """
 
 

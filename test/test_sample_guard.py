@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from thermo_comp.calibration import Axes, AxisReference, Unit
 from thermo_comp.compensator import Compensator, CompensatorConfig
 from thermo_comp.sample_guard import BURST_SAMPLES, LARGEST_RATE, STUCK_SAMPLES, RateWatch
+from thermo_comp.status import DROPPED, Counters
 
 K = 300.0
 UP = (0.36, -0.48, 0.8)
@@ -181,6 +182,12 @@ def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
         # 0.3 counts of noise, 0.29 of rounding: 1.4 mm/s^2 per probe, some 110 probes; and the
         # fractions of a count that noise this small does not average out, a tenth of 0.5.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
+
+
+def test_every_reason_is_counted_once():
+    counters = Counters(**{name: 2**k for k, name in enumerate(DROPPED)})
+    assert counters.n_dropped == 2 ** len(DROPPED) - 1
+    assert counters.n_in == counters.n_dropped
 
 
 def test_a_long_excess_is_soon_forgiven():

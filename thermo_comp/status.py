@@ -62,6 +62,19 @@ class CompensatorConfig:
         ThermalConfig(self.transition_time_s, self.case_timeout_s)
 
 
+#: The counters of samples that came in and did not go out.
+DROPPED = (
+    'n_not_finite',
+    'n_saturated',
+    'n_out_of_order',
+    'n_no_temperature',
+    'n_stale',
+    'n_stuck',
+    'n_too_fast',
+    'n_refuted',
+)
+
+
 @dataclass(slots=True)
 class Counters:
     """

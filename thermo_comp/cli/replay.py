@@ -94,14 +94,15 @@ def replay(
 
 
 def _say(out: Output, result: ReplayResult) -> None:
+    from ..status import DROPPED
+
     counters = result.counters
     if result.info.truncated:
         out.note(f'{result.info.path}: {result.info.truncated}')
     dropped = {
         name.removeprefix('n_').replace('_', ' '): n
         for name, n in asdict(counters).items()
-        if name in ('n_not_finite', 'n_saturated', 'n_out_of_order', 'n_no_temperature', 'n_stale')
-        and n
+        if name in DROPPED and n
     }
     out.line(f'{result.output}: {counters.n_out} of {counters.n_in} samples corrected')
     for reason, n in dropped.items():
