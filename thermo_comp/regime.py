@@ -27,6 +27,7 @@ from math import acos, inf, isnan, log, nan, pi, sqrt
 from .thermometer import Thermometer, ThermometerSettings
 
 BEND_SHARES = (1.0, 10.0)  # accelerations the two filters are tuned to / the smallest onset
+CELL_NOISE_SHARE = 0.4  # noise in a filter's own variance when cells make it come in bunches
 SETTLING = 5.0  # memories until a filter's noise is the formula's
 HOLD_LAGS = 0.75  # the shortest dynamic state, in lags of the leading sensor
 # "The rate is below": the variance in a calm is mostly that of what may begin, so half a sd.
@@ -411,7 +412,7 @@ class _OnsetTest:
             pace = dt * (power / (self._noise * dt)) ** 0.25
             correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
             squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
-            noise_share = 1.0 if self._has_cells else 0.25 + 0.08 * min(pace, 1.0)
+            noise_share = CELL_NOISE_SHARE if self._has_cells else 0.25 + 0.08 * min(pace, 1.0)
             self._thresholds.append(squared * noise_share)
         self._edge_margin = sqrt(squared) * self._edge_noise
         self._settled_s = SETTLING * (self._noise * dt / self._powers[0]) ** 0.25
