@@ -71,7 +71,7 @@ def test_each_candidate_equals_the_dense_solution(rng):
         variance = np.diag(combination @ joint @ combination.T)
         variances.append(one.weight * (variance + off**2))
     sd = found.prediction_sd(ramp(new), new, np.full(2, 25.0))
-    np.testing.assert_allclose(sd, np.sqrt(np.sum(variances, axis=0)), rtol=1e-6)
+    np.testing.assert_allclose(sd, np.sqrt(found.inflation * np.sum(variances, axis=0)), rtol=1e-6)
 
 
 def test_counts_weigh(rng):
@@ -122,6 +122,20 @@ def test_slope_sd_is_honest(rng):
     # 60 draws of a unit normal have an rms of 1 within 0.09 (1 sd). With six time constants of
     # data the doubt about the noise makes the claim somewhat wide; it must not be narrow.
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.25
+
+
+def test_smooth_errors_are_not_taken_for_small_ones(rng):
+    # WHY: hysteresis is smooth. From window to window it looks like nothing, so that a
+    # first-order process predicted a sixth of what was found. WHAT: the predicted sd covers it.
+    time = np.arange(400) * 15.0
+    columns = np.column_stack((np.ones(400), np.sin(time / 900.0)))
+    data = columns @ (3.0, 0.5) + 0.2 * np.cos(time / 900.0) + 0.01 * rng.standard_normal(400)
+    odd = (time // 300.0) % 2 == 1
+    found = fit_with_wander(columns[~odd], data[~odd], time[~odd], np.full(200, 25.0))
+    left = (data - columns @ found.parameters)[odd]
+    sd = found.prediction_sd(columns[odd], time[odd], np.full(200, 25.0))
+    assert found.inflation > 4.0
+    assert np.sqrt(np.mean((left / sd) ** 2)) == pytest.approx(1.0, abs=0.3)
 
 
 def test_drift_sd_is_that_of_a_difference():

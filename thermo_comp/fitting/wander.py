@@ -19,7 +19,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -119,6 +119,10 @@ class WanderFit:
         Times of the data [s].
     candidates : tuple of Candidate
         The guesses of the noise that count, the likeliest first.
+    inflation : float
+        Factor on all variances, at least 1, by which the data miss their own curve by more than
+        any such noise explains: errors smoother than a first-order process, such as hysteresis,
+        look small from window to window and are large over hours. `covariance` has it already.
 
     """
 
@@ -126,6 +130,7 @@ class WanderFit:
     covariance: Array
     time: Array
     candidates: tuple[Candidate, ...]
+    inflation: float = 1.0
 
     @property
     def noise(self) -> Noise:
@@ -167,16 +172,15 @@ class WanderFit:
             # Terms of a random walk nearly cancel: what is left is never below the white noise.
             total += one.weight * np.maximum(variance, white)
             total += one.weight * (columns @ (one.parameters - self.parameters)) ** 2
-        return np.asarray(np.sqrt(total))
+        return np.asarray(np.sqrt(self.inflation * total))
 
     def drift_sd(self, after_s: float) -> float:
         """
         How far the level is from itself after some time: sd of the difference.
 
         """
-        return float(
-            np.sqrt(sum(one.weight * one.noise.drift_sd(after_s) ** 2 for one in self.candidates))
-        )
+        total = sum(one.weight * one.noise.drift_sd(after_s) ** 2 for one in self.candidates)
+        return float(np.sqrt(self.inflation * total))
 
 
 def fit_with_wander(columns: Array, data: Array, time: Array, count: Array) -> WanderFit:
@@ -211,23 +215,27 @@ def fit_with_wander(columns: Array, data: Array, time: Array, count: Array) -> W
     step = float(np.median(np.diff(time)))
     span = float(time[-1] - time[0])
     longest = max(_LONGEST_SPANS * span, 4.0 * step)
-    found = [
+    solutions = [
         solution
         for constant in np.geomspace(2.0 * step, longest, _N_TIME_CONSTANTS).tolist()
         for solution in _solutions(columns, data, time, count, constant, max(1.0, constant / span))
     ]
-    cost = np.array([solution.cost for solution in found])
+    cost = np.array([solution.cost for solution in solutions])
     weight = np.exp(-0.5 * (cost - cost.min()))
     weight = np.where(weight > _LEAST_WEIGHT, weight, 0.0)
     weight /= weight.sum()
     order = np.argsort(-weight)[: int(np.count_nonzero(weight))].tolist()
-    candidates = tuple(found[i].candidate(float(weight[i])) for i in order)
+    candidates = tuple(solutions[i].candidate(float(weight[i])) for i in order)
     parameters = candidates[0].parameters
     covariance = np.zeros((p, p))
     for one in candidates:
         off = one.parameters - parameters
         covariance += one.weight * (one.covariance + np.outer(off, off))
-    return WanderFit(parameters, covariance, time, candidates)
+    found = WanderFit(parameters, covariance, time, candidates)
+    left = data - columns @ parameters
+    missed = float(np.mean((left / found.prediction_sd(columns, time, count)) ** 2))
+    inflation = max(1.0, missed)
+    return replace(found, covariance=inflation * covariance, inflation=inflation)
 
 
 @dataclass(frozen=True)
