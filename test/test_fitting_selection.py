@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from fitting_truth import GRAVITY, Truth, history, table_of, without_memory
 
+from thermo_comp.calibration import Unit
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions
+from thermo_comp.fitting.assembly import UnitFacts, build_calibration
 from thermo_comp.fitting.evidence import (
     corrected,
     inflation,
@@ -45,8 +47,10 @@ from thermo_comp.fitting.verdict import (
     judge_result,
     judge_table,
 )
+from thermo_comp.fitting.warm_up import find_warm_up
 from thermo_comp.functions import CubicSpline, Exponential
 from thermo_comp.metrics import MICRO_G
+from thermo_comp.regime import DetectorSettings
 from thermo_comp.simulation import positions
 
 
@@ -367,6 +371,78 @@ def test_scale_factors_far_from_one_are_said(rng: np.random.Generator) -> None:
 def test_options_out_of_range_are_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         FitOptions(**{'gravity': 9.81, **change})
+
+
+def settling(table: WindowTable, size: float, *tau_s: float) -> WindowTable:
+    """
+    Add what warming-up adds: per axis another size, per bag another start.
+
+    """
+    signs = np.array([1.0, -0.6, 0.8])
+    starts = size * (1.0 + 0.1 * np.sin(table.bag))
+    decay = sum(np.exp(-table.time / tau) for tau in tau_s)
+    return replace(table, mean=table.mean + (starts * decay)[:, None] * signs)
+
+
+def test_warming_up_is_found_and_taken_out(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 9, rng, window_s=60.0)
+    # 3000 ug that die with 25 minutes, and at first with 4 minutes, too.
+    warming = settling(table, 30.0, 1500.0, 240.0)
+    constant = constant_calibration(position_means(warming), GRAVITY, with_misalignment=True)
+    freedom = Freedom(time_constant_range_s=(60.0, 6000.0))
+    found = find_warm_up(warming, GRAVITY, constant, freedom)
+    assert found is not None
+    # The slow exponential is known once the fast one has died and is left out.
+    assert found.time_constant_s == pytest.approx(1500.0, rel=0.1)
+    assert 600.0 <= found.cut_s <= 3600.0
+    assert 'switch on 2.' in found.finding().message
+    kept = warming.select(warming.time >= found.cut_s).renumbered()
+    spec = model_spec('quadratic+memory2', kept)
+    outcome = fit_model(kept, spec, GRAVITY, constant, freedom, transient_s=found.time_constant_s)
+    # 3000 ppm of warming-up leave a few ppm; the residuals are the noise of 0.01 counts.
+    np.testing.assert_allclose(outcome.solution.scale[:, 0], Truth().scale, rtol=1e-5)
+    assert outcome.residual.std() < 0.0115
+
+
+def test_a_settled_unit_is_not_warming_up(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 9, rng, window_s=120.0)
+    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=True)
+    freedom = Freedom(time_constant_range_s=(60.0, 6000.0))
+    assert find_warm_up(table, GRAVITY, constant, freedom) is None
+
+
+def test_positions_that_were_left_out_leave_no_gap(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 4, rng, window_s=600.0, thermal=history(step_s=20.0))
+    kept = table.select(table.position != 1).renumbered()
+    assert kept.n_positions == 3
+    assert len(position_means(kept)) == 3
+
+
+def test_linear_terms_reach_further_than_the_curve(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 9, rng, window_s=300.0)
+    for name, reach in (('quadratic', 1.0), ('quadratic+memory2', 2.0)):
+        outcome = selector_of(table).try_model(model_spec(name, table)).outcome
+        calibration = build_calibration(
+            outcome, table, [], DetectorSettings(),
+            UnitFacts(Unit('7', 'counts', 32767.0, 0.01), np.ones(3), 900.0, np.zeros((2, 3))),
+            20.0,
+        )  # fmt: skip
+        fastest = float(np.max(table.rate)) * 60.0
+        assert calibration.static.rate_range_k_min[1] == pytest.approx(reach * fastest, rel=0.06)
+        edges = np.array(calibration.static.temperature_range_c) - 20.0
+        # Two per cent of the span on either side.
+        np.testing.assert_allclose(edges, [table.t.min(), table.t.max()], atol=0.6)
+
+
+def test_a_misalignment_that_was_not_measured_is_not_claimed(rng: np.random.Generator) -> None:
+    table, _ = table_of(replace(Truth(), skew=np.zeros(3)), 9, rng, window_s=300.0)
+    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=False)
+    spec = model_spec('quadratic', table)
+    outcome = fit_model(table, spec, GRAVITY, constant, Freedom(misalignment=False))
+    facts = UnitFacts(Unit('7', 'counts', 32767.0, 0.01), np.ones(3), 900.0, np.zeros((2, 3)))
+    found = build_calibration(outcome, table, [], DetectorSettings(), facts, 20.0)
+    assert found.misalignment == ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    assert min(found.misalignment_sd) > 1e-3
 
 
 def test_held_lags_stay(rng: np.random.Generator) -> None:

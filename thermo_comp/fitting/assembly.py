@@ -39,6 +39,12 @@ Array = npt.NDArray[np.float64]
 _EDGE_MARGIN = 0.02
 # A regime that the bags do not show has no range of its own: it takes all of them.
 _FEWEST_WINDOWS = 5
+# The response of a unit to heat flowing through it is linear: a ramp twice as fast as the
+# chamber's has twice the terms. A curve over temperature has no such law: it ends where the data
+# end.
+_LINEAR_REACH = 2.0
+# Orthogonality of a triad whose misalignment was not measured [rad].
+_UNKNOWN_SKEW = 5e-3
 
 
 @dataclass(frozen=True)
@@ -204,7 +210,7 @@ def _triple(values: Array) -> tuple[float, float, float]:
 def _misalignment_sd(outcome: Outcome, covariance: Array) -> tuple[float, float, float]:
     where = outcome.layout.skew
     if where[0] < 0:
-        return 0.0, 0.0, 0.0
+        return (_UNKNOWN_SKEW,) * 3
     a, _, c = outcome.solution.skew
     # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the skew (a, b, c) of its inverse.
     jacobian = np.array([[-1.0, 0.0, 0.0], [c, -1.0, a], [0.0, 0.0, -1.0]])
@@ -227,12 +233,19 @@ def _ranges(
         rows = np.ones(len(table.t), dtype=bool)
     lags = regressors(table, solution.spec, solution.time_constants_s, solution.start_memory)
     memory = lags.bias[rows][:, list(solution.spec.memory_columns('bias'))]
+    spec = solution.spec
+    reach = _LINEAR_REACH if spec.gradient or spec.rate or spec.n_lags else 1.0
     return {
         'temperature_range_c': _range(table.t[rows] + reference_temperature, 0.01),
-        'rate_range_k_min': _range(table.rate[rows] * 60.0, 0.01),
-        'gradient_range_k': _range(table.gradient[rows], 0.01),
-        'memory_range_k': _range(memory.ravel(), 0.01) if memory.size else (-50.0, 50.0),
+        'rate_range_k_min': _widened(table.rate[rows] * 60.0, reach),
+        'gradient_range_k': _widened(table.gradient[rows], reach),
+        'memory_range_k': _widened(memory.ravel(), reach) if memory.size else (-50.0, 50.0),
     }
+
+
+def _widened(values: Array, reach: float) -> tuple[float, float]:
+    lower, upper = _range(values, 0.01)
+    return min(lower, reach * lower), max(upper, reach * upper)
 
 
 def _range(values: Array, smallest_margin: float) -> tuple[float, float]:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ..metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from .reduction import ReducedBag, StillInterval
 from .regression import Outcome
-from .solution import Solution, correct, regressors
+from .solution import Solution, correct, regressors, warming_up
 from .table import WindowTable
 
 Array = npt.NDArray[np.float64]
@@ -97,7 +97,7 @@ def residual_rows(
 
     """
     bias, scale = reference_constants(table, fitted)
-    raw = (table.mean - bias) / scale @ fitted.misalignment.T
+    raw = (table.mean - warming_up(table, fitted) - bias) / scale @ fitted.misalignment.T
     by_model = [statistics_by_regime(norm_residual(raw, fitted.gravity), table.is_dynamic)]
     for solution in (one_set, fitted):
         residual = norm_residual(corrected(table, solution), fitted.gravity)

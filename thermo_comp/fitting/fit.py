@@ -47,6 +47,7 @@ from .verdict import (
     judge_result,
     judge_table,
 )
+from .warm_up import find_warm_up
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -217,6 +218,12 @@ def _fit_table(
         time_constant_range_s=(2.0 * options.window_s, max(longest / 2.0, 4.0 * options.window_s)),
     )
     coarse = table.coarsened(_selection_window(table, options))
+    tell('models', 0.7)
+    warm_up = find_warm_up(coarse, options.gravity, constant, freedom)
+    if warm_up is not None:
+        findings.append(warm_up.finding())
+        table = table.select(table.time >= warm_up.cut_s).renumbered()
+        coarse = table.coarsened(_selection_window(table, options))
     n_tried = 0
 
     def trying(_name: str) -> None:
@@ -224,7 +231,8 @@ def _fit_table(
         n_tried += 1
         tell('models', min(0.7 + 0.01 * n_tried, 0.95))
 
-    selector = Selector(coarse, options.gravity, constant, freedom, trying)
+    transient_s = warm_up.time_constant_s if warm_up is not None else None
+    selector = Selector(coarse, options.gravity, constant, freedom, trying, transient_s)
     if options.model == 'auto':
         name = selector.choose()
     else:

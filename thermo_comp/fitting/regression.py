@@ -44,8 +44,9 @@ class Freedom:
 
     Parameters
     ----------
-    misalignment, lags, start_memory, attitudes : bool, optional
-        Which parts are estimated; the rest stays as it starts.
+    misalignment, lags, start_memory, attitudes, axes, transient : bool, optional
+        Which parts are estimated; the rest stays as it starts. A transient is estimated only
+        where the start has one.
     time_constant_range_s : (float, float), optional
         Bounds of the time constants [s].
 
@@ -56,6 +57,7 @@ class Freedom:
     start_memory: bool = True
     attitudes: bool = True
     axes: bool = True
+    transient: bool = True
     time_constant_range_s: tuple[float, float] = (20.0, 1e5)
 
 
@@ -112,6 +114,10 @@ class Layout:
         Attitudes, in the tangent basis.
     start : ndarray of int, shape (n_bags, n_lags)
         Start memories.
+    transient : ndarray of int, shape (n_bags, 3) or (0, 3)
+        Warming-up of each bag.
+    transient_lag : ndarray of int, shape (1,) or (0,)
+        ``ln`` of its time constant.
     n : int
         How many are free.
 
@@ -122,6 +128,8 @@ class Layout:
     lags: npt.NDArray[np.int64]
     up: npt.NDArray[np.int64]
     start: npt.NDArray[np.int64]
+    transient: npt.NDArray[np.int64]
+    transient_lag: npt.NDArray[np.int64]
     n: int
 
 
@@ -158,6 +166,8 @@ def layout_of(solution: Solution, freedom: Freedom, table: WindowTable) -> Layou
     skew = take((3,), freedom.misalignment)
     lags = take(solution.time_constants_s.shape, freedom.lags)
     start = take(solution.start_memory.shape, freedom.start_memory)
+    transient = take(solution.transient.shape, freedom.transient)
+    transient_lag = take((min(1, len(solution.transient)),), freedom.transient)
     up = take((len(solution.up), 2), freedom.attitudes)
     present = np.zeros(len(solution.up), dtype=bool)
     present[np.unique(table.position)] = True
@@ -166,7 +176,7 @@ def layout_of(solution: Solution, freedom: Freedom, table: WindowTable) -> Layou
         first = n - 2 * len(solution.up)
         up[present] = first + np.arange(2 * int(present.sum())).reshape(-1, 2)
         n = first + 2 * int(present.sum())
-    return Layout(axis, skew, lags, up, start, n)
+    return Layout(axis, skew, lags, up, start, transient, transient_lag, n)
 
 
 def regress(
@@ -401,6 +411,11 @@ def _normal_equations(
                 )
                 parts += [effect * columns.slope[rows], effect * columns.decay[rows]]
                 places += [layout.lags, layout.start[bag]]
+            if len(layout.transient):
+                since = table.time[rows, None] / state.transient_s
+                decay = np.exp(-since)
+                parts += [decay, float(state.transient[bag, axis]) * decay * since]
+                places += [layout.transient[bag, axis : axis + 1], layout.transient_lag]
             jacobian = np.concatenate(parts, axis=1) * root_weight[rows, axis, None]
             where = np.concatenate(places)
             normal[np.ix_(where, where)] += jacobian.T @ jacobian
@@ -437,6 +452,7 @@ def _moved(state: Solution, step: Array, layout: Layout, freedom: Freedom) -> So
     lower, upper = freedom.time_constant_range_s
     # A factor of 2 per step is as far as the derivative can be trusted.
     change = np.clip(padded[layout.lags], -0.7, 0.7)
+    slower = float(np.sum(padded[layout.transient_lag]))
     return replace(
         state,
         bias=state.bias + axis[:, :n_bias],
@@ -445,4 +461,8 @@ def _moved(state: Solution, step: Array, layout: Layout, freedom: Freedom) -> So
         up=up / np.linalg.norm(up, axis=1, keepdims=True),
         time_constants_s=np.clip(state.time_constants_s * np.exp(change), lower, upper),
         start_memory=state.start_memory + padded[layout.start],
+        transient=state.transient + padded[layout.transient],
+        transient_s=float(
+            np.clip(state.transient_s * np.exp(np.clip(slower, -0.7, 0.7)), lower, upper)
+        ),
     )

@@ -219,6 +219,8 @@ class Selector:
         What the regression may move.
     progress : callable
         Told the name of each candidate.
+    transient_s : float or None, optional
+        Time constant of warming-up [s], where it is modelled.
 
     """
 
@@ -229,12 +231,14 @@ class Selector:
         constant: ConstantCalibration,
         freedom: Freedom,
         progress: Callable[[str], None],
+        transient_s: float | None = None,
     ) -> None:
         self._table = table
         self._gravity = gravity
         self._constant = constant
         self._freedom = freedom
         self._progress = progress
+        self._transient_s = transient_s
         self._folds = fold_numbers(table)
         self._trials: dict[str, Trial] = {}
 
@@ -345,6 +349,7 @@ class Selector:
             self._constant,
             self._freedom,
             like=like,
+            transient_s=self._transient_s,
             max_steps=_MAX_STEPS,
         )
 
@@ -352,7 +357,7 @@ class Selector:
         tried = []
         for e_fold in _E_FOLDS_K:
             one = replace(spec, static=Exponential(0.0, (0.0,), (e_fold,)))
-            start = begin(self._table, one, self._gravity, self._constant, like)
+            start = begin(self._table, one, self._gravity, self._constant, like, self._transient_s)
             held = replace(self._freedom, lags=False, start_memory=False)
             tried.append(regress(self._table, start, held, max_rounds=2, max_steps=5))
         best = min(tried, key=lambda outcome: float(np.mean(outcome.residual**2)))
@@ -394,6 +399,7 @@ def fit_model(
     freedom: Freedom,
     *,
     like: Solution | None = None,
+    transient_s: float | None = None,
     max_steps: int = 60,
 ) -> Outcome:
     """
@@ -413,6 +419,8 @@ def fit_model(
         What may move.
     like : Solution or None, optional
         A similar model's fit, for a better first guess.
+    transient_s : float or None, optional
+        Time constant of warming-up [s], where it is modelled.
     max_steps : int, optional
         Bound of the Gauss-Newton steps of one round.
 
@@ -422,7 +430,7 @@ def fit_model(
         The fit.
 
     """
-    start = begin(table, spec, gravity, constant, like)
+    start = begin(table, spec, gravity, constant, like, transient_s)
     if spec.n_lags:
         # With zero coefficients the lags feel nothing; these come first, at held lags.
         held = replace(freedom, lags=False, start_memory=False)
@@ -436,6 +444,7 @@ def begin(
     gravity: float,
     constant: ConstantCalibration,
     like: Solution | None,
+    transient_s: float | None = None,
 ) -> Solution:
     """
     Make the start of a model's regression, from another model's fit where there is one.
@@ -444,11 +453,13 @@ def begin(
     lags = np.array(_START_LAGS_S.get(spec.n_lags, ()))
     if like is not None and len(like.time_constants_s) == spec.n_lags:
         lags = like.time_constants_s
-    start = starting_solution(table, spec, gravity, constant, lags)
+    start = starting_solution(table, spec, gravity, constant, lags, transient_s)
     if like is None:
         return start
     start.bias[:, 0] = like.bias[:, 0]
     start.scale[:, 0] = like.scale[:, 0]
+    if len(like.transient):
+        start = replace(start, transient=like.transient, transient_s=like.transient_s)
     return replace(start, skew=like.skew, up=like.up, noise_sd=like.noise_sd)
 
 

@@ -11,7 +11,7 @@ Measurement model of window w of position p, axis i::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,10 @@ class Solution:
         Memory at each bag's start [K].
     noise_sd : ndarray, shape (2, 3)
         Residual sd of a window of typical length, per regime and axis, in input units.
+    transient : ndarray, shape (n_bags, 3) or (0, 3), optional
+        What warming-up adds at each bag's start, in input units; empty when it is not modelled.
+    transient_s : float, optional
+        Its time constant [s].
 
     """
 
@@ -60,6 +64,8 @@ class Solution:
     time_constants_s: Array
     start_memory: Array
     noise_sd: Array
+    transient: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    transient_s: float = 1800.0
 
     @property
     def inverse_misalignment(self) -> Array:
@@ -170,13 +176,38 @@ def predict(table: WindowTable, solution: Solution, columns: Regressors) -> Arra
     """
     force = solution.gravity * solution.up @ solution.inverse_misalignment.T
     return np.asarray(
-        columns.bias @ solution.bias.T + force[table.position] * (columns.scale @ solution.scale.T)
+        columns.bias @ solution.bias.T
+        + force[table.position] * (columns.scale @ solution.scale.T)
+        + warming_up(table, solution)
     )
+
+
+def warming_up(table: WindowTable, solution: Solution) -> Array:
+    """
+    Evaluate what warming-up adds to the windows.
+
+    Parameters
+    ----------
+    table : WindowTable
+        The windows.
+    solution : Solution
+        The estimates.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        In input units; zero when it is not modelled.
+
+    """
+    if not len(solution.transient):
+        return np.zeros_like(table.mean)
+    decay = np.exp(-table.time / solution.transient_s)
+    return np.asarray(solution.transient[table.bag] * decay[:, None])
 
 
 def correct(table: WindowTable, solution: Solution, columns: Regressors) -> Array:
     """
-    Correct the window means, as the compensator would.
+    Correct the window means, as the compensator would; what warming-up added is taken out first.
 
     Returns
     -------
@@ -184,5 +215,6 @@ def correct(table: WindowTable, solution: Solution, columns: Regressors) -> Arra
         Specific force.
 
     """
-    along = (table.mean - columns.bias @ solution.bias.T) / (columns.scale @ solution.scale.T)
+    settled = table.mean - warming_up(table, solution)
+    along = (settled - columns.bias @ solution.bias.T) / (columns.scale @ solution.scale.T)
     return np.asarray(along @ solution.misalignment.T)

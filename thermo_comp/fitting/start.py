@@ -128,6 +128,7 @@ def starting_solution(
     gravity: float,
     constant: ConstantCalibration,
     time_constants_s: Array,
+    transient_s: float | None = None,
 ) -> Solution:
     """
     Turn the constant calibration into a start of the full regression.
@@ -144,6 +145,8 @@ def starting_solution(
         The first guess.
     time_constants_s : ndarray, shape (n_lags,)
         First guess of the lags [s].
+    transient_s : float or None, optional
+        Time constant of warming-up [s], where it is modelled.
 
     Returns
     -------
@@ -167,6 +170,8 @@ def starting_solution(
         time_constants_s=np.asarray(time_constants_s, dtype=np.float64),
         start_memory=np.zeros((len(table.histories), spec.n_lags)),
         noise_sd=np.tile(1e-4 * gravity * constant.scale, (2, 1)),
+        transient=np.zeros((0 if transient_s is None else len(table.histories), 3)),
+        transient_s=transient_s or 1.0,
     )
 
 

@@ -126,6 +126,14 @@ class WindowTable:
         """
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
+    def renumbered(self) -> WindowTable:
+        """
+        Close the gaps that positions without windows left in the numbers.
+
+        """
+        _, position = np.unique(self.position, return_inverse=True)
+        return replace(self, position=position)
+
     def coarsened(self, window_s: float) -> WindowTable:
         """
         Merge neighbouring windows of one position and section into longer ones.
