@@ -12,12 +12,12 @@ import pytest
 from pose_helpers import GRAVITY, MG, Rest
 
 from thermo_comp.errors import FitError
+from thermo_comp.fitting.held_out import held_out
 from thermo_comp.fitting.one_pose import (
     PoseOptions,
     fit_branches,
     fit_series,
     fit_whole,
-    held_out,
     order_for,
     read_pose,
 )

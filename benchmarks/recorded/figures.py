@@ -18,7 +18,7 @@ mpl.use('Agg')
 
 from matplotlib import pyplot as plt
 
-from thermo_comp.fitting.one_pose import HeldOut
+from thermo_comp.fitting.held_out import HeldOut
 
 from .freezer import COLD_C, HOT_C, TEST_S, TRAIN_S, Freezer, Tracked
 from .handheld import MG, PARAMETERS, Handheld

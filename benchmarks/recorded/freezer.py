@@ -18,16 +18,15 @@ import numpy.typing as npt
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.held_out import HeldOut, held_out
 from thermo_comp.fitting.one_pose import (
     AlongGravity,
     BranchFit,
-    HeldOut,
     Pose,
     PoseOptions,
     fit_branches,
     fit_series,
     fit_whole,
-    held_out,
     read_pose,
 )
 from thermo_comp.fitting.sources import FitSource

@@ -19,7 +19,6 @@ cubic. Its uncertainty counts the wander (`wander`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -470,86 +469,3 @@ def _inliers(columns: Array, data: Array) -> BoolArray:
     spread = 1.4826 * float(np.median(np.abs(left)))
     use: BoolArray = np.abs(left) <= _OUTLIER_SDS * max(spread, 1e-300)
     return use
-
-
-def held_out(
-    model: AlongGravity, series: PoseSeries, rows: BoolArray | Sequence[bool], extend: bool = False
-) -> HeldOut:
-    """
-    Judge a model on windows that were not in its fit.
-
-    Parameters
-    ----------
-    model : AlongGravity
-        Fitted to other windows of the same recording.
-    series : PoseSeries
-        The recording.
-    rows : array_like of bool, shape (n,)
-        The windows to be judged; all of them count, still or not.
-    extend : bool, optional
-        See `AlongGravity.reading`.
-
-    Returns
-    -------
-    HeldOut
-        Residuals and their predicted sd.
-
-    """
-    part = series.select(np.asarray(rows, dtype=np.bool_))
-    residual = part.norm - model.reading(part.temperature, extend)
-    sd = model.solution.prediction_sd(
-        model.columns(part.temperature, extend), part.time, part.count
-    )
-    return HeldOut(part.time, residual, sd)
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """
-    What a model leaves of windows that it has not seen.
-
-    Parameters
-    ----------
-    time, residual, predicted_sd : ndarray, shape (n,)
-        When, ``|a|`` less its prediction, and the sd that was predicted for it [input units].
-
-    """
-
-    time: Array
-    residual: Array
-    predicted_sd: Array
-
-    @property
-    def rms(self) -> float:
-        """
-        Root mean square of the residuals.
-
-        """
-        return float(np.sqrt(np.mean(self.residual**2)))
-
-    @property
-    def normalised_rms(self) -> float:
-        """
-        Of residual over predicted sd: about 1 where the prediction is honest.
-
-        """
-        return float(np.sqrt(np.mean((self.residual / self.predicted_sd) ** 2)))
-
-    @property
-    def coverage(self) -> float:
-        """
-        Part of the residuals within the predicted 95 % interval.
-
-        """
-        return float(np.mean(np.abs(self.residual) <= 1.959964 * self.predicted_sd))
-
-    def __add__(self, other: HeldOut) -> HeldOut:
-        """
-        Pool two folds.
-
-        """
-        return HeldOut(
-            np.concatenate((self.time, other.time)),
-            np.concatenate((self.residual, other.residual)),
-            np.concatenate((self.predicted_sd, other.predicted_sd)),
-        )
