@@ -286,8 +286,11 @@ def part_efficiency(options: argparse.Namespace) -> None:
     Bias and scale at the reference against the Cramer-Rao bound.
 
     """
-    print('| positions | units | bias: RMS error / bound | scale | 95 % intervals, bias | scale |')
-    print('|---|---|---|---|---|---|')
+    print(
+        '| positions | units | bias: RMS error / bound | scale | bias: error / claimed sd | scale '
+        '| 95 % intervals, bias | scale |'
+    )
+    print('|---|---|---|---|---|---|---|---|')
     for n_positions in (18, 24):
         ratios: list[Array] = []
         claimed: list[Array] = []
@@ -315,9 +318,11 @@ def part_efficiency(options: argparse.Namespace) -> None:
             sd = [[one.covariance[k][k] ** 0.5 for one in sets] for k in (0, at)]
             claimed.append(errors / np.array(sd))
         ratio = np.sqrt(np.mean(np.square(ratios), axis=(0, 2)))
+        own = np.sqrt(np.mean(np.square(claimed), axis=(0, 2)))
         inside = np.mean(np.abs(claimed) < 1.96, axis=(0, 2))
         print(
             f'| {n_positions} | {options.units} | {ratio[0]:.3f} | {ratio[1]:.3f} '
+            f'| {own[0]:.3f} | {own[1]:.3f} '
             f'| {100 * inside[0]:.1f} % | {100 * inside[1]:.1f} % |',
             flush=True,
         )

@@ -38,6 +38,7 @@ from thermo_comp.fitting.selection import (
 from thermo_comp.fitting.solution import regressors
 from thermo_comp.fitting.start import constant_calibration, position_means
 from thermo_comp.fitting.table import WindowTable
+from thermo_comp.fitting.uncertainty import full_covariance, predicted_sd
 from thermo_comp.fitting.verdict import (
     Finding,
     can_tell_misalignment,
@@ -443,6 +444,32 @@ def test_a_misalignment_that_was_not_measured_is_not_claimed(rng: np.random.Gene
     found = build_calibration(outcome, table, [], DetectorSettings(), facts, 20.0)
     assert found.misalignment == ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     assert min(found.misalignment_sd) > 1e-3
+
+
+def test_predicted_sd_is_the_scatter_over_drawn_parameters(rng: np.random.Generator) -> None:
+    table, _ = table_of(Truth(), 9, rng, window_s=300.0)
+    outcome = selector_of(table).try_model(model_spec('quadratic+memory2', table)).outcome
+    slow = np.full((2, 3), 3e-6)
+    facts = UnitFacts(Unit('7', 'counts', 32767.0, 0.01), np.ones(3), 900.0, slow)
+    calibration = build_calibration(outcome, table, [], DetectorSettings(), facts, 20.0)
+    rate = 0.7 / 60.0
+    found = predicted_sd(calibration, np.array([8.0, 33.0]), np.array([0.0, rate]))
+    axis = calibration.dynamic.y
+    covariance = full_covariance(axis)
+    draws = rng.multivariate_normal(np.zeros(len(covariance)), covariance, 4000, tol=1e-6)
+    tau = calibration.memory_time_constants_s
+    for row, t in enumerate((-12.0, 13.0)):
+        # Level, t, t^2, gradient and rate (not in this model), the two memories.
+        bias = draws[:, 0] + draws[:, 1] * t + draws[:, 2] * t * t
+        bias += (draws[:, 5] * tau[0] + draws[:, 6] * tau[1]) * rate
+        scale = draws[:, 7] + draws[:, 8] * t + draws[:, 9] * t * t
+        scale += (draws[:, 12] * tau[0] + draws[:, 13] * tau[1]) * rate
+        spread = np.hypot(bias.std() / calibration.axes.y.scale_factor, 3e-6)
+        # 4000 draws know a standard deviation to 1.1 %.
+        assert found.bias[row, 1, 1] == pytest.approx(spread, rel=0.05)
+        assert found.scale[row, 1, 1] == pytest.approx(scale.std(), rel=0.05)
+    # In a ramp no less is unknown than in a soak, and the edges are known worse than the middle.
+    assert (found.scale[:, 1] > found.scale[:, 0]).all()
 
 
 def test_held_lags_stay(rng: np.random.Generator) -> None:

@@ -12,6 +12,7 @@ from .gravity import normal_gravity, resolve_gravity
 from .options import FitOptions
 from .selection import Candidate
 from .sources import ArrayBlock, FitSource, SourceBlock
+from .uncertainty import PredictedSd, predicted_sd
 from .verdict import Finding
 
 __all__ = [
@@ -25,10 +26,12 @@ __all__ = [
     'FitResult',
     'FitSource',
     'PositionReport',
+    'PredictedSd',
     'ResidualRow',
     'SourceBlock',
     'assess',
     'fit',
     'normal_gravity',
+    'predicted_sd',
     'resolve_gravity',
 ]
