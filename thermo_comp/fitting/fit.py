@@ -27,11 +27,12 @@ from .evidence import (
     slow_error,
 )
 from .history import ThermalHistory, thermal_history
+from .ladder import model_spec
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .reduction import ReducedBag, reduce_source
 from .regression import Freedom, Outcome, regress
 from .rests import judge_rests
-from .selection import Candidate, Selector, model_spec
+from .selection import Candidate, Selector
 from .sensors import learn_detector
 from .solution import Solution
 from .sources import FitSource

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import FitError
-from ..functions import CubicSpline, Exponential, TemperatureFunction
-from .model import ModelSpec, polynomial
+from ..functions import Exponential
+from .ladder import E_FOLDS_K, FUNCTION_NAMES, TERM_NAMES, golovach_spec, model_spec
+from .model import ModelSpec
 from .regression import Freedom, Outcome, regress
 from .solution import Solution, predict, regressors
 from .start import ConstantCalibration, starting_solution
@@ -35,14 +35,9 @@ N_FOLDS = 5
 _START_LAGS_S = {1: (600.0,), 2: (250.0, 1500.0)}
 # A model must beat a smaller one by this much to be worth its parameters.
 _TIE = 0.02
-_E_FOLDS_K = (-60.0, -30.0, -15.0, 15.0, 30.0, 60.0)
-_N_SPLINE_KNOTS = 5
 _PULL_SDS = 6.0
 # A candidate that has not settled by then has lags that wander because nothing needs them.
 _MAX_STEPS = 15
-
-FUNCTION_NAMES = ('constant', 'linear', 'quadratic', 'cubic', 'spline', 'exponential')
-TERM_NAMES = ('', 'rate', 'gradient', 'memory1', 'memory2', 'gradient+memory1')
 
 
 @dataclass(frozen=True)
@@ -107,100 +102,6 @@ class Trial:
         """
         total = float(self.fold_counts.sum())
         return float(np.sqrt(self.fold_squares.sum() / total)) if total else np.nan
-
-
-def golovach_spec() -> ModelSpec:
-    """
-    Give the paper's scheme: static linear, dynamic quadratic, told apart by the flag alone.
-
-    """
-    return ModelSpec('golovach', polynomial(1), polynomial(2))
-
-
-def model_spec(name: str, table: WindowTable) -> ModelSpec:
-    """
-    Make a model from its name.
-
-    Parameters
-    ----------
-    name : str
-        ``golovach`` or ``FUNCTION[+TERM...][@dynamic]``: the function one of `FUNCTION_NAMES`,
-        terms ``rate``, ``gradient``, ``memory1``, ``memory2``; ``@dynamic`` keeps the terms out
-        of the static set.
-    table : WindowTable
-        Gives the range for knots.
-
-    Returns
-    -------
-    ModelSpec
-        The model.
-
-    Raises
-    ------
-    FitError
-        If the name is not understood.
-
-    """
-    if name == 'golovach':
-        return golovach_spec()
-    body, _, live = name.partition('@')
-    function, *terms = body.split('+')
-    known = {'rate', 'gradient', 'memory1', 'memory2'}
-    n_memory = sum(term.startswith('memory') for term in terms)
-    if (
-        function not in FUNCTION_NAMES
-        or not known.issuperset(terms)
-        or live not in ('', 'dynamic')
-        or n_memory > 1
-    ):
-        raise FitError(
-            f"model '{name}' is not known: give auto, golovach, or one of "
-            f'{"|".join(FUNCTION_NAMES)}, with +rate, +gradient, +memory1 or +memory2 as wanted'
-        )
-    lags = next((int(term[-1]) for term in terms if term.startswith('memory')), 0)
-    return ModelSpec(
-        name=name,
-        static=function_shape(function, table),
-        gradient='gradient' in terms,
-        rate='rate' in terms,
-        n_lags=lags,
-        live='dynamic' if live else 'both',
-    )
-
-
-def function_shape(name: str, table: WindowTable) -> TemperatureFunction:
-    """
-    Make the shape of a function family over a table's temperatures.
-
-    Parameters
-    ----------
-    name : str
-        One of `FUNCTION_NAMES`.
-    table : WindowTable
-        Gives the range.
-
-    Returns
-    -------
-    TemperatureFunction
-        The shape; an exponential's e-fold is a first guess.
-
-    """
-    orders = {'constant': 0, 'linear': 1, 'quadratic': 2, 'cubic': 3}
-    if name in orders:
-        return polynomial(orders[name])
-    if name == 'exponential':
-        return Exponential(0.0, (0.0,), (_E_FOLDS_K[3],))
-    lower, upper = float(np.min(table.t)), float(np.max(table.t))
-    upper = max(upper, lower + 1.0)
-    knots = np.linspace(lower, upper, _N_SPLINE_KNOTS)
-    # The reference is a knot: the one nearest moves there, or the outermost when it lies outside.
-    nearest = int(np.argmin(np.abs(knots)))
-    if lower < 0.0 < upper:
-        knots[nearest] = 0.0
-        values = knots
-    else:
-        values = np.sort(np.append(knots, 0.0))
-    return CubicSpline(tuple(values.tolist()), (0.0,) * len(values))
 
 
 class Selector:
@@ -355,7 +256,7 @@ class Selector:
 
     def _best_e_fold(self, spec: ModelSpec, like: Solution | None) -> ModelSpec:
         tried = []
-        for e_fold in _E_FOLDS_K:
+        for e_fold in E_FOLDS_K:
             one = replace(spec, static=Exponential(0.0, (0.0,), (e_fold,)))
             start = begin(self._table, one, self._gravity, self._constant, like, self._transient_s)
             held = replace(self._freedom, lags=False, start_memory=False)

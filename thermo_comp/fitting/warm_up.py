@@ -18,8 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..metrics import MICRO_G
+from .ladder import model_spec
 from .regression import Freedom, Outcome
-from .selection import fit_model, model_spec
+from .selection import fit_model
 from .start import ConstantCalibration
 from .table import WindowTable
 from .verdict import Finding

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..fitting import FitResult
+from ..fitting.ladder import golovach_spec
 from ..fitting.model import ModelSpec, polynomial
 from ..fitting.regression import Freedom, regress
-from ..fitting.selection import golovach_spec
 from ..fitting.solution import Solution, correct, regressors
 from ..fitting.start import constant_calibration, position_means, starting_solution
 from ..fitting.table import WindowTable
