@@ -4,6 +4,7 @@
 # make demo   sets up .venv, plays the sample bag over DDS into the node, prints the table
 # make test   sets up .venv, runs the whole test suite
 # make lint   ruff, mypy --strict and the layering test
+# make docs   builds the documentation as a site, in site/
 # make clean  removes .venv and everything made
 
 PYTHON ?= python3
@@ -22,7 +23,7 @@ unexport COLCON_PREFIX_PATH
 unexport LD_LIBRARY_PATH
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test lint clean help
+.PHONY: demo test lint docs clean help
 .DEFAULT_GOAL := help
 
 help:
@@ -39,6 +40,9 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy --strict thermo_comp
 	$(BIN)/python -m pytest test/test_layers.py
+
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir site
 
 clean:
 	rm -rf $(VENV) build install log out site *.egg-info .mypy_cache .ruff_cache .pytest_cache
@@ -71,4 +75,8 @@ $(VENV)/.installed-test: setup.py setup.cfg pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-dev: $(VENV)/.installed-test
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+$(VENV)/.installed-docs: setup.py setup.cfg pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[docs]'
 	@touch $@

@@ -120,13 +120,22 @@ class Survey:
         if self.info.truncated:
             found.append(f'cut off: {self.info.truncated}')
         if self.n == 0:
-            found.append('no accelerometer samples: record accel/counts or imu/uncompensated')
+            found.append(
+                'no accelerometer samples: record accel/counts or imu/uncompensated, or name '
+                'yours with --counts-topic or --imu-topic'
+            )
         if self.board is None:
-            found.append('no board temperature: a thermal fit needs temperature/board')
+            found.append(
+                'no board temperature: a thermal fit needs temperature/board, or name yours with '
+                '--board-topic'
+            )
         else:
             found += self._thermal_findings(self.board)
         if self.case is None:
-            found.append('no case temperature: the regime will follow the slower board sensor')
+            found.append(
+                'no case temperature: the regime will follow the slower board sensor; name yours '
+                'with --case-topic'
+            )
         if self.n and not self.n_still:
             found.append('it never rests for 3 s: the fit works on positions at rest')
         if self.n_backwards:

@@ -64,7 +64,7 @@ def simulate(
     bag's metadata.
 
     Example:
-      thermo_comp simulate --profile chamber --positions 12 -o bags/sim
+      thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
 
     """
     from .. import simulation

@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A user's desk: a folder with every file that an example in a help text or a page names.
+
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT, Cli
+
+NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
+
+
+class Desk:
+    """
+    Prepare files once, and run examples in folders where they lie ready.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the files are made.
+    cli : Cli
+        The command line.
+
+    """
+
+    def __init__(self, folder: Path, cli: Cli) -> None:
+        self._cli = cli
+        self._ready = folder / 'ready'
+        self._folder = folder
+        self._n = 0
+        bags = self._ready / 'bags'
+        bags.mkdir(parents=True)
+        (bags / 'unit42').symlink_to(ROOT / 'bags' / 'fit')
+        (bags / 'fit').symlink_to(ROOT / 'bags' / 'fit')
+        for name in ('bags/held_out.mcap', 'held_out.mcap', 'flight.mcap', 'new.mcap'):
+            (self._ready / name).symlink_to(ROOT / 'bags' / 'held_out.mcap')
+        (self._ready / 'config').symlink_to(ROOT / 'config')
+
+    def _make(self, name: str) -> None:
+        """
+        Make one file, when the first example asks for it.
+
+        """
+        path = self._ready / name
+        if path.exists():
+            return
+        if name in ('unit42.yaml', 'unit.yaml'):
+            fit = ('fit', *sorted((ROOT / 'bags' / 'fit').iterdir()), '--gravity', '9.80665')
+            self._cli(*fit, '-o', path, '-q')
+        elif name == 'autopilot.params':
+            self._make('unit42.yaml')
+            self._cli('export', self._ready / 'unit42.yaml', '--to', 'px4', '-o', path, '-q')
+        elif name in ('chamber.mcap', 'unit42_p01'):
+            # Short: some examples play it as slowly as it was recorded.
+            self._cli('simulate', '--profile', '20 4s', '-o', path, '-q')
+        elif name == 'freezer.mcap':
+            program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
+            self._cli('simulate', *program, '-o', path, '-q')
+        elif name == 'log.csv':
+            rng = np.random.default_rng(3)
+            rows = [
+                f'{1.0 + 0.01 * k:.2f},{x:.4f},{y:.4f},{z:.4f},{25.0 + 1e-4 * k:.3f}'
+                for k, (x, y, z) in enumerate(
+                    np.array([0.2, -0.1, 9.8]) + 0.01 * rng.standard_normal((1000, 3))
+                )
+            ]
+            path.write_text('\n'.join(['t,ax,ay,az,temp', *rows]) + '\n')
+        elif name == 'map.yaml':
+            path.write_text(
+                'stamp: {column: t, unit: s}\n'
+                'accel: {columns: [ax, ay, az], unit: m/s^2, output: imu}\n'
+                'board: {column: temp, unit: degC}\n'
+            )
+        elif name == 'flight.ulg':
+            pytest.importorskip('pyulog', reason='pyulog is not installed: the extra `px4`')
+            from test_convert_ulog import write_two_imus
+
+            write_two_imus(path, np.random.default_rng(4))
+        elif name == 'flight.bin':
+            pytest.importorskip('pymavlink', reason='pymavlink is not installed')
+            from test_convert_dataflash import write_new
+
+            write_new(path, np.random.default_rng(5))
+
+    def run(self, command: str) -> subprocess.CompletedProcess[str]:
+        """
+        Run one example as it is written, in a fresh folder; it must succeed.
+
+        Parameters
+        ----------
+        command : str
+            A line that starts with ``thermo_comp``; wildcards are expanded as a shell does.
+
+        Returns
+        -------
+        subprocess.CompletedProcess
+            With its output.
+
+        """
+        words = shlex.split(command, comments=True)
+        assert words.pop(0) == 'thermo_comp'
+        outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}
+        self._n += 1
+        here = self._folder / f'run{self._n}'
+        (here / 'bags').mkdir(parents=True)
+        for word in words:
+            if '/' not in word and word not in outputs:
+                self._make(word)
+        for path in [*self._ready.iterdir(), *(self._ready / 'bags').iterdir()]:
+            name = path.relative_to(self._ready)
+            if path.name != 'bags' and str(name) not in outputs:
+                (here / name).symlink_to(path)
+        arguments = [
+            one
+            for word in words
+            for one in (
+                sorted(str(path.relative_to(here)) for path in here.glob(word))
+                if '*' in word
+                else [word]
+            )
+        ]
+        if arguments[0] == 'play':
+            pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+        if arguments[0] == 'view':
+            return self._view(arguments, here)
+        return self._cli(*arguments, cwd=here)
+
+    def _view(self, arguments: list[str], here: Path) -> subprocess.CompletedProcess[str]:
+        """
+        Start a command that serves until Ctrl-C, and press Ctrl-C once it says where.
+
+        """
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'thermo_comp', *arguments],
+            cwd=here,
+            env={**os.environ, 'PYTHONPATH': str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=60)
+        assert process.returncode == 0, errors
+        assert 'Traceback' not in errors
+        return subprocess.CompletedProcess(arguments, 0, first + rest, errors)
+
+
+def same_words(got: str, expected: str) -> bool:
+    """
+    Compare two outputs: words exactly, numbers by a third.
+
+    A figure may differ on another processor (last bits) or another day (dates, speed); its order
+    of magnitude may not.
+
+    """
+    if NUMBER.sub('#', got).split() != NUMBER.sub('#', expected).split():
+        return False
+    numbers = zip(NUMBER.findall(got), NUMBER.findall(expected), strict=True)
+    return all(abs(float(a) - float(b)) <= max(abs(float(b)) / 3.0, 5.0) for a, b in numbers)

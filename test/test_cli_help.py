@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a terminal shows can be believed: examples run, JSON parses, quiet is quiet, lines fit.
+
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from conftest import Cli
+from desk_helpers import Desk
+from typer.main import get_command
+
+from thermo_comp.cli.app import app
+
+COMMANDS = get_command(app).commands
+# `demo` runs whole in test_readme and test_cli_demo.
+EXAMPLES = [
+    line.strip()
+    for name, command in COMMANDS.items()
+    if name != 'demo'
+    for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
+]
+# What prints figures: all that only serves a page or plays a bag does not.
+WITH_JSON = [one for one in EXAMPLES if one.split()[1] not in ('view', 'play')]
+
+QUICK = [one for one in EXAMPLES if one.split()[1] in ('info', 'convert', 'export', 'import')]
+
+
+@pytest.fixture(scope='module')
+def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Desk:
+    return Desk(tmp_path_factory.mktemp('desk'), cli)
+
+
+def test_every_command_has_an_example() -> None:
+    with_example = {one.split()[1] for one in EXAMPLES}
+    assert with_example == set(COMMANDS) - {'demo'}
+
+
+@pytest.mark.parametrize('example', EXAMPLES)
+def test_the_example_runs_and_fits_a_pipe(example: str, desk: Desk) -> None:
+    finished = desk.run(example)
+    assert '\x1b' not in finished.stdout + finished.stderr
+    long = [line for line in finished.stdout.splitlines() if len(line) > 80]
+    # Prose is wrapped by the terminal; a table must not be.
+    assert [line for line in long if not line.startswith('- ') and '  ' in line.strip()] == []
+
+
+@pytest.mark.parametrize('example', WITH_JSON)
+def test_json_is_one_object_and_nothing_else(example: str, desk: Desk) -> None:
+    finished = desk.run(f'{example} --json -q')
+    assert finished.stderr == ''
+
+    def no_nan(text: str) -> None:
+        raise AssertionError(f'{text} is not JSON')
+
+    data = json.loads(finished.stdout, parse_constant=no_nan)
+    assert isinstance(data, dict)
+    assert data
+
+
+@pytest.mark.parametrize('example', QUICK)
+def test_quiet_says_nothing(example: str, desk: Desk) -> None:
+    finished = desk.run(f'{example} -q')
+    assert (finished.stdout, finished.stderr) == ('', '')
+
+
+def test_commands_that_print_figures_have_json() -> None:
+    lacking = {
+        name for name, one in COMMANDS.items() if not any('--json' in p.opts for p in one.params)
+    }
+    assert lacking <= {'view', 'play'}
+
+
+def test_every_option_says_what_it_is_for() -> None:
+    bare = [
+        f'{name} {parameter.name}'
+        for name, one in COMMANDS.items()
+        for parameter in one.params
+        if parameter.name != 'help' and not getattr(parameter, 'help', '')
+    ]
+    assert bare == []
+
+
+class TestExchange:
+    def test_what_is_lost_is_said(self, desk: Desk) -> None:
+        written = desk.run('thermo_comp export unit42.yaml --to px4 -o unit.params').stdout
+        assert 'scale over temperature is lost' in written
+        assert 'set it to the device id' in written
+
+    @pytest.mark.parametrize(
+        ('arguments', 'message'),
+        [
+            (('--to', 'px4', '--number', '4'), r'`instance` must be 0\.\.3, got 4'),
+            (('--to', 'ardupilot', '--number', '0'), r'`imu` must be 1\.\.3, got 0'),
+            (('--to', 'px4', '--up', '0', '0', '2'), r'`up` must be a unit vector'),
+            (('--to', 'ardupilot', '--device-id', '7'), r'--device-id is for PX4'),
+            (('--to', 'betaflight'), r'betaflight'),
+        ],
+    )
+    def test_export_s_usage(
+        self, arguments: tuple[str, ...], message: str, root: Path, cli: Cli, tmp_path: Path
+    ) -> None:
+        example = root / 'config' / 'calibration.example.yaml'
+        finished = cli('export', example, *arguments, '-o', tmp_path / 'out', code=2)
+        assert re.search(message, finished.stderr)
+        assert 'export --help' in finished.stderr
+
+    @pytest.mark.parametrize(
+        ('content', 'message'),
+        [
+            ('hello', 'no TC_A* (PX4) or INS_TCAL* (ArduPilot) parameters'),
+            ('TC_A0_X1_0 1\nTC_A1_X1_0 1', 'several sets of parameters [0, 1]: choose one'),
+        ],
+    )
+    def test_import_refuses(self, content: str, message: str, cli: Cli, tmp_path: Path) -> None:
+        (tmp_path / 'file').write_text(content)
+        arguments = ('import', tmp_path / 'file', '--serial', '1', '-o', tmp_path / 'out.yaml')
+        finished = cli(*arguments, code=1)
+        assert message in finished.stderr
+        assert not (tmp_path / 'out.yaml').exists()

@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the pages tell a reader to type works: every command, every snippet, every page in the site.
+
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from conftest import ROOT, Cli
+from desk_helpers import Desk, same_words
+
+PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
+FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
+# README's console blocks run with their output in test_readme; a bag that plays for minutes, and
+# the demo, have tests of their own (test_player, test_cli_demo).
+ELSEWHERE = ('thermo_comp demo', 'thermo_comp play bags/held_out.mcap --rate 20')
+
+
+def commands() -> list[tuple[str, str, str]]:
+    """
+    Return page, command and the output shown for it (empty for none).
+
+    """
+    found = []
+    for page in PAGES:
+        for kind, text in FENCE.findall(page.read_text(encoding='utf-8')):
+            if (page.name == 'README.md' and kind == 'console') or kind not in ('console', 'sh'):
+                continue
+            joined = re.sub(r'\\\n\s*', '', text)
+            prompt = r'^\$ ' if kind == 'console' else r'^'
+            for part in re.split(prompt, joined, flags=re.MULTILINE):
+                line, _, output = part.partition('\n')
+                command = re.sub(r'\s+#.*', '', line).strip()
+                if command.startswith('thermo_comp ') and command not in ELSEWHERE:
+                    found.append((page.name, command, output if kind == 'console' else ''))
+    return found
+
+
+COMMANDS = commands()
+
+
+@pytest.fixture(scope='module')
+def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Desk:
+    return Desk(tmp_path_factory.mktemp('desk'), cli)
+
+
+@pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
+def test_the_command_does_what_the_page_says(
+    page: str, command: str, output: str, desk: Desk
+) -> None:
+    if '--install-completion' in command:
+        pytest.skip('writes into the home of who runs it')
+    finished = desk.run(command)
+    if output.strip():
+        assert same_words(finished.stdout, output), finished.stdout
+
+
+def test_there_are_commands_to_run() -> None:
+    assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
+
+
+def test_completion_is_a_script_that_bash_takes(root: Path) -> None:
+    bash = shutil.which('bash')
+    if bash is None:
+        pytest.skip('no bash')
+    # The program looks which shell it was started by; the `:` keeps that shell waiting for it.
+    finished = subprocess.run(
+        [bash, '-c', f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (finished.returncode, finished.stderr) == (0, '')
+    assert 'thermo_comp' in finished.stdout
+
+
+def test_every_page_is_in_the_site_s_menu() -> None:
+    nav = yaml.safe_load((ROOT / 'mkdocs.yml').read_text())['nav']
+    listed = [one if isinstance(one, str) else next(iter(one.values())) for one in nav]
+    assert sorted(listed) == sorted(page.name for page in PAGES[1:])
+
+
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip('material', reason='mkdocs-material is not installed: the extra `docs`')
+    finished = subprocess.run(
+        [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site'],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert (tmp_path / 'site' / 'index.html').is_file()
+
+
+def test_imu_calib_s_matrix_is_taken_apart_as_shown() -> None:
+    text = (ROOT / 'docs' / 'integration.md').read_text()
+    (snippet,) = (body for kind, body in FENCE.findall(text) if kind == 'python')
+    names: dict[str, np.ndarray] = {}
+    exec(snippet, names)  # noqa: S102 - our own page
+    matrix = names['misalignment']
+    np.testing.assert_allclose(np.diag(matrix), 1.0)
+    np.testing.assert_array_less(np.abs(np.triu(matrix, 1)), 1e-12)
+    rotation = names['rotation']
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) > 0.0
+    # The same reading through their formula, and through ours with the rotation of tf behind it.
+    raw = np.array([3.0, -4.0, 8.0])
+    theirs = names['SM'] @ raw - names['bias']
+    ours = rotation @ matrix @ ((raw - names['raw_bias']) / names['scale_factor'])
+    np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+def test_refusals_are_quoted_as_they_are_said() -> None:
+    text = (ROOT / 'docs' / 'recording.md').read_text()
+    quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
+    assert len(quoted) > 10
+    sources = ''.join(path.read_text() for path in (ROOT / 'thermo_comp').rglob('*.py'))
+    # Adjacent literals are one sentence to a reader.
+    spoken = re.sub(r"'\s+f?'", '', sources)
+    for sentence in quoted:
+        # Figures and what follows them come at run time.
+        words = max(re.split(r'\d+(?:\.\d+)?|\.\.\.', sentence), key=len).strip(' ,;')
+        assert words in spoken, sentence
