@@ -253,3 +253,14 @@ def test_a_slow_ramp_is_not_to_be_missed(rng: np.random.Generator) -> None:
     # The ramp is 0.15 K/min: seven tenths of it.
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5
+
+
+@pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
+def test_a_coarse_sensor_rests_too(step: float, rng: np.random.Generator) -> None:
+    # An axis that reads one number for long, and toggles between two for long, is still all the
+    # time, whatever its step; a tenth of the cells has no variance at all.
+    slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
+    accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
+    bag = reduced([block(np.round(accel) * step)], full_scale=None)
+    assert len(bag.intervals) == 1
+    assert bag.n_still_cells == bag.n_cells

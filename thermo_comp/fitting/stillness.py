@@ -27,6 +27,9 @@ BoolArray = npt.NDArray[np.bool_]
 _VARIANCE_RATIO = 4.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
+_QUANTUM_SAMPLES = 20000
+# Noise below this many quanta leaves a sensor on one number for long.
+_STUCK = 0.3
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,8 @@ class Cells:
         Samples at the full scale.
     is_integer : bool
         Whether all samples are whole numbers (counts).
+    quantum : ndarray, shape (3,)
+        Step of the samples, 0 when they have none to speak of.
 
     """
 
@@ -67,6 +72,7 @@ class Cells:
     n_dropped: int
     n_saturated: int
     is_integer: bool
+    quantum: Array
 
 
 class CellAccumulator:
@@ -96,6 +102,7 @@ class CellAccumulator:
         self._n_dropped = 0
         self._n_saturated = 0
         self._is_integer = True
+        self._quantum = np.zeros(3)
         self._open = np.zeros((0, 8))
         self._open_id = -1
 
@@ -164,6 +171,7 @@ class CellAccumulator:
             n_dropped=self._n_dropped,
             n_saturated=self._n_saturated,
             is_integer=self._is_integer,
+            quantum=self._quantum,
         )
 
     def _begin(self, stamp_ns: IntArray, samples: Array) -> None:
@@ -171,6 +179,7 @@ class CellAccumulator:
         self._cell_ns = int(max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
+        self._quantum = _quantum_of(samples[:_QUANTUM_SAMPLES])
 
     def _accumulate(self, stamp_ns: IntArray, samples: Array) -> None:
         since = stamp_ns - self._start_ns
@@ -194,6 +203,24 @@ class CellAccumulator:
         if len(ids) > 1:
             self._ids.append(ids[:-1])
             self._sums.append(sums[:-1].copy())
+
+
+def _quantum_of(samples: Array) -> Array:
+    """
+    Step of each axis, from the changes between samples; 0 where they are all different.
+
+    """
+    result = np.zeros(3)
+    for axis in range(3):
+        changes = np.abs(np.diff(samples[:, axis]))
+        changes = np.sort(changes[changes > 0.0])
+        if not len(changes):
+            continue
+        # Changes of one step differ by rounding only; without a step no two are alike.
+        n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
+        if n_levels < 0.2 * len(changes) or n_levels == 1:
+            result[axis] = changes[0]
+    return result
 
 
 def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
@@ -238,7 +265,9 @@ def _is_quiet(cells: Cells, full: BoolArray) -> BoolArray:
     Compare each cell's variance with the quietest tenth of the bag.
 
     """
-    floor = 0.25 if cells.is_integer else 0.0
+    # A sensor that reads the same number for long is no measure of its noise: toggling between two
+    # neighbours has a variance of a quarter step squared.
+    floor = 0.25 * cells.quantum**2
     level = np.quantile(cells.variance[full], 0.1, axis=0)
     # A tenth-percentile of a chi-square variance lies a little below its mean; 1.3 covers it
     # for cells of 32 samples.
@@ -257,6 +286,10 @@ def _is_joined(cells: Cells, quiet: BoolArray) -> BoolArray:
         return np.zeros(len(step), dtype=bool)
     spread = 1.4826 * np.median(np.abs(step[both]), axis=0)
     noise = np.sqrt(2.0 * np.median(cells.variance[quiet] / cells.count[quiet, None], axis=0))
-    limit = _STEP_SDS * np.maximum(spread, noise)
+    # One that mostly reads the same number goes from one to the next in a step that is no knock.
+    is_stuck = np.median(cells.variance[quiet], axis=0) < (_STUCK * cells.quantum) ** 2
+    limit = np.maximum(
+        _STEP_SDS * np.maximum(spread, noise), np.where(is_stuck, 1.1 * cells.quantum, 0.0)
+    )
     joined: BoolArray = both & (np.abs(step) <= limit).all(axis=1)
     return joined
