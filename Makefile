@@ -42,7 +42,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest test/test_layers.py
 
 docs: $(VENV)/.installed-docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir site
 
 clean:
 	rm -rf $(VENV) build install log out site *.egg-info .mypy_cache .ruff_cache .pytest_cache
