@@ -281,7 +281,9 @@ class Selector:
             return 0.0, 0.0
         unseen = ~np.isin(judged.position, training.position)
         if unseen.any():
-            only_attitudes = Freedom(False, False, False, True, False)
+            only_attitudes = Freedom(
+                misalignment=False, lags=False, start_memory=False, axes=False, transient=False
+            )
             trained = regress(
                 judged.select(unseen), trained, only_attitudes, max_rounds=1
             ).solution
