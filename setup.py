@@ -11,13 +11,13 @@ VERSION = re.search(
     r"^__version__ = '([^']+)'$", (ROOT / NAME / '__init__.py').read_text(), re.MULTILINE
 ).group(1)
 
-# On Ubuntu 24.04 apt already satisfies every floor but those of pydantic, rosbags and mcap.
+# On Ubuntu 24.04 apt satisfies every floor but those of pydantic, typer, rosbags and mcap.
 INSTALL = [
     'numpy>=1.26',
-    'pydantic>=2.6',
+    'pydantic>=2.10',
     'PyYAML>=6.0',
     'scipy>=1.11',
-    'typer>=0.9',
+    'typer>=0.20',
     'rich>=13.7',
     'rosbags>=0.11',
     'mcap>=1.1',

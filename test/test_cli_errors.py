@@ -45,7 +45,8 @@ def bag(
             if wanted:
                 writer.write_temperature(topic, stamps[::10], np.full(len(stamps[::10]), 20.0))
         if counts:
-            writer.write_counts(TOPICS.counts, stamps, np.tile(3000.0 * np.array(up), (n, 1)))
+            noise = np.random.default_rng(2).integers(-1, 2, (n, 3))
+            writer.write_counts(TOPICS.counts, stamps, 3000.0 * np.array(up) + noise)
     return path
 
 
@@ -265,6 +266,8 @@ class TestEvaluations:
         path = tmp_path / 'bag'
         stamps = START_NS + np.arange(3000) * 100_000_000
         level = np.tile([0.0, 0.0, 300.0 * 9.80665], (3000, 1))
+        # The output of a sensor that lives is never constant.
+        level[:, :2] += np.random.default_rng(2).integers(-1, 2, (3000, 2))
         with BagWriter(path) as writer:
             writer.write_temperature(TOPICS.board, stamps[::10], np.full(300, 20.0))
             writer.write_counts(TOPICS.counts, stamps, level)

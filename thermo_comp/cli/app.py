@@ -39,7 +39,6 @@ _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
 app = typer.Typer(
     name='thermo_comp',
     help='Thermal-drift compensation of a three-axis accelerometer.',
-    no_args_is_help=True,
     add_completion=True,
     rich_markup_mode='rich',
     pretty_exceptions_enable=False,
@@ -115,6 +114,9 @@ def run(arguments: list[str]) -> int:
 
     """
     arguments, ros_arguments = split_ros_arguments(arguments)
+    if not arguments:
+        app(['--help'], prog_name='thermo_comp', standalone_mode=False)
+        return 2
     try:
         code = app(arguments, prog_name='thermo_comp', standalone_mode=False, obj=ros_arguments)
         sys.stdout.flush()
