@@ -164,8 +164,11 @@ class CompensationNode:
         try:
             self._samples, self._converter = self._open_samples(self._config)
             self._temperatures: list[tuple[RawSubscription, Callable[[int, float], None]]] = [
-                (subscribe(Temperature, 'temperature/board', TEMPERATURE_QOS), self._push_board),
-                (subscribe(Temperature, 'temperature/case', TEMPERATURE_QOS), self._push_case),
+                (subscribe(Temperature, topic, TEMPERATURE_QOS, is_hot=False), push)
+                for topic, push in (
+                    ('temperature/board', self._push_board),
+                    ('temperature/case', self._push_case),
+                )
             ]
             self._imu, self._flag, self._diagnostics = (
                 self.node.create_publisher(

@@ -118,12 +118,12 @@ class RawPublisher:
 @dataclass(frozen=True, slots=True)
 class _Entities:
     """
-    A wait set, and what goes into it: the raw subscriptions alone, or everything.
+    A wait set, and what goes into it: the hot subscriptions alone, or everything.
 
     """
 
     wait_set: Any
-    fill_raw: list[tuple[Callable[[Any], Any], Any]]
+    fill_hot: list[tuple[Callable[[Any], Any], Any]]
     fill: list[tuple[Callable[[Any], Any], Any]]
     other_subscriptions: range
 
@@ -162,11 +162,14 @@ class WaitLoop:
         self._signal_guard = SignalHandlerGuardCondition(context=node.context)
         self._reserved = _Reserved()
         self._raw: list[RawSubscription] = []
+        self._hot: list[RawSubscription] = []
         self._is_stopping = False
         self._is_stale = True
         node.context.on_shutdown(self.stop)
 
-    def subscribe(self, message_type: Any, topic: str, qos: QoSProfile) -> RawSubscription:
+    def subscribe(
+        self, message_type: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
+    ) -> RawSubscription:
         """
         Subscribe to a topic in serialized form, QoS overridable through parameters.
 
@@ -178,6 +181,9 @@ class WaitLoop:
             Relative topic name.
         qos : rclpy.qos.QoSProfile
             The default quality of service.
+        is_hot : bool, optional
+            Whether each message wakes the loop; otherwise it may be `OTHERS_PERIOD_NS` late while
+            others flow.
 
         Returns
         -------
@@ -196,6 +202,8 @@ class WaitLoop:
         )
         raw = RawSubscription(subscription)
         self._raw.append(raw)
+        if is_hot:
+            self._hot.append(raw)
         self._is_stale = True
         return raw
 
@@ -210,6 +218,8 @@ class WaitLoop:
 
         """
         self._raw.remove(raw)
+        if raw in self._hot:
+            self._hot.remove(raw)
         self._is_stale = True
         self._node.destroy_subscription(raw.subscription)
 
@@ -271,13 +281,14 @@ class WaitLoop:
             0,
             self._node.context.handle,
         )
+        hot = [(wait_set.add_subscription, one.subscription.handle) for one in self._hot]
         fill = [(wait_set.add_subscription, one.handle) for one in (*raw, *others)]
         fill += [(wait_set.add_guard_condition, one.handle) for one in guards]
         fill += [(wait_set.add_timer, one.handle) for one in timers]
         fill += [(wait_set.add_client, one.handle) for one in clients]
         fill += [(wait_set.add_service, one.handle) for one in services]
         self._is_stale = False
-        return _Entities(wait_set, fill[: len(raw)], fill, range(len(raw), len(raw) + len(others)))
+        return _Entities(wait_set, hot, fill, range(len(raw), len(raw) + len(others)))
 
     def _serve(self, on_data: Callable[[], None], entities: _Entities) -> None:
         """
@@ -289,8 +300,8 @@ class WaitLoop:
         while not (self._is_stopping or self._is_stale):
             clear()
             left_ns = others_due_ns - now_ns()
-            if left_ns > 0:
-                for add, handle in entities.fill_raw:
+            if left_ns > 0 and entities.fill_hot:
+                for add, handle in entities.fill_hot:
                     add(handle)
                 wait(left_ns)
                 on_data()
