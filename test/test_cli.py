@@ -22,7 +22,7 @@ from conftest import Cli
 
 from thermo_comp.calibration_file import save_calibration
 from thermo_comp.cli import output
-from thermo_comp.cli.app import app
+from thermo_comp.cli.app import app, split_ros_arguments
 from thermo_comp.recording import inspect_recording, read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -163,6 +163,42 @@ def on_a_terminal(*arguments: str, no_color: bool = False) -> str:
     os.close(leader)
     assert process.wait(timeout=60) == 0
     return shown.decode()
+
+
+class TestPlay:
+    @pytest.fixture(autouse=True)
+    def needs_ros(self) -> None:
+        pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+    def test_sends_everything_under_the_names_asked_for(self, bag: Path, cli: Cli) -> None:
+        arguments = ('play', bag, '--rate', '0', '--wait', '0', '--json')
+        finished = cli(*arguments, '--ros-args', '-r', '__ns:=/here')
+        data = json.loads(finished.stdout)
+        info = inspect_recording(bag)
+        assert data['messages'] == {
+            f'/here{name}': count for name, (_, count) in info.topics.items()
+        }
+        assert data['unheard'] == sorted(data['unheard'])
+        assert 'nobody listened to /here/accel/counts' in finished.stderr
+
+    def test_ros_arguments_end_where_ros_says(self) -> None:
+        words = ['play', 'a', '--ros-args', '-r', 'x:=y', '--', '--loop']
+        assert split_ros_arguments(words) == (['play', 'a', '--loop'], ['-r', 'x:=y'])
+        assert split_ros_arguments(['info', '--', 'a']) == (['info', '--', 'a'], [])
+
+
+class TestReport:
+    def test_of_a_bag_and_of_nothing(
+        self, bag: Path, unit: Path, cli: Cli, tmp_path: Path
+    ) -> None:
+        page = tmp_path / 'page.html'
+        arguments = ('report', bag, '-c', unit, '--serial', '', '-o', page, '--json')
+        data = json.loads(cli(*arguments, code=None).stdout)
+        assert data['verdict']['level'] in ('good', 'reserved', 'poor', 'open')
+        assert page.read_text().startswith('<!DOCTYPE html>')
+        assert 'exists already' in cli(*arguments, code=1).stderr
+        said = cli('report', '-o', tmp_path / 'other.html', code=2).stderr
+        assert 'give bags, a calibration, or both' in said
 
 
 class TestSimulate:
