@@ -10,7 +10,8 @@ temperatures at 10 Hz, a sink process receives the Imu messages, and between the
 node, with everything on, or the naive relay: an rclpy node that copies Vector3Stamped to Imu in a
 callback. The CPU time is that of the whole relay process, all its threads, from the first sample
 to the last; the latency runs from the source's publish call to the sink's take. The figures of
-interest are the ratios; absolute ones depend on the machine and on what else it does.
+interest are the ratios; absolute ones depend on the machine and on what else it does. At the last
+rate the node is measured once more while its `calibration_file` is set twice a second.
 
 """
 
@@ -21,13 +22,14 @@ import json
 import os
 import platform
 import select
+import statistics
 import struct
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,8 @@ RELIABILITIES = ('best_effort', 'reliable')
 DEPTH = 2000
 #: The sink calls it a day when nothing came for this long.
 SILENCE_S = 2.0
+#: The first sample may take this long.
+PATIENCE_S = 30.0
 
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 COUNTS = struct.Struct('<4siII7s5x3d')
@@ -56,32 +60,50 @@ def main() -> None:
         return
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    results = []
     print(_machine(), flush=True)
-    for rate in arguments.rates:
-        for reliability in RELIABILITIES:
-            naive, node = (
-                _measure(relay, rate, reliability, arguments.seconds)
-                for relay in ('naive', 'node')
-            )
-            _print_row(naive, node)
-            results += [naive, node]
-    document = {'machine': _machine(), 'seconds': arguments.seconds, 'results': results}
+    cases: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for rate in arguments.rates:
+            calibration = _calibration_for(rate, Path(folder))
+            for reliability in RELIABILITIES:
+                options = ['--rate', str(rate), '--reliability', reliability]
+                options += ['--seconds', str(arguments.seconds), '--calibration', calibration]
+                runs: dict[str, list[dict[str, Any]]] = {'naive': [], 'node': []}
+                for _ in range(arguments.repeats):
+                    for relay, done in runs.items():
+                        done.append(_measure(relay, rate, arguments.seconds, options))
+                naive, node = (_summary(done) for done in runs.values())
+                case = {'rate': rate, 'reliability': reliability, 'naive': naive, 'node': node}
+                case['cpu_ratio'] = node['cpu_us'] / naive['cpu_us']
+                _print_row(case)
+                cases.append(case)
+        reload = _measure('node', rate, arguments.seconds, options, reloads=True)
+        _print_reload(rate, reload)
+    document = {
+        'machine': _machine(),
+        'seconds': arguments.seconds,
+        'repeats': arguments.repeats,
+        'cases': cases,
+        'reload': {'rate': rate, **reload},
+    }
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(document, indent=1), encoding='utf-8')
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
-    parser.add_argument('--quick', action='store_true', help='3 s per case, three rates')
-    parser.add_argument('--seconds', type=float, help='length of each case (default 20)')
+    parser.add_argument('--quick', action='store_true', help='3 s, once, three rates')
+    parser.add_argument('--seconds', type=float, help='length of a run (default 10)')
+    parser.add_argument('--repeats', type=int, help='runs of each case (default 3)')
     parser.add_argument('--rates', type=int, nargs='+', help=f'default {RATES}')
     parser.add_argument('--json', help='write the figures to this file')
     parser.add_argument('--role', choices=tuple(_ROLES), help=argparse.SUPPRESS)
     parser.add_argument('--rate', type=int, help=argparse.SUPPRESS)
     parser.add_argument('--reliability', choices=RELIABILITIES, help=argparse.SUPPRESS)
+    parser.add_argument('--calibration', help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    arguments.seconds = arguments.seconds or (3.0 if arguments.quick else 20.0)
+    arguments.seconds = arguments.seconds or (3.0 if arguments.quick else 10.0)
+    arguments.repeats = arguments.repeats or (1 if arguments.quick else 3)
     arguments.rates = arguments.rates or ((400, 2000, 10000) if arguments.quick else RATES)
     return arguments
 
@@ -89,36 +111,72 @@ def _arguments() -> argparse.Namespace:
 # --- the parent ----------------------------------------------------------------------------------
 
 
-def _measure(relay: str, rate: int, reliability: str, seconds: float) -> dict[str, Any]:
+def _calibration_for(rate: int, folder: Path) -> str:
     """
-    Run one case: source, relay and sink as processes; return its figures.
+    Write the example's calibration for a unit of this rate.
 
     """
-    options = ['--rate', str(rate), '--reliability', reliability, '--seconds', str(seconds)]
-    with (
-        _process(relay, options) as middle,
-        _process('sink', options) as sink,
-        _process('source', options) as source,
-    ):
-        assert source.stdin
+    from dataclasses import replace
+
+    from thermo_comp.calibration_file import load_calibration, save_calibration
+
+    calibration = load_calibration(CALIBRATION)
+    unit = replace(calibration.unit, cycle_time_s=1.0 / rate)
+    path = folder / f'unit_{rate}.yaml'
+    save_calibration(replace(calibration, unit=unit), path)
+    return str(path)
+
+
+def _measure(
+    relay: str, rate: int, seconds: float, options: list[str], *, reloads: bool = False
+) -> dict[str, Any]:
+    """
+    Run source, relay and sink as processes once; return the figures.
+
+    """
+    with ExitStack() as stack:
+        middle, sink, source = (
+            stack.enter_context(_process(role, options)) for role in (relay, 'sink', 'source')
+        )
         _expect(sink, 'ready')
-        source.stdin.write('go\n')
-        source.stdin.flush()
+        reloader = stack.enter_context(_process('reloader', options)) if reloads else None
+        if reloader:
+            _expect(reloader, 'ready')
+        _say(source, 'go')
         _expect(source, 'start')
         before = _cpu_time(middle.pid)
         _expect(source, 'end')
         received = json.loads(_line(sink))
         cpu = _cpu_time(middle.pid) - before
+        if reloader:
+            _say(reloader, 'enough')
+            received['reload_ms'] = json.loads(_line(reloader))
     n_sent = round(rate * seconds)
+    n_received = received.pop('n')
     return {
-        'relay': relay,
-        'rate': rate,
-        'reliability': reliability,
         'n_sent': n_sent,
-        'n_lost': n_sent - received['n'],
-        'cpu_us': cpu / received['n'] * 1e6,
-        **{key: received[key] for key in ('p50_ms', 'p99_ms', 'p999_ms')},
+        'n_lost': n_sent - n_received,
+        'cpu_us': cpu / n_received * 1e6,
+        **received,
     }
+
+
+def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """
+    Sum up the loss; take the least CPU time, to which other load only adds, and median latencies.
+
+    """
+    summary = {name: sum(run[name] for run in runs) for name in ('n_sent', 'n_lost')}
+    summary['cpu_us'] = min(run['cpu_us'] for run in runs)
+    for name in ('p50_ms', 'p99_ms', 'p999_ms'):
+        summary[name] = statistics.median(run[name] for run in runs)
+    return summary
+
+
+def _say(process: subprocess.Popen[str], word: str) -> None:
+    assert process.stdin
+    process.stdin.write(word + '\n')
+    process.stdin.flush()
 
 
 def _line(process: subprocess.Popen[str]) -> str:
@@ -162,16 +220,26 @@ def _cpu_time(pid: int) -> float:
     return time.clock_gettime((~pid << 3) | 2)
 
 
-def _print_row(naive: dict[str, Any], node: dict[str, Any]) -> None:
+def _print_row(case: dict[str, Any]) -> None:
+    naive, node = case['naive'], case['node']
+    latencies = [
+        '/'.join(f'{relay[key]:.2f}' for key in ('p50_ms', 'p99_ms', 'p999_ms'))
+        for relay in (node, naive)
+    ]
     print(
-        f'{node["rate"]:6d} Hz {node["reliability"]:11s} CPU/sample {node["cpu_us"]:6.1f} us = '
-        f'{node["cpu_us"] / naive["cpu_us"]:.3f} x naive ({naive["cpu_us"]:6.1f})   '
-        f'lost {node["n_lost"]} ({naive["n_lost"]})   p50/p99/p99.9 '
-        + '/'.join(f'{node[key]:.2f}' for key in ('p50_ms', 'p99_ms', 'p999_ms'))
-        + ' ms ('
-        + '/'.join(f'{naive[key]:.2f}' for key in ('p50_ms', 'p99_ms', 'p999_ms'))
-        + ')',
+        f'{case["rate"]:6d} Hz {case["reliability"]:11s} CPU/sample {node["cpu_us"]:6.1f} us = '
+        f'{case["cpu_ratio"]:.3f} x naive ({naive["cpu_us"]:6.1f})   '
+        f'lost {node["n_lost"]} ({naive["n_lost"]})   '
+        f'p50/p99/p99.9 {latencies[0]} ms ({latencies[1]})',
         flush=True,
+    )
+
+
+def _print_reload(rate: int, run: dict[str, Any]) -> None:
+    times = run['reload_ms']
+    print(
+        f'{rate:6d} Hz with {len(times)} reloads: answered in {statistics.median(times):.1f} ms '
+        f'(median), {max(times):.1f} ms (worst); lost {run["n_lost"]}; p99 {run["p99_ms"]:.2f} ms'
     )
 
 
@@ -219,9 +287,11 @@ def _source(arguments: argparse.Namespace) -> None:
         for publisher in temperatures:
             publisher.publish(serialize_message(reading))
 
-    def publish(frame: bytes) -> None:
+    def publish(index: int, frame: bytes) -> None:
         sec, nanosec = divmod(time.monotonic_ns(), 1_000_000_000)
-        counts.publish(COUNTS.pack(ENCAPSULATION, sec, nanosec, 7, frame, 5.0, -3.0, 2940.0))
+        # A unit that stands, with a count or two of noise: anything else the node would doubt.
+        x, y, z = 5.0 + index % 3, -3.0 + index % 2, 2950.0 + index % 5
+        counts.publish(COUNTS.pack(ENCAPSULATION, sec, nanosec, 7, frame, x, y, z))
 
     def run(n: int, frame: bytes, until: Callable[[], bool]) -> None:
         period, tenth = 1e9 / arguments.rate, max(1, arguments.rate // 10)
@@ -232,7 +302,7 @@ def _source(arguments: argparse.Namespace) -> None:
             for index in range(n_sent, due):
                 if index % tenth == 0:
                     publish_temperatures()
-                publish(frame)
+                publish(index, frame)
             n_sent = due
             wait = start + n_sent * period - time.monotonic_ns()
             if wait > 0:
@@ -265,7 +335,7 @@ def _sink(arguments: argparse.Namespace) -> None:
     stamp = struct.Struct('<iI')
     latencies: list[int] = []
     n_expected = round(arguments.rate * arguments.seconds)
-    last = 0.0
+    last = time.monotonic() + PATIENCE_S
     is_ready = False
 
     def on_data() -> None:
@@ -286,11 +356,13 @@ def _sink(arguments: argparse.Namespace) -> None:
             loop.stop()
 
     def check_silence() -> None:
-        if latencies and time.monotonic() - last > SILENCE_S:
+        if time.monotonic() - last > SILENCE_S:
             loop.stop()
 
     node.create_timer(0.5, check_silence)
     loop.run(on_data)
+    if not latencies:
+        sys.exit('nothing came out of the relay')
     percentiles = np.percentile(latencies, (50, 99, 99.9)) * 1e-6
     figures = dict(zip(('p50_ms', 'p99_ms', 'p999_ms'), percentiles, strict=True))
     print(json.dumps({'n': len(latencies), **figures}), flush=True)
@@ -325,28 +397,52 @@ def _naive(arguments: argparse.Namespace) -> None:
 
 def _node(arguments: argparse.Namespace) -> None:
     """
-    Run the real node, with a calibration for this rate.
+    Run the real node.
 
     """
-    from dataclasses import replace
-
-    from thermo_comp.calibration_file import load_calibration, save_calibration
     from thermo_comp.ros.node import main as run_node
 
-    calibration = load_calibration(CALIBRATION)
-    unit = replace(calibration.unit, cycle_time_s=1.0 / arguments.rate)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / 'unit.yaml'
-        save_calibration(replace(calibration, unit=unit), path)
-        overrides = [
-            f'calibration_file:={path}',
-            f'qos_overrides./accel/counts.subscription.reliability:={arguments.reliability}',
-        ]
-        command = [argument for override in overrides for argument in ('-p', override)]
-        run_node(['thermo_comp_node', '--ros-args', '--log-level', 'WARN', *command])
+    overrides = [
+        f'calibration_file:={arguments.calibration}',
+        f'qos_overrides./accel/counts.subscription.reliability:={arguments.reliability}',
+    ]
+    command = [argument for override in overrides for argument in ('-p', override)]
+    run_node(['thermo_comp_node', '--ros-args', '--log-level', 'FATAL', *command])
 
 
-_ROLES = {'source': _source, 'sink': _sink, 'naive': _naive, 'node': _node}
+def _reloader(arguments: argparse.Namespace) -> None:
+    """
+    Set `calibration_file` again and again; print how long each answer took.
+
+    """
+    import rclpy
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+
+    rclpy.init()
+    node = rclpy.create_node('reloader')
+    client = node.create_client(SetParameters, 'thermo_comp/set_parameters')
+    client.wait_for_service()
+    value = Parameter('calibration_file', value=arguments.calibration).to_parameter_msg()
+    times: list[float] = []
+    print('ready', flush=True)
+    while not select.select([sys.stdin], [], [], 0.5)[0]:
+        start = time.monotonic()
+        future = client.call_async(SetParameters.Request(parameters=[value]))
+        rclpy.spin_until_future_complete(node, future, timeout_sec=10.0)
+        assert future.result().results[0].successful
+        times.append((time.monotonic() - start) * 1e3)
+    print(json.dumps(times), flush=True)
+    sys.stdin.read()
+
+
+_ROLES = {
+    'source': _source,
+    'sink': _sink,
+    'naive': _naive,
+    'node': _node,
+    'reloader': _reloader,
+}
 
 if __name__ == '__main__':
     main()
