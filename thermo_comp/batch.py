@@ -12,18 +12,16 @@ the operations of `Compensator.process` in their order.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from .blocks import AccelBlock, CompensatedBlock, Floats, Stamps
 from .sample_guard import Mask
 
 if TYPE_CHECKING:
     from .compensator import Compensator
-
-Floats = npt.NDArray[np.float64]
-Stamps = npt.NDArray[np.int64]
 
 #: Longest time over which bias and scale are taken as linear in time.
 SEGMENT_NS = 1_000_000_000
@@ -31,87 +29,6 @@ SEGMENT_NS = 1_000_000_000
 TIME_JUMP_NS = 1_000_000_000
 #: Samples corrected at a time, so that the columns in work stay in the cache.
 _CHUNK = 16384
-
-
-class AccelBlock(Protocol):
-    """
-    Columns of a run of messages in file order.
-
-    `board_after[k]` and `case_after[k]` say how many of the block's samples come before reading k.
-
-    """
-
-    @property
-    def accel_stamp_ns(self) -> Stamps:
-        """
-        Stamps of the samples, shape (n,).
-
-        """
-
-    @property
-    def accel(self) -> Floats:
-        """
-        Samples in the calibration's input unit, shape (n, 3).
-
-        """
-
-    @property
-    def board_stamp_ns(self) -> Stamps:
-        """
-        Stamps of the board readings, shape (m,).
-
-        """
-
-    @property
-    def board(self) -> Floats:
-        """
-        Board readings [degC], shape (m,).
-
-        """
-
-    @property
-    def board_after(self) -> Stamps:
-        """
-        Samples before each board reading, shape (m,).
-
-        """
-
-    @property
-    def case_stamp_ns(self) -> Stamps:
-        """
-        Stamps of the case readings, shape (k,).
-
-        """
-
-    @property
-    def case(self) -> Floats:
-        """
-        Case readings [degC], shape (k,).
-
-        """
-
-    @property
-    def case_after(self) -> Stamps:
-        """
-        Samples before each case reading, shape (k,).
-
-        """
-
-
-@dataclass(frozen=True)
-class CompensatedBlock:
-    """
-    The published samples of a block.
-
-    """
-
-    #: Which samples of the block these are, shape (n,).
-    index: npt.NDArray[np.int64]
-    stamp_ns: Stamps
-    #: [m/s^2], shape (n, 3).
-    specific_force: Floats
-    #: Row-major 3x3 [m^2/s^4], shape (n, 9).
-    covariance: Floats
 
 
 @dataclass(slots=True)

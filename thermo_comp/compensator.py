@@ -20,32 +20,24 @@ per sample, and a batch comes to the same verdicts.
 
 from __future__ import annotations
 
-import heapq
 import math
-from dataclasses import replace
 
-from .batch import SEGMENT_NS, TIME_JUMP_NS, AccelBlock, CompensatedBlock, process_block
+from .batch import SEGMENT_NS, TIME_JUMP_NS, process_block
+from .blocks import AccelBlock, CompensatedBlock
 from .calibration import Calibration
 from .correction import Correction
 from .health import GravityMonitor
+from .reading_queue import ReadingQueue
 from .regime import Regime
 from .sample_guard import RateWatch, StuckWatch
+from .snapshot import snapshot
 from .status import CompensatorConfig, CompensatorStatus, Counters
 from .thermal import ThermalConfig, ThermalTracker
-
-#: The board temperature is called stale beyond this many of its usual intervals.
-STALE_INTERVALS = 5.0
-#: ... but never sooner than this [s].
-SHORTEST_STALE_S = 0.5
-
-#: Readings that wait for samples: more than this means that their clock is not the samples'.
-PENDING_LIMIT = 4096
 
 #: Samples this much faster than calibrated, relative, still have the calibrated noise.
 RATE_TOLERANCE = 0.1
 
-#: Later than any stamp, earlier than any stamp.
-_NEVER_NS = 1 << 62
+#: Earlier than any stamp.
 _EVER_NS = -(1 << 62)
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
@@ -68,8 +60,7 @@ class Compensator:
     def __init__(self, calibration: Calibration, config: CompensatorConfig | None = None) -> None:
         self.config = config or CompensatorConfig()
         self.counters = Counters()
-        self._pending: list[tuple[int, int, int, float]] = []
-        self._n_pushed = 0
+        self._queue = ReadingQueue()
         self._flags: list[tuple[int, bool]] = []
         self._n_applied = 0
         self._segment_key: tuple[int, int] | None = None
@@ -127,13 +118,10 @@ class Compensator:
         self._push(stamp_ns, 1, celsius)
 
     def _push(self, stamp_ns: int, kind: int, celsius: float) -> None:
-        if len(self._pending) >= PENDING_LIMIT:
+        if self._queue.push(stamp_ns, kind, celsius):
+            self._event_ns = min(self._event_ns, stamp_ns)
+        else:
             self._count_rejected(kind)
-            return
-        # Ties: the board first, so that the detector decides with the newest of both.
-        heapq.heappush(self._pending, (stamp_ns, kind, self._n_pushed, celsius))
-        self._n_pushed += 1
-        self._event_ns = min(self._event_ns, stamp_ns)
 
     def process(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
         """
@@ -250,8 +238,7 @@ class Compensator:
         """
         if not self._admit(stamp_ns):
             return False
-        while self._pending and self._pending[0][0] <= stamp_ns:
-            reading_ns, kind, _, celsius = heapq.heappop(self._pending)
+        for reading_ns, kind, _, celsius in self._queue.due(stamp_ns):
             self.apply_reading(reading_ns, kind, celsius)
         return self._enter_segment(stamp_ns)
 
@@ -262,8 +249,7 @@ class Compensator:
             self.counters.n_out_of_order += 1
             return False
         # Readings of the old time that no sample reached belong to the time that is gone.
-        self._pending = [entry for entry in self._pending if entry[0] <= stamp_ns]
-        heapq.heapify(self._pending)
+        self._queue.drop_after(stamp_ns)
         self.tracker.reset()
         self.stuck.reset()
         self.rate.reset()
@@ -300,7 +286,7 @@ class Compensator:
         tracker = self.tracker
         board_ns = tracker.board.stamp_ns
         updated_ns = tracker.updated_ns
-        next_ns = self._pending[0][0] if self._pending else _NEVER_NS
+        next_ns = self._queue.next_ns
         if board_ns is None or updated_ns is None:
             self.counters.n_no_temperature += 1
             # Every sample comes back here until there is a temperature, and is counted here.
@@ -389,17 +375,9 @@ class Compensator:
 
     def process_block(self, block: AccelBlock) -> CompensatedBlock:
         """
-        Correct a block of samples with the bits that `process` gives one by one.
+        Correct a block, e.g. a `recording.Block`, with the bits that `process` gives one by one.
 
-        Parameters
-        ----------
-        block : AccelBlock
-            Columns in file order, e.g. a `recording.Block`.
-
-        Returns
-        -------
-        CompensatedBlock
-            The published samples; flags wait in `take_flags`, counts in `counters`.
+        Flags wait in `take_flags`, counts in `counters`.
 
         """
         result = process_block(self, block)
@@ -423,16 +401,14 @@ class Compensator:
         Take the readings that no sample has reached: (stamp, kind, order, degC).
 
         """
-        pending, self._pending = self._pending, []
-        return pending
+        return self._queue.take()
 
     def flush(self, stamp_ns: int) -> None:
         """
         Let queued readings up to a stamp take effect without a sample (no samples are coming).
 
         """
-        while self._pending and self._pending[0][0] <= stamp_ns:
-            reading_ns, kind, _, celsius = heapq.heappop(self._pending)
+        for reading_ns, kind, _, celsius in self._queue.due(stamp_ns):
             self.apply_reading(reading_ns, kind, celsius)
         self._event_ns = _EVER_NS
 
@@ -451,7 +427,7 @@ class Compensator:
         self._use(calibration)
         self._segment_key = None
         if same:
-            self.tracker.reconfigure(self._thermal_config(), self._now())
+            self.tracker.reconfigure(self._thermal_config(), self.now_ns)
         else:
             self.tracker = self._restarted(calibration)
         self._event_ns = _EVER_NS
@@ -481,11 +457,23 @@ class Compensator:
         self.config = config
         self.gravity = self._gravity_monitor()
         self._segment_key = None
-        self.tracker.reconfigure(self._thermal_config(), self._now())
+        self.tracker.reconfigure(self._thermal_config(), self.now_ns)
         self._event_ns = _EVER_NS
 
-    def _now(self) -> int | None:
+    @property
+    def now_ns(self) -> int | None:
+        """
+        Stamp of the last sample; None before the first.
+
+        """
         return self.last_ns if self.last_ns != _EVER_NS else None
+
+    def pending_ahead(self, stamp_ns: int) -> float:
+        """
+        How far the farthest reading that waits for a sample lies ahead of a stamp [s]; 0 if none.
+
+        """
+        return self._queue.ahead(stamp_ns)
 
     def reset(self) -> None:
         """
@@ -493,7 +481,7 @@ class Compensator:
 
         """
         self.tracker.reset()
-        self._pending.clear()
+        self._queue.take()
         self._flags.clear()
         self.stuck.reset()
         self.rate.reset()
@@ -507,64 +495,4 @@ class Compensator:
         Snapshot of what is going on, at the last sample's stamp.
 
         """
-        tracker = self.tracker
-        stamp_ns = self._now()
-        if stamp_ns is None:
-            stamp_ns = tracker.updated_ns
-        counters = replace(self.counters)
-        ahead_s = 0.0
-        if self._pending and stamp_ns is not None:
-            ahead_s = (max(entry[0] for entry in self._pending) - stamp_ns) * 1e-9
-        board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
-        if stamp_ns is None or board_ns is None:
-            return CompensatorStatus(
-                counters,
-                stamp_ns,
-                None,
-                math.inf,
-                math.inf,
-                True,
-                True,
-                True,
-                0.0,
-                0.0,
-                0.0,
-                pending_ahead_s=ahead_s,
-            )
-        board_age = (stamp_ns - board_ns) * 1e-9
-        # Half the time-out at the latest, so that a warning always comes before the error.
-        stale_after = self.config.temperature_timeout_s / 2.0
-        usual = STALE_INTERVALS * tracker.board.interval_s
-        if usual < stale_after:
-            stale_after = max(usual, SHORTEST_STALE_S)
-        state = tracker.sample(stamp_ns)
-        regime_set = (
-            self.correction.dynamic
-            if tracker.detector.regime == Regime.DYNAMIC
-            else self.correction.static
-        )
-        _, excess = regime_set.regressors(state)
-        return CompensatorStatus(
-            counters,
-            stamp_ns,
-            tracker.state_at(stamp_ns),
-            board_age,
-            math.inf if case_ns is None else (stamp_ns - case_ns) * 1e-9,
-            board_age > stale_after,
-            board_age > self.config.temperature_timeout_s,
-            not tracker.is_case_live(stamp_ns),
-            regime_set.relative_excess(excess),
-            excess.temperature,
-            excess.rate * 60.0,
-            gradient_excess_k=excess.gradient,
-            board_fault=tracker.board_guard.fault,
-            case_fault=tracker.case_guard.fault,
-            board_step_k=tracker.board_guard.step,
-            case_step_k=tracker.case_guard.step,
-            is_lead_reversed=tracker.lead.is_reversed,
-            rate_ratio=self.rate.ratio,
-            is_too_fast=self.rate_refuses,
-            gravity=self.gravity.result,
-            is_refuted=self.gravity.is_refuted,
-            pending_ahead_s=ahead_s,
-        )
+        return snapshot(self)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import __version__
-from .batch import CompensatedBlock
+from .blocks import CompensatedBlock
 from .calibration import Calibration
 from .compensator import Compensator
 from .errors import CalibrationError
