@@ -81,11 +81,11 @@ def view(
             f'port {port}: {failure.strerror}; give another one with --port'
         ) from failure
     with server:
-        out.line(f'{server.url}  (Ctrl-C ends it)')
-        sys.stdout.flush()  # whoever reads this through a pipe waits for the address
-        if browser:
-            webbrowser.open(server.url)
         try:
+            out.line(f'{server.url}  (Ctrl-C ends it)')
+            sys.stdout.flush()  # whoever reads this through a pipe waits for the address
+            if browser:
+                webbrowser.open(server.url)
             server.serve_forever()
         except KeyboardInterrupt:
             out.note('ended')
