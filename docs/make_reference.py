@@ -81,7 +81,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | temperature or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
 | a temperature that jumps as no part can | its readings are not used until they are possible again or the sensor has been lost |
 | a temperature that stands still while the other moves | its readings are not used: held, then lost |
-| both temperatures the same to the bit for 10 s | used, with a covariance that grows, WARN |
+| both temperatures the same to the bit for 5 s | used, with a covariance that grows, WARN |
 | a board that leads the case in ramps (swapped topics) | larger covariance, ERROR |
 | counts the same to the bit for `stuck_timeout`, or all zero | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |

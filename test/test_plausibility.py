@@ -72,6 +72,24 @@ def test_a_step_that_stays_is_a_new_beginning_after_the_time_out():
     assert not state.is_settled
 
 
+def test_a_small_step_is_believed_with_doubt():
+    """
+    WHY: two kelvin at once are no temperature of a board either, but a sensor that came back.
+    WHAT: the new level counts, and for about a lag the variance says that it may be wrong.
+
+    """
+    tracker = tracker_of()
+    now = soak(tracker)
+    now = soak(tracker, 22.0, 10, now)
+    assert tracker.board.temperature == pytest.approx(22.0, abs=0.01)
+    flat = tracker.sample(now * SECOND_NS)
+    assert math.sqrt(flat[VAR_BOARD]) == pytest.approx(2.0, rel=0.02)
+    assert math.sqrt(flat[VAR_GRADIENT]) == pytest.approx(2.0, rel=0.02)
+    now = soak(tracker, 22.0, 3000, now)
+    # exp(-5) of the variance after five lags of 600 s.
+    assert math.sqrt(tracker.sample(now * SECOND_NS)[VAR_BOARD]) < 0.2
+
+
 def test_what_a_sensor_says_first_may_be_wrong():
     """
     WHY: a DS18B20 says 85 degC before its first conversion.
@@ -143,6 +161,19 @@ def test_two_sensors_that_stand_still_count_with_growing_doubt():
     assert sd == pytest.approx(30.0, rel=1e-3)
     assert tracker.board_reading(600 * SECOND_NS, 20.004)
     assert math.sqrt(tracker.sample(600 * SECOND_NS)[VAR_BOARD]) < 0.01
+
+
+def test_a_ramp_does_not_end_because_a_sensor_stands_still():
+    tracker = tracker_of()
+    soak(tracker, seconds=1500)
+    for second in range(1500, 2500):
+        # The ramp stops in the readings only.
+        flicker = 0.004 * (-1) ** second
+        ramp = min(second, 1900) - 1500
+        tracker.board_reading(second * SECOND_NS, 20.0 + ramp / 90.0 + flicker * (ramp < 400))
+        tracker.case_reading(second * SECOND_NS, 20.0 + ramp / 60.0 + flicker * (ramp < 400))
+    assert tracker.case_guard.fault == Fault.STILL
+    assert tracker.detector.regime == Regime.DYNAMIC
 
 
 def test_a_standstill_within_the_quantum_is_no_fault():

@@ -13,7 +13,7 @@ doubted: its readings are left out, or the variance grows by what may be wrong w
 from __future__ import annotations
 
 from enum import Enum
-from math import erf, isfinite, log, nan, sqrt
+from math import erf, exp, isfinite, log, nan, sqrt
 
 from .thermometer import Thermometer, ThermometerSettings
 
@@ -23,25 +23,29 @@ LARGEST_RATE = 0.2
 #: The rule of steps holds from so many readings on: what a sensor says first may be wrong.
 SETTLED_READINGS = 5
 
-#: Readings stand still when so many of them, over so long [s], are the same to the bit.
+#: Readings stand still when so many of them, over so long [s], are the same to the bit, or as
+#: many as the declared noise makes this unlikely; a few of them are enough to doubt.
 STILL_READINGS = 20
-STILL_S = 10.0
-#: ... or when the declared noise makes it this unlikely.
+STILL_S = 5.0
 STILL_PROBABILITY = 1e-9
+DOUBTFUL_READINGS = 4
 #: How far [K] the other sensor must have moved meanwhile to call a sensor frozen that has noise
 #: of its own, and one whose quantum hides it.
 OTHER_MOVED = 0.3
 OTHER_MOVED_BEYOND_CELL = 0.7
 #: A frozen sensor may be off by any temperature it was made for, at most by this [K].
 LARGEST_DOUBT = 60.0
+#: Doubt below this is none [K^2].
+_SMALLEST_DOUBT = 1e-6
 
 #: A lead must be this large [K] and this part of the movement to be one ...
 LEAD_K = 0.5
 LEAD_SHARE = 0.15
 #: ... in so many readings running, while the slower of both moves at least at this part of the
-#: rate of the faster.
+#: rate of the faster; for a doubt a smaller part is enough.
 LEAD_READINGS = 5
 LEAD_RATE_SHARE = 0.3
+DOUBTFUL_RATE_SHARE = 0.03
 _SIGMAS = 6.0
 
 
@@ -81,6 +85,8 @@ class SensorGuard:
         What is wrong at the moment.
     step : float
         Size of the last step that was not believed [K].
+    is_revived : bool
+        Whether the reading just admitted ends a standstill: what was before counts no more.
 
     """
 
@@ -93,6 +99,8 @@ class SensorGuard:
         self._has_cells = settings.has_cells
         self._n_still = still_readings(settings)
         self._rate = settings.fastest_ramp_k_min / 60.0
+        self._decay = 1e-9 / max(settings.lag_s, other.settings.lag_s)
+        self._n_doubtful = min(DOUBTFUL_READINGS, self._n_still)
         self.reset()
 
     def reset(self) -> None:
@@ -102,8 +110,11 @@ class SensorGuard:
         """
         self.fault = Fault.NONE
         self.step = 0.0
+        self.is_revived = False
         self._n_same = 0
         self._n_used = 0
+        self._jumped = 0.0
+        self._jumped_ns = 0
         self._other_then = nan
         self._expected = 0.0
         self._moved = 0.0
@@ -127,6 +138,7 @@ class SensorGuard:
 
         """
         own = self.own
+        self.is_revived = False
         if own.stamp_ns is None or stamp_ns <= own.stamp_ns or not isfinite(celsius):
             return True  # the first one, or one that the estimator itself rejects
         if celsius == own.reading:
@@ -135,8 +147,9 @@ class SensorGuard:
             return self.fault != Fault.FROZEN
         self._n_same = 0
         self._other_then = nan
+        self.is_revived = self.fault in (Fault.STILL, Fault.FROZEN)
         age = (stamp_ns - own.stamp_ns) * 1e-9
-        if self._n_used >= SETTLED_READINGS:
+        if self._n_used >= SETTLED_READINGS and not self.is_revived:
             expected, _, variance = own.at(stamp_ns)
             step = celsius - expected
             possible = LARGEST_STEP + 2.0 * self._quantum + LARGEST_RATE * age
@@ -187,16 +200,40 @@ class SensorGuard:
             return Fault.NONE
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
-    def doubt(self, stamp_ns: int) -> float:
+    def note_jump(self, stamp_ns: int, change: float) -> None:
         """
-        Return the variance that comes to the temperature's while the sensor stands still [K^2].
+        Note that the sensor has begun anew elsewhere: was it wrong before, or is it wrong now?
 
         """
-        changed_ns = self.own.changed_ns
-        if changed_ns is None or self.fault in (Fault.NONE, Fault.STEP):
+        self._jumped = self._jump_at(stamp_ns) + change * change
+        self._jumped_ns = stamp_ns
+
+    def _jump_at(self, stamp_ns: int) -> float:
+        if not self._jumped:
             return 0.0
-        doubt: float = min(self._rate * max(stamp_ns - changed_ns, 0) * 1e-9, LARGEST_DOUBT)
-        return doubt * doubt
+        return self._jumped * exp(-max(stamp_ns - self._jumped_ns, 0) * self._decay)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """
+        Whether `doubt` may give anything but 0.
+
+        """
+        return self._n_same >= self._n_doubtful or self._jumped > _SMALLEST_DOUBT
+
+    def doubt(self, stamp_ns: int) -> float:
+        """
+        Return the variance that comes to the temperature's: standstills and jumps [K^2].
+
+        """
+        doubt = self._jump_at(stamp_ns)
+        changed_ns = self.own.changed_ns
+        if changed_ns is None or self._n_same < self._n_doubtful:
+            return doubt
+        if self._has_cells and self.fault != Fault.FROZEN:
+            return doubt
+        moved: float = min(self._rate * max(stamp_ns - changed_ns, 0) * 1e-9, LARGEST_DOUBT)
+        return doubt + moved * moved
 
 
 def still_readings(settings: ThermometerSettings) -> int:
@@ -232,19 +269,24 @@ class LeadWatch:
     ----------
     case, board : Thermometer
         The estimators.
+    calm_k_min : float
+        It is calm while both rates are below this, K/min.
 
     Attributes
     ----------
     is_reversed : bool
         Whether the board has led in the last ramp that told.
+    doubt : float
+        Square of the lead that the board may have had in this ramp [K^2].
 
     """
 
-    def __init__(self, case: Thermometer, board: Thermometer) -> None:
+    def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:
+        self._calm_rate = calm_k_min / 60.0
         self._case = case
         self._board = board
-        quanta = case.settings.quantum_c + board.settings.quantum_c
-        self._margin = LEAD_K + 2.0 * quanta
+        self._quanta = case.settings.quantum_c + board.settings.quantum_c
+        self._margin = LEAD_K + 2.0 * self._quanta
         self.reset()
 
     def reset(self) -> None:
@@ -253,6 +295,7 @@ class LeadWatch:
 
         """
         self.is_reversed = False
+        self.doubt = 0.0
         self._calm: tuple[float, float] | None = None
         self._n_for = self._n_against = 0
 
@@ -262,9 +305,11 @@ class LeadWatch:
 
         """
         case, board = self._case, self._board
-        if is_static:
+        calm = self._calm_rate
+        if is_static or (abs(case.rate) < calm and abs(board.rate) < calm):
             self._calm = (case.temperature, board.temperature)
             self._n_for = self._n_against = 0
+            self.doubt = 0.0
             return
         if self._calm is None or not (case.is_ready and board.is_ready):
             return
@@ -275,6 +320,10 @@ class LeadWatch:
         noise = _SIGMAS * sqrt(case.var_temperature + board.var_temperature)
         largest = max(abs(by_case), abs(by_board))
         lead = direction * (by_case - by_board)
+        if lead > -noise - self._quanta:
+            self.doubt = 0.0
+        elif slow > DOUBTFUL_RATE_SHARE * fast:
+            self.doubt = lead * lead
         is_telling = (
             slow > LEAD_RATE_SHARE * fast
             and abs(lead) > self._margin + noise

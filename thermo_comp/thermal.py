@@ -144,7 +144,7 @@ class ThermalTracker:
         self.detector = RegimeDetector(detector)
         self.board_guard = SensorGuard(self.board, self.case, self.config.board_lag_s)
         self.case_guard = SensorGuard(self.case, self.board, 0.0)
-        self.lead = LeadWatch(self.case, self.board)
+        self.lead = LeadWatch(self.case, self.board, detector.relaxed_rate_k_min)
         self._clear()
 
     def _clear(self) -> None:
@@ -152,6 +152,8 @@ class ThermalTracker:
         self.updated_ns: int | None = None
         self._decided_ns: int | None = None
         self._is_doubted = False
+        self._memory: list[float] = []
+        self._var_memory: list[float] = []
         self._forget_memory()
         self._weight = 0.0
         self._weight_ns = 0
@@ -207,24 +209,30 @@ class ThermalTracker:
             last, an outlier, or not plausible.
 
         """
-        board = self.board
-        if not self.board_guard.admits(stamp_ns, celsius):
+        board, guard = self.board, self.board_guard
+        before_ns, before, n_restarts = board.stamp_ns, board.temperature, board.n_restarts
+        is_anew = False
+        if not guard.admits(stamp_ns, celsius):
             self._is_doubted = True
-            if not self._starts_anew(
-                self.board_guard, stamp_ns, self.config.temperature_timeout_s
-            ):
+            if not self._may_begin_anew(guard, stamp_ns, self.config.temperature_timeout_s):
                 return False
-            self._forget_memory()
-        before_ns, before = board.stamp_ns, board.temperature
-        n_restarts = board.n_restarts
+            is_anew = True
+        if is_anew or guard.is_revived:
+            board.reset()
         if not board.update(stamp_ns, celsius):
             return False
         if before_ns is not None:
-            self._remember(
-                (stamp_ns - before_ns) * 1e-9,
-                board.temperature - before,
-                board.n_restarts != n_restarts,
-            )
+            dt = (stamp_ns - before_ns) * 1e-9
+            change = board.temperature - before
+            has_restarted = board.n_restarts != n_restarts
+            is_gap = has_restarted and dt > self.settings.board.lag_s
+            if is_anew or is_gap:
+                self._forget_memory()
+            else:
+                self._step_memory(dt, change)
+            if is_anew or guard.is_revived or (has_restarted and not is_gap):
+                guard.note_jump(stamp_ns, change)
+                self._var_memory = [value + change * change for value in self._var_memory]
         self.case_guard.watch_other()
         self._note(stamp_ns)
         if not self.is_case_live(stamp_ns):
@@ -248,31 +256,42 @@ class ThermalTracker:
             Whether the reading was used.
 
         """
-        if not self.case_guard.admits(stamp_ns, celsius):
+        case, guard = self.case, self.case_guard
+        before_ns, before, n_restarts = case.stamp_ns, case.temperature, case.n_restarts
+        is_anew = False
+        if not guard.admits(stamp_ns, celsius):
             self._is_doubted = True
-            if not self._starts_anew(self.case_guard, stamp_ns, self.config.case_timeout_s):
+            if not self._may_begin_anew(guard, stamp_ns, self.config.case_timeout_s):
                 return False
-        if not self.case.update(stamp_ns, celsius):
+            is_anew = True
+        is_anew = is_anew or guard.is_revived
+        if is_anew:
+            case.reset()
+        if not case.update(stamp_ns, celsius):
             return False
+        if before_ns is not None:
+            is_gap = (stamp_ns - before_ns) * 1e-9 > self.settings.case.lag_s
+            if is_anew or (case.n_restarts != n_restarts and not is_gap):
+                guard.note_jump(stamp_ns, case.temperature - before)
         self.board_guard.watch_other()
         self._note(stamp_ns)
-        self._decide(stamp_ns, self.case)
+        if guard.fault != Fault.STILL or self.detector.regime != Regime.DYNAMIC:
+            # One that stands still does not tell that a ramp has ended.
+            self._decide(stamp_ns, case)
         self.lead.update(self.detector.regime == Regime.STATIC)
         return True
 
     @staticmethod
-    def _starts_anew(guard: SensorGuard, stamp_ns: int, patience_s: float) -> bool:
+    def _may_begin_anew(guard: SensorGuard, stamp_ns: int, patience_s: float) -> bool:
         """
         Let a sensor begin again that has stayed where it cannot have come to for long enough.
 
         """
-        sensor = guard.own
-        seen_ns = sensor.stamp_ns
+        seen_ns = guard.own.stamp_ns
         if guard.fault != Fault.STEP or seen_ns is None:
             return False
         if (stamp_ns - seen_ns) * 1e-9 <= patience_s:
             return False
-        sensor.reset()
         guard.reset()
         return True
 
@@ -280,9 +299,10 @@ class ThermalTracker:
         if self.updated_ns is None or stamp_ns > self.updated_ns:
             self.updated_ns = stamp_ns
         self._is_doubted = (
-            self.board_guard.fault != Fault.NONE
-            or self.case_guard.fault != Fault.NONE
+            self.board_guard.is_doubtful
+            or self.case_guard.is_doubtful
             or self.lead.is_reversed
+            or self.lead.doubt > 0.0
         )
 
     def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
@@ -304,19 +324,6 @@ class ThermalTracker:
         n_lags = len(self.memory_time_constants_s)
         self._memory = [0.0] * n_lags
         self._var_memory = [MEMORY_START_SD**2] * n_lags
-
-    def _remember(self, dt: float, change: float, is_restart: bool) -> None:
-        """
-        Carry the memory over to the next reading; what nobody saw is doubt.
-
-        """
-        if is_restart and dt > self.settings.board.lag_s:
-            self._forget_memory()
-            return
-        self._step_memory(dt, change)
-        if is_restart:
-            # A sensor that stepped: was it wrong before, or is it wrong now?
-            self._var_memory = [variance + change * change for variance in self._var_memory]
 
     def _step_memory(self, dt: float, change: float) -> None:
         for k, tau in enumerate(self.memory_time_constants_s):
@@ -374,6 +381,8 @@ class ThermalTracker:
             if self.lead.is_reversed:
                 # What is called the case may be the board.
                 var_board += gradient * gradient
+            else:
+                var_board += self.lead.doubt
         unknown = 1.0 if self.detector.regime == Regime.UNKNOWN else 0.0
         state = (board, var_board, rate, gradient, var_gradient, self.weight_at(stamp_ns), unknown)
         if not self._memory:
