@@ -8,7 +8,6 @@ clear error; nothing crashes, hangs or takes memory that the file does not justi
 
 from __future__ import annotations
 
-import os
 import resource
 import struct
 import tempfile
@@ -24,16 +23,9 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from recording_helpers import (
-    ACCEL,
-    BOARD,
-    CASE,
-    OTHER,
-    Message,
     assert_columns,
     regular_messages,
-    serialize,
     write_mcap,
-    write_rosbag1,
     write_rosbag2,
 )
 
@@ -41,9 +33,7 @@ from thermo_comp.errors import RecordingError
 from thermo_comp.recording import (
     BagWriter,
     Recording,
-    Topics,
     inspect_recording,
-    open_recording,
     read_recording,
 )
 
@@ -438,189 +428,3 @@ def test_a_changed_number_is_found_by_the_checksum(tmp_path: Path) -> None:
     path.write_bytes(changed)
     with pytest.raises(RecordingError, match='checksum does not fit'):
         read(path)
-
-
-def short_message(data: bytes) -> bytes:
-    record = struct.pack('<HIQQ', 1, 0, 1, 1) + data
-    return struct.pack('<BQ', Opcode.MESSAGE, len(record)) + record
-
-
-def text(value: str) -> bytes:
-    return struct.pack('<I', len(value.encode())) + value.encode()
-
-
-def declared(encoding: str = 'cdr', kind: str = 'geometry_msgs/msg/Vector3Stamped') -> bytes:
-    schema = struct.pack('<H', 1) + text(kind) + text('ros2msg') + text('')
-    channel = struct.pack('<HH', 1, 1) + text(ACCEL) + text(encoding) + text('')
-    return b''.join(
-        struct.pack('<BQ', opcode, len(body)) + body
-        for opcode, body in ((Opcode.SCHEMA, schema), (Opcode.CHANNEL, channel))
-    )
-
-
-@pytest.mark.parametrize(
-    ('data', 'reason'),
-    [
-        (b'', 'its size does not fit'),
-        (b'\x00\x01\x00\x00' + bytes(12), 'its size does not fit'),
-        (b'\x00\x01\x00\x00' + bytes(8) + struct.pack('<I', 1 << 31) + bytes(40), 'does not fit'),
-        (b'\x00\x07\x00\x00' + bytes(48), 'representation 0x0007'),
-        (b'\x00\x01\x00\x00' + bytes(80), 'does not fit'),
-    ],
-)
-def test_messages_of_another_layout_are_named(tmp_path: Path, data: bytes, reason: str) -> None:
-    path = tmp_path / 'bag.mcap'
-    path.write_bytes(whole_file(declared(), short_message(data)))
-    with pytest.raises(RecordingError, match=rf'bag\.mcap: {ACCEL}: .*{reason}'):
-        read(path)
-
-
-def test_ros_1_messages_in_an_mcap_file(tmp_path: Path) -> None:
-    path = tmp_path / 'bag.mcap'
-    numbers = struct.pack('<3d', 1.5, -2.5, 3.5)
-    data = struct.pack('<IIII', 9, 12, 34, 4) + b'link' + numbers
-    path.write_bytes(
-        whole_file(declared('ros1', 'geometry_msgs/Vector3Stamped'), short_message(data))
-    )
-    with open_recording(path, require=('accel',)) as reader:
-        (block,) = reader.blocks(raw=True)
-    assert block.accel.tolist() == [[1.5, -2.5, 3.5]]
-    assert block.accel_stamp_ns.tolist() == [12 * 10**9 + 34]
-    assert block.frame_id == 'link'
-    # Given out raw, it is CDR like any other.
-    message = Message(ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
-    assert block.raw[0].data.tobytes() == serialize(message)
-
-
-def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
-    path = tmp_path / 'bag.mcap'
-    both = declared() + declared('ros1').replace(
-        struct.pack('<HH', 1, 1), struct.pack('<HH', 2, 1)
-    )
-    message = Message(ACCEL, 1, 1, '', (1.0, 2.0, 3.0))
-    path.write_bytes(whole_file(both, short_message(serialize(message))))
-    with pytest.raises(RecordingError, match=f'{ACCEL}: its messages have several encodings'):
-        read(path)
-    path.write_bytes(whole_file(declared('json'), short_message(b'{}')))
-    with pytest.raises(RecordingError, match="encoded as 'json', expected cdr"):
-        read(path)
-
-
-def test_what_is_no_bag(tmp_path: Path) -> None:
-    def refused(path: Path, reason: str) -> None:
-        with pytest.raises(RecordingError, match=reason):
-            open_recording(path)
-
-    refused(tmp_path / 'nowhere', 'nowhere: no such file or directory')
-    refused(tmp_path / ('x' * 300), 'cannot be opened: File name too long')
-    os.mkfifo(tmp_path / 'pipe.mcap')
-    refused(tmp_path / 'pipe.mcap', 'not a bag: neither a file nor a directory')
-    (tmp_path / 'notes.txt').write_text('hello')
-    refused(tmp_path / 'notes.txt', r'not a bag: expected a directory, \.mcap, \.db3 or \.bag')
-    (tmp_path / 'text.mcap').write_text('hello, this is no bag at all')
-    refused(tmp_path / 'text.mcap', 'not an MCAP file')
-    (tmp_path / 'empty.mcap').write_bytes(b'')
-    refused(tmp_path / 'empty.mcap', 'the file is empty')
-    (tmp_path / 'begun.mcap').write_bytes(b'\x89MCAP0\r\n\x01')
-    refused(tmp_path / 'begun.mcap', 'cut off inside its header')
-    (tmp_path / 'odd.mcap').write_bytes(b'\x89MCAP0\r\n\x02' + bytes(50))
-    refused(tmp_path / 'odd.mcap', 'does not begin with a header')
-    (tmp_path / 'text.bag').write_text('hello')
-    refused(tmp_path / 'text.bag', r'text\.bag: the bag cannot be read')
-    (tmp_path / 'text.db3').write_text('hello')
-    refused(tmp_path / 'text.db3', r'text\.db3: the bag cannot be read')
-    (tmp_path / 'folder').mkdir()
-    refused(tmp_path / 'folder', r'not a bag: the directory has no metadata\.yaml')
-    for content, reason in (
-        ('{', 'not valid YAML'),
-        ('a: 1', 'not the metadata of a rosbag2 bag'),
-        ('- 1', 'not the metadata of a rosbag2 bag'),
-        ('rosbag2_bagfile_information: {relative_file_paths: []}', 'not the metadata'),
-        (
-            'rosbag2_bagfile_information: {relative_file_paths: [a.mcap], storage_identifier: m}',
-            r'the file a\.mcap of the bag is missing',
-        ),
-        ('[' * 5000, 'not valid YAML'),
-    ):
-        (tmp_path / 'folder' / 'metadata.yaml').write_text(content)
-        refused(tmp_path / 'folder', reason)
-
-
-def test_topics_that_are_not_there_or_are_something_else(tmp_path: Path) -> None:
-    path = tmp_path / 'bag.mcap'
-    messages = regular_messages(8)
-    write_mcap(path, messages)
-    with pytest.raises(RecordingError, match=r'counts: no such topic; the bag has /accel/counts '):
-        open_recording(path, Topics(counts='my/counts'), input='counts')
-    with pytest.raises(
-        RecordingError, match=r'or x/imu: no such topic.*--counts-topic or --imu-t'
-    ):
-        open_recording(path, Topics(counts='x/counts', imu='x/imu'))
-    with pytest.raises(RecordingError, match='name another with --case-topic'):
-        open_recording(path, Topics(case='other/case'))
-    with pytest.raises(RecordingError, match='has type sensor_msgs/msg/Temperature, expected geo'):
-        open_recording(path, Topics(counts=BOARD))
-    write_mcap(path, [m for m in messages if m.topic != CASE])
-    with pytest.raises(RecordingError, match='temperature/case: no such topic'):
-        open_recording(path)
-    with open_recording(path, require=('accel', 'board')) as reader:
-        (block,) = reader.blocks()
-        assert (len(block), len(block.board), len(block.case)) == (8, 1, 0)
-    write_mcap(path, [])
-    with pytest.raises(RecordingError, match='the bag holds no messages'):
-        open_recording(path)
-    assert inspect_recording(path).input is None
-    assert len(read(path).columns) == 0
-
-
-def test_a_required_topic_without_messages(tmp_path: Path) -> None:
-    path = tmp_path / 'bag.mcap'
-    with BagWriter(path) as bag:
-        bag.write_counts('accel/counts', [1, 2], np.zeros((2, 3)))
-        bag.write_temperature('temperature/board', [1], [20.0])
-        bag.write_temperature('temperature/case', [], [])
-    with pytest.raises(RecordingError, match='/temperature/case: the topic has no messages'):
-        open_recording(path)
-
-
-def test_two_topics_that_fit_are_ambiguous(tmp_path: Path) -> None:
-    path = tmp_path / 'bag.mcap'
-    with BagWriter(path) as bag:
-        for unit in ('a', 'b'):
-            bag.write_counts(f'{unit}/accel/counts', [1], np.zeros((1, 3)))
-    with pytest.raises(RecordingError, match=r'several topics end in it: /a/.*, /b/.*--counts-to'):
-        open_recording(path)
-    with open_recording(path, Topics(counts='b/accel/counts'), require=('accel',)) as reader:
-        assert reader.topics == {'accel': '/b/accel/counts'}
-
-
-def test_names_from_a_bag_cannot_forge_lines(tmp_path: Path) -> None:
-    """
-    WHY: a topic's name is whatever stands in the file; an error is one line of a terminal.
-
-    """
-    path = tmp_path / 'bag.mcap'
-    with BagWriter(path) as bag:
-        for row in range(30):
-            bag.write_bool(f'a\nb\x1b[31m{row:02}' + 'x' * 1000, [1], [True])
-    with pytest.raises(RecordingError, match=r'/a\\nb\\x1b\[31m00x.* and 10 more; name') as caught:
-        open_recording(path)
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) < 3000
-
-
-def test_torn_bags_of_other_storages_are_one_line(tmp_path: Path) -> None:
-    messages = [*regular_messages(400), Message(OTHER, 0)]
-    write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
-    write_rosbag1(tmp_path / 'bag.bag', messages)
-    for path in (tmp_path / 'bag' / 'bag.db3', tmp_path / 'bag.bag'):
-        content = path.read_bytes()
-        path.write_bytes(content[: len(content) * 2 // 3])
-        with pytest.raises(RecordingError, match='cannot be read') as caught:
-            read(path)
-        assert '\n' not in str(caught.value)
-
-
-def test_wire_sizes_are_as_the_layout_says() -> None:
-    # 4 encapsulation + align8(12 + 6) = 24 + 3 * 8: the sizes that the tests above rely on.
-    assert len(serialize(Message(ACCEL, 0, 0, 'accel', (1.0, 2.0, 3.0)))) == 52
