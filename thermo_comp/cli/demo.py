@@ -12,11 +12,7 @@ bit, and against gravity.
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,13 +29,9 @@ if TYPE_CHECKING:
     from ..evaluation import Evaluation
 
 _GRAVITY = 9.80665
-# Its own, so that a demonstration hears no other one and disturbs no robot.
-_NAMESPACE = f'/thermo_comp_demo_{os.getpid()}'
 _SAMPLES, _OUTPUT = 'accel/counts', 'imu/data_raw'
-_PATIENCE_S = 30.0
 # Two hours in eight seconds.
 _RATE = 1000.0
-_DEPTH = 20_000
 
 # Column headings and the models behind them: one set for all temperatures; the paper's two sets
 # (static linear, dynamic quadratic); what the fit chooses, which is what the node runs.
@@ -90,7 +82,7 @@ def demo(
     calibrations = _fit(out, fit_bags, output)
     out.line(f'fitted {output / "unit.yaml"} from {len(fit_bags)} bags of {folder / "fit"}')
     with out.progress('playing', total=1.0) as done:
-        played = _play(held_out, output / 'unit.yaml', recorded, output / 'node.log', done)
+        played = _play(held_out, output / 'unit.yaml', recorded, done)
     out.line(
         f'played {held_out} through the node: {played.bag_s / 60.0:.0f} min in '
         f'{played.wall_s:.1f} s, {played.bag_s / played.wall_s:.0f} times real time'
@@ -158,78 +150,27 @@ def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
     return calibrations
 
 
-def _play(
-    bag: Path, calibration: Path, recorded: Path, log: Path, done: Callable[[float], None]
-) -> _Played:
+def _play(bag: Path, calibration: Path, recorded: Path, done: Callable[[float], None]) -> _Played:
     """
-    Send the bag through the node and record what comes out.
+    Send the bag through the node and record what comes out, on this machine only.
 
     """
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     from ..recording import inspect_recording
-    from ..ros.player import play
-    from ..ros.recorder import Recorder
+    from ..ros.round_trip import round_trip
 
     info = inspect_recording(bag)
-    ros_args = ['-r', f'__ns:={_NAMESPACE}']
-    with (
-        Recorder(recorded, ros_args=ros_args, overwrite=True) as recorder,
-        _node(calibration, log) as node,
-    ):
-        if not recorder.wait_for_publishers(_PATIENCE_S):
-            raise ThermoCompError(f'the node did not start{_last_words(node, log)}')
-        report = play(bag, rate=_RATE, ros_args=ros_args, progress=done)
-        n_in = report.n_messages[f'{_NAMESPACE}/{_SAMPLES}']
-        recorder.wait_until(lambda counts: counts[_OUTPUT] >= n_in, _PATIENCE_S)
-        counts = recorder.counts
+    trip = round_trip(
+        bag, calibration, recorded, rate=_RATE, overwrite=recorded.exists(), progress=done
+    )
+    (n_in,) = (n for name, n in trip.played.n_messages.items() if name.endswith(_SAMPLES))
     return _Played(
         n_in=n_in,
-        n_out=counts[_OUTPUT],
-        n_flags=counts['regime/dynamic'],
-        wall_s=report.duration_s,
+        n_out=trip.recorded[_OUTPUT],
+        n_flags=trip.recorded['regime/dynamic'],
+        wall_s=trip.played.duration_s,
         bag_s=(info.end_ns - info.start_ns) * 1e-9,
     )
-
-
-@contextmanager
-def _node(calibration: Path, log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """
-    Run the node in a process of its own, as its console script would.
-
-    """
-    command = [
-        *(sys.executable, '-c', 'from thermo_comp.ros.node import main; raise SystemExit(main())'),
-        *('--ros-args', '-r', f'__ns:={_NAMESPACE}', '-p', f'calibration_file:={calibration}'),
-    ]
-    # A sensor's samples are best effort and come at the sensor's pace. These come a thousand times
-    # faster, and none may be lost: reliable, and with room for all of them in every queue.
-    for topic, end in (
-        (_SAMPLES, 'subscription'),
-        ('temperature/board', 'subscription'),
-        ('temperature/case', 'subscription'),
-        (_OUTPUT, 'publisher'),
-    ):
-        policies = f'qos_overrides.{_NAMESPACE}/{topic}.{end}'
-        command += ['-p', f'{policies}.depth:={_DEPTH}', '-p', f'{policies}.reliability:=reliable']
-    with log.open('wb') as file:
-        process = subprocess.Popen(  # noqa: S603  our own interpreter and words
-            command, stdout=file, stderr=subprocess.STDOUT
-        )
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(timeout=_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-
-
-def _last_words(node: subprocess.Popen[bytes], log: Path) -> str:
-    if node.poll() is None:
-        return f' within {_PATIENCE_S:g} s'
-    lines = log.read_text(errors='replace').strip().splitlines()
-    return f': {lines[-1]}' if lines else ''
 
 
 def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool:
