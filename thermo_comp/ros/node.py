@@ -98,6 +98,18 @@ class CompensationNode:
 
     def __init__(self, context: Context | None = None) -> None:
         self.node = rclpy.create_node(NODE_NAME, context=context)
+        try:
+            self._build()
+        except BaseException:
+            self.node.destroy_node()
+            raise
+        self._say_calibration()
+
+    def _build(self) -> None:
+        """
+        Make all that runs on the ROS node.
+
+        """
         self._config = parameters.declare(self.node)
         self._loaded = load(self._config)
         self._compensator = Compensator(
@@ -106,8 +118,10 @@ class CompensationNode:
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
         self._n_malformed = 0
+        self._n_fallback = 0
         self._n_unpublished = 0
         self._n_flags = 0
+        self._converter = SampleConverter(_INPUTS[self._config.input][0], self._config.frame_id)
         self._level = b''
         self._last_samples = time.monotonic()
         self._loop = WaitLoop(self.node)
@@ -131,7 +145,6 @@ class CompensationNode:
             # The input that is not open may be opened later, with these.
             if not name.startswith(inputs):
                 self._log.warning(f'there is no parameter `{name}`, it has no effect')
-        self._say_calibration()
 
     def run(self) -> None:
         """
@@ -162,7 +175,7 @@ class CompensationNode:
         """
         subscribe, overridable = self._loop.subscribe, QoSOverridingOptions.with_default_policies()
         try:
-            self._samples, self._converter = self._open_samples(self._config)
+            self._samples = self._open_samples(self._config)
             self._temperatures: list[tuple[RawSubscription, Callable[[int, float], None]]] = [
                 (subscribe(Temperature, topic, TEMPERATURE_QOS, is_hot=False), push)
                 for topic, push in (
@@ -184,10 +197,8 @@ class CompensationNode:
             raise ParameterError(f'a topic cannot be opened: {error}') from error
         self._publish = RawPublisher(self._imu).publish
 
-    def _open_samples(self, config: NodeConfig) -> tuple[RawSubscription, SampleConverter]:
-        message_type, topic = _INPUTS[config.input]
-        subscription = self._loop.subscribe(message_type, topic, SAMPLE_QOS)
-        return subscription, SampleConverter(message_type, config.frame_id)
+    def _open_samples(self, config: NodeConfig) -> RawSubscription:
+        return self._loop.subscribe(*_INPUTS[config.input], SAMPLE_QOS)
 
     def _push_board(self, stamp_ns: int, celsius: float) -> None:
         self._compensator.push_board(stamp_ns, celsius)
@@ -261,7 +272,7 @@ class CompensationNode:
             n_unpublished=self._n_unpublished,
             n_malformed=self._n_malformed + converter.n_malformed,
             n_flags=self._n_flags,
-            n_fallback=converter.n_fallback,
+            n_fallback=self._n_fallback + converter.n_fallback,
         )
         variances = None if last is None else (last[3], last[6], last[8])
         return Snapshot(self._compensator.status, traffic, variances)
@@ -338,12 +349,14 @@ class CompensationNode:
         self._config = config
         if config.compensator_config() != before.compensator_config():
             self._compensator.reconfigure(config.compensator_config())
-        if config.input != before.input:
-            self._loop.unsubscribe(self._samples)
-            self._samples, self._converter = self._open_samples(config)
-        elif config.frame_id != before.frame_id:
+        if (config.input, config.frame_id) != (before.input, before.frame_id):
+            self._n_malformed += self._converter.n_malformed
+            self._n_fallback += self._converter.n_fallback
             message_type, _ = _INPUTS[config.input]
             self._converter = SampleConverter(message_type, config.frame_id)
+        if config.input != before.input:
+            self._loop.unsubscribe(self._samples)
+            self._samples = self._open_samples(config)
         if config.diagnostics_period != before.diagnostics_period:
             self._timer.timer_period_ns = int(config.diagnostics_period * 1e9)
             self._timer.reset()
