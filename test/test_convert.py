@@ -13,13 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from builders import calibration
 from conftest import Cli
 
+from thermo_comp.calibration import Axes, AxisReference, Unit
+from thermo_comp.calibration_file import save_calibration
 from thermo_comp.convert import ColumnMap, load_column_map, table_log, write_log
 from thermo_comp.convert.columns import STANDARD_GRAVITY
 from thermo_comp.convert.log import Readings, thin
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import read_recording
+from thermo_comp.replay import replay
 
 ROOT = Path(__file__).resolve().parent.parent
 STEP_NS = 10_000_000
@@ -383,6 +387,34 @@ class TestFreezer:
         assert block.board.min() == pytest.approx(3.6, abs=0.5)
         # The air sensor holds its value between readings of its own: fewer messages than rows.
         assert report.case_messages < 0.75 * report.rows
+
+    def test_it_plays_into_the_node(self, path: Path, tmp_path: Path) -> None:
+        pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+        from thermo_comp.ros.round_trip import round_trip
+
+        columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
+        write_log(table_log(path, columns), tmp_path / 'bag')
+        # A unit that already speaks m/s^2, +-2 g as the map says.
+        reference = AxisReference(1.0, 0.0)
+        unit = calibration(
+            unit=Unit('freezer-mpu6050', 'm/s^2', 1.999 * STANDARD_GRAVITY, 0.08),
+            axes=Axes(reference, reference, reference),
+        )
+        save_calibration(unit, tmp_path / 'unit.yaml')
+        live = round_trip(
+            tmp_path / 'bag',
+            tmp_path / 'unit.yaml',
+            tmp_path / 'live.mcap',
+            node_args=['-p', 'input:=imu'],
+        )
+        offline = replay(tmp_path / 'bag', unit, tmp_path / 'offline.mcap')
+        # Every row is a message, and every message goes out or is counted with its reason.
+        assert sum(n for name, n in live.played.n_messages.items() if 'imu' in name) == 24514
+        assert offline.counters.n_in == 24514
+        assert live.recorded['imu/data_raw'] == offline.counters.n_out
+        assert live.recorded['regime/dynamic'] > 0
+        # The clipped rows are among what the node holds back.
+        assert offline.counters.n_dropped >= offline.counters.n_saturated >= 7
 
     def test_a_map_with_the_wrong_unit_is_refused(self, path: Path, tmp_path: Path) -> None:
         text = (ROOT / 'config' / 'columns' / 'freezer.yaml').read_text()
