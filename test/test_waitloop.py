@@ -178,6 +178,21 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Pee
     assert OTHERS_PERIOD_NS <= 50_000_000
 
 
+def test_a_callback_that_fails_in_the_middleware_stops_no_samples(node: Node, peer: Peer) -> None:
+    failed: list[int] = []
+
+    def fail() -> None:
+        failed.append(len(failed))
+        raise RCLError('the client went away')
+
+    node.create_timer(0.005, fail)
+    with Running(node) as running:
+        publisher = peer.publisher(Vector3Stamped, 'samples')
+        peer.poll(lambda: len(failed) > 2, 'failures')
+        publisher.publish(Vector3Stamped())
+        running.wait_for(lambda: running.messages)
+
+
 def test_raw_subscriptions_are_never_the_executors(node: Node, peer: Peer) -> None:
     # The executor would take a message, and the sample would be lost.
     node.create_timer(0.001, lambda: None)

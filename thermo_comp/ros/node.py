@@ -256,15 +256,25 @@ class CompensationNode:
             try:
                 publish(data)
             except RCLError:  # noqa: PERF203  costs nothing unless raised
-                if not self.node.context.ok():
-                    raise
-                self._n_unpublished += 1
+                self._count_unpublished()
         self._publish_flags()
 
     def _publish_flags(self) -> None:
         for _, is_dynamic in self._compensator.take_flags():
-            self._flag.publish(Bool(data=is_dynamic))
+            try:
+                self._flag.publish(Bool(data=is_dynamic))
+            except RCLError:
+                self._count_unpublished()
             self._n_flags += 1
+
+    def _count_unpublished(self) -> None:
+        """
+        Go on after a message that the middleware did not take, but not after the shutdown.
+
+        """
+        if not self.node.context.ok():
+            raise ExternalShutdownException
+        self._n_unpublished += 1
 
     def _snapshot(self) -> Snapshot:
         last, converter = self._converter.last_result, self._converter

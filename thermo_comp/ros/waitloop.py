@@ -314,8 +314,20 @@ class WaitLoop:
             if entities.wait_set.get_ready_entities('guard_condition'):
                 self._is_stopping = True
             elif entities.is_other_ready():
-                self._executor.spin_once(timeout_sec=0.0)
+                self._serve_others()
                 self._is_stale = True
+
+    def _serve_others(self) -> None:
+        """
+        Let the executor run one callback; samples go on where one fails in the middleware.
+
+        """
+        try:
+            self._executor.spin_once(timeout_sec=0.0)
+        except RCLError as error:
+            if not self._node.context.ok():
+                raise
+            self._node.get_logger().error(f'a callback failed: {error}')
 
 
 def _never_called(message: bytes) -> None:
