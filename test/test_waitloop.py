@@ -140,6 +140,27 @@ def test_one_drain_takes_what_waits_and_leaves_nothing(node: Node, peer: Peer) -
     loop.close()
 
 
+def test_what_a_full_queue_loses_is_counted(node: Node, peer: Peer) -> None:
+    loop = WaitLoop(node)
+    raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=10))
+    publisher = peer.publisher(Vector3Stamped, 'samples')
+    publisher.publish(Vector3Stamped())
+    taken: list[bytes] = []
+    peer.poll(lambda: taken.extend(raw.drain()[0]) or taken, 'the first message')
+    for k in range(50):
+        message = Vector3Stamped()
+        message.vector.x = float(k)
+        publisher.publish(message)
+
+    def is_last_taken() -> bool:
+        taken.extend(raw.drain()[0])
+        return deserialize_message(taken[-1], Vector3Stamped).vector.x == 49.0
+
+    peer.poll(is_last_taken, 'the last message')
+    assert raw.n_lost == 51 - len(taken)
+    loop.close()
+
+
 def test_raw_publisher_sends_the_bytes(node: Node, peer: Peer) -> None:
     heard = peer.listen(Vector3Stamped, 'copies', raw=True)
     publisher = node.create_publisher(Vector3Stamped, 'copies', DEEP)

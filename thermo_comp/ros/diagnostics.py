@@ -39,6 +39,8 @@ class Traffic:
 
     """
 
+    #: Samples that the driver sent and the node did not get.
+    n_lost: int = 0
     #: Output messages that the middleware did not accept.
     n_unpublished: int = 0
     #: Messages that could not be read.
@@ -156,6 +158,7 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> lis
         (new.n_not_finite, 'samples not finite, dropped'),
         (new.n_out_of_order, 'samples out of order, dropped'),
         (new.n_time_jumps, 'jumps of time backwards, estimators reset'),
+        (now.traffic.n_lost - before.traffic.n_lost, 'samples lost on the way to the node'),
         (now.traffic.n_malformed - before.traffic.n_malformed, 'messages unreadable, dropped'),
         (now.traffic.n_unpublished - before.traffic.n_unpublished, 'messages not accepted by DDS'),
     ):

@@ -117,6 +117,8 @@ class CompensationNode:
         )
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
+        self._n_publishers = 0
+        self._n_lost = 0
         self._n_malformed = 0
         self._n_fallback = 0
         self._n_unpublished = 0
@@ -279,6 +281,7 @@ class CompensationNode:
     def _snapshot(self) -> Snapshot:
         last, converter = self._converter.last_result, self._converter
         traffic = Traffic(
+            n_lost=self._n_lost,
             n_unpublished=self._n_unpublished,
             n_malformed=self._n_malformed + converter.n_malformed,
             n_flags=self._n_flags,
@@ -292,6 +295,7 @@ class CompensationNode:
         Publish diagnostics; log when the level changes.
 
         """
+        self._count_lost()
         now = self._snapshot()
         if now.status.counters.n_in != self._reported.status.counters.n_in:
             self._last_samples = time.monotonic()
@@ -311,6 +315,17 @@ class CompensationNode:
                 self._log.warning(status.message)
             else:
                 self._log.error(status.message)
+
+    def _count_lost(self) -> None:
+        """
+        Count gaps in the driver's numbering, which mean something only while there is one driver.
+
+        """
+        samples = self._samples
+        n_lost, samples.n_lost = samples.n_lost, 0
+        before, self._n_publishers = self._n_publishers, samples.subscription.get_publisher_count()
+        if before == self._n_publishers == 1:
+            self._n_lost += n_lost
 
     def _advance_without_samples(self) -> None:
         """

@@ -72,6 +72,9 @@ class RawSubscription:
         self.subscription = subscription
         self._message_type = subscription.msg_type
         self._take: Callable[[Any, bool], Any] = subscription.handle.take_message
+        self._sequence: int | None = None
+        #: Messages that were sent and did not get here, as far as one publisher numbers them.
+        self.n_lost = 0
 
     def drain(self) -> tuple[list[bytes], list[int]]:
         """
@@ -95,7 +98,15 @@ class RawSubscription:
             message, info = taken
             messages.append(message)
             received_ns.append(info['received_timestamp'])
+        if messages:
+            self._count_lost(info['publication_sequence_number'], len(messages))
         return messages, received_ns
+
+    def _count_lost(self, sequence: int | None, n_taken: int) -> None:
+        before, self._sequence = self._sequence, sequence
+        if before is not None and sequence is not None:
+            # Another publisher's numbers can go back.
+            self.n_lost += max(0, sequence - before - n_taken)
 
 
 class RawPublisher:
