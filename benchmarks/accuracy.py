@@ -209,6 +209,33 @@ def part_held_out(options: argparse.Namespace) -> None:
                 )
 
 
+def part_ladder(options: argparse.Namespace) -> None:
+    """
+    Every rung of the ladder on the same bags, judged on the program that none has seen.
+
+    """
+    print('| unit | model | norm RMS | norm peak | vector RMS |')
+    print('|---|---|---|---|---|')
+    rungs = (
+        'constant', 'quadratic', 'golovach', 'quadratic+gradient', 'quadratic+memory1',
+        'quadratic+memory2',
+    )  # fmt: skip
+    for preset in LIMITS:
+        unit = unit_preset(preset, 1)
+        sources = []
+        for number, up in enumerate(positions(options.positions, 1)):
+            kept = list(blocks(unit, 'chamber', up, 1000 + number, 25.0))
+            sources.append(FitSource(f'position-{number}', lambda kept=kept: kept))
+        for model in rungs:
+            settings = FitOptions(gravity=STANDARD_GRAVITY, model=model)
+            found = held_out(fit(sources, settings).calibration, unit, 1, options.rate_hz)
+            print(
+                f'| {preset} | {model} | {found.norm_rms:.2f} | {found.norm_peak:.1f} '
+                f'| {found.vector_rms:.2f} |',
+                flush=True,
+            )
+
+
 def exact_unit(seed: int) -> UnitModel:
     """
     Make a unit whose drift is a quadratic of the board's temperature, and nothing else.
@@ -361,6 +388,7 @@ def main() -> int:
 
     """
     parts = {
+        'ladder': part_ladder,
         'held-out': part_held_out,
         'restraint': part_restraint,
         'efficiency': part_efficiency,
