@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from .columns import Block, Floats, ImuColumns, Ints, RawMessages, Role
 from .wire import IMU_ACCELERATION, imu_columns
 
-#: A block is given out once it has so many messages: enough that what a block costs as such, in
-#: the reader and in those behind it, is little beside its samples; some MB of columns.
-BLOCK_MESSAGES = 1 << 16
+#: A block is given out once it has so many messages; a chunk of usual size has more.
+BLOCK_MESSAGES = 1 << 13
 
 
 @dataclass(slots=True)
