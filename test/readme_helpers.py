@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the reading of the README: its blocks, the outputs that it shows, and how alike is alike.
+
+``python test/readme_helpers.py`` runs the shown commands and writes what they say into the README,
+and the picture of the demonstration into docs/images; look at the difference before you commit it.
+
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / 'README.md').read_text(encoding='utf-8')
+FENCES = re.findall(r'^```(\w+)\n(.*?)^```', README, re.MULTILINE | re.DOTALL)
+_NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
+
+
+def shown() -> dict[str, tuple[list[str], str]]:
+    """
+    Return what the README shows: sub-command -> (words of the command line, output).
+
+    """
+    found = {}
+    for kind, text in FENCES:
+        if kind == 'console':
+            command, _, output = text.partition('\n')
+            words = shlex.split(command.removeprefix('$ '))
+            assert words[0] == 'thermo_comp'
+            found[words[1]] = (words[1:], output)
+    return found
+
+
+def is_alike(got: str, expected: str) -> bool:
+    """
+    Compare two outputs: words exactly, numbers by a third.
+
+    A figure may differ on another processor (last bits) or another day (speed); its order of
+    magnitude may not.
+
+    """
+    if _NUMBER.sub('#', got).split() != _NUMBER.sub('#', expected).split():
+        return False
+    numbers = zip(_NUMBER.findall(got), _NUMBER.findall(expected), strict=True)
+    return all(abs(float(a) - float(b)) <= max(abs(float(b)) / 3.0, 5.0) for a, b in numbers)
+
+
+def refresh() -> None:
+    """
+    Write the real output of the shown commands, and the table of the parameters, into the README.
+
+    """
+    from thermo_comp.ros.parameters import parameters_table
+
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80'}
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, 'bags').symlink_to(ROOT / 'bags')
+
+        def run(match: re.Match[str]) -> str:
+            command = match[1].partition('\n')[0]
+            program = f'{shlex.quote(sys.executable)} -m thermo_comp'
+            finished = subprocess.run(
+                ['bash', '-c', command.replace('$ thermo_comp', program, 1)],
+                cwd=folder,
+                env=environment,
+                capture_output=True,
+                text=True,
+                check=True,
+            )
+            return f'```console\n{command}\n{finished.stdout.rstrip()}\n```'
+
+        text = re.sub(r'^```console\n(.*?)^```', run, README, flags=re.MULTILINE | re.DOTALL)
+        shutil.copy(
+            Path(folder, 'out', 'figures', '4_gravity.png'), ROOT / 'docs/images/gravity.png'
+        )
+    table = rf'\g<1>{parameters_table().strip()}\n\g<2>'
+    text = re.sub(r'(<!-- parameters.*?-->\n).*?(<!-- end)', table, text, flags=re.DOTALL)
+    (ROOT / 'README.md').write_text(text, encoding='utf-8')
+
+
+if __name__ == '__main__':
+    sys.path.insert(0, str(ROOT))
+    refresh()
