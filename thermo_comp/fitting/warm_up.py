@@ -33,6 +33,7 @@ _FIRST_GUESS_S = 1800.0
 _NEEDED_RATIO = 0.7
 _CUTS_S = (600.0, 1200.0, 1800.0, 2700.0, 3600.0, 5400.0)
 _LARGEST_PART = 0.4
+_WINDOWS_PER_BAG = 80.0
 # The shortest cut that is about as good as the best is taken.
 _GOOD_RATIO = 1.04
 
@@ -96,6 +97,9 @@ def find_warm_up(
         None when the bags do without.
 
     """
+    # To see whether there is a transient of minutes and hours needs no finer windows.
+    longest = float(np.max(table.time))
+    coarse = table.coarsened(longest / _WINDOWS_PER_BAG)
     spec = model_spec(_REFERENCE_MODEL, table)
 
     def fitted(kept: WindowTable, transient_s: float | None) -> Outcome:
@@ -103,12 +107,11 @@ def find_warm_up(
             kept, spec, gravity, constant, freedom, transient_s=transient_s, max_steps=15
         )
 
-    settling = fitted(table, _FIRST_GUESS_S)
-    if _rms(settling, table, 0.0) > _NEEDED_RATIO * _rms(fitted(table, None), table, 0.0):
+    plain, settling = fitted(coarse, None), fitted(coarse, _FIRST_GUESS_S)
+    if _rms(settling, coarse, 0.0) > _NEEDED_RATIO * _rms(plain, coarse, 0.0):
         return None
     # What is left out is judged on what all the cuts leave in: a transient of more than one
     # exponential at the start bends the fit of the rest.
-    longest = float(np.max(table.time))
     cuts = [0.0, *(cut for cut in _CUTS_S if cut <= _LARGEST_PART * longest)]
     tried = []
     for cut_s in cuts:
