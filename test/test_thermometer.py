@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from thermal_signals import LAG_S, SECOND_NS, lagged, read
 
-from thermo_comp.thermometer import Thermometer, ThermometerSettings, correct, predict
+from thermo_comp.modes import blend, correct, predict
+from thermo_comp.thermometer import Thermometer, ThermometerSettings
 
 SOAK_S, RAMP_S = 1800.0, 2400.0
 SENSORS = {
@@ -226,6 +227,22 @@ def test_correction_is_that_of_matrices():
     np.testing.assert_allclose(out[3:], (covariance - np.outer(gain, covariance[0]))[upper])
     assert innovation == 5.0 - mean[0]
     assert spread == pytest.approx(covariance[0, 0] + 0.2)
+
+
+def test_a_blend_has_the_moments_of_the_mixture():
+    rng = np.random.default_rng(2)
+    states, samples = [], []
+    upper = np.triu_indices(3)
+    for n in (300_000, 100_000):
+        root = rng.normal(size=(3, 3))
+        mean = rng.normal(size=3)
+        states.append((*mean, *(root @ root.T)[upper]))
+        samples.append(rng.multivariate_normal(mean, root @ root.T, n))
+    out = blend(*states, 0.25)
+    mixed = np.concatenate(samples)
+    # 400 000 samples of sds of a few: 1 % of the covariances
+    np.testing.assert_allclose(out[:3], mixed.mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(out[3:], np.cov(mixed.T)[upper], atol=0.1)
 
 
 @pytest.mark.parametrize('reading', [math.nan, math.inf, -math.inf])

@@ -251,26 +251,30 @@ class Compensator:
         # Readings of the old time that no sample reached belong to the time that is gone.
         self._queue.drop_after(stamp_ns)
         self.tracker.reset()
-        self.stuck.reset()
-        self.rate.reset()
+        self._forget_samples()
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
         return True
+
+    def _forget_samples(self) -> None:
+        # What comes is another recording.
+        self.stuck.reset()
+        self.rate.reset()
+        self.gravity = self._gravity_monitor()
 
     def apply_reading(self, stamp_ns: int, kind: int, celsius: float) -> None:
         """
         Let a reading take effect now: kind 0 is the board, 1 the case.
 
         """
-        counters = self.counters
         self._n_applied += 1
         if kind == 0:
             if self.tracker.board_reading(stamp_ns, celsius):
-                counters.n_board += 1
+                self.counters.n_board += 1
             else:
                 self._count_rejected(kind)
         elif self.tracker.case_reading(stamp_ns, celsius):
-            counters.n_case += 1
+            self.counters.n_case += 1
             if self.tracker.detector.regime != Regime.UNKNOWN:
                 self._flags.append((stamp_ns, self.tracker.detector.regime == Regime.DYNAMIC))
         else:
@@ -483,8 +487,7 @@ class Compensator:
         self.tracker.reset()
         self._queue.take()
         self._flags.clear()
-        self.stuck.reset()
-        self.rate.reset()
+        self._forget_samples()
         self._segment_key = None
         self.last_ns = _EVER_NS
         self._event_ns = _EVER_NS

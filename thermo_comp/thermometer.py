@@ -25,10 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import erf, exp, inf, isfinite, nan, sqrt
 
-State = tuple[float, float, float, float, float, float, float, float, float]
-"""Temperature, rate, acceleration; then P00, P01, P02, P11, P12, P22 of their covariance."""
-
-_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)
+from .modes import NOWHERE, State, blend, correct, predict
 
 OUTLIER_SIGMAS = 6.0  # innovations beyond this limit count less ...
 OUTLIER_LIMITS = 5.0  # ... and beyond this many limits not at all ...
@@ -39,7 +36,7 @@ CELL_SHARE = 0.2  # the same where wide cells hide slow changes
 CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells ...
 WIDE_CELL_SIGMAS = 8.5  # ... that noise never crosses: six sds of a difference
 HORIZON_INTERVALS = 5.0  # extrapolation is linear up to here, then held
-NOISE_MEMORY = 200.0  # readings over which the innovations judge the declared noise
+NOISE_MEMORY = 200.0  # surprises over which the declared noise is judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +118,10 @@ class Thermometer:
         Its variances, K^2, K^2/s^2, K^2/s^4; infinite before the first reading.
     interval_s : float
         Typical interval between readings, s; NaN before the second one.
+    n_in_row : int
+        Readings used since the last start.
     is_ready : bool
-        Whether two readings in a row have been used, so that there is a rate.
+        Whether there are two of them, so that there is a rate.
     measured, measured_variance : float
         What the last used reading said of the temperature at its stamp, degC and K^2: the
         reading itself, or its equivalent for a sensor with cells. Infinite variance: nothing.
@@ -147,6 +146,7 @@ class Thermometer:
         self._flat = noise * noise + quantum * quantum / 12.0
         self.noise_factor = 1.0
         self._noise_scale = 1.0  # its square
+        self._n_turns = 8.0  # surprises it rests on
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -168,13 +168,14 @@ class Thermometer:
         self.temperature = self.rate = self.acceleration = nan
         self.var_temperature = self.var_rate = self.var_acceleration = inf
         self.interval_s = nan
+        self.n_in_row = 0
         self.is_ready = False
         self.measured = nan
         self.measured_variance = inf
         self.bending = 0.5
         self._covariance = 0.0  # of temperature and rate
-        self._quiet: State = _NOWHERE
-        self._bent: State = _NOWHERE
+        self._quiet: State = NOWHERE
+        self._bent: State = NOWHERE
         self._surprise = 0.0
         self._n_strange = 0
 
@@ -217,8 +218,8 @@ class Thermometer:
         bending = self.bending
         prior_bending = bending * (1.0 - to_quiet) + (1.0 - bending) * to_bending
         prior_quiet = 1.0 - prior_bending
-        quiet = _blend(self._quiet, self._bent, bending * to_quiet / prior_quiet)
-        bent = _blend(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
+        quiet = blend(self._quiet, self._bent, bending * to_quiet / prior_quiet)
+        bent = blend(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
         quiet = predict(quiet, dt, lag, self._quiet_power)
         bent = predict(bent, dt, lag, self._bending_power)
 
@@ -235,7 +236,9 @@ class Thermometer:
         if is_turning and not self._has_cells:
             # Only surprises that change sign are noise; a bend makes a row of one sign.
             excess = min(surprise * surprise / spread - 1.0, 8.0)
-            self._noise_scale = max(1.0, scale * (1.0 + excess / NOISE_MEMORY))
+            if self._n_turns < NOISE_MEMORY:
+                self._n_turns += 1.0
+            self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
             self.noise_factor = sqrt(self._noise_scale)
         limit = OUTLIER_SIGMAS * sqrt(spread) + 5.0 * self._bend * dt * dt + 1.5 * self._quantum
         if abs(surprise) > limit:
@@ -282,13 +285,14 @@ class Thermometer:
             self.var_rate,
             _,
             self.var_acceleration,
-        ) = _blend(quiet, bent, bending)
+        ) = blend(quiet, bent, bending)
         self.measured = measured
         self.measured_variance = noise
         if reading_c != self.reading:
             self.changed_ns = stamp_ns
             self.reading = reading_c
         self.stamp_ns = stamp_ns
+        self.n_in_row += 1
         self.interval_s = self.interval_s + 0.05 * (dt - self.interval_s) if self.is_ready else dt
         self.is_ready = True
         self.n_used += 1
@@ -337,6 +341,7 @@ class Thermometer:
         self._quiet = self._bent = (
             reading_c, 0.0, 0.0, noise, 0.0, 0.0, self.var_rate, 0.0, self.var_acceleration
         )  # fmt: skip
+        self.n_in_row = 1
         self.n_used += 1
 
     def _cell(
@@ -380,116 +385,3 @@ class Thermometer:
         if variance > box:
             return reading, variance * box / (variance - box)
         return reading, inf
-
-
-def predict(state: State, dt: float, lag: float, power: float) -> State:
-    """
-    Carry a state over a time step: constant acceleration that decays and wanders.
-
-    Parameters
-    ----------
-    state : tuple of float
-        Temperature, rate, acceleration and the upper triangle of their covariance.
-    dt : float
-        The step, s.
-    lag : float
-        Decay time of the acceleration, s; infinite = none.
-    power : float
-        Spectral density of the white noise that drives the acceleration, K^2/s^5.
-
-    Returns
-    -------
-    tuple of float
-        The state at the end of the step.
-
-    """
-    t, v, a, p00, p01, p02, p11, p12, p22 = state
-    half = 0.5 * dt * dt
-    decay = 1.0 / (1.0 + dt / lag)
-    grown = power * dt
-    p12 += dt * p22
-    p02 += dt * p12 - half * p22
-    cross = p01 + dt * p11 + half * (p12 - dt * p22)
-    p00 += dt * (p01 + cross) + half * (p02 - dt * p12 + half * p22 + p02)
-    return (
-        t + dt * v + half * a,
-        v + dt * a,
-        decay * a,
-        p00 + grown * half * half / 5.0,
-        cross + dt * p02 + grown * half * dt / 4.0,
-        decay * p02 + grown * half / 3.0,
-        p11 + dt * (p12 + p12 - dt * p22) + grown * dt * dt / 3.0,
-        decay * p12 + grown * dt / 2.0,
-        decay * decay * p22 + grown,
-    )
-
-
-def correct(state: State, measured: float, variance: float) -> tuple[State, float, float]:
-    """
-    Let a state learn from one measurement of the temperature.
-
-    Parameters
-    ----------
-    state : tuple of float
-        Temperature, rate, acceleration and the upper triangle of their covariance.
-    measured : float
-        The measured temperature, degC.
-    variance : float
-        Its variance, K^2.
-
-    Returns
-    -------
-    state : tuple of float
-        The corrected state.
-    innovation : float
-        Measured minus expected, K.
-    spread : float
-        Variance of the innovation, K^2.
-
-    """
-    t, v, a, p00, p01, p02, p11, p12, p22 = state
-    spread = p00 + variance
-    innovation = measured - t
-    k0 = p00 / spread
-    k1 = p01 / spread
-    k2 = p02 / spread
-    left = variance / spread
-    return (
-        (
-            t + k0 * innovation,
-            v + k1 * innovation,
-            a + k2 * innovation,
-            left * p00,
-            left * p01,
-            left * p02,
-            p11 - k1 * p01,
-            p12 - k1 * p02,
-            p22 - k2 * p02,
-        ),
-        innovation,
-        spread,
-    )
-
-
-def _blend(one: State, other: State, share: float) -> State:
-    """
-    Mean and covariance of a mixture of two states.
-
-    """
-    t, v, a, p00, p01, p02, p11, p12, p22 = one
-    u, w, b, r00, r01, r02, r11, r12, r22 = other
-    u -= t
-    w -= v
-    b -= a
-    apart = share * (1.0 - share)
-    return (
-        t + share * u,
-        v + share * w,
-        a + share * b,
-        p00 + share * (r00 - p00) + apart * u * u,
-        p01 + share * (r01 - p01) + apart * u * w,
-        p02 + share * (r02 - p02) + apart * u * b,
-        p11 + share * (r11 - p11) + apart * w * w,
-        p12 + share * (r12 - p12) + apart * w * b,
-        p22 + share * (r22 - p22) + apart * b * b,
-    )

@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the arithmetic of one mode of the thermometer: predict, correct and blend its state.
+
+Plain floats, written out: a matrix library costs more per call than all of this together.
+
+"""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+State = tuple[float, float, float, float, float, float, float, float, float]
+"""Temperature, rate, acceleration; then P00, P01, P02, P11, P12, P22 of their covariance."""
+
+NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)
+"""Nothing is known."""
+
+
+def predict(state: State, dt: float, lag: float, power: float) -> State:
+    """
+    Carry a state over a time step: constant acceleration that decays and wanders.
+
+    Parameters
+    ----------
+    state : tuple of float
+        Temperature, rate, acceleration and the upper triangle of their covariance.
+    dt : float
+        The step, s.
+    lag : float
+        Decay time of the acceleration, s; infinite = none.
+    power : float
+        Spectral density of the white noise that drives the acceleration, K^2/s^5.
+
+    Returns
+    -------
+    tuple of float
+        The state at the end of the step.
+
+    """
+    t, v, a, p00, p01, p02, p11, p12, p22 = state
+    half = 0.5 * dt * dt
+    decay = 1.0 / (1.0 + dt / lag)
+    grown = power * dt
+    p12 += dt * p22
+    p02 += dt * p12 - half * p22
+    cross = p01 + dt * p11 + half * (p12 - dt * p22)
+    p00 += dt * (p01 + cross) + half * (p02 - dt * p12 + half * p22 + p02)
+    return (
+        t + dt * v + half * a,
+        v + dt * a,
+        decay * a,
+        p00 + grown * half * half / 5.0,
+        cross + dt * p02 + grown * half * dt / 4.0,
+        decay * p02 + grown * half / 3.0,
+        p11 + dt * (p12 + p12 - dt * p22) + grown * dt * dt / 3.0,
+        decay * p12 + grown * dt / 2.0,
+        decay * decay * p22 + grown,
+    )
+
+
+def correct(state: State, measured: float, variance: float) -> tuple[State, float, float]:
+    """
+    Let a state learn from one measurement of the temperature.
+
+    Parameters
+    ----------
+    state : tuple of float
+        Temperature, rate, acceleration and the upper triangle of their covariance.
+    measured : float
+        The measured temperature, degC.
+    variance : float
+        Its variance, K^2.
+
+    Returns
+    -------
+    state : tuple of float
+        The corrected state.
+    innovation : float
+        Measured minus expected, K.
+    spread : float
+        Variance of the innovation, K^2.
+
+    """
+    t, v, a, p00, p01, p02, p11, p12, p22 = state
+    spread = p00 + variance
+    innovation = measured - t
+    k0 = p00 / spread
+    k1 = p01 / spread
+    k2 = p02 / spread
+    left = variance / spread
+    return (
+        (
+            t + k0 * innovation,
+            v + k1 * innovation,
+            a + k2 * innovation,
+            left * p00,
+            left * p01,
+            left * p02,
+            p11 - k1 * p01,
+            p12 - k1 * p02,
+            p22 - k2 * p02,
+        ),
+        innovation,
+        spread,
+    )
+
+
+def blend(one: State, other: State, share: float) -> State:
+    """
+    Mix two states: mean and covariance of the mixture.
+
+    Parameters
+    ----------
+    one, other : tuple of float
+        The states.
+    share : float
+        Share of the other one, 0..1.
+
+    Returns
+    -------
+    tuple of float
+        The mixture; its covariance contains the distance of the two.
+
+    """
+    t, v, a, p00, p01, p02, p11, p12, p22 = one
+    u, w, b, r00, r01, r02, r11, r12, r22 = other
+    u -= t
+    w -= v
+    b -= a
+    apart = share * (1.0 - share)
+    return (
+        t + share * u,
+        v + share * w,
+        a + share * b,
+        p00 + share * (r00 - p00) + apart * u * u,
+        p01 + share * (r01 - p01) + apart * u * w,
+        p02 + share * (r02 - p02) + apart * u * b,
+        p11 + share * (r11 - p11) + apart * w * w,
+        p12 + share * (r12 - p12) + apart * w * b,
+        p22 + share * (r22 - p22) + apart * b * b,
+    )

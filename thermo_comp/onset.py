@@ -1,0 +1,326 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the test for an onset: has the rate of one sensor left the baseline of the soak?
+
+Two linear filters of temperature and rate, of different memory, integrate the second derivative.
+A rate counts as departed when it is beyond the baseline by more than the soak is known to swing,
+and by more than the filter's noise reaches at the allowed rate of false alarms (Rice's formula,
+see docs/regime.md). The swing is what the ripple of the surroundings makes through the lag, or
+what has been seen, if that is more.
+
+Where the cells of a sensor are so wide that noise cannot cross one, the time between two edges
+crossed in the same direction gives the mean rate between them, sharply, and takes the filters'
+place.
+
+References
+----------
+.. [1] S. O. Rice, "Mathematical analysis of random noise", Bell System Technical Journal 24, 1945.
+
+"""
+
+from __future__ import annotations
+
+from math import acos, inf, isnan, log, nan, pi, sqrt
+
+from .thermometer import Thermometer, ThermometerSettings
+
+BEND_SHARES = (1.0, 10.0)  # accelerations the two filters are tuned to / the smallest onset
+TUNING = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
+CELL_NOISE_SHARE = 0.4  # noise in a filter's own variance when cells make it come in bunches
+SETTLING = 5.0  # memories until a filter's noise is the formula's
+LONGEST_HALF_SWING_S = 600.0  # a ripple turns faster
+SWING_MARGIN = 1.25  # on a swing of the rate about its trend ...
+SWING_SIGMAS = 3.0  # ... beyond what the noise makes of it
+SWING_MEMORY_LAGS = 10.0  # and how slowly it is forgotten
+
+
+class OnsetTest:
+    """
+    Baseline, swing and departure of the rate of one sensor.
+
+    Parameters
+    ----------
+    sensor : ThermometerSettings
+        The sensor.
+    smallest_rate : float
+        Rate of the smallest ramp that must be seen, K/s.
+    ripple : float
+        Amplitude of the surroundings' temperature in a soak, K.
+    false_alarms : float
+        Allowed rate of departures by noise alone, 1/s.
+
+    Attributes
+    ----------
+    rate : float
+        The rate, of the filter with the longer memory, K/s.
+    swing : float
+        How far the rate of a soak is known to go from its baseline, K/s.
+
+    """
+
+    def __init__(
+        self,
+        sensor: ThermometerSettings,
+        smallest_rate: float,
+        ripple: float,
+        false_alarms: float,
+    ) -> None:
+        self._largest_swing = 0.5 * smallest_rate
+        self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
+        self._baseline_s = 0.5 * sensor.lag_s
+        self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
+        self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
+        # The memory (1 / tracking frequency) that sees an acceleration soonest at 1 Hz, and from
+        # it the power of the acceleration that the filter expects, whatever the readings' rate.
+        self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
+        onset = smallest_rate / sensor.lag_s
+        memories = [TUNING * (sqrt(self._noise) / (share * onset)) ** 0.4 for share in BEND_SHARES]
+        self._powers = [self._noise / memory**4 for memory in memories]
+        # crossings per second of h: acos(rho) / (2 pi dt) exp(-h^2 / 2); two filters, two signs
+        self._log_crossings = -log(2.0 * pi * false_alarms / (2.0 * len(self._powers)))
+        self._edge_noise = sensor.noise_sd_c * sqrt(2.0)
+        self._quantum = sensor.quantum_c
+        self._has_cells = sensor.has_cells
+        self._by_edges = sensor.has_wide_cells
+        self.reset()
+
+    def reset(self) -> None:
+        """
+        Forget everything.
+
+        """
+        self._stamp_ns: int | None = None
+        self._n_restarts = -1
+        self._filters: list[tuple[float, float, float, float, float]] = []
+        self._dt = 0.0
+        self._thresholds: list[float] = []
+        self._noise_share = 0.0
+        self._edge_margin = 0.0
+        self._settled_s = 0.0
+        self._age_s = 0.0
+        self.rate = 0.0
+        self.swing = self._ripple_rate
+        self._baseline = 0.0
+        self._doubt = self.swing  # of the baseline, which may begin at a crest
+        self._trend = 0.0
+        self._is_above = False
+        self._turned_s = 0.0
+        self._peak = 0.0
+        self._peak_before = 0.0
+        self._edge = nan
+        self._edge_ns = 0
+        self._reading = nan
+
+    def settle(self, sensor: Thermometer, least_doubt: float = 0.0) -> None:
+        """
+        Begin a soak: what the rate is now is its baseline.
+
+        Parameters
+        ----------
+        sensor : Thermometer
+            The sensor.
+        least_doubt : float, optional
+            How far the baseline may be off at the least, K/s; it fades with the soak.
+
+        """
+        self._baseline = self.rate
+        self._doubt = max(self.swing, least_doubt, 2.0 * sqrt(sensor.var_rate))
+        self._edge = nan  # edges that were crossed before the soak tell of the ramp
+
+    def is_following(self, stamp_ns: int) -> bool:
+        """
+        Tell whether `rate` is that of the reading with this stamp.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            The stamp, ns.
+
+        Returns
+        -------
+        bool
+            False while the test starts, or follows nothing.
+
+        """
+        return self._stamp_ns == stamp_ns and self._age_s > 0.0
+
+    def is_back(self) -> bool:
+        """
+        Tell whether the rate is within a swing of the baseline.
+
+        Returns
+        -------
+        bool
+            True when nothing is left of a departure.
+
+        """
+        return abs(self.rate - self._baseline) < self.swing + self._doubt
+
+    def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
+        """
+        Take the sensor's last used reading.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp, ns.
+        sensor : Thermometer
+            The sensor.
+        pace : float
+            How fast the baseline may follow the rate: 1 in a soak, 0 in a ramp.
+
+        Returns
+        -------
+        int
+            Sign of the departure from the baseline, 0 = none.
+
+        """
+        stamp = self._stamp_ns
+        dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9
+        if (
+            stamp is None
+            or dt > self._baseline_s
+            or sensor.n_restarts != self._n_restarts
+            or not sensor.is_ready
+        ):
+            self._start(stamp_ns, sensor)
+            return 0
+        if dt <= 0.0:
+            return 0
+        self._stamp_ns = stamp_ns
+        self._age_s += dt
+        if not 0.95 * self._dt < dt < 1.05 * self._dt:
+            self._tune(dt)
+        # Back towards rest is no departure: the band reaches from the baseline to zero.
+        swing = self.swing + self._doubt
+        high = max(self._baseline, 0.0) + swing
+        low = min(self._baseline, 0.0) - swing
+        if self._by_edges:
+            departure = self._watch_edges(stamp_ns, sensor, low, high)
+        else:
+            departure = self._watch_filters(
+                dt, sensor.measured, sensor.measured_variance, low, high
+            )
+        if self._age_s < self._settled_s:
+            self.settle(sensor)
+            self._trend = self.rate
+            return 0
+        if not self._by_edges:
+            self._learn_swing(dt)
+            if not departure or pace < 1.0:
+                self._follow(self.rate, pace * dt)
+        return departure
+
+    def _start(self, stamp_ns: int, sensor: Thermometer) -> None:
+        self._stamp_ns = stamp_ns
+        self._n_restarts = sensor.n_restarts
+        self._age_s = 0.0
+        self._filters = [(sensor.temperature, 0.0, self._noise, 0.0, self._rate_variance)] * 2
+        self._edge = nan
+        self._edge_ns = stamp_ns
+        self._reading = sensor.reading
+
+    def _tune(self, dt: float) -> None:
+        """
+        Set the thresholds, squared and relative to a filter's own variance of the rate.
+
+        """
+        self._dt = dt
+        self._thresholds = []
+        squared = 1.0
+        for power in reversed(self._powers):
+            pace = dt * (power / (self._noise * dt)) ** 0.25
+            correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
+            squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
+            share = CELL_NOISE_SHARE if self._has_cells else 0.25 + 0.08 * min(pace, 1.0)
+            self._thresholds.insert(0, squared * share)
+            self._noise_share = share
+        self._edge_margin = sqrt(squared) * self._edge_noise
+        self._settled_s = SETTLING * (self._noise * dt / self._powers[0]) ** 0.25
+
+    def _watch_filters(
+        self, dt: float, measured: float, variance: float, low: float, high: float
+    ) -> int:
+        departure = 0
+        filters = self._filters
+        for k in (1, 0):
+            power = self._powers[k]
+            t, v, p00, p01, p11 = filters[k]
+            t += dt * v
+            p00 += dt * (2.0 * p01 + dt * (p11 + power * dt / 3.0))
+            p01 += dt * (p11 + 0.5 * power * dt)
+            p11 += power * dt
+            if variance < inf:
+                spread = p00 + variance
+                gain = p01 / spread
+                innovation = measured - t
+                left = variance / spread
+                t += p00 / spread * innovation
+                v += gain * innovation
+                p11 -= gain * p01
+                p00 *= left
+                p01 *= left
+            filters[k] = (t, v, p00, p01, p11)
+            beyond = v - high if v > high else (low - v if v < low else 0.0)
+            if beyond * beyond > self._thresholds[k] * p11:
+                departure = 1 if v > high else -1
+        self.rate = v
+        return departure
+
+    def _watch_edges(self, stamp_ns: int, sensor: Thermometer, low: float, high: float) -> int:
+        self.rate = sensor.rate
+        departure = 0
+        reading, before = sensor.reading, self._reading
+        apart = (stamp_ns - self._edge_ns) * 1e-9
+        if reading == before:
+            # nothing crossed since: no rate above one quantum in that time
+            bound = self._quantum / apart
+            if bound < self._doubt + abs(self._baseline):
+                self._doubt = max(min(self._doubt, bound), self.swing)
+                self._baseline = min(max(self._baseline, -bound), bound)
+            return 0
+        edge = 0.5 * (reading + before)
+        moved = edge - self._edge
+        sure = abs(moved) - self._edge_margin
+        if sure > 0.0 and sure > (high if moved > 0.0 else -low) * apart:
+            departure = 1 if moved > 0.0 else -1
+        elif not isnan(moved):
+            self._follow(moved / apart, apart)
+        self._edge = edge
+        self._edge_ns = stamp_ns
+        self._reading = reading
+        return departure
+
+    def _follow(self, rate: float, dt: float) -> None:
+        """
+        Let the baseline follow what the rate has been over a while, at most a swing per memory.
+
+        """
+        limit = self.swing + self._doubt
+        share = dt / (dt + self._baseline_s)
+        self._baseline += share * min(max(rate - self._baseline, -limit), limit)
+        self._doubt -= share * self._doubt
+
+    def _learn_swing(self, dt: float) -> None:
+        """
+        Learn how far the rate swings about its trend, from two quick half swings in a row.
+
+        """
+        self._trend += dt / (dt + self._baseline_s) * (self.rate - self._trend)
+        self.swing += dt / (dt + self._swing_memory_s) * (self._ripple_rate - self.swing)
+        apart = self.rate - self._trend
+        if (apart > 0.0) == self._is_above:
+            self._peak = max(self._peak, abs(apart))
+            return
+        if self._age_s - self._turned_s < LONGEST_HALF_SWING_S:
+            # the lesser of the two: an onset or an end is large to one side only
+            noise = SWING_SIGMAS * sqrt(self._noise_share * self._filters[0][4])
+            swing = SWING_MARGIN * min(self._peak, self._peak_before) - noise
+            self.swing = max(self.swing, min(swing, self._largest_swing))
+            self._peak_before = self._peak
+        else:
+            self._peak_before = 0.0
+        self._is_above = apart > 0.0
+        self._turned_s = self._age_s
+        self._peak = abs(apart)
