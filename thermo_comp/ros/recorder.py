@@ -18,6 +18,7 @@ from struct import Struct
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 import rclpy
 from rclpy.context import Context
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -217,7 +218,8 @@ class Recorder:
             if self._newest_ns is None:
                 self._early[name] = messages
             elif messages:
-                self._writer.write_raw(name, _type_name(self._topics[name]), times, messages)
+                stamps = np.array(times, np.int64)
+                self._writer.write_raw(name, _type_name(self._topics[name]), stamps, messages)
                 new[name] = messages
         if new:
             with self._changed:
