@@ -69,8 +69,7 @@ class Compensator:
         self.tracker = ThermalTracker(
             calibration.detector, calibration.memory_time_constants_s, self._thermal_config()
         )
-        self.last_ns = _EVER_NS
-        self._event_ns = _EVER_NS
+        self.last_ns = self._event_ns = _EVER_NS
 
     def _use(self, calibration: Calibration) -> None:
         self.calibration = calibration
@@ -489,8 +488,7 @@ class Compensator:
         self._flags.clear()
         self._forget_samples()
         self._segment_key = None
-        self.last_ns = _EVER_NS
-        self._event_ns = _EVER_NS
+        self.last_ns = self._event_ns = _EVER_NS
 
     @property
     def status(self) -> CompensatorStatus:
