@@ -7,9 +7,10 @@ Owns the fit: bags of a thermal test -> still positions -> regression -> calibra
 
 from .assessment import Assessment, AssessmentRow, AxisShift, assess
 from .evidence import PositionReport, ResidualRow
-from .fit import FitResult, fit
+from .fit import FitResult, fit, fit_bags, reduce_bag
 from .gravity import normal_gravity, resolve_gravity
 from .options import FitOptions
+from .reduction import ReducedBag
 from .selection import Candidate
 from .sources import ArrayBlock, FitSource, SourceBlock
 from .uncertainty import PredictedSd, predicted_sd
@@ -27,11 +28,14 @@ __all__ = [
     'FitSource',
     'PositionReport',
     'PredictedSd',
+    'ReducedBag',
     'ResidualRow',
     'SourceBlock',
     'assess',
     'fit',
+    'fit_bags',
     'normal_gravity',
     'predicted_sd',
+    'reduce_bag',
     'resolve_gravity',
 ]

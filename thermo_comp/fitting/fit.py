@@ -127,7 +127,36 @@ def fit(
     """
     tell = progress or _no_progress
     check_serial(sources, options)
-    bags = reduce_sources(sources, options, tell)
+    return fit_bags(reduce_sources(sources, options, tell), options, tell)
+
+
+def fit_bags(
+    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress | None = None
+) -> FitResult:
+    """
+    Fit a calibration to bags that have been reduced, by whomever.
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        One per bag; each interval's number of the bag is its place here.
+    options : FitOptions
+        What the user said; the lengths are those of the reduction.
+    progress : callable, optional
+        Told a stage's name and how far the whole is, 0..1.
+
+    Returns
+    -------
+    FitResult
+        Calibration and evidence.
+
+    Raises
+    ------
+    FitError
+        If the data cannot carry the fit.
+
+    """
+    tell = progress or _no_progress
     detector = options.detector or learn_detector(bags)
     histories = []
     for number, bag in enumerate(bags):
@@ -165,31 +194,58 @@ def reduce_sources(
     """
     if not sources:
         raise FitError('no bag was given')
-    full_scale = options.full_scale
-    if full_scale is None and options.input == 'counts':
-        full_scale = COUNTS_FULL_SCALE
     bags = []
     for number, source in enumerate(sources):
         progress('reading', 0.6 * number / len(sources))
-        bag = reduce_source(
-            source,
-            number,
-            window_s=options.window_s,
-            cell_s=options.cell_s,
-            min_still_s=options.min_still_s,
-            full_scale=full_scale,
-        )
-        if not bag.n_samples:
-            raise FitError(f'{source.name}: no accelerometer samples')
-        if not len(bag.board.value):
-            raise FitError(f'{source.name}: no board temperature; a thermal fit needs it')
-        if not bag.intervals:
-            raise FitError(
-                f'{source.name}: no still interval of {options.min_still_s:g} s; the unit must '
-                'rest in each position'
-            )
-        bags.append(bag)
+        bags.append(reduce_bag(source, number, options))
     return bags
+
+
+def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBag:
+    """
+    Stream one source into its sufficient statistics.
+
+    Parameters
+    ----------
+    source : FitSource
+        The bag.
+    number : int
+        Its place among the bags of the fit.
+    options : FitOptions
+        Lengths and full scale.
+
+    Returns
+    -------
+    ReducedBag
+        With all that a fit needs.
+
+    Raises
+    ------
+    FitError
+        If it has no samples, no still interval or no board temperature.
+
+    """
+    full_scale = options.full_scale
+    if full_scale is None and options.input == 'counts':
+        full_scale = COUNTS_FULL_SCALE
+    bag = reduce_source(
+        source,
+        number,
+        window_s=options.window_s,
+        cell_s=options.cell_s,
+        min_still_s=options.min_still_s,
+        full_scale=full_scale,
+    )
+    if not bag.n_samples:
+        raise FitError(f'{source.name}: no accelerometer samples')
+    if not len(bag.board.value):
+        raise FitError(f'{source.name}: no board temperature; a thermal fit needs it')
+    if not bag.intervals:
+        raise FitError(
+            f'{source.name}: no still interval of {options.min_still_s:g} s; the unit must '
+            'rest in each position'
+        )
+    return bag
 
 
 def history_of(bag: ReducedBag, detector: DetectorSettings, options: FitOptions) -> ThermalHistory:

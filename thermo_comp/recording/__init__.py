@@ -20,7 +20,15 @@ from .columns import (
     Role,
     Topics,
 )
-from .reader import RecordingReader, inspect_recording, open_recording, read_recording
+from .random_access import LocalFile, OpenFile, RandomAccess
+from .reader import (
+    RecordingReader,
+    in_split_order,
+    inspect_recording,
+    open_mcap,
+    open_recording,
+    read_recording,
+)
 from .writer import BagWriter
 
 __all__ = [
@@ -29,13 +37,18 @@ __all__ = [
     'Block',
     'ImuColumns',
     'Input',
+    'LocalFile',
+    'OpenFile',
+    'RandomAccess',
     'RawMessages',
     'Recording',
     'RecordingInfo',
     'RecordingReader',
     'Role',
     'Topics',
+    'in_split_order',
     'inspect_recording',
+    'open_mcap',
     'open_recording',
     'read_recording',
 ]

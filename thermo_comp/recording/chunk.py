@@ -11,7 +11,6 @@ its end opens the next one.
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import numpy as np
 
 from . import mcap_records as mcap
 from .mcap_records import ChunkSpan, DamagedError
+from .random_access import RandomAccess
 from .unpack import Region, Stream, open_stream, unpack
 from .walk import ENDS_EARLY, OTHER_RECORD, ZERO_OPCODE, Messages, OnRecord, locate, walk
 from .wire import Bytes
@@ -60,14 +60,16 @@ class StreamSpan:
     is_torn: bool = False
 
 
-def load_chunk(handle: int, span: ChunkSpan, on_record: OnRecord) -> tuple[Bytes, Messages]:
+def load_chunk(
+    handle: RandomAccess, span: ChunkSpan, on_record: OnRecord
+) -> tuple[Bytes, Messages]:
     """
     Read a whole chunk.
 
     Parameters
     ----------
-    handle : int
-        The file's descriptor.
+    handle : RandomAccess
+        The open file.
     span : ChunkSpan
         Where the chunk stands.
     on_record : callable of (int, bytes)
@@ -86,7 +88,7 @@ def load_chunk(handle: int, span: ChunkSpan, on_record: OnRecord) -> tuple[Bytes
         Damage anywhere in the chunk, with its place in the file.
 
     """
-    record = os.pread(handle, span.length + span.index_length, span.position)
+    record = handle.read_at(span.position, span.length + span.index_length)
     try:
         if len(record) != span.length + span.index_length:
             raise DamagedError('the file ends inside it')
@@ -107,8 +109,8 @@ class Windows:
 
     Parameters
     ----------
-    handle : int
-        The file's descriptor.
+    handle : RandomAccess
+        The open file.
     span : StreamSpan
         The stretch.
     on_record : callable of (int, bytes)
@@ -123,7 +125,7 @@ class Windows:
 
     """
 
-    def __init__(self, handle: int, span: StreamSpan, on_record: OnRecord) -> None:
+    def __init__(self, handle: RandomAccess, span: StreamSpan, on_record: OnRecord) -> None:
         self._handle = handle
         self._span = span
         self._on_record = on_record
@@ -185,7 +187,7 @@ class Windows:
         span = self._span
         if not span.is_chunk:
             return Region(self._handle, span.position, span.end), None, 0
-        head = os.pread(self._handle, HEAD_BYTES, span.position)
+        head = self._handle.read_at(span.position, HEAD_BYTES)
         chunk, data_at, checksum = mcap.parse_chunk_head(head, span.position)
         limit = chunk.compressed_size * _MAX_GROWTH + MAX_CHUNK_BYTES
         if chunk.size > limit and not span.is_torn:

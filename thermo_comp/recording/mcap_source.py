@@ -28,6 +28,7 @@ from .chunk import Windows, load_chunk
 from .columns import Role
 from .decode import Decoder, Feed
 from .mcap_records import ChunkSpan, DamagedError
+from .random_access import LocalFile, OpenFile, RandomAccess
 from .survey import Survey
 from .sweep import in_log_order
 from .topics import shown
@@ -54,6 +55,8 @@ class McapSource:
         Key-value pairs that stand beside the files.
     note : str or None, optional
         What is missing beside the files.
+    open_file : callable, optional
+        Opens each where it lies.
 
     Raises
     ------
@@ -69,13 +72,14 @@ class McapSource:
         files: Sequence[Path],
         metadata: Mapping[str, str] | None = None,
         note: str | None = None,
+        open_file: OpenFile = LocalFile,
     ) -> None:
         self._is_closed = False
         self._pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
         self._surveys: list[Survey] = []
         try:
             for file in files:
-                self._surveys.append(Survey(file))
+                self._surveys.append(Survey(file, open_file))
         except BaseException:
             self.close()
             raise
@@ -246,7 +250,7 @@ def _placed(
 
 
 def _loaded(
-    pool: ThreadPoolExecutor, handle: int, groups: Sequence[list[ChunkSpan]]
+    pool: ThreadPoolExecutor, handle: RandomAccess, groups: Sequence[list[ChunkSpan]]
 ) -> Iterator[tuple[Bytes, Messages]]:
     """
     Read and decompress ahead in threads; most of what they do needs no interpreter lock.
@@ -276,7 +280,7 @@ def _loaded(
             future.cancel()
 
 
-def _load(handle: int, spans: list[ChunkSpan]) -> tuple[Bytes, Messages]:
+def _load(handle: RandomAccess, spans: list[ChunkSpan]) -> tuple[Bytes, Messages]:
     """
     Read chunks that follow each other in log time as if they were one.
 

@@ -11,7 +11,7 @@ Reading order
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -21,6 +21,7 @@ from .assemble import Part, assemble, join_blocks
 from .columns import ROLES, Block, Input, Recording, RecordingInfo, Role, Topics
 from .foreign import ForeignSource
 from .mcap_source import McapSource
+from .random_access import OpenFile
 from .rosbag2_metadata import read_metadata
 from .topics import select_topics
 
@@ -192,6 +193,45 @@ def open_recording(
         raise
 
 
+def open_mcap(
+    files: Sequence[Path],
+    open_file: OpenFile,
+    topics: Topics | None = None,
+    input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    *,
+    require: Collection[Role] = ROLES,
+) -> RecordingReader:
+    """
+    Open the MCAP files of one bag that lie where only the caller can read.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Their names, in the order in which they follow each other.
+    open_file : callable
+        Opens one of them for reading at places; `OSError` where it cannot.
+    topics, input, require
+        As for `open_recording`.
+
+    Returns
+    -------
+    RecordingReader
+        Whose path is that of the first file.
+
+    Raises
+    ------
+    RecordingError
+        As for `open_recording`.
+
+    """
+    source = McapSource(files, open_file=open_file)
+    try:
+        return RecordingReader(files[0], source, topics or Topics(), input, require)
+    except BaseException:
+        source.close()
+        raise
+
+
 def read_recording(
     path: str | Path,
     topics: Topics | None = None,
@@ -268,7 +308,7 @@ def _open_directory(path: Path) -> Source:
             return McapSource(description.files, description.custom)
         return ForeignSource(path)
     for suffix in ('.mcap', '.db3'):
-        files = sorted((file for file in path.iterdir() if file.suffix == suffix), key=_number)
+        files = in_split_order(file for file in path.iterdir() if file.suffix == suffix)
         if files:
             note = 'metadata.yaml is missing, the recording was not finished'
             if suffix == '.mcap':
@@ -276,6 +316,14 @@ def _open_directory(path: Path) -> Source:
             if len(files) == 1:
                 return ForeignSource(files[0], note)
     raise RecordingError('not a bag: the directory has no metadata.yaml', path)
+
+
+def in_split_order(files: Iterable[Path]) -> list[Path]:
+    """
+    Sort the files of a split bag by the number at the end of their names.
+
+    """
+    return sorted(files, key=_number)
 
 
 def _number(file: Path) -> tuple[int, str]:

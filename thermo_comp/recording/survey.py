@@ -11,7 +11,6 @@ So a file without a summary, or cut off anywhere, is mapped by the same walk as 
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from ..errors import RecordingError
 from . import mcap_records as mcap
 from .chunk import HEAD_BYTES, MAX_CHUNK_BYTES, StreamSpan, Windows, load_chunk
 from .mcap_records import Channel, ChunkSpan, DamagedError, Schema, Statistics
+from .random_access import LocalFile, OpenFile, RandomAccess
 from .walk import Messages, walk
 from .wire import Bytes
 
@@ -40,11 +40,13 @@ class Survey:
     ----------
     path : Path
         The file.
+    open_file : callable, optional
+        Opens it where it lies.
 
     Attributes
     ----------
-    handle : int
-        Its descriptor.
+    handle : RandomAccess
+        The open file.
     spans : list of ChunkSpan or StreamSpan
         What holds messages, in the order of the file.
     channels : dict of int to Channel
@@ -63,7 +65,7 @@ class Survey:
 
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, open_file: OpenFile = LocalFile) -> None:
         self.path = path
         self.spans: list[ChunkSpan | StreamSpan] = []
         self.channels: dict[int, Channel] = {}
@@ -79,7 +81,7 @@ class Survey:
         self._unscanned: list[tuple[ChunkSpan | StreamSpan, bool]] = []
         self._last_index: Counter[int] = Counter()
         try:
-            self.handle = os.open(path, os.O_RDONLY)
+            self.handle: RandomAccess = open_file(path)
         except OSError as error:
             raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
         try:
@@ -99,10 +101,10 @@ class Survey:
         Close the file.
 
         """
-        os.close(self.handle)
+        self.handle.close()
 
     def _map(self) -> None:
-        self._size = os.fstat(self.handle).st_size
+        self._size = self.handle.size
         begin = self._read_header()
         end = self._read_footer(begin)
         self._has_footer = end is not None
@@ -125,7 +127,7 @@ class Survey:
                 self.end_ns = self._statistics.end_ns
 
     def _read(self, at: int, n_bytes: int) -> bytes:
-        return os.pread(self.handle, n_bytes, at)
+        return self.handle.read_at(at, n_bytes)
 
     def _read_header(self) -> int:
         head = self._read(0, len(mcap.MAGIC) + mcap.PREFIX_BYTES)

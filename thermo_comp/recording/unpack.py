@@ -10,7 +10,6 @@ what the reader is willing to hold, and output beyond the claim is damage.
 
 from __future__ import annotations
 
-import os
 import zlib
 from typing import IO, Protocol, cast
 
@@ -19,6 +18,7 @@ import numpy as np
 import zstandard
 
 from .mcap_records import DamagedError
+from .random_access import RandomAccess
 from .wire import Bytes
 
 _MAX_WINDOW = 1 << 27
@@ -112,14 +112,14 @@ class Region:
 
     Parameters
     ----------
-    handle : int
-        An open file descriptor.
+    handle : RandomAccess
+        The open file.
     begin, end : int
         The stretch [bytes].
 
     """
 
-    def __init__(self, handle: int, begin: int, end: int) -> None:
+    def __init__(self, handle: RandomAccess, begin: int, end: int) -> None:
         self._handle = handle
         self._at = begin
         self._end = end
@@ -130,7 +130,7 @@ class Region:
 
         """
         left = self._end - self._at
-        data = os.pread(self._handle, left if n_bytes < 0 else min(n_bytes, left), self._at)
+        data = self._handle.read_at(self._at, left if n_bytes < 0 else min(n_bytes, left))
         self._at += len(data)
         return data
 

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the way to the bytes of a file: so many from such a place, from any thread.
+
+A file on this machine is one kind; whoever keeps bags elsewhere brings another.
+
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+
+class RandomAccess(Protocol):
+    """
+    An open file that is read at places, by several threads at once.
+
+    Attributes
+    ----------
+    size : int
+        Bytes in it.
+
+    """
+
+    size: int
+
+    def read_at(self, at: int, n_bytes: int) -> bytes:
+        """
+        Read up to so many bytes; fewer only where the file ends.
+
+        Raises
+        ------
+        OSError
+            If they cannot be read.
+
+        """
+        ...
+
+    def close(self) -> None:
+        """
+        Close the file.
+
+        """
+        ...
+
+
+OpenFile = Callable[[Path], RandomAccess]
+
+
+class LocalFile:
+    """
+    A file of this machine.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_RDONLY)
+        try:
+            self.size = os.fstat(self._descriptor).st_size
+        except BaseException:
+            os.close(self._descriptor)
+            raise
+
+    def read_at(self, at: int, n_bytes: int) -> bytes:
+        """
+        Read up to so many bytes.
+
+        """
+        return os.pread(self._descriptor, n_bytes, at)
+
+    def close(self) -> None:
+        """
+        Close the file.
+
+        """
+        os.close(self._descriptor)
