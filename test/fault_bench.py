@@ -1,0 +1,242 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the fault bench: messages over DDS into the real node process, and what comes out of it.
+
+Messages go in at full speed, some hundred at a time; after each lot the bench waits until the
+node's diagnostics account for every sample. So nothing is lost that is not to be lost, a fault
+shows in at least one report, and the result does not depend on the machine.
+
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from fault_rig import CONFIG, START_NS, Event, seconds_of
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.context import Context
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Imu, Temperature
+
+from thermo_comp.ros.round_trip import NodeProcess, lossless
+from thermo_comp.ros.waitloop import WaitLoop
+
+#: Longest wait for anything [s]; only a broken bench ever waits as long.
+TIMEOUT_S = 60.0
+#: A lot is this much of the bag [s], and at most so many messages: shared memory of Fast DDS holds
+#: 512, and what does not get in is sent again seconds later, out of order.
+LOT_S, LOT_SIZE = 10.0, 400
+QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+FRAME = b'sensor\0'
+_HEAD = '<4siII7s5x'
+_COUNTS, _READING = struct.Struct(_HEAD + '3d'), struct.Struct(_HEAD + '2d')
+_IMU = np.dtype(
+    [('head', 'V4'), ('sec', '<i4'), ('nanosec', '<u4'), ('frame', 'V16'), ('values', '<f8', 37)]
+)
+_TOPICS = {
+    'counts': (Vector3Stamped, 'accel/counts'),
+    'board': (Temperature, 'temperature/board'),
+    'case': (Temperature, 'temperature/case'),
+}
+PARAMETERS = (
+    f'transition_time:={CONFIG.transition_time_s}',
+    f'temperature_timeout:={CONFIG.temperature_timeout_s}',
+    f'case_timeout:={CONFIG.case_timeout_s}',
+    f'gravity_tolerance:={CONFIG.gravity_tolerance_m_s2}',
+    'diagnostics_period:=0.02',
+)
+
+
+@dataclass
+class Heard:
+    """
+    What the node said while one bag played.
+
+    """
+
+    stamp_ns: np.ndarray
+    force: np.ndarray
+    covariance: np.ndarray
+    #: (level, message) of each report, and all key values of the last one.
+    reports: list[tuple[int, str]] = field(default_factory=list)
+    values: dict[str, str] = field(default_factory=dict)
+
+    def says(self, text: str, level: int) -> bool:
+        """Whether a report at least that severe contains a text."""
+        return any(level <= found and text in message for found, message in self.reports)
+
+
+class Bench:
+    """
+    A peer of the node: three drivers and an INS in one.
+
+    """
+
+    def __init__(self, node: NodeProcess, context: Context) -> None:
+        self.process = node
+        self.node = rclpy.create_node('fault_bench', context=context)
+        self._loop = WaitLoop(self.node)
+        self._imu = self._loop.subscribe(Imu, 'imu/data_raw', QOS)
+        self._diagnostics = self._loop.subscribe(DiagnosticArray, '/diagnostics', QOS)
+        self._news = threading.Condition()
+        self._frames: list[bytes] = []
+        self._reports: list[tuple[int, str]] = []
+        self._values: dict[str, str] = {}
+        self.n_sent = self._n_taken = self._n_reports = 0
+        self._publish = {
+            name: self.node.create_publisher(kind, topic, QOS).handle.publish_raw
+            for name, (kind, topic) in _TOPICS.items()
+        }
+        self._thread = threading.Thread(target=self._loop.run, args=(self._hear,), daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._loop.stop()
+        self._thread.join(TIMEOUT_S)
+        self._loop.close()
+        self.node.destroy_node()
+
+    def _hear(self) -> None:
+        frames, _ = self._imu.drain()
+        reports, _ = self._diagnostics.drain()
+        with self._news:
+            self._frames += frames
+            for data in reports:
+                (status,) = deserialize_message(data, DiagnosticArray).status
+                self._reports.append((status.level[0], status.message))
+                self._n_reports += 1
+                self._values = {one.key: one.value for one in status.values}
+            self._news.notify_all()
+
+    def wait_for(self, condition: Any, what: str) -> None:
+        with self._news:
+            found = self._news.wait_for(
+                lambda: condition() or not self.process.is_alive, TIMEOUT_S
+            )
+        assert self.process.is_alive, self.process.said
+        assert found, f'{what} did not come true; {self._values}'
+
+    def send(self, events: Iterable[Event]) -> int:
+        """Publish messages; return how many samples."""
+        n = 0
+        for topic, stamp_ns, value in events:
+            sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+            if topic == 'counts':
+                n += 1
+                data = _COUNTS.pack(b'\0\1\0\0', sec, nanosec, 7, FRAME, *value)
+            else:
+                data = _READING.pack(b'\0\1\0\0', sec, nanosec, 7, FRAME, value, 0.0)
+            self._publish[topic](data)
+        self.n_sent += n
+        return n
+
+    def meet(self) -> None:
+        """Send samples of another time until the first one comes back."""
+        pause = threading.Event()
+        for k in range(1000):
+            stamp_ns = START_NS + (100_000 + k) * 1_000_000_000
+            self.send([('board', stamp_ns, 20.0), ('counts', stamp_ns, (1e6, 1.0, 2.7e6 + k))])
+            pause.wait(0.02)
+            if self._frames:
+                break
+        # What was sent before both ends knew each other is lost, and is not counted from here.
+        last_ns = stamp_ns + 1_000_000_000
+        self.send([('counts', last_ns, (1e6, 1.0, 2.6e6))])
+        self.wait_for(lambda: self._frames and _stamp_of(self._frames[-1]) == last_ns, 'the meet')
+        n_reports = self._n_reports
+        self.wait_for(lambda: self._n_reports > n_reports + 1, 'a report')
+        self.n_sent = int(self._values['samples in'])
+        self._n_taken = int(self._values['samples out']) - len(self._frames)
+
+    def settle(self) -> None:
+        """Wait until the node accounts for every sample, and all that it published is here."""
+
+        def is_done() -> bool:
+            values = self._values
+            return (
+                int(values.get('samples in', -1)) == self.n_sent
+                and len(self._frames) >= int(values['samples out']) - self._n_taken
+            )
+
+        self.wait_for(is_done, f'{self.n_sent} samples')
+
+    def play(self, events: list[Event]) -> Heard:
+        """Play messages in the order of arrival; return what the node made of them."""
+        self.take()
+        for lot in lots(events):
+            if self.send(lot):
+                self.settle()
+            else:
+                # The node empties its queues before each report.
+                n_reports = self._n_reports
+                self.wait_for(lambda n=n_reports: self._n_reports > n + 2, 'three reports')
+        return self.take()
+
+    def take(self) -> Heard:
+        """Return what has been heard since the last call."""
+        with self._news:
+            frames, self._frames = self._frames, []
+            reports, self._reports = self._reports, []
+            self._n_taken += len(frames)
+            values = dict(self._values)
+        table = np.frombuffer(b''.join(frames), _IMU)
+        stamps = table['sec'].astype(np.int64) * 1_000_000_000 + table['nanosec']
+        numbers = table['values']
+        return Heard(stamps, numbers[:, 25:28], numbers[:, 28:].reshape(-1, 3, 3), reports, values)
+
+
+def _stamp_of(frame: bytes) -> int:
+    sec, nanosec = struct.unpack_from('<iI', frame, 4)
+    return int(sec * 1_000_000_000 + nanosec)
+
+
+def lots(events: list[Event]) -> Iterator[list[Event]]:
+    """Cut messages into lots."""
+    lot: list[Event] = []
+    edge = None
+    for event in events:
+        span = int(seconds_of(event[1]) // LOT_S)
+        is_sample = event[0] == 'counts'
+        if lot and ((is_sample and span != edge) or len(lot) == LOT_SIZE):
+            yield lot
+            lot = []
+        if is_sample:
+            edge = span
+        lot.append(event)
+    yield lot
+
+
+@contextmanager
+def bench(calibration: Path, *parameters: str) -> Iterator[Bench]:
+    """
+    Start a node process and a peer that has met it.
+
+    """
+    overrides = [f'calibration_file:={calibration}', *PARAMETERS, *parameters]
+    arguments = [word for one in overrides for word in ('-p', one)]
+    context = Context()
+    rclpy.init(args=[], context=context)
+    try:
+        with NodeProcess(*lossless(), '--log-level', 'FATAL', *arguments) as node:
+            peer = Bench(node, context)
+            try:
+                peer.meet()
+                yield peer
+                assert node.is_alive, node.said
+                assert node.stop() == 0
+                assert 'Traceback' not in node.said, node.said
+            finally:
+                peer.close()
+    finally:
+        context.try_shutdown()

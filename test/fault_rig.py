@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the simulated bag of the fault bench: a unit in a soak, a ramp and a soak, with its truth,
+and what may be done to its messages.
+
+The unit is described by what its calibration can describe, so that every error beyond noise is the
+fault's: any published number can be held against the truth with the covariance it came with. Time
+is short: the lags are seconds where those of a real unit are minutes.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set
+
+from thermo_comp.calibration import Axes, AxisReference, Calibration, LinearTerm, MemoryTerm, Unit
+from thermo_comp.regime import DetectorSettings
+from thermo_comp.status import CompensatorConfig
+from thermo_comp.thermometer import ThermometerSettings
+
+START_NS = 1_767_225_600 * SECOND_NS
+RATE_HZ = 25.0
+READINGS_HZ = 5.0
+DURATION_S = 320.0
+#: The platform turns until here and stands from here on.
+STANDS_S = 40.0
+RAMP_S = (60.0, 120.0)
+RAMP_K_S = 0.1
+CASE_LAG_S, BOARD_LAG_S, MEMORY_S = 10.0, 60.0, 20.0
+READING_SD = 0.003
+
+#: Counts per m/s^2: a 24-bit converter, whose rounding is 0.3 ug.
+K = 3e5
+FULL_SCALE = 8388607.0
+NOISE_SD = 1e-4
+BIAS = (18000.0, -15000.0, 16500.0)  # 5 mg
+BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K: 100 ug/K
+SCALE_SLOPE = 7e-5
+BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
+
+#: What the static set may leave while a ramp is not detected yet; it is in the covariance.
+STATIC_RESIDUAL = 1.5e-4
+DYNAMIC_RESIDUAL = 3e-5
+
+CONFIG = CompensatorConfig(
+    transition_time_s=5.0,
+    temperature_timeout_s=20.0,
+    case_timeout_s=10.0,
+    gravity_tolerance_m_s2=0.02,
+)
+
+# One message: topic, stamp, value; a list of them is the order of arrival.
+Event = tuple[str, int, Any]
+Inject = Callable[[list[Event]], list[Event]]
+
+
+def unit(**changes: Any) -> Calibration:
+    """Return the calibration of the unit."""
+
+    def one(dynamic: bool) -> Any:
+        return axis_set(
+            (0.0, BIAS_SLOPE, BIAS_CURVE),
+            (1.0, SCALE_SLOPE),
+            gradient=LinearTerm(BY_GRADIENT if dynamic else 0.0),
+            memory=MemoryTerm((BY_MEMORY,), (0.0,)),
+            residual_sd_m_s2=DYNAMIC_RESIDUAL if dynamic else STATIC_RESIDUAL,
+        )
+
+    ranges = {'rate_range_k_min': (-8.0, 8.0), 'gradient_range_k': (-6.0, 6.0)}
+    sensor = ThermometerSettings(READING_SD, 0.0, 12.0, CASE_LAG_S)
+    values = {
+        'unit': Unit('F-1', 'counts', FULL_SCALE, 1.0 / RATE_HZ),
+        'axes': Axes(*[AxisReference(K, bias) for bias in BIAS]),
+        'static': regime_set(*[one(False)] * 3, **ranges),
+        'dynamic': regime_set(*[one(True)] * 3, **ranges),
+        'noise_density_m_s2_sqrt_hz': (NOISE_SD / math.sqrt(RATE_HZ),) * 3,
+        'memory_time_constants_s': (MEMORY_S,),
+        'board_lag_s': BOARD_LAG_S,
+        'detector': DetectorSettings(
+            smallest_ramp_k_min=1.0,
+            relaxed_rate_k_min=0.4,
+            dwell_s=5.0,
+            case=sensor,
+            board=replace(sensor, lag_s=BOARD_LAG_S),
+        ),
+        **changes,
+    }
+    return calibration(**values)
+
+
+def force_at(seconds: np.ndarray) -> np.ndarray:
+    """Return the true specific force: a slow turn, then rest."""
+    angle = 0.02 * np.minimum(seconds, STANDS_S)
+    up = np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
+    return GRAVITY * up
+
+
+@dataclass(frozen=True)
+class Truth:
+    """
+    The unit's thermal truth on a fine grid.
+
+    """
+
+    time: np.ndarray
+    case: np.ndarray
+    board: np.ndarray
+    memory: np.ndarray
+
+    def at(self, seconds: np.ndarray) -> tuple[np.ndarray, ...]:
+        return tuple(
+            np.interp(seconds, self.time, c) for c in (self.case, self.board, self.memory)
+        )
+
+
+def truth(ramp_s: tuple[float, float] = RAMP_S, duration_s: float = DURATION_S) -> Truth:
+    """Solve air -> case -> board -> memory through their lags."""
+    step = 0.01
+    time = np.arange(0.0, duration_s + 1.0, step)
+    air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])
+
+    def follow(source: np.ndarray, lag: float) -> np.ndarray:
+        share = step / lag
+        result = np.empty_like(source)
+        value = source[0]
+        for k, target in enumerate(source.tolist()):
+            value += share * (target - value)
+            result[k] = value
+        return result
+
+    case = follow(air, CASE_LAG_S)
+    board = follow(case, BOARD_LAG_S)
+    return Truth(time, case, board, board - follow(board, MEMORY_S))
+
+
+def counts_of(force: np.ndarray, case: np.ndarray, board: np.ndarray, memory: np.ndarray) -> Any:
+    """Return what the converter gives for a specific force (method, eqs 6 to 9)."""
+    t = board - 20.0
+    drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
+    drift += BY_GRADIENT * (case - board) + BY_MEMORY * memory
+    scale = K * (1.0 + SCALE_SLOPE * t)
+    return force * scale[:, None] + np.array(BIAS) + drift[:, None]
+
+
+def bag(
+    rate_hz: float = RATE_HZ,
+    ramp_s: tuple[float, float] = RAMP_S,
+    duration_s: float = DURATION_S,
+    start_s: float = 0.0,
+) -> list[Event]:
+    """Return the undisturbed messages in order of arrival."""
+    rng = np.random.default_rng(7)
+    thermal = truth(ramp_s, duration_s)
+    n = round((duration_s - start_s) * rate_hz)
+    seconds = start_s + (np.arange(n) + 1) / rate_hz
+    counts = counts_of(force_at(seconds), *thermal.at(seconds))
+    counts += K * NOISE_SD * rng.standard_normal(counts.shape)
+    events = [
+        ('counts', START_NS + round(second * 1e9), tuple(row))
+        for second, row in zip(seconds.tolist(), np.rint(counts).tolist(), strict=True)
+    ]
+    times = start_s + np.arange(round((duration_s - start_s) * READINGS_HZ)) / READINGS_HZ
+    case, board, _ = thermal.at(times)
+    for topic, values in (('board', board), ('case', case)):
+        noisy = values + READING_SD * rng.standard_normal(len(values))
+        events += [
+            (topic, START_NS + round(second * 1e9), value)
+            for second, value in zip(times.tolist(), noisy.tolist(), strict=True)
+        ]
+    return sorted(events, key=lambda event: event[1])
+
+
+def seconds_of(stamp_ns: int) -> float:
+    return (stamp_ns - START_NS) * 1e-9
+
+
+def changed(topic: str, begin_s: float, end_s: float, change: Callable[..., Any]) -> Inject:
+    """
+    Change the messages of a topic within a span.
+
+    `change(event)` returns the events that come instead.
+    """
+
+    def inject(events: list[Event]) -> list[Event]:
+        result = []
+        for event in events:
+            if event[0] == topic and begin_s <= seconds_of(event[1]) < end_s:
+                result += change(event)
+            else:
+                result.append(event)
+        return result
+
+    return inject
+
+
+def value(topic: str, begin_s: float, end_s: float, change: Callable[[Any], Any]) -> Inject:
+    """Change the values of a topic within a span."""
+    return changed(topic, begin_s, end_s, lambda e: [(e[0], e[1], change(e[2]))])
+
+
+def stop(topic: str, begin_s: float, end_s: float) -> Inject:
+    """Lose the messages of a topic within a span."""
+    return changed(topic, begin_s, end_s, lambda _: [])
+
+
+def frozen(topic: str, begin_s: float, end_s: float) -> Inject:
+    """Repeat the last value of a topic throughout a span, with living stamps."""
+    last: list[Any] = []
+
+    def hold(event: Event) -> list[Event]:
+        last.append(event[2])
+        return [(event[0], event[1], last[0])]
+
+    return changed(topic, begin_s, end_s, hold)
+
+
+def late(topic: str, delay_s: float, begin_s: float, end_s: float) -> Inject:
+    """Deliver the messages of a topic later than they were stamped."""
+
+    def inject(events: list[Event]) -> list[Event]:
+        def arrival(event: Event) -> float:
+            seconds = seconds_of(event[1])
+            is_late = event[0] == topic and begin_s <= seconds < end_s
+            return seconds + delay_s * is_late
+
+        return sorted(events, key=arrival)
+
+    return inject
+
+
+def shuffled(topic: str, begin_s: float, end_s: float) -> Inject:
+    """Exchange each message of a topic with its neighbour."""
+
+    def inject(events: list[Event]) -> list[Event]:
+        result = list(events)
+        places = [
+            k
+            for k, event in enumerate(result)
+            if event[0] == topic and begin_s <= seconds_of(event[1]) < end_s
+        ]
+        for one, other in zip(places[::2], places[1::2], strict=False):
+            result[one], result[other] = result[other], result[one]
+        return result
+
+    return inject
+
+
+def chain(*steps: Inject) -> Inject:
+    """Inject one after the other."""
+
+    def inject(events: list[Event]) -> list[Event]:
+        for step in steps:
+            events = step(events)
+        return events
+
+    return inject
+
+
+def shifted(begin_s: float, by_s: float) -> Inject:
+    """Let the clock of all topics jump."""
+
+    def inject(events: list[Event]) -> list[Event]:
+        by_ns = round(by_s * 1e9)
+        return [
+            (topic, stamp + by_ns * (seconds_of(stamp) >= begin_s), v)
+            for topic, stamp, v in events
+        ]
+
+    return inject

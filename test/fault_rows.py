@@ -1,0 +1,438 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the table of faults: what is injected, what must come out, what the diagnostics must say.
+
+Times are seconds of the bag of `fault_rig`: it turns until 40, ramps from 60 to 120, and the lag
+of the board has died by 270. The same rows make the table in docs/faults.md.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from fault_rig import (
+    FULL_SCALE,
+    RATE_HZ,
+    START_NS,
+    Event,
+    Inject,
+    bag,
+    chain,
+    changed,
+    frozen,
+    late,
+    seconds_of,
+    shifted,
+    shuffled,
+    stop,
+    value,
+)
+
+OK, WARN, ERROR = 0, 1, 2
+#: Samples of the undisturbed bag.
+N_SAMPLES = 8000
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One fault.
+
+    """
+
+    fault: str
+    injection: str
+    does: str
+    inject: Inject
+    #: (level, part of the message) of reports that must come.
+    says: tuple[tuple[int, str], ...]
+    #: Published samples at least.
+    n_least: int
+    #: Spans in which nothing may be published.
+    silent: tuple[tuple[float, float], ...] = ()
+    #: Span until the fault can be known, in which numbers are wrong.
+    blind: tuple[float, float] = (0.0, 0.0)
+    #: From here on the output is that of the undisturbed run within 1 ug; None: never disturbed.
+    recovered: float = 0.0
+    #: By how much stamps run ahead of the truth, from when on [s].
+    shift: tuple[float, float] = (math.inf, 0.0)
+    #: What plays when it is not the usual bag.
+    source: list[Event] | None = field(default=None, repr=False)
+
+
+def swap_topics(events: list[Event]) -> list[Event]:
+    other = {'board': 'case', 'case': 'board'}
+    return [(other.get(topic, topic), stamp, v) for topic, stamp, v in events]
+
+
+def lose(share: float) -> Inject:
+    rng = np.random.default_rng(3)
+    return changed('counts', 0.0, 999.0, lambda e: [e] if rng.random() >= share else [])
+
+
+def faster(begin_s: float, end_s: float, factor: int) -> Inject:
+    """Convert faster: a sample becomes `factor` samples of a shorter cycle, with less charge."""
+    step_ns = round(1e9 / RATE_HZ / factor)
+
+    def split(event: Event) -> list[Event]:
+        topic, stamp_ns, sample = event
+        part = tuple(float(round(one / factor)) for one in sample)
+        return [
+            (topic, stamp_ns - k * step_ns, (part[0] + k % 2, *part[1:]))
+            for k in reversed(range(factor))
+        ]
+
+    return changed('counts', begin_s, end_s, split)
+
+
+def half_time(begin_s: float) -> Inject:
+    """Let a whole bag loop: play its beginning, then all of it."""
+    return lambda events: [e for e in events if seconds_of(e[1]) < begin_s] + events
+
+
+def sensor_rows(name: str) -> list[Row]:
+    """Return the rows of one thermometer; only the board's faults stop the output."""
+    is_board = name == 'board'
+    lost = 'nothing is published' if is_board else 'the board sensor decides the regime'
+    level = ERROR if is_board else WARN
+    held = (WARN, 'board temperature') if is_board else (WARN, 'case temperature lost')
+    after = (
+        'held, then after `temperature_timeout` nothing is published'
+        if is_board
+        else ('after `case_timeout` the board decides; its lag stands in for the gradient')
+    )
+    return [
+        Row(
+            f'{name} stops',
+            'none for 50 s in the ramp',
+            after,
+            stop(name, 80.0, 130.0),
+            ((level, lost),),
+            7200,
+            silent=((100.5, 129.5),) if is_board else (),
+            recovered=165.0,
+        ),
+        Row(
+            f'{name} freezes in the ramp',
+            'its last value with living stamps for 50 s',
+            'doubted from the fourth equal reading on; not used once the other moves: ' + after,
+            frozen(name, 80.0, 130.0),
+            ((WARN, f'{name} temperature frozen'), (level, lost)),
+            7300,
+            silent=((107.0, 129.5),) if is_board else (),
+            recovered=165.0,
+        ),
+        Row(
+            f'{name} freezes in the soak',
+            'its last value with living stamps, 15 s before the ramp',
+            'as above; before the ramp its variance grows',
+            frozen(name, 45.0, 130.0),
+            ((WARN, f'{name} temperature stands still'), (WARN, f'{name} temperature frozen')),
+            6900,
+            recovered=200.0,
+        ),
+        Row(
+            f'{name} jumps by 40 K',
+            '+40 K for 15 s',
+            'not used: no part takes such a step; the good ones after it count at once',
+            value(name, 80.0, 95.0, lambda v: v + 40.0),
+            ((WARN, f'{name} temperature jumped by +'),),
+            N_SAMPLES,
+            recovered=125.0,
+        ),
+        Row(
+            f'{name} jumps by 40 K and stays',
+            '+40 K for 50 s',
+            'not used until it has been lost; then a new beginning, with a larger covariance',
+            value(name, 80.0, 130.0, lambda v: v + 40.0),
+            (
+                (WARN, f'{name} temperature jumped by +'),
+                (WARN, 'outside the calibrated range'),
+            ),
+            7900,
+            recovered=230.0,
+        ),
+        Row(
+            f'{name} jumps by 2 K',
+            '+2 K for 50 s',
+            'believed after four readings, with a variance that says it may be wrong',
+            value(name, 80.0, 130.0, lambda v: v + 2.0),
+            (),
+            N_SAMPLES,
+            recovered=220.0,
+        ),
+        *(
+            Row(
+                f'{name} is {word}',
+                f'{word} for 15 s',
+                'dropped and counted; held meanwhile',
+                value(name, 80.0, 95.0, lambda _, bad=bad: bad),
+                (held,),
+                N_SAMPLES,
+                recovered=125.0,
+            )
+            for word, bad in (('NaN', math.nan), ('infinite', -math.inf))
+        ),
+        Row(
+            f'{name} in whole degrees',
+            'rounded for 115 s, unknown to the calibration',
+            'equal readings are doubted, each new degree begins anew; held or lost in between',
+            value(name, 45.0, 160.0, lambda v: float(round(v))),
+            ((WARN, f'{name} temperature'),),
+            7700,
+            recovered=220.0,
+        ),
+        Row(
+            f'{name} twice',
+            'each message comes twice',
+            'the second one is dropped and counted',
+            changed(name, 45.0, 160.0, lambda e: [e, e]),
+            (),
+            N_SAMPLES,
+        ),
+        Row(
+            f'{name} out of order',
+            'neighbours change places',
+            'the older one is dropped and counted',
+            shuffled(name, 45.0, 160.0),
+            (),
+            N_SAMPLES,
+            recovered=170.0,
+        ),
+        Row(
+            f'{name} late by 5 s',
+            'each message arrives 5 s after its stamp',
+            'counts for its stamp; extrapolated by five intervals, then held, variance grows',
+            late(name, 5.0, 45.0, 160.0),
+            ((WARN, 'board temperature 5'),) if is_board else (),
+            N_SAMPLES,
+            recovered=200.0,
+        ),
+    ]
+
+
+SENSOR_ROWS = [*sensor_rows('board'), *sensor_rows('case')]
+
+BOTH_ROWS = [
+    Row(
+        'both temperatures freeze',
+        'both repeat their last value for 50 s in the ramp',
+        'used with a variance that grows as the fastest ramp; the ramp is not over for that',
+        chain(frozen('board', 80.0, 130.0), frozen('case', 80.0, 130.0)),
+        ((WARN, 'board temperature stands still'), (WARN, 'case temperature stands still')),
+        N_SAMPLES,
+        recovered=230.0,
+    ),
+    Row(
+        'both temperatures stop',
+        'none of both for 50 s in the ramp',
+        'as the board alone',
+        chain(stop('board', 80.0, 130.0), stop('case', 80.0, 130.0)),
+        ((ERROR, 'nothing is published'), (WARN, 'case temperature lost')),
+        7200,
+        silent=((100.5, 129.5),),
+        recovered=170.0,
+    ),
+    Row(
+        'topics swapped',
+        'board and case exchanged throughout',
+        'the board leads in the ramp: the variance grows with its lead',
+        swap_topics,
+        ((ERROR, 'swapped'),),
+        N_SAMPLES,
+        recovered=math.inf,
+    ),
+]
+
+SAMPLE_ROWS = [
+    Row(
+        'counts are NaN',
+        'one axis NaN for 15 s',
+        'dropped and counted',
+        value('counts', 80.0, 95.0, lambda v: (math.nan, v[1], v[2])),
+        ((WARN, 'samples not finite, dropped'),),
+        7600,
+        silent=((80.0, 95.0),),
+    ),
+    Row(
+        'counts saturated',
+        'one axis at full scale for 15 s',
+        'dropped and counted',
+        value('counts', 80.0, 95.0, lambda v: (v[0], -FULL_SCALE, v[2])),
+        ((ERROR, 'samples saturated'),),
+        7600,
+        silent=((80.0, 95.0),),
+    ),
+    Row(
+        'counts stuck',
+        'the last sample again for 50 s, at rest',
+        'after `stuck_timeout` dropped and counted',
+        frozen('counts', 80.0, 130.0),
+        ((ERROR, 'samples stuck or all zero, dropped'),),
+        6750,
+        silent=((82.1, 130.0),),
+        recovered=130.0,
+    ),
+    Row(
+        'counts stuck in motion',
+        'the last sample again for 10 s while the platform turns',
+        'as above; wrong until `stuck_timeout`, since a standing sample is not wrong in itself',
+        frozen('counts', 10.0, 20.0),
+        ((ERROR, 'samples stuck or all zero, dropped'),),
+        7700,
+        silent=((12.1, 20.0),),
+        blind=(10.0, 12.1),
+        recovered=20.0,
+    ),
+    Row(
+        'counts all zero',
+        'three exact zeros for 15 s',
+        'dropped and counted from the first one on',
+        value('counts', 80.0, 95.0, lambda _: (0.0, 0.0, 0.0)),
+        ((ERROR, 'samples stuck or all zero, dropped'),),
+        7600,
+        silent=((80.0, 95.0),),
+    ),
+    Row(
+        'an axis reversed',
+        'z with the other sign for 90 s at rest',
+        'three windows at rest miss gravity: nothing is published until two do not',
+        value('counts', 130.0, 220.0, lambda v: (v[0], v[1], -v[2])),
+        ((ERROR, 'or an axis reversed? Nothing is published'),),
+        5600,
+        silent=((137.0, 220.0),),
+        blind=(130.0, 137.0),
+        recovered=220.0,
+    ),
+    Row(
+        'an axis reversed from the start',
+        'z with the other sign throughout',
+        'as above, once the platform stands',
+        value('counts', 0.0, 999.0, lambda v: (v[0], v[1], -v[2])),
+        ((ERROR, 'or an axis reversed? Nothing is published'),),
+        1000,
+        silent=((47.0, 320.0),),
+        blind=(0.0, 47.0),
+        recovered=math.inf,
+    ),
+    *(
+        Row(
+            f'{share:.0%} of the counts lost',
+            'at random',
+            'the others are as ever',
+            lose(share),
+            (),
+            round(0.95 * N_SAMPLES * (1.0 - share)),
+        )
+        for share in (0.01, 0.1, 0.5)
+    ),
+    Row(
+        'counts lost in bursts',
+        'every other 7 s',
+        'the others are as ever',
+        changed('counts', 0.0, 999.0, lambda e: [e] if seconds_of(e[1]) // 7 % 2 else []),
+        ((WARN, 'samples/s, calibrated for'),),
+        3900,
+        recovered=300.0,
+    ),
+    Row(
+        'counts twice',
+        'each message comes twice',
+        'the second one is dropped and counted',
+        changed('counts', 0.0, 999.0, lambda e: [e, e]),
+        ((WARN, 'samples out of order, dropped'),),
+        N_SAMPLES,
+    ),
+    Row(
+        'counts out of order',
+        'neighbours change places',
+        'the older one is dropped and counted',
+        shuffled('counts', 0.0, 999.0),
+        ((WARN, 'samples out of order, dropped'),),
+        N_SAMPLES // 2,
+        recovered=300.0,
+    ),
+    Row(
+        'counts 20 times as fast',
+        'from 25 to 500 Hz for 10 s: a count is charge per cycle, a twentieth now',
+        'dropped and counted once there are more than conversions can be',
+        faster(150.0, 160.0, 20),
+        ((ERROR, 'samples too fast for their conversion cycle, dropped'),),
+        7600,
+        silent=((151.0, 160.0),),
+        blind=(149.9, 151.0),
+        recovered=165.0,
+    ),
+]
+
+TIME_ROWS = [
+    Row(
+        'a gap of 10 min',
+        'nothing from 130 to 730 s',
+        'the regime is unknown again, the memory unsettled: larger covariance',
+        chain(stop('counts', 130, 730), stop('board', 130, 730), stop('case', 130, 730)),
+        (),
+        4600,
+        recovered=820.0,
+        source=bag(duration_s=850.0),
+    ),
+    Row(
+        'counts alone pause for 2 min',
+        'none from 80 to 200 s',
+        'the temperatures go on; as ever afterwards',
+        stop('counts', 80.0, 200.0),
+        (),
+        5000,
+    ),
+    Row(
+        'time jumps back',
+        'the bag begins anew after 100 s',
+        'estimators reset, said once; as ever afterwards',
+        half_time(100.0),
+        ((WARN, 'jumps of time backwards, estimators reset'),),
+        10_000,
+    ),
+    *(
+        Row(
+            f'time jumps forward by {word}{where}',
+            'all stamps, at once',
+            'the regime is unknown, the memory unsettled: larger covariance',
+            shifted(at, by),
+            (),
+            7990,
+            shift=(at, by),
+            recovered=at + 80.0,
+        )
+        for word, by in (('10 min', 600.0), ('a day', 86400.0))
+        for where, at in ((' in the ramp', 90.0), (' in the soak', 220.0))
+    ),
+    Row(
+        'temperatures of another clock',
+        'both stamped an hour ahead of the counts',
+        'no reading ever counts: nothing is published',
+        lambda events: [
+            (topic, stamp + (topic != 'counts') * 3_600_000_000_000, v)
+            for topic, stamp, v in events
+        ],
+        (
+            (ERROR, 'no board temperature yet, nothing is published'),
+            (WARN, 'temperatures are stamped 36'),
+        ),
+        0,
+        silent=((0.0, 320.0),),
+        recovered=math.inf,
+    ),
+]
+
+ROWS = [*SENSOR_ROWS, *BOTH_ROWS, *SAMPLE_ROWS, *TIME_ROWS]
+
+
+def true_seconds(row: Row, stamps: np.ndarray) -> np.ndarray:
+    """Return the time of the bag that stamps stand for."""
+    seconds = (stamps - START_NS) * 1e-9
+    at, by = row.shift
+    return np.where(seconds >= at + by, seconds - by, seconds)
