@@ -1,0 +1,234 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the scenes of benchmarks/regime.py: ramps behind lags, sensors, the rival rules, the bound.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import oaconvolve
+
+Array = npt.NDArray[np.float64]
+RIPPLE_C = 0.1
+DRIFT_K_MIN = 0.01
+DRIFT_S = 5400.0
+BOARD_LAG_S = 600.0
+WINDOW_S = 120.0
+SPAN_S = 600.0
+SENSORS = ((0.001, 0.0), (0.01, 0.0), (0.001, 0.0625), (0.01, 0.0625), (0.01, 1.0))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """
+    One cell of the matrix: a ramp, a lag, a sensor.
+
+    """
+
+    ramp_k_min: float
+    lag_s: float
+    noise_sd: float
+    quantum: float
+    rate_hz: float
+
+    @property
+    def sensor(self) -> str:
+        """
+        The sensor in words.
+
+        """
+        quantum = f', {1e3 * self.quantum:g} mK steps' if self.quantum else ''
+        return f'{1e3 * self.noise_sd:g} mK{quantum}'
+
+
+def first_order(t: Array, lag: float) -> Array:
+    """
+    Response of a lag to a unit ramp that starts at 0.
+
+    """
+    x = np.maximum(t, 0.0)
+    return x - lag * (1.0 - np.exp(-x / lag))
+
+
+def second_order(t: Array, lag: float, other: float) -> Array:
+    """
+    Response of two different lags in a row to a unit ramp that starts at 0.
+
+    """
+    x = np.maximum(t, 0.0)
+    decay = lag**2 * np.exp(-x / lag) - other**2 * np.exp(-x / other)
+    return x - lag - other + decay / (lag - other)
+
+
+def temperatures(
+    scene: Scene, t: Array, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
+) -> tuple[Array, Array]:
+    """
+    Case and board for a ramp from 0 to `duration`; no ramp when the duration is 0.
+
+    """
+    rate = scene.ramp_k_min / 60.0 * rng.choice((-1.0, 1.0))
+    start = 20.0 + rng.uniform(-0.5, 0.5) * max(scene.quantum, 0.1)
+    board_lag = BOARD_LAG_S if abs(BOARD_LAG_S - scene.lag_s) > 1.0 else 1.01 * scene.lag_s
+    case = start + rate * (first_order(t, scene.lag_s) - first_order(t - duration, scene.lag_s))
+    board = start + rate * (
+        second_order(t, scene.lag_s, board_lag)
+        - second_order(t - duration, scene.lag_s, board_lag)
+    )
+    if ripple:
+        omega = 2.0 * np.pi / rng.uniform(180.0, 900.0)
+        swing = np.sin(omega * t + rng.uniform(0.0, 2.0 * np.pi))
+        case += ripple / np.hypot(1.0, omega * scene.lag_s) * swing
+        drift = DRIFT_K_MIN / 60.0 * DRIFT_S * (1.0 - np.exp(-(t - t[0]) / DRIFT_S))
+        case += drift
+        board += drift
+    return case, board
+
+
+def read(truth: Array, scene: Scene, rng: np.random.Generator) -> Array:
+    """
+    Let a sensor read.
+
+    """
+    reading = truth + rng.normal(0.0, scene.noise_sd, truth.shape)
+    return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
+
+
+def moving_fit(readings: Array, n: int, powers: int, wanted: int, at_end: bool) -> Array:
+    """
+    Derive a least-squares polynomial over the last n readings, per sample period.
+
+    """
+    k = np.arange(n) - (n - 1 if at_end else 0.5 * (n - 1))
+    design = np.stack([k**p for p in range(powers + 1)], axis=1)
+    weights = np.linalg.pinv(design)[wanted] * (1.0, 1.0, 2.0)[wanted]
+    out = np.zeros(len(readings))
+    out[n - 1 :] = oaconvolve(readings - readings[0], weights[::-1], mode='valid')
+    return out
+
+
+def second_derivative(scene: Scene, readings: Array) -> Array:
+    """
+    |d2T/dt2| of a parabola over the window, K/s^2.
+
+    """
+    n = max(5, round(WINDOW_S * scene.rate_hz))
+    return np.abs(moving_fit(readings, n, 2, 2, at_end=False)) * scene.rate_hz**2
+
+
+def first_derivative(scene: Scene, readings: Array) -> Array:
+    """
+    |dT/dt| of a straight line over the window, K/s.
+
+    """
+    n = max(5, round(WINDOW_S * scene.rate_hz))
+    return np.abs(moving_fit(readings, n, 1, 1, at_end=False)) * scene.rate_hz
+
+
+def savitzky_golay(scene: Scene, readings: Array) -> Array:
+    """
+    |dT/dt| at the newest end of a parabola over the window, K/s.
+
+    """
+    n = max(5, round(WINDOW_S * scene.rate_hz))
+    return np.abs(moving_fit(readings, n, 2, 1, at_end=True)) * scene.rate_hz
+
+
+def exponential_fit(scene: Scene, readings: Array) -> Array:
+    """
+    |dT/dt| of an exponential with the unit's lag, fitted over the last 600 s of updates, K/s.
+
+    After the idea of Kozlov and Tarygin (Sensors 2020, 20(5), 1299): only readings that change the
+    output of a quantized sensor are used, as the edge crossed, and the model extrapolates.
+
+    """
+    lag, span = scene.lag_s, SPAN_S
+    if not scene.quantum:
+        n = max(5, round(span * scene.rate_hz))
+        decay = np.exp(-(np.arange(n) - (n - 1)) / (scene.rate_hz * lag))
+        weights = np.linalg.pinv(np.stack([np.ones(n), decay], axis=1))[1] / -lag
+        out = np.zeros(len(readings))
+        out[n - 1 :] = oaconvolve(readings - readings[0], weights[::-1], mode='valid')
+        return np.abs(out)
+    changed = np.flatnonzero(np.diff(readings)) + 1
+    at = changed / scene.rate_hz
+    edge = 0.5 * (readings[changed] + readings[changed - 1]) - readings[0]
+    rates = np.zeros(len(changed))
+    first = 0
+    for k in range(len(changed)):
+        while at[k] - at[first] > span:
+            first += 1
+        used = slice(first, k + 1)
+        decay = np.exp(-(at[used] - at[k]) / lag)
+        spread = np.sum((decay - decay.mean()) ** 2)
+        if spread > 1e-9:
+            slope = np.sum((decay - decay.mean()) * (edge[used] - edge[used].mean())) / spread
+            rates[k] = -slope / lag
+    out = np.zeros(len(readings))
+    for k, begin in enumerate(changed):
+        end = changed[k + 1] if k + 1 < len(changed) else len(readings)
+        held = np.arange(min(end - begin, round(span * scene.rate_hz)))
+        out[begin : begin + len(held)] = np.abs(rates[k]) * np.exp(-held / scene.rate_hz / lag)
+    return out
+
+
+Rule = Callable[[Scene, Array], Array]
+RIVALS: dict[str, Rule] = {
+    '|d2T/dt2|': second_derivative,
+    '|dT/dt|': first_derivative,
+    'Savitzky-Golay': savitzky_golay,
+    'exponential fit': exponential_fit,
+}
+
+
+def known_signature_delays(
+    scene: Scene, per_hour: float, hours: float, n: int, seed: int
+) -> tuple[float, float]:
+    """
+    Median and 95 % delay of the CUSUM that knows the ramp, the baseline and the noise.
+
+    Page's statistic with the signature of the true ramp: the largest log likelihood ratio over
+    the onset times. Its threshold comes from the exceedances counted in noise alone, whose
+    logarithm falls linearly with the level.
+
+    """
+    rng = np.random.default_rng([seed, 9])
+    dt = 1.0 / scene.rate_hz
+    bend = scene.ramp_k_min / 60.0 / scene.lag_s
+    # an onset collects 4.5 sigma in this time; twice as long sees it surely
+    longest = round(2.0 * (20.0 * dt * (4.5 * scene.noise_sd / bend) ** 2) ** 0.2 / dt)
+    signature = scene.ramp_k_min / 60.0 * first_order(np.arange(1, longest + 1) * dt, scene.lag_s)
+
+    def cusum(x: Array) -> Array:
+        best = np.zeros(len(x))
+        energy = np.cumsum(signature**2)
+        sums = np.zeros(len(x))
+        for length in range(1, longest + 1):
+            # the reading `length - 1` ago carries signature[0], the newest signature[length - 1]
+            sums = np.convolve(x, signature[:length][::-1])[: len(x)]
+            np.maximum(best, (sums - 0.5 * energy[length - 1]) / scene.noise_sd**2, out=best)
+        return best
+
+    levels = np.arange(3.0, 8.0, 0.25)
+    counts = np.zeros(len(levels))
+    for _ in range(max(1, round(hours / 5.0))):
+        best = cusum(rng.normal(0.0, scene.noise_sd, round(18000.0 / dt)))
+        for i, level in enumerate(levels):
+            above = np.flatnonzero(best > level)
+            counts[i] += 0 if len(above) == 0 else 1 + np.count_nonzero(np.diff(above) > longest)
+    seen = counts > 2
+    slope, offset = np.polyfit(levels[seen], np.log(counts[seen] / hours), 1)
+    threshold = (np.log(per_hour) - offset) / slope
+    delays = []
+    for _ in range(n):
+        x = rng.normal(0.0, scene.noise_sd, 2 * longest)
+        x[longest:] += signature
+        above = cusum(x)[longest:] > threshold
+        delays.append((int(np.argmax(above)) + 1) * dt if above.any() else np.inf)
+    return float(np.median(delays)), float(np.percentile(delays, 95))
