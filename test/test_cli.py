@@ -95,6 +95,7 @@ class TestOutput:
         arguments = ('evaluate', bag, '-c', unit, '--serial', '', '--json')
         data = json.loads(cli(*arguments, code=None).stdout)
         assert set(data['statistics_m_s2']) == {'raw', 'unit'}
+        assert data['is_valid'] == data['verdict'].startswith('still valid')
 
     def test_quiet_says_nothing(self, bag: Path, unit: Path, cli: Cli, tmp_path: Path) -> None:
         arguments = ('replay', bag, '-c', unit, '-o', tmp_path / 'out', '--serial', '', '-q')

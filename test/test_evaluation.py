@@ -16,7 +16,7 @@ from builders import GRAVITY, axis_set, calibration, regime_set
 
 from thermo_comp.calibration import Calibration, Provenance, ResidualSummary
 from thermo_comp.errors import CalibrationError, RecordingError
-from thermo_comp.evaluation import RAW, evaluate
+from thermo_comp.evaluation import RAW, evaluate, joined
 from thermo_comp.metrics import MICRO_G
 from thermo_comp.recording import BagWriter, Topics
 
@@ -153,3 +153,27 @@ def test_refusals(tmp_path: Path) -> None:
         evaluate(bag, [('a', calibration())])
     with pytest.raises(RecordingError, match='no window of 600 s at rest'):
         evaluate(bag, [('a', calibration())], window_s=600.0, serial='')
+
+
+def test_several_recordings_are_judged_as_one(tmp_path: Path) -> None:
+    models = [('a', corrected_by(SLOPE))]
+    parts = [
+        evaluate(resting(tmp_path / name, at, error=error), models)
+        for name, at, error in (('one', 20.0, 0.3), ('two', 30.0, -0.3))
+    ]
+    whole = joined(parts, models[0][1])
+    # +102 ug in the one, -102 ug in the other: nothing on average, 102 ug RMS.
+    row = whole.statistics['a']['all'].micro_g
+    assert row.n == sum(part.statistics['a']['all'].n for part in parts)
+    assert row.mean == pytest.approx(0.0, abs=0.5)
+    assert row.rms == pytest.approx(0.3 / K / MICRO_G, rel=1e-3)
+    assert whole.counters['a'].n_out == sum(part.counters['a'].n_out for part in parts)
+
+
+def test_what_the_judgement_does_not_reach_is_said(tmp_path: Path) -> None:
+    knows = corrected_by(SLOPE)
+    lower, upper = knows.static.temperature_range_c
+    (unsaid,) = evaluate(resting(tmp_path / 'in', 20.0), [('a', knows)]).notes
+    assert 'does not say what its fit left' in unsaid
+    outside, _ = evaluate(resting(tmp_path / 'out', upper + 2.0), [('a', knows)]).notes
+    assert outside.startswith(f'100% of the windows lie outside the calibrated {lower:.1f}..')

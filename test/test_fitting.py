@@ -180,7 +180,7 @@ def test_a_unit_as_it_was_is_still_valid(chosen: FitResult) -> None:
     told: list[float] = []
     found = assess(chosen.calibration, sources_of(UNIT, 6, 7), progress=told.append)
     assert found.is_valid
-    assert found.verdict.startswith('still valid: |g| error')
+    assert found.verdict.startswith('still valid: ')
     assert found.ratio < 1.5
     assert (found.n_positions, len(found.shifts), told[-1]) == (6, 3, 1.0)
     for shift in found.shifts:
@@ -298,3 +298,21 @@ def test_bags_of_two_units_are_refused(rng: np.random.Generator) -> None:
     options = FitOptions(gravity=9.81, input='m/s^2')
     with pytest.raises(FitError, match='different units: s0, s1'):
         fit(bags, options)
+
+
+def test_a_misalignment_that_the_positions_cannot_tell_is_not_taken_for_drift() -> None:
+    options = FitOptions(gravity=STANDARD_GRAVITY, model='quadratic+memory2')
+    result = fit(sources_of(UNIT, 7, 1), options)
+    calibration = result.calibration
+    np.testing.assert_array_equal(calibration.misalignment, np.eye(3))
+    assert 'warm-up' not in {finding.name for finding in result.findings}
+    references = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    for axis, (reference, static) in enumerate(
+        zip(references, calibration.static.axes(), strict=True)
+    ):
+        off = np.log(reference.scale_factor / UNIT.scale_factor[axis])
+        sd = np.sqrt(static.covariance[static.n_bias_parameters][static.n_bias_parameters])
+        # M reaches 3 mrad in this unit: 7 oblique positions make 100 ppm of scale of that, and
+        # the covariance must say so; from the noise alone it would be 1 ppm.
+        assert abs(off) < 4.0 * sd
+        assert 3e-5 < sd < 2e-3

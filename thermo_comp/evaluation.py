@@ -12,7 +12,7 @@ residual; white noise averages out, thermal errors stay.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +70,8 @@ class Evaluation:
         Per calibration.
     findings : tuple of str
         What speaks against the first calibration; empty when it holds.
+    notes : tuple of str
+        What the judgement does not reach.
 
     """
 
@@ -85,6 +87,7 @@ class Evaluation:
     statistics: dict[str, dict[str, ResidualStatistics]]
     counters: dict[str, Counters]
     findings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def evaluate(
@@ -170,6 +173,7 @@ def evaluate(
         name: statistics_by_regime(residual, is_dynamic) for name, residual in residuals.items()
     }
     claimed_sd = first.claimed_sd(windows, judged)
+    near_board = _nearest(board, first.start_ns, time, window_s)
     return Evaluation(
         info=info,
         gravity=gravity,
@@ -177,7 +181,7 @@ def evaluate(
         start_ns=first.start_ns,
         time=time,
         is_dynamic=is_dynamic,
-        board=_nearest(board, first.start_ns, time, window_s),
+        board=near_board,
         residuals=residuals,
         claimed_sd=claimed_sd,
         statistics=statistics,
@@ -187,6 +191,59 @@ def evaluate(
             if model.compensator is not None
         },
         findings=_findings(judged, statistics, calibrations[0][0], claimed_sd),
+        notes=_notes(judged, near_board),
+    )
+
+
+def joined(parts: Sequence[Evaluation], calibration: Calibration) -> Evaluation:
+    """
+    Judge one calibration on several recordings as one.
+
+    Parameters
+    ----------
+    parts : sequence of Evaluation
+        What each recording told, with the same models and windows.
+    calibration : Calibration
+        The first of the models.
+
+    Returns
+    -------
+    Evaluation
+        Windows of all, one after another; recording and start are the first one's, the counters
+        are added up.
+
+    """
+    if len(parts) == 1:
+        return parts[0]
+    first = parts[0]
+    is_dynamic = np.concatenate([part.is_dynamic for part in parts])
+    residuals = {
+        name: np.concatenate([part.residuals[name] for part in parts]) for name in first.residuals
+    }
+    statistics = {
+        name: statistics_by_regime(residual, is_dynamic) for name, residual in residuals.items()
+    }
+    claimed_sd = np.concatenate([part.claimed_sd for part in parts])
+    board = np.concatenate([part.board for part in parts])
+    names = [field.name for field in fields(Counters)]
+    counters = {
+        model: Counters(
+            **{name: sum(getattr(part.counters[model], name) for part in parts) for name in names}
+        )
+        for model in first.counters
+    }
+    judged = next(iter(first.counters))
+    return replace(
+        first,
+        time=np.concatenate([part.time for part in parts]),
+        is_dynamic=is_dynamic,
+        board=board,
+        residuals=residuals,
+        claimed_sd=claimed_sd,
+        statistics=statistics,
+        counters=counters,
+        findings=_findings(calibration, statistics, judged, claimed_sd),
+        notes=_notes(calibration, board),
     )
 
 
@@ -376,3 +433,22 @@ def _findings(
                 f'{row.rms_m_s2 / MICRO_G:.0f}; another unit, or it has drifted: fit anew'
             )
     return tuple(findings)
+
+
+def _notes(judged: Calibration, board: Array) -> tuple[str, ...]:
+    notes = []
+    ranges = (judged.static.temperature_range_c, judged.dynamic.temperature_range_c)
+    lower, upper = min(low for low, _ in ranges), max(high for _, high in ranges)
+    known = board[np.isfinite(board)]
+    outside = (known < lower) | (known > upper)
+    if outside.any():
+        notes.append(
+            f'{outside.mean():.0%} of the windows lie outside the calibrated {lower:.1f}..'
+            f'{upper:.1f} degC (they reach {np.min(known):.1f}..{np.max(known):.1f}): no residual '
+            'there speaks for the unit, only for the extrapolation'
+        )
+    if not judged.provenance.residuals:
+        notes.append(
+            'the calibration does not say what its fit left: it is held to its own claims alone'
+        )
+    return tuple(notes)

@@ -1,26 +1,32 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns ``thermo_comp evaluate``: what a calibration leaves of |g| on a bag it has not seen.
+Owns ``thermo_comp evaluate``: what a calibration leaves of |g| on bags it has not seen.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..errors import FitError
 from . import options
 from .output import Cell, Output, micro_g
 
 if TYPE_CHECKING:
     from ..evaluation import Evaluation
+    from ..fitting import Assessment
 
 
 def evaluate(
-    bag: options.Bag,
+    bags: Annotated[
+        list[Path], typer.Argument(help='Bags of one unit, any positions.', metavar='BAG...')
+    ],
     calibration: Annotated[
         list[Path],
         typer.Option(
@@ -41,10 +47,12 @@ def evaluate(
     quiet: options.Quiet = False,
 ) -> None:
     """
-    Judge a calibration on a bag: |f| - g at rest, raw and corrected.
+    Judge a calibration on new bags: |f| - g at rest, raw and corrected.
 
-    Exit code 1 when the calibration does not hold: it makes |g| worse, or
-    leaves much more than it did on the bags of its fit.
+    The verdict holds the residual against what the calibration claims; six
+    positions or more tell which axis has moved. Exit code 1 when it does not
+    hold: it makes |g| worse, leaves much more than on the bags of its fit or
+    than it claims, or an axis has moved.
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml
@@ -52,6 +60,11 @@ def evaluate(
     """
     from ..calibration_file import load_calibration
     from ..evaluation import evaluate as run
+    from ..evaluation import joined
+    from ..fit_sources import fit_sources
+    from ..fitting import assess
+    from ..replay import input_for
+    from ..status import CompensatorConfig
 
     out = Output(as_json, quiet)
     if not window > 0.0:
@@ -63,23 +76,52 @@ def evaluate(
     models = [
         (name, load_calibration(path)) for name, path in zip(names, calibration, strict=True)
     ]
+    topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
+    config = CompensatorConfig()
     with out.progress('evaluating', total=1.0) as done:
-        result = run(
-            bag,
-            models,
-            gravity=gravity,
-            window_s=window,
-            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
-            input=input_.value,
-            serial=serial,
-            progress=done,
-        )
-    say(out, result)
-    if result.findings:
+        # half of the way to the table, half to the verdict
+        part = 0.5 / len(bags)
+        parts = [
+            run(
+                bag,
+                models,
+                gravity=gravity,
+                window_s=window,
+                config=config,
+                topics=topics,
+                input=input_.value,
+                serial=serial,
+                progress=_part_of(done, part * number, part),
+            )
+            for number, bag in enumerate(bags)
+        ]
+        _, judged = models[0]
+        sources, _ = fit_sources(bags, topics, input_for(judged, input_.value), serial)
+        verdict: Assessment | str
+        try:
+            verdict = assess(
+                judged,
+                # whose they are has been checked
+                [replace(source, serial=None) for source in sources],
+                gravity=gravity,
+                config=config,
+                progress=_part_of(done, 0.5, 0.5),
+            )
+        except FitError as why:
+            verdict = f'no verdict: {why}'
+    result = joined(parts, judged)
+    say(out, result, verdict, bags)
+    if result.findings or not (isinstance(verdict, str) or verdict.is_valid):
         raise typer.Exit(1)
 
 
-def say(out: Output, result: Evaluation) -> None:
+def _part_of(
+    done: Callable[[float], None], begin: float, length: float
+) -> Callable[[float], None]:
+    return lambda share: done(begin + length * share)
+
+
+def say(out: Output, result: Evaluation, verdict: Assessment | str, bags: Sequence[Path]) -> None:
     """
     Print an evaluation.
 
@@ -89,6 +131,10 @@ def say(out: Output, result: Evaluation) -> None:
         Where to.
     result : Evaluation
         The evaluation.
+    verdict : Assessment or str
+        The judgement, or why there is none.
+    bags : sequence of Path
+        The recordings.
 
     """
     if result.info.truncated:
@@ -105,15 +151,54 @@ def say(out: Output, result: Evaluation) -> None:
         rows,
         title=f'|f| - g over {result.window_s:g} s at rest',
     )
-    for finding in result.findings:
-        out.line(f'- {finding}')
+    if isinstance(verdict, str):
+        out.line(f'- {verdict}')
+    else:
+        _say_axes(out, verdict)
+    for line in (*result.notes, *result.findings):
+        out.line(f'- {line}')
+    if not isinstance(verdict, str):
+        out.line(verdict.verdict)
     out.json(
         {
-            'bag': result.info.path,
+            'bags': [str(bag) for bag in bags],
             'gravity': result.gravity,
             'window_s': result.window_s,
             'statistics_m_s2': result.statistics,
             'counters': result.counters,
+            'notes': result.notes,
             'findings': result.findings,
+            'verdict': verdict if isinstance(verdict, str) else verdict.verdict,
+            'is_valid': None if isinstance(verdict, str) else verdict.is_valid,
+            'shifts': () if isinstance(verdict, str) else verdict.shifts,
+            'wander_m_s2': None if isinstance(verdict, str) else verdict.wander.tolist(),
         }
     )
+
+
+def _say_axes(out: Output, verdict: Assessment) -> None:
+    """
+    Print what is known axis by axis: wander always, shifts where the positions tell.
+
+    """
+    from ..metrics import MICRO_G
+
+    columns = ['axis', 'static ug', 'dynamic ug']
+    if verdict.shifts:
+        columns += ['bias ug', '+-', 'scale ppm', '+-']
+    rows: list[tuple[Cell, ...]] = []
+    for axis, name in enumerate('xyz'):
+        row: list[Cell] = [name, *(micro_g(one / MICRO_G) for one in verdict.wander[:, axis])]
+        if verdict.shifts:
+            shift = verdict.shifts[axis]
+            row += [
+                micro_g(shift.bias / MICRO_G),
+                micro_g(shift.bias_sd / MICRO_G),
+                micro_g(1e6 * shift.scale),
+                micro_g(1e6 * shift.scale_sd),
+            ]
+        rows.append(tuple(row))
+    title = 'what temperature moves each axis at rest (60 s means, RMS)'
+    if verdict.shifts:
+        title += '; shift since the fit'
+    out.table(columns, rows, title=title)

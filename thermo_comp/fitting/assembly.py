@@ -44,7 +44,7 @@ _FEWEST_WINDOWS = 5
 # end.
 _LINEAR_REACH = 2.0
 # Orthogonality of a triad whose misalignment was not measured [rad].
-_UNKNOWN_SKEW = 5e-3
+UNKNOWN_SKEW = 5e-3
 
 
 @dataclass(frozen=True)
@@ -203,14 +203,14 @@ def build_calibration(
 
 
 def _triple(values: Array) -> tuple[float, float, float]:
-    a, b, c = (float(v) for v in values)
+    a, b, c = (float(v) + 0.0 for v in values)  # no -0.0
     return a, b, c
 
 
 def _misalignment_sd(outcome: Outcome, covariance: Array) -> tuple[float, float, float]:
     where = outcome.layout.skew
     if where[0] < 0:
-        return (_UNKNOWN_SKEW,) * 3
+        return (UNKNOWN_SKEW,) * 3
     a, _, c = outcome.solution.skew
     # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the skew (a, b, c) of its inverse.
     jacobian = np.array([[-1.0, 0.0, 0.0], [c, -1.0, a], [0.0, 0.0, -1.0]])

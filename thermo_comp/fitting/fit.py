@@ -8,7 +8,7 @@ Owns the fit as a whole: sources in, calibration with its evidence out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from ..calibration import Calibration, Unit
 from ..errors import FitError
 from ..regime import DetectorSettings
 from ..thermal import ThermalConfig
-from .assembly import UnitFacts, build_calibration
+from .assembly import UNKNOWN_SKEW, UnitFacts, build_calibration
 from .evidence import (
     PositionReport,
     ResidualRow,
@@ -268,10 +268,11 @@ def _fit_table(
     findings += enforce(judge_rests(bags, options), options)
     constant, table_findings = first_guess(table, bags, options)
     findings += enforce(table_findings, options)
-    with_misalignment = bool(np.any(constant.misalignment != np.eye(3)))
+    tells_misalignment = bool(np.any(constant.misalignment != np.eye(3)))
     longest = max(len(history.board) * history.step_s for history in table.histories)
     freedom = Freedom(
-        misalignment=with_misalignment,
+        misalignment=options.misalignment is not False,
+        skew_sd=np.inf if tells_misalignment else UNKNOWN_SKEW,
         time_constant_range_s=(2.0 * options.window_s, max(longest / 2.0, 4.0 * options.window_s)),
     )
     coarse = table.coarsened(_selection_window(table, options))
@@ -297,8 +298,10 @@ def _fit_table(
     tell('regression', 0.95)
     chosen = _refined(table, selector, name, freedom)
     one_set = _refined(table, selector, 'quadratic', freedom)
-    residuals = residual_rows(table, chosen.solution, one_set.solution)
     slow = slow_error(table, chosen)
+    if not tells_misalignment:
+        chosen, one_set = without_misalignment(chosen), without_misalignment(one_set)
+    residuals = residual_rows(table, chosen.solution, one_set.solution)
     findings += judge_result(chosen.solution, residuals, slow, options)
     facts = UnitFacts(
         _unit(bags, options), noise_density(table, bags, chosen), board_lag(table), slow
@@ -382,6 +385,21 @@ def first_guess(
     if not wanted:
         return box, findings
     return constant_calibration(means, options.gravity, with_misalignment=True), findings
+
+
+def without_misalignment(outcome: Outcome) -> Outcome:
+    """
+    Publish the identity for an M that the positions cannot tell.
+
+    It was free within what a triad's M may be, lest it be taken for drift: the covariance of the
+    other parameters keeps that doubt.
+
+    """
+    return replace(
+        outcome,
+        solution=replace(outcome.solution, skew=np.zeros(3)),
+        layout=replace(outcome.layout, skew=np.full(3, -1)),
+    )
 
 
 def _refined(table: WindowTable, selector: Selector, name: str, freedom: Freedom) -> Outcome:

@@ -49,6 +49,10 @@ class Freedom:
         where the start has one.
     time_constant_range_s : (float, float), optional
         Bounds of the time constants [s].
+    skew_sd : float, optional
+        What is known of the misalignment beforehand [rad], about zero. Where the positions cannot
+        tell it, it is estimated within this all the same: held at zero, it would be taken for
+        drift.
 
     """
 
@@ -59,6 +63,7 @@ class Freedom:
     axes: bool = True
     transient: bool = True
     time_constant_range_s: tuple[float, float] = (20.0, 1e5)
+    skew_sd: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -299,12 +304,15 @@ def _minimise(
     state = start
     memory = table.memory(state.time_constants_s)
     damping = 0.0
-    cost, columns, residual, huber = _evaluate(table, state, root_weight, is_robust, memory)
+    skew_sd = freedom.skew_sd
+    cost, columns, residual, huber = _evaluate(
+        table, state, root_weight, is_robust, memory, skew_sd
+    )
     is_converged = is_stuck = False
     n_steps = 0
     while n_steps < max_steps and not is_converged:
         normal, gradient = _normal_equations(
-            table, state, columns, residual, root_weight * np.sqrt(huber), layout, slices
+            table, state, columns, residual, root_weight * np.sqrt(huber), layout, slices, skew_sd
         )
         n_steps += 1
         while True:
@@ -312,7 +320,7 @@ def _minimise(
             trial = _moved(state, step, layout, freedom)
             moves_lags = not np.array_equal(trial.time_constants_s, state.time_constants_s)
             trial_memory = table.memory(trial.time_constants_s) if moves_lags else memory
-            found = _evaluate(table, trial, root_weight, is_robust, trial_memory)
+            found = _evaluate(table, trial, root_weight, is_robust, trial_memory, skew_sd)
             if found[0] <= cost * (1.0 + 1e-12):
                 is_converged = promised < _CONVERGED_DECREASE or promised < 1e-12 * cost
                 state, memory = trial, trial_memory
@@ -327,13 +335,18 @@ def _minimise(
         if is_stuck:
             break
     normal, _ = _normal_equations(
-        table, state, columns, residual, root_weight * np.sqrt(huber), layout, slices
+        table, state, columns, residual, root_weight * np.sqrt(huber), layout, slices, skew_sd
     )
     return Outcome(state, cost, n_steps, is_converged, residual, huber, normal, layout)
 
 
 def _evaluate(
-    table: WindowTable, state: Solution, root_weight: Array, is_robust: bool, memory: Memory
+    table: WindowTable,
+    state: Solution,
+    root_weight: Array,
+    is_robust: bool,
+    memory: Memory,
+    skew_sd: float,
 ) -> tuple[float, Regressors, Array, Array]:
     columns = regressors(table, state.spec, state.time_constants_s, state.start_memory, memory)
     residual = table.mean - predict(table, state, columns)
@@ -345,6 +358,7 @@ def _evaluate(
         huber[odd] = _HUBER_SDS / size[odd]
         loss[odd] = _HUBER_SDS * (size[odd] - 0.5 * _HUBER_SDS)
     prior = 0.5 * float(np.sum((state.start_memory / START_MEMORY_SD) ** 2))
+    prior += 0.5 * float(np.sum((state.skew / skew_sd) ** 2))
     return float(loss.sum()) + prior, columns, residual, huber
 
 
@@ -378,6 +392,7 @@ def _normal_equations(
     root_weight: Array,
     layout: Layout,
     slices: list[slice],
+    skew_sd: float,
 ) -> tuple[Array, Array]:
     spec, g = state.spec, state.gravity
     inverse = state.inverse_misalignment
@@ -424,6 +439,9 @@ def _normal_equations(
     normal[free, free] += 1.0 / START_MEMORY_SD**2
     held = layout.start >= 0
     gradient[layout.start[held]] -= state.start_memory[held] / START_MEMORY_SD**2
+    # What is held stands in the spare place, where this does no harm.
+    normal[layout.skew, layout.skew] += 1.0 / skew_sd**2
+    gradient[layout.skew] -= state.skew / skew_sd**2
     return normal[:n, :n], gradient[:n]
 
 
