@@ -26,7 +26,7 @@ from thermo_comp.status import CompensatorConfig
 from thermo_comp.thermometer import ThermometerSettings
 
 START_NS = 1_767_225_600 * SECOND_NS
-RATE_HZ = 25.0
+RATE_HZ = 12.5
 READINGS_HZ = 5.0
 DURATION_S = 320.0
 #: The platform turns until here and stands from here on.

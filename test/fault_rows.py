@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from fault_rig import (
+    DURATION_S,
     FULL_SCALE,
     RATE_HZ,
     START_NS,
@@ -34,7 +35,7 @@ from fault_rig import (
 
 OK, WARN, ERROR = 0, 1, 2
 #: Samples of the undisturbed bag.
-N_SAMPLES = 8000
+N_SAMPLES = round(RATE_HZ * DURATION_S)
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def sensor_rows(name: str) -> list[Row]:
             after,
             stop(name, 80.0, 130.0),
             ((level, lost),),
-            7200,
+            3600,
             silent=((100.5, 129.5),) if is_board else (),
             recovered=165.0,
         ),
@@ -122,7 +123,7 @@ def sensor_rows(name: str) -> list[Row]:
             'doubted from the fourth equal reading on; not used once the other moves: ' + after,
             frozen(name, 80.0, 130.0),
             ((WARN, f'{name} temperature frozen'), (level, lost)),
-            7300,
+            3650,
             silent=((107.0, 129.5),) if is_board else (),
             recovered=165.0,
         ),
@@ -132,7 +133,7 @@ def sensor_rows(name: str) -> list[Row]:
             'as above; before the ramp its variance grows',
             frozen(name, 45.0, 130.0),
             ((WARN, f'{name} temperature stands still'), (WARN, f'{name} temperature frozen')),
-            6900,
+            3450,
             recovered=200.0,
         ),
         Row(
@@ -153,7 +154,7 @@ def sensor_rows(name: str) -> list[Row]:
                 (WARN, f'{name} temperature jumped by +'),
                 (WARN, 'outside the calibrated range'),
             ),
-            7900,
+            3950,
             recovered=230.0,
         ),
         Row(
@@ -183,7 +184,7 @@ def sensor_rows(name: str) -> list[Row]:
             'equal readings are doubted, each new degree begins anew; held or lost in between',
             value(name, 45.0, 160.0, lambda v: float(round(v))),
             ((WARN, f'{name} temperature'),),
-            7700,
+            3850,
             recovered=220.0,
         ),
         Row(
@@ -233,7 +234,7 @@ BOTH_ROWS = [
         'as the board alone',
         chain(stop('board', 80.0, 130.0), stop('case', 80.0, 130.0)),
         ((ERROR, 'nothing is published'), (WARN, 'case temperature lost')),
-        7200,
+        3600,
         silent=((100.5, 129.5),),
         recovered=170.0,
     ),
@@ -255,7 +256,7 @@ SAMPLE_ROWS = [
         'dropped and counted',
         value('counts', 80.0, 95.0, lambda v: (math.nan, v[1], v[2])),
         ((WARN, 'samples not finite, dropped'),),
-        7600,
+        3800,
         silent=((80.0, 95.0),),
     ),
     Row(
@@ -264,7 +265,7 @@ SAMPLE_ROWS = [
         'dropped and counted',
         value('counts', 80.0, 95.0, lambda v: (v[0], -FULL_SCALE, v[2])),
         ((ERROR, 'samples saturated'),),
-        7600,
+        3800,
         silent=((80.0, 95.0),),
     ),
     Row(
@@ -273,8 +274,8 @@ SAMPLE_ROWS = [
         'after `stuck_timeout` dropped and counted',
         frozen('counts', 80.0, 130.0),
         ((ERROR, 'samples stuck or all zero, dropped'),),
-        6750,
-        silent=((82.1, 130.0),),
+        3375,
+        silent=((84.1, 130.0),),
         recovered=130.0,
     ),
     Row(
@@ -283,9 +284,9 @@ SAMPLE_ROWS = [
         'as above; wrong until `stuck_timeout`, since a standing sample is not wrong in itself',
         frozen('counts', 10.0, 20.0),
         ((ERROR, 'samples stuck or all zero, dropped'),),
-        7700,
-        silent=((12.1, 20.0),),
-        blind=(10.0, 12.1),
+        3850,
+        silent=((14.1, 20.0),),
+        blind=(10.0, 14.1),
         recovered=20.0,
     ),
     Row(
@@ -294,7 +295,7 @@ SAMPLE_ROWS = [
         'dropped and counted from the first one on',
         value('counts', 80.0, 95.0, lambda _: (0.0, 0.0, 0.0)),
         ((ERROR, 'samples stuck or all zero, dropped'),),
-        7600,
+        3800,
         silent=((80.0, 95.0),),
     ),
     Row(
@@ -303,7 +304,7 @@ SAMPLE_ROWS = [
         'three windows at rest miss gravity: nothing is published until two do not',
         value('counts', 130.0, 220.0, lambda v: (v[0], v[1], -v[2])),
         ((ERROR, 'or an axis reversed? Nothing is published'),),
-        5600,
+        2800,
         silent=((137.0, 220.0),),
         blind=(130.0, 137.0),
         recovered=220.0,
@@ -314,7 +315,7 @@ SAMPLE_ROWS = [
         'as above, once the platform stands',
         value('counts', 0.0, 999.0, lambda v: (v[0], v[1], -v[2])),
         ((ERROR, 'or an axis reversed? Nothing is published'),),
-        1000,
+        500,
         silent=((47.0, 320.0),),
         blind=(0.0, 47.0),
         recovered=math.inf,
@@ -336,7 +337,7 @@ SAMPLE_ROWS = [
         'the others are as ever',
         changed('counts', 0.0, 999.0, lambda e: [e] if seconds_of(e[1]) // 7 % 2 else []),
         ((WARN, 'samples/s, calibrated for'),),
-        3900,
+        1950,
         recovered=300.0,
     ),
     Row(
@@ -358,11 +359,11 @@ SAMPLE_ROWS = [
     ),
     Row(
         'counts 20 times as fast',
-        'from 25 to 500 Hz for 10 s: a count is charge per cycle, a twentieth now',
+        'from 12.5 to 250 Hz for 10 s: a count is charge per cycle, a twentieth now',
         'dropped and counted once there are more than conversions can be',
         faster(150.0, 160.0, 20),
         ((ERROR, 'samples too fast for their conversion cycle, dropped'),),
-        7600,
+        3800,
         silent=((151.0, 160.0),),
         blind=(149.9, 151.0),
         recovered=165.0,
@@ -376,7 +377,7 @@ TIME_ROWS = [
         'the regime is unknown again, the memory unsettled: larger covariance',
         chain(stop('counts', 130, 730), stop('board', 130, 730), stop('case', 130, 730)),
         (),
-        4600,
+        2300,
         recovered=820.0,
         source=bag(duration_s=850.0),
     ),
@@ -386,7 +387,7 @@ TIME_ROWS = [
         'the temperatures go on; as ever afterwards',
         stop('counts', 80.0, 200.0),
         (),
-        5000,
+        2500,
     ),
     Row(
         'time jumps back',
@@ -394,7 +395,7 @@ TIME_ROWS = [
         'estimators reset, said once; as ever afterwards',
         half_time(100.0),
         ((WARN, 'jumps of time backwards, estimators reset'),),
-        10_000,
+        5000,
     ),
     *(
         Row(
@@ -403,7 +404,7 @@ TIME_ROWS = [
             'the regime is unknown, the memory unsettled: larger covariance',
             shifted(at, by),
             (),
-            7990,
+            3995,
             shift=(at, by),
             recovered=at + 80.0,
         )

@@ -315,7 +315,8 @@ class Correction:
 
         The variance of a blend is at most the blend of the variances; to it comes what the two
         sets disagree by, while the regime is unknown, while they cross over, and in proportion
-        to how far the state lies outside the calibrated ranges.
+        to how far the state lies outside the calibrated ranges. While the regime is unknown
+        either set may be the right one, and the variances of both count.
 
         Parameters
         ----------
@@ -335,6 +336,10 @@ class Correction:
         relative = rest * self.static.relative_excess(excess_s)
         relative = relative + weight * self.dynamic.relative_excess(excess_d)
         doubt = state[thermal.UNKNOWN] + weight * rest + relative * relative
+        rest, weight = (
+            rest + state[thermal.UNKNOWN] * weight,
+            weight + state[thermal.UNKNOWN] * rest,
+        )
         result = []
         for K, noise, axis_s, axis_d in zip(
             self._K, self.noise, self.static.axes, self.dynamic.axes, strict=True

@@ -100,6 +100,7 @@ class SensorGuard:
         self._n_still = still_readings(settings)
         self._rate = settings.fastest_ramp_k_min / 60.0
         self._decay = 1e-9 / max(settings.lag_s, other.settings.lag_s)
+        self._largest_noise = self._quantum + _SIGMAS * settings.noise_sd_c
         self._n_doubtful = min(DOUBTFUL_READINGS, self._n_still)
         self.reset()
 
@@ -145,6 +146,11 @@ class SensorGuard:
             self._n_same += 1
             self.fault = self._judge_still(stamp_ns)
             return self.fault != Fault.FROZEN
+        if self._n_same >= self._n_doubtful and not self._has_cells:
+            change = celsius - own.reading
+            if abs(change) > self._largest_noise:
+                # Those equal readings were wrong, and the estimate has followed them.
+                self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
         self.is_revived = self.fault in (Fault.STILL, Fault.FROZEN)
@@ -157,6 +163,9 @@ class SensorGuard:
                 self.fault = Fault.STEP
                 self.step = step
                 return False
+            if self.fault == Fault.STEP:
+                # Possible after so long, but not where it was expected.
+                self.is_revived = abs(step) > self._largest_noise + _SIGMAS * sqrt(variance)
         self.fault = Fault.NONE
         self._n_used += 1
         return True

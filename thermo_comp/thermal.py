@@ -308,8 +308,7 @@ class ThermalTracker:
     def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
         board = self.board if self.board.stamp_ns is not None else None
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
-        unwatched_s = max(UNWATCHED_SHARE * self.settings.case.lag_s, self.config.case_timeout_s)
-        if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > unwatched_s:
+        if decided_ns is not None and self._is_unwatched(decided_ns, stamp_ns):
             # Nobody has seen whether a ramp began or ended meanwhile.
             self.detector.reset()
             self.lead.reset()
@@ -319,6 +318,10 @@ class ThermalTracker:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
             self._target = target
+
+    def _is_unwatched(self, decided_ns: int, stamp_ns: int) -> bool:
+        limit_s = max(UNWATCHED_SHARE * self.settings.case.lag_s, self.config.case_timeout_s)
+        return (stamp_ns - decided_ns) * 1e-9 > limit_s
 
     def _forget_memory(self) -> None:
         n_lags = len(self.memory_time_constants_s)
@@ -372,8 +375,12 @@ class ThermalTracker:
         else:
             lag = self.config.board_lag_s
             gradient = lag * rate
-            var_gradient = (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2 + (
-                lag * lag * self.board.var_rate
+            # Nor has anybody seen what the case did since the board was last read.
+            unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
+            var_gradient = (
+                (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2
+                + lag * lag * self.board.var_rate
+                + unseen * unseen
             )
         if self._is_doubted:
             var_board += self.board_guard.doubt(stamp_ns)
@@ -383,7 +390,12 @@ class ThermalTracker:
                 var_board += gradient * gradient
             else:
                 var_board += self.lead.doubt
-        unknown = 1.0 if self.detector.regime == Regime.UNKNOWN else 0.0
+        is_unknown = (
+            self._decided_ns is None
+            or self.detector.regime == Regime.UNKNOWN
+            or self._is_unwatched(self._decided_ns, stamp_ns)
+        )
+        unknown = 1.0 if is_unknown else 0.0
         state = (board, var_board, rate, gradient, var_gradient, self.weight_at(stamp_ns), unknown)
         if not self._memory:
             return state

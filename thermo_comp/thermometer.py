@@ -323,11 +323,22 @@ class Thermometer:
         dt = ahead if -horizon <= ahead <= horizon else (horizon if ahead > 0.0 else -horizon)
         variance = self.var_temperature + dt * (2.0 * self._covariance + dt * self.var_rate)
         beyond = ahead - dt
-        return (
-            self.temperature + dt * self.rate,
-            self.rate,
-            variance + beyond * beyond * (self.var_rate + self.rate * self.rate),
-        )
+        if beyond:
+            # The rate is not known to hold, and a ramp may begin that nobody sees.
+            unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
+            squared = self.var_rate + self.rate * self.rate + unseen * unseen
+            variance += beyond * beyond * squared
+        return self.temperature + dt * self.rate, self.rate, variance
+
+    def beyond(self, stamp_ns: int) -> float:
+        """
+        Say how far a stamp lies beyond what is extrapolated to [s]; 0 within.
+
+        """
+        if self.stamp_ns is None or not self.is_ready:
+            return 0.0
+        ahead = (stamp_ns - self.stamp_ns) * 1e-9
+        return max(ahead - HORIZON_INTERVALS * self.interval_s, 0.0)
 
     def _start(self, stamp_ns: int, reading_c: float) -> None:
         self.reset()
