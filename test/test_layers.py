@@ -35,6 +35,7 @@ LAYERS = {
     'batch': 2,
     'reading_queue': 2,
     'blocks': 2,
+    'kernel': 2,
     'snapshot': 2,
     'plausibility': 2,
     'sample_guard': 2,

@@ -17,7 +17,13 @@ from hypothesis import strategies as st
 
 from thermo_comp.calibration import Axes, AxisReference, Unit
 from thermo_comp.compensator import Compensator, CompensatorConfig
-from thermo_comp.sample_guard import BURST_SAMPLES, LARGEST_RATE, STUCK_SAMPLES, RateWatch
+from thermo_comp.sample_guard import (
+    BURST_SAMPLES,
+    LARGEST_RATE,
+    STUCK_SAMPLES,
+    RateWatch,
+    StuckWatch,
+)
 from thermo_comp.status import DROPPED, Counters
 
 K = 300.0
@@ -81,6 +87,38 @@ def test_few_equal_samples_are_chance_however_long_they_take(rng):
     stuck = at_rest(rng)
     run(compensator, recording(STUCK_SAMPLES, 1.0, lambda _: stuck))
     assert compensator.counters.n_stuck == 0
+
+
+@given(
+    st.lists(st.sampled_from([1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]), max_size=40),
+    st.lists(st.integers(1, 300), min_size=1, max_size=10),
+    st.sampled_from([0, 1, 49, 60]),
+)
+@settings(max_examples=200, deadline=None)
+def test_standstills_are_found_however_long_the_batch(lengths, cuts, period):
+    # Runs of equal samples, each of one value that differs from its neighbours' in one axis.
+    values = np.repeat(np.arange(len(lengths)), lengths)
+    samples = np.stack([values * (k == values % 3) for k in range(3)], axis=1) + 1.0
+    stamps = np.arange(len(values), dtype=np.int64) * 20_000_000
+    one, many = (StuckWatch(period / 50.0) for _ in range(2))
+    expected = []
+    for stamp_ns, sample in zip(stamps.tolist(), samples.tolist(), strict=True):
+        if tuple(sample) == one.run[:3]:
+            expected.append(one.again(stamp_ns))
+        else:
+            one.run, one.n_same = (*sample, stamp_ns), 0
+            expected.append(False)
+    found = []
+    begin = 0
+    for cut in [*cuts, len(values)]:
+        end = min(begin + cut, len(values))
+        if end > begin:
+            mask = many.find(stamps[begin:end], samples[begin:end])
+            found += [False] * (end - begin) if mask is None else mask.tolist()
+        begin = end
+    assert found == expected
+    assert many.n_same == one.n_same
+    np.testing.assert_array_equal(many.run, one.run)  # equal_nan: none before the first sample
 
 
 def test_noughts_are_no_measurement_from_the_first_on(rng):

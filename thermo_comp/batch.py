@@ -11,13 +11,13 @@ the operations of `Compensator.process` in their order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from .blocks import AccelBlock, CompensatedBlock, Floats, Stamps
+from .kernel import Lines, correct
 from .sample_guard import Mask
 
 if TYPE_CHECKING:
@@ -27,27 +27,28 @@ if TYPE_CHECKING:
 SEGMENT_NS = 1_000_000_000
 #: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
 TIME_JUMP_NS = 1_000_000_000
-#: Samples corrected at a time, so that the columns in work stay in the cache.
-_CHUNK = 16384
+#: Where xx, xy, xz, yy, yz, zz stand in a row of the covariance.
+_UNIQUE = [0, 1, 2, 4, 5, 8]
 
 
-@dataclass(slots=True)
-class _Segments:
+class _Segment(NamedTuple):
     """
-    The segments of a block: where each begins and ends, and the thermal states at both ends.
+    A run of samples over which the correction is linear in time.
 
     """
 
-    start_ns: list[int]
-    first: list[int]
-    after: list[int]
-    states: list[tuple[float, ...]]
-    end_states: list[tuple[float, ...]]
+    start_ns: int
+    #: Its samples are first..after - 1.
+    first: int
+    after: int
     #: Not the rest of one that the end of the block before has cut.
-    is_new: list[bool]
+    is_new: bool
     #: Held back because the samples come too fast; and what the rate adds to their noise.
-    is_too_fast: list[bool]
-    noise_excess: list[float]
+    is_too_fast: bool
+    noise_excess: float
+    #: The thermal states at both ends.
+    state: tuple[float, ...]
+    end_state: tuple[float, ...]
 
 
 def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
@@ -58,19 +59,22 @@ def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlo
     counters = compensator.counters
     n_seen = counters.n_in - counters.n_out_of_order
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
-    before = np.maximum.accumulate(np.concatenate(([compensator.last_ns], stamps)))[:-1]
-    in_order = stamps > before
-    if np.any(stamps <= before - TIME_JUMP_NS):
-        return _one_by_one(compensator, block)
-    compensator.counters.n_out_of_order += int(len(stamps) - np.count_nonzero(in_order))
-    if in_order.all():
+    samples = np.asarray(block.accel, dtype=np.float64)
+    if not len(stamps) or (
+        int(stamps[0]) > compensator.last_ns and (stamps[1:] > stamps[:-1]).all()
+    ):
         index = np.arange(len(stamps), dtype=np.int64)
-        samples = np.asarray(block.accel, dtype=np.float64)
+        kept_before = None
     else:
+        before = np.maximum.accumulate(np.concatenate(([compensator.last_ns], stamps)))[:-1]
+        if np.any(stamps <= before - TIME_JUMP_NS):
+            return _one_by_one(compensator, block)
+        in_order = stamps > before
         index = np.flatnonzero(in_order)
-        stamps = stamps[index]
-        samples = np.asarray(block.accel, dtype=np.float64)[index]
-    segments = _run_thermal_side(compensator, block, stamps, in_order, n_seen)
+        counters.n_out_of_order += len(stamps) - len(index)
+        kept_before = np.concatenate(([0], np.cumsum(in_order)))
+        stamps, samples = stamps[index], samples[index]
+    segments = _run_thermal_side(compensator, block, stamps, kept_before, n_seen)
     if len(stamps):
         compensator.last_ns = int(stamps[-1])
     return _apply(compensator, segments, index, stamps, samples)
@@ -118,13 +122,12 @@ def _run_thermal_side(
     compensator: Compensator,
     block: AccelBlock,
     stamps: Stamps,
-    in_order: npt.NDArray[np.bool_],
+    kept_before: Stamps | None,
     n_seen: int,
-) -> _Segments:
-    segments = _Segments([], [], [], [], [], [], [], [])
+) -> list[_Segment]:
+    segments: list[_Segment] = []
     n_samples = len(stamps)
     # A reading takes effect at the first sample that is not before it and that comes after it.
-    kept_before = np.concatenate(([0], np.cumsum(in_order)))
     pending = compensator.take_pending()
     reading_ns = [np.array([entry[0] for entry in pending], dtype=np.int64)]
     kinds = [np.array([entry[1] for entry in pending], dtype=np.int64)]
@@ -142,7 +145,8 @@ def _run_thermal_side(
         # Behind whatever was pushed before: only the order within one sensor and stamp counts.
         orders.append(np.arange(len(s)) + (1 << 60))
         values.append(np.asarray(v, dtype=np.float64))
-        after.append(kept_before[np.asarray(a, dtype=np.int64)])
+        place = np.asarray(a, dtype=np.int64)
+        after.append(place if kept_before is None else kept_before[place])
     reading_stamps = np.concatenate(reading_ns)
     kind_column = np.concatenate(kinds)
     value_column = np.concatenate(values)
@@ -150,13 +154,15 @@ def _run_thermal_side(
         np.searchsorted(stamps, reading_stamps, side='left'), np.concatenate(after)
     )
     order = np.lexsort((np.concatenate(orders), kind_column, reading_stamps, effect))
+    effect = effect[order]
     events = zip(
-        effect[order].tolist(),
+        effect.tolist(),
         reading_stamps[order].tolist(),
         kind_column[order].tolist(),
         value_column[order].tolist(),
         strict=True,
     )
+    apply_reading = compensator.apply_reading
     position = 0
     for at, stamp_ns, kind, celsius in events:
         if at > position:
@@ -166,7 +172,7 @@ def _run_thermal_side(
         if at >= n_samples:
             (compensator.push_board, compensator.push_case)[kind](stamp_ns, celsius)
         else:
-            compensator.apply_reading(stamp_ns, kind, celsius)
+            apply_reading(stamp_ns, kind, celsius)
     if position < n_samples:
         _add_segments(compensator, segments, stamps, position, n_samples, n_seen)
     return segments
@@ -174,7 +180,7 @@ def _run_thermal_side(
 
 def _add_segments(
     compensator: Compensator,
-    segments: _Segments,
+    segments: list[_Segment],
     stamps: Stamps,
     first: int,
     after: int,
@@ -189,84 +195,70 @@ def _add_segments(
     if board_ns is None or updated_ns is None:
         compensator.counters.n_no_temperature += after - first
         return
-    if int(stamps[after - 1]) - board_ns > compensator.timeout_ns:
+    last_ns = stamps.item(after - 1)
+    if last_ns - board_ns > compensator.timeout_ns:
         fresh = int(
             np.searchsorted(stamps[first:after], board_ns + compensator.timeout_ns, 'right')
         )
         compensator.counters.n_stale += after - first - fresh
         after = first + fresh
     while first < after:
-        start_ns = updated_ns + (int(stamps[first]) - updated_ns) // SEGMENT_NS * SEGMENT_NS
+        stamp_ns = stamps.item(first)
+        start_ns = updated_ns + (stamp_ns - updated_ns) // SEGMENT_NS * SEGMENT_NS
         end_ns = start_ns + SEGMENT_NS
-        if int(stamps[after - 1]) < end_ns:
+        if last_ns < end_ns:
             stop = after
         else:
             stop = first + int(np.searchsorted(stamps[first:after], end_ns, 'left'))
-        is_new = compensator.open_segment(start_ns, n_seen + first, int(stamps[first]))
-        segments.is_new.append(is_new)
-        is_too_fast = compensator.rate_refuses and (is_new or compensator.is_refusing)
-        segments.is_too_fast.append(is_too_fast)
-        segments.noise_excess.append(compensator.noise_excess)
-        segments.start_ns.append(start_ns)
-        segments.first.append(first)
-        segments.after.append(stop)
-        segments.states.append(tracker.sample(start_ns))
-        segments.end_states.append(tracker.sample(end_ns))
+        is_new = compensator.open_segment(start_ns, n_seen + first, stamp_ns)
+        is_too_fast = (is_new or compensator.is_refusing) and compensator.rate_refuses
+        segments.append(
+            _Segment(
+                start_ns,
+                first,
+                stop,
+                is_new,
+                is_too_fast,
+                compensator.noise_excess,
+                tracker.sample(start_ns),
+                tracker.sample(end_ns),
+            )
+        )
         first = stop
 
 
 def _apply(
     compensator: Compensator,
-    segments: _Segments,
+    segments: list[_Segment],
     index: npt.NDArray[np.int64],
     stamps: Stamps,
     samples: Floats,
 ) -> CompensatedBlock:
-    if not segments.start_ns:
+    if not segments:
         return CompensatedBlock(index[:0], stamps[:0], np.empty((0, 3)), np.empty((0, 9)))
-    starts = tuple(np.array(segments.states).T.copy())
-    ends = tuple(np.array(segments.end_states).T.copy())
+    start_ns, firsts, afters, is_new, is_too_fast, noise_excess, states, end_states = zip(
+        *segments, strict=True
+    )
+    starts = tuple(np.array(states).T.copy())
+    ends = tuple(np.array(end_states).T.copy())
     at_start = compensator.correction.bias_scale(starts)
     at_end = compensator.correction.bias_scale(ends)
-    columns: list[npt.NDArray[Any]] = [np.array(segments.start_ns, dtype=np.int64)]
+    columns: list[Floats] = []
     for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
         columns += [bias, bias_end - bias, scale, scale_end - scale]
-    excess = np.array(segments.noise_excess)
+    excess = np.array(noise_excess)
     correction = compensator.correction
     for (a, b, c), noise in zip(correction.variance(ends), correction.noise, strict=True):
         columns += (a + excess * noise, b, c)
-    first = np.array(segments.first)
-    counts = np.array(segments.after) - first
-    n = int(counts.sum())
-    # The columns stand one after the other in memory: each is written in one run.
-    force = np.empty((3, n)).T
-    covariance = np.empty((9, n)).T
-    keep = np.ones(n, dtype=bool)
+    first = np.array(firsts)
+    counts = np.array(afters) - first
     source = _covered(first, counts, len(stamps))
-    ends_at = np.cumsum(counts)
-    low = 0
-    begin = 0
-    while begin < n:
-        # Whole segments, about a cache's worth of them.
-        high = max(int(np.searchsorted(ends_at, begin + _CHUNK, 'right')), low + 1)
-        end = int(ends_at[high - 1])
-        rows = source[begin:end] if source is not None else slice(begin, end)
-        with np.errstate(invalid='ignore', over='ignore'):
-            # What is not finite is corrected like the rest and then left out.
-            _correct(
-                compensator,
-                [column[low:high] for column in columns],
-                counts[low:high],
-                stamps[rows],
-                samples[rows],
-                force[begin:end],
-                covariance[begin:end],
-                keep[begin:end],
-            )
-        low, begin = high, end
     if source is not None:
         index, stamps, samples = index[source], stamps[source], samples[source]
-    _judge(compensator, segments, counts, stamps, samples, force, covariance, keep)
+    lines = Lines(np.array(start_ns, dtype=np.int64), columns, counts)
+    force, covariance = correct(lines, compensator.misalignment, stamps, samples)
+    keep = _good(compensator.calibration.unit.full_scale, samples)
+    _judge(compensator, is_new, is_too_fast, counts, stamps, samples, force, covariance, keep)
     if not keep.all():
         index, stamps = index[keep], stamps[keep]
         force, covariance = force[keep], covariance[keep]
@@ -286,103 +278,49 @@ def _covered(
     return np.concatenate([np.arange(f, f + c) for f, c in zip(first, counts, strict=True)])
 
 
-def _correct(
-    compensator: Compensator,
-    columns: list[npt.NDArray[Any]],
-    counts: npt.NDArray[np.int64],
-    stamps: Stamps,
-    samples: Floats,
-    force: Floats,
-    covariance: Floats,
-    keep: npt.NDArray[np.bool_],
-) -> None:
-    if counts[0] * len(counts) == len(stamps) and (counts == counts[0]).all():
-        # Segments of one length stand as the rows of a table: their columns spread for nothing.
-        shape: tuple[int, ...] = (len(counts), int(counts[0]))
-        spread = [column[:, None] for column in columns]
-    else:
-        shape = (len(stamps),)
-        spread = [np.repeat(column, counts) for column in columns]
-    dt = (stamps.reshape(shape) - spread[0]) * 1e-9
-    _mark_bad(compensator.calibration.unit.full_scale, samples, keep)
-    x, y, z = (
-        _divide(samples[:, i].reshape(shape), spread[1 + 4 * i : 5 + 4 * i], dt) for i in range(3)
-    )
-    vx, vy, vz = (
-        _variance(value, *spread[at : at + 3])
-        for value, at in zip((x, y, z), (13, 16, 19), strict=True)
-    )
-    yx, zx, zy, var_yx, var_zx, var_zy = compensator.misalignment
-    xx = x * x
-    cxy = yx * vx
-    cxz = zx * vx
-    out = [column.reshape(shape) for column in (*force.T, *covariance.T)]
-    out[0][...] = x
-    np.add(yx * x, y, out=out[1])
-    np.add(zx * x + zy * y, z, out=out[2])
-    out[3][...] = vx
-    out[4][...] = cxy
-    out[6][...] = cxy
-    out[5][...] = cxz
-    out[9][...] = cxz
-    np.add(yx * cxy + vy, xx * var_yx, out=out[7])
-    np.add(yx * cxz, zy * vy, out=out[8])
-    out[10][...] = out[8]
-    np.add(zx * cxz + zy * zy * vy + vz + xx * var_zx, y * y * var_zy, out=out[11])
-
-
-def _mark_bad(full_scale: float, samples: Floats, keep: npt.NDArray[np.bool_]) -> None:
+def _good(full_scale: float, samples: Floats) -> Mask:
     # One look at the extremes settles the usual case; a NaN fails both comparisons.
     if -full_scale < np.min(samples) and np.max(samples) < full_scale:
-        return
-    keep &= ((-full_scale < samples) & (samples < full_scale)).all(axis=1)
+        return np.ones(len(samples), dtype=bool)
+    good: Mask = ((-full_scale < samples) & (samples < full_scale)).all(axis=1)
+    return good
 
 
 def _judge(
     compensator: Compensator,
-    segments: _Segments,
+    is_new: tuple[bool, ...],
+    is_too_fast: tuple[bool, ...],
     counts: npt.NDArray[np.int64],
     stamps: Stamps,
     samples: Floats,
     force: Floats,
     covariance: Floats,
-    keep: npt.NDArray[np.bool_],
+    keep: Mask,
 ) -> None:
     """
     Leave out what the stream would not publish, and count why.
 
     """
-    counters, gravity = compensator.counters, compensator.gravity
-    is_good = keep.copy()
+    counters = compensator.counters
+    is_good = keep
     is_stuck = _stuck(compensator, stamps, samples)
     if is_stuck is not None:
+        is_good = keep.copy()
         keep &= ~is_stuck
-    begins = np.concatenate(([0], np.cumsum(counts)[:-1]))
-    is_refuted: list[bool] = []
-    trace = compensator.noise_trace
-    firsts = zip(
-        begins.tolist(),
-        stamps[begins].tolist(),
-        keep[begins].tolist(),
-        segments.is_new,
-        segments.is_too_fast,
-        strict=True,
+    begins = np.cumsum(counts) - counts
+    is_refuted = _refuted(
+        compensator, is_new, is_too_fast, begins, stamps, force, covariance, keep
     )
-    for row, stamp_ns, is_kept, is_new, is_fast in firsts:
-        if not is_new:
-            is_refuted.append(compensator.is_refusing and not is_fast)
-            continue
-        is_refuted.append(gravity.is_refuted and not is_fast)
-        if is_kept and not is_fast and gravity.wants(stamp_ns):
-            xx, xy, xz, _, yy, yz, _, _, zz = covariance[row].tolist()
-            x, y, z = force[row].tolist()
-            gravity.add(stamp_ns, (x, y, z), (xx, xy, xz, yy, yz, zz), trace)
-    compensator.is_refusing = segments.is_too_fast[-1] or is_refuted[-1]
+    compensator.is_refusing = is_too_fast[-1] or is_refuted[-1]
+    n_kept = int(np.count_nonzero(keep))
+    if n_kept == len(keep) and not any(is_too_fast) and not any(is_refuted):
+        return
+    is_good = is_good.copy()
     # Every sample of a segment that is held back counts for that; the first one of a refuted
     # segment has been looked at like any other.
-    is_fast_row = np.repeat(segments.is_too_fast, counts)
+    is_fast_row = np.repeat(is_too_fast, counts)
     is_held_row = np.repeat(is_refuted, counts)
-    first = begins[np.array(is_refuted) & np.array(segments.is_new)]
+    first = begins[np.array(is_refuted) & np.array(is_new)]
     is_held_row[first] = False
     counters.n_too_fast += int(np.count_nonzero(is_fast_row))
     counters.n_refuted += int(np.count_nonzero(is_held_row))
@@ -399,6 +337,41 @@ def _judge(
     keep[first] = False
 
 
+def _refuted(
+    compensator: Compensator,
+    is_new: tuple[bool, ...],
+    is_too_fast: tuple[bool, ...],
+    begins: npt.NDArray[np.int64],
+    stamps: Stamps,
+    force: Floats,
+    covariance: Floats,
+    keep: Mask,
+) -> list[bool]:
+    """
+    Let the first sample of each segment tell of gravity; say which segments are held back for it.
+
+    """
+    gravity, trace = compensator.gravity, compensator.noise_trace
+    is_refuted: list[bool] = []
+    firsts = zip(
+        stamps[begins].tolist(),
+        force[begins].tolist(),
+        covariance[begins][:, _UNIQUE].tolist(),
+        keep[begins].tolist(),
+        is_new,
+        is_too_fast,
+        strict=True,
+    )
+    for stamp_ns, mean, spread, is_kept, is_new_one, is_fast in firsts:
+        if not is_new_one:
+            is_refuted.append(compensator.is_refusing and not is_fast)
+            continue
+        is_refuted.append(gravity.is_refuted and not is_fast)
+        if is_kept and not is_fast and gravity.wants(stamp_ns):
+            gravity.add(stamp_ns, mean, spread, trace)
+    return is_refuted
+
+
 def _stuck(compensator: Compensator, stamps: Stamps, samples: Floats) -> Mask | None:
     """
     Find the samples that are not believed: too long the same, or three exact zeros.
@@ -407,27 +380,10 @@ def _stuck(compensator: Compensator, stamps: Stamps, samples: Floats) -> Mask | 
     if not compensator.stuck.is_on:
         return None
     found = compensator.stuck.find(stamps, samples)
-    is_zero = samples[:, 0] == 0.0
-    if is_zero.any():
-        is_zero &= (samples[:, 1] == 0.0) & (samples[:, 2] == 0.0)
-        found = is_zero if found is None else found | is_zero
+    zeros = np.flatnonzero(samples[:, 0] == 0.0)
+    if len(zeros):
+        zeros = zeros[(samples[zeros, 1] == 0.0) & (samples[zeros, 2] == 0.0)]
+    if len(zeros):
+        found = np.zeros(len(stamps), dtype=bool) if found is None else found
+        found[zeros] = True
     return found
-
-
-def _divide(raw: Floats, line: list[npt.NDArray[Any]], dt: Floats) -> Floats:
-    bias, bias_slope, scale, scale_slope = line
-    value: Floats = bias_slope * dt
-    value += bias
-    np.subtract(raw, value, out=value)
-    divisor = scale_slope * dt
-    divisor += scale
-    value /= divisor
-    return value
-
-
-def _variance(x: Floats, a: Floats, b: Floats, c: Floats) -> Floats:
-    value = x * c
-    value += b
-    value *= x
-    value += a
-    return value

@@ -13,6 +13,7 @@ serves as well as all of them; the window is longer where they are few.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 #: Shortest window; it is longer where samples are few, up to the second figure.
@@ -116,8 +117,8 @@ class GravityMonitor:
     def add(
         self,
         stamp_ns: int,
-        force: tuple[float, float, float],
-        covariance: tuple[float, float, float, float, float, float],
+        force: Sequence[float],
+        covariance: Sequence[float],
         noise_variance: float,
     ) -> None:
         """
@@ -127,15 +128,16 @@ class GravityMonitor:
         ----------
         stamp_ns : int
             Its stamp.
-        force : tuple of 3 floats
+        force : sequence of 3 floats
             Specific force [m/s^2].
-        covariance : tuple of 6 floats
+        covariance : sequence of 6 floats
             xx, xy, xz, yy, yz, zz of the sample [m^2/s^4].
         noise_variance : float
             The part of the trace of the covariance that is noise of one sample [m^2/s^4].
 
         """
         start = self._window_ns
+        x, y, z = force
         if (
             start is None
             or not 0 <= stamp_ns - start < LONGEST_WINDOW_NS
@@ -143,10 +145,11 @@ class GravityMonitor:
         ):
             self._window_ns = start = stamp_ns
             self._clear_window()
-            self._origin = force
+            self._origin = (x, y, z)
         self._last_ns = stamp_ns
         total = self._sum
-        dx, dy, dz = (value - o for value, o in zip(force, self._origin, strict=True))
+        from_x, from_y, from_z = self._origin
+        dx, dy, dz = x - from_x, y - from_y, z - from_z
         total[0] += dx
         total[1] += dy
         total[2] += dz
@@ -158,7 +161,7 @@ class GravityMonitor:
 
     def _close(
         self,
-        covariance: tuple[float, float, float, float, float, float],
+        covariance: Sequence[float],
         noise_variance: float,
     ) -> None:
         n = self._n

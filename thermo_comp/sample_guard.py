@@ -89,6 +89,22 @@ class StuckWatch:
             None where there are none.
 
         """
+        if len(stamps) < 2 * STUCK_SAMPLES or _may_stand_still(samples):
+            return self._find(stamps, samples)
+        # The run that came in ends among the first samples, the one that goes on begins among
+        # the last, and those between are too short.
+        head = self._find(stamps[:STUCK_SAMPLES], samples[:STUCK_SAMPLES])
+        self.reset()
+        self._find(stamps[-STUCK_SAMPLES:], samples[-STUCK_SAMPLES:])
+        if head is None:
+            return None
+        found = np.zeros(len(stamps), dtype=bool)
+        found[:STUCK_SAMPLES] = head
+        return found
+
+    def _find(
+        self, stamps: npt.NDArray[np.int64], samples: npt.NDArray[np.float64]
+    ) -> Mask | None:
         x, y, z = samples.T
         same = np.empty(len(stamps), dtype=bool)
         same[0] = (x[0], y[0], z[0]) == self.run[:3]
@@ -116,6 +132,15 @@ class StuckWatch:
         else:
             self.n_same += len(row)
         return found
+
+
+def _may_stand_still(samples: npt.NDArray[np.float64]) -> bool:
+    """
+    Look at a few samples whether `STUCK_SAMPLES` in a row may be equal anywhere.
+
+    """
+    probes = samples[:: STUCK_SAMPLES // 2]
+    return bool((probes[1:] == probes[:-1]).all(axis=1).any())
 
 
 class RateWatch:

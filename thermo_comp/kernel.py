@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the arithmetic of many samples: that of `Compensator.process`, in its order, column by column.
+
+What a sample costs here is memory traffic, so the samples go through in pieces whose columns stay
+in the cache, and a segment's coefficients are spread over its samples just before they are used.
+
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .blocks import Floats, Stamps
+
+Ints = npt.NDArray[np.int64]
+
+#: Samples corrected at a time.
+PIECE = 8192
+
+
+class Lines:
+    """
+    The coefficients of the segments of a block, spread over samples on demand.
+
+    Parameters
+    ----------
+    start_ns : ndarray of int64, shape (n,)
+        Where each segment begins.
+    columns : list of ndarray, each of shape (n,)
+        Per axis bias, its change per second, scale, its change per second; then per axis a, b, c
+        of the error variance.
+    counts : ndarray of int64, shape (n,)
+        Samples of each segment.
+
+    """
+
+    def __init__(self, start_ns: Ints, columns: list[Floats], counts: Ints) -> None:
+        self._start_ns = start_ns
+        self._columns = columns
+        self._ends = np.cumsum(counts)
+        self._begins = self._ends - counts
+        self._rows = slice(0, 0)
+        self._counts: Ints | None = None
+
+    def select(self, begin: int, end: int) -> None:
+        """
+        Say of which samples the coefficients are wanted.
+
+        """
+        low = int(np.searchsorted(self._ends, begin, 'right'))
+        high = int(np.searchsorted(self._ends, end, 'left')) + 1
+        self._rows = slice(low, high)
+        if high == low + 1:
+            self._counts = None
+        else:
+            ends = np.minimum(self._ends[self._rows], end)
+            self._counts = ends - np.maximum(self._begins[self._rows], begin)
+
+    def spread(self, column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """
+        Repeat the value of each selected segment for each of its samples.
+
+        """
+        values = column[self._rows]
+        return values if self._counts is None else np.repeat(values, self._counts)
+
+    def age(self, stamps: Stamps) -> Floats:
+        """
+        Time since the beginning of each sample's segment [s].
+
+        """
+        age: Floats = (stamps - self.spread(self._start_ns)) * 1e-9
+        return age
+
+    def corrected(self, axis: int, raw: Floats, dt: Floats) -> Floats:
+        """
+        Take bias and scale from the samples of one axis.
+
+        """
+        bias, bias_slope, scale, scale_slope = self._columns[4 * axis : 4 * axis + 4]
+        value: Floats = self.spread(bias_slope) * dt
+        value += self.spread(bias)
+        np.subtract(raw, value, out=value)
+        divisor = self.spread(scale_slope) * dt
+        divisor += self.spread(scale)
+        value /= divisor
+        return value
+
+    def variance(self, axis: int, x: Floats) -> Floats:
+        """
+        Error variance of one axis.
+
+        """
+        a, b, c = self._columns[12 + 3 * axis : 15 + 3 * axis]
+        value: Floats = x * self.spread(c)
+        value += self.spread(b)
+        value *= x
+        value += self.spread(a)
+        return value
+
+
+def correct(
+    lines: Lines,
+    misalignment: tuple[float, ...],
+    stamps: Stamps,
+    samples: Floats,
+) -> tuple[Floats, Floats]:
+    """
+    Correct the samples that stand in segments.
+
+    Parameters
+    ----------
+    lines : Lines
+        The segments, which cover the samples.
+    misalignment : tuple of float
+        yx, zx, zy and their variances.
+    stamps : ndarray of int64, shape (n,)
+        When they were taken.
+    samples : ndarray, shape (n, 3)
+        In the calibration's input unit.
+
+    Returns
+    -------
+    force : ndarray, shape (n, 3)
+        [m/s^2].
+    covariance : ndarray, shape (n, 9)
+        [m^2/s^4].
+
+    """
+    n = len(stamps)
+    # The columns stand one after the other in memory: each is written in one run.
+    force, covariance = np.empty((3, n)), np.empty((9, n))
+    # What is not finite is corrected like the rest; whoever asked leaves it out.
+    with np.errstate(invalid='ignore', over='ignore'):
+        for begin in range(0, n, PIECE):
+            piece = slice(begin, min(begin + PIECE, n))
+            lines.select(piece.start, piece.stop)
+            _correct(
+                lines,
+                misalignment,
+                stamps[piece],
+                samples[piece],
+                force[:, piece],
+                covariance[:, piece],
+            )
+    return force.T, covariance.T
+
+
+def _correct(
+    lines: Lines,
+    misalignment: tuple[float, ...],
+    stamps: Stamps,
+    samples: Floats,
+    force: Floats,
+    covariance: Floats,
+) -> None:
+    yx, zx, zy, var_yx, var_zx, var_zy = misalignment
+    dt = lines.age(stamps)
+    x, y, z = (lines.corrected(axis, samples[:, axis], dt) for axis in range(3))
+    vx, vy, vz = (lines.variance(axis, value) for axis, value in enumerate((x, y, z)))
+    force[0] = x
+    np.add(np.multiply(x, yx, out=dt), y, out=force[1])
+    third = zx * x
+    third += np.multiply(y, zy, out=dt)
+    np.add(third, z, out=force[2])
+    covariance[0] = vx
+    cxy = np.multiply(vx, yx, out=covariance[1])
+    cxz = np.multiply(vx, zx, out=covariance[2])
+    covariance[3] = cxy
+    covariance[6] = cxz
+    xx = np.multiply(x, x, out=x)
+    value = np.multiply(cxy, yx, out=third)
+    value += vy
+    np.add(value, np.multiply(xx, var_yx, out=dt), out=covariance[4])
+    value = np.multiply(cxz, yx, out=value)
+    value += np.multiply(vy, zy, out=dt)
+    covariance[5] = value
+    covariance[7] = value
+    value = np.multiply(cxz, zx, out=value)
+    value += np.multiply(vy, zy * zy, out=dt)
+    value += vz
+    value += np.multiply(xx, var_zx, out=dt)
+    yy = np.multiply(y, y, out=y)
+    np.add(value, np.multiply(yy, var_zy, out=dt), out=covariance[8])
