@@ -61,6 +61,8 @@ class TestHelp:
         said = cli(command, '--help').stdout
         assert re.search(rf'Example:?\s+thermo_comp {command} ', said), said
         assert max(map(len, said.splitlines())) <= 80
+        # Square brackets are mark-up to the help's printer, and what stands in them is gone.
+        assert not re.search(r' \.\s', said)
         assert said == cli(command, '-h').stdout
 
     def test_version(self, cli: Cli) -> None:

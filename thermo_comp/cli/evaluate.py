@@ -36,7 +36,7 @@ def evaluate(
     gravity: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
-    window: Annotated[float, typer.Option(help='Length of a window at rest [s].')] = 10.0,
+    window: Annotated[float, typer.Option(help='Length of a window at rest, in s.')] = 10.0,
     serial: options.Serial = None,
     input_: options.InputOption = options.InputChoice.auto,
     counts_topic: options.CountsTopic = 'accel/counts',

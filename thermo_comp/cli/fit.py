@@ -7,6 +7,8 @@ Owns ``thermo_comp fit``: bags of a thermal test to a calibration, once per unit
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,9 +40,9 @@ def fit(
         float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
     ] = None,
     reference_temperature: Annotated[
-        float, typer.Option(help='Reference temperature [degC].')
+        float, typer.Option(help='Reference temperature in degC.')
     ] = 20.0,
-    min_still: Annotated[float, typer.Option(help='Shortest still interval used [s].')] = 3.0,
+    min_still: Annotated[float, typer.Option(help='Shortest still interval used, in s.')] = 3.0,
     allow: Annotated[
         list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
     ] = None,
@@ -50,6 +52,9 @@ def fit(
     board_topic: options.BoardTopic = 'temperature/board',
     case_topic: options.CaseTopic = 'temperature/case',
     force: options.Force = False,
+    verbose: Annotated[
+        bool, typer.Option('--verbose', '-v', help='List the positions that were found, too.')
+    ] = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -98,13 +103,16 @@ def fit(
         from ..report import write_report
 
         write_report(result, report, paths=bags)
-    _say(out, result, output)
+    _say(out, result, output, verbose)
     if report is not None:
         out.line(f'{report}: certificate')
 
 
-def _say(out: Output, result: FitResult, output: Path) -> None:
+def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
     calibration = result.calibration
+    if verbose:
+        _say_positions(out, result)
+    _say_candidates(out, result)
     out.table(
         ('section', 'windows', 'raw ug', 'one set ug', 'fitted ug', 'max ug'),
         [
@@ -139,4 +147,51 @@ def _say(out: Output, result: FitResult, output: Path) -> None:
             'candidates': result.candidates,
             'findings': result.findings,
         }
+    )
+
+
+def _say_positions(out: Output, result: FitResult) -> None:
+    """
+    Print every rest: where, when, how long, which way was up, what the fit leaves of |f| - g.
+
+    """
+    from ..metrics import MICRO_G
+
+    out.table(
+        ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', '|f| - g ug'),
+        [
+            (
+                one.source,
+                f'{datetime.fromtimestamp(one.start_ns // 10**9, timezone.utc):%m-%d %H:%M:%S}',
+                f'{one.duration_s / 60.0:.1f}',
+                *(f'{component:+.3f}' for component in one.up),
+                micro_g(one.residual_rms / MICRO_G),
+            )
+            for one in result.positions
+        ],
+        title='positions at rest',
+    )
+
+
+def _say_candidates(out: Output, result: FitResult) -> None:
+    """
+    Print what each model left per axis; the held-out error decides, ties go to the simpler one.
+
+    """
+    from ..metrics import MICRO_G
+
+    out.table(
+        ('candidate', 'parameters', 'fitted ug', 'held out ug', 'BIC', ''),
+        [
+            (
+                one.name,
+                one.n_parameters,
+                micro_g(one.fitted_rms / MICRO_G),
+                micro_g(one.held_out_rms / MICRO_G) if isfinite(one.held_out_rms) else '-',
+                f'{one.bic:.3g}',
+                'chosen' if one.is_chosen else '',
+            )
+            for one in result.candidates
+        ],
+        title='error of each axis, RMS',
     )

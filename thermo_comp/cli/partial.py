@@ -30,8 +30,8 @@ def partial(
     branches: Annotated[
         bool, typer.Option('--branches', help='Fit each run between jumps by itself.')
     ] = False,
-    begin: Annotated[float | None, typer.Option('--from', help='Use it from here [s].')] = None,
-    end: Annotated[float | None, typer.Option('--to', help='Use it up to here [s].')] = None,
+    begin: Annotated[float | None, typer.Option('--from', help='Use it from here, in s.')] = None,
+    end: Annotated[float | None, typer.Option('--to', help='Use it up to here, in s.')] = None,
     input_: options.InputOption = options.InputChoice.auto,
     counts_topic: options.CountsTopic = 'accel/counts',
     imu_topic: options.ImuTopic = 'imu/uncompensated',

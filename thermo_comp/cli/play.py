@@ -30,7 +30,7 @@ def play(
         bool, typer.Option('--clock/--no-clock', help='Publish /clock, the time of the bag.')
     ] = True,
     wait: Annotated[
-        float, typer.Option(help='Longest wait for a subscriber on every topic [s].', min=0.0)
+        float, typer.Option(help='Longest wait for a subscriber on every topic, in s.', min=0.0)
     ] = 10.0,
     input_: options.InputOption = options.InputChoice.auto,
     counts_topic: options.CountsTopic = 'accel/counts',

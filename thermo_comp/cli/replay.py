@@ -34,13 +34,13 @@ def replay(
         str, typer.Option(help="Frame of the output; empty keeps the input's.")
     ] = '',
     transition_time: Annotated[
-        float | None, typer.Option(help='As the parameter of the node [s].', min=0.0)
+        float | None, typer.Option(help='As the parameter of the node, in s.', min=0.0)
     ] = None,
     temperature_timeout: Annotated[
-        float | None, typer.Option(help='As the parameter of the node [s].')
+        float | None, typer.Option(help='As the parameter of the node, in s.')
     ] = None,
     case_timeout: Annotated[
-        float | None, typer.Option(help='As the parameter of the node [s].')
+        float | None, typer.Option(help='As the parameter of the node, in s.')
     ] = None,
     input_: options.InputOption = options.InputChoice.auto,
     counts_topic: options.CountsTopic = 'accel/counts',
