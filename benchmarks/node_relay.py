@@ -350,7 +350,8 @@ def _sink(arguments: argparse.Namespace) -> None:
                 continue
             sec, nanosec = stamp.unpack_from(data, 4)
             latencies.append(now - sec * 1_000_000_000 - nanosec)
-        if latencies:
+        # The timer wakes the loop, too.
+        if messages and latencies:
             last = time.monotonic()
         if len(latencies) >= n_expected:
             loop.stop()

@@ -32,6 +32,7 @@ from thermo_comp.calibration import Calibration
 from thermo_comp.calibration_file import load_calibration
 from thermo_comp.compensator import Compensator
 from thermo_comp.recording import BagWriter, open_recording
+from thermo_comp.replay import BLOCK_MESSAGES
 from thermo_comp.replay import replay as replay_bag
 
 START_NS = 1_700_000_000_000_000_000
@@ -76,7 +77,7 @@ def read(path: Path) -> int:
 
     """
     with open_recording(path) as reader:
-        return sum(len(block) for block in reader.blocks())
+        return sum(len(block) for block in reader.blocks(n_messages=BLOCK_MESSAGES))
 
 
 def read_and_compensate(path: Path) -> int:
@@ -86,7 +87,10 @@ def read_and_compensate(path: Path) -> int:
     """
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
-        return sum(len(compensator.process_block(block).index) for block in reader.blocks())
+        return sum(
+            len(compensator.process_block(block).index)
+            for block in reader.blocks(n_messages=BLOCK_MESSAGES)
+        )
 
 
 def compensate(path: Path) -> tuple[int, float]:
@@ -98,7 +102,7 @@ def compensate(path: Path) -> tuple[int, float]:
     spent = 0.0
     n = 0
     with open_recording(path) as reader:
-        for block in reader.blocks():
+        for block in reader.blocks(n_messages=BLOCK_MESSAGES):
             # The thread's own clock: the reader decompresses ahead in others.
             begin = time.thread_time()
             n += len(compensator.process_block(block).index)

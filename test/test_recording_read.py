@@ -365,6 +365,22 @@ def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
     assert first.accel.tobytes() == again.accel.tobytes()
 
 
+def test_blocks_have_the_size_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('thermo_comp.recording.mcap_source._GROUP_BYTES', 0)
+    path = tmp_path / 'bag.mcap'
+    write_mcap(path, regular_messages(2000), chunk_size=2000)
+    whole = read(path).columns
+    with open_recording(path) as reader:
+        few, many = (list(reader.blocks(n_messages=n)) for n in (100, 500))
+    for blocks, n_messages in ((few, 100), (many, 500)):
+        sizes = [len(block) + len(block.board) + len(block.case) for block in blocks]
+        assert min(sizes[:-1]) >= n_messages
+        assert np.concatenate([block.accel for block in blocks]).tobytes() == whole.accel.tobytes()
+    assert len(few) > 2 * len(many)
+
+
 def test_a_closed_recording_gives_nothing(tmp_path: Path) -> None:
     write_mcap(tmp_path / 'bag.mcap', regular_messages())
     write_rosbag1(tmp_path / 'bag.bag', regular_messages())

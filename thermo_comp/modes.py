@@ -18,6 +18,59 @@ NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)
 """Nothing is known."""
 
 
+def mix(quiet: State, bent: State, to_quiet: float, to_bent: float) -> tuple[State, State]:
+    """
+    Blend each of two states with the other one: what they differ by is worked out once.
+
+    Parameters
+    ----------
+    quiet, bent : tuple of float
+        The states.
+    to_quiet : float
+        Share of the bent state in the new quiet one, 0..1.
+    to_bent : float
+        Share of the quiet state in the new bent one, 0..1.
+
+    Returns
+    -------
+    quiet, bent : tuple of float
+        ``blend(quiet, bent, to_quiet)`` and ``blend(bent, quiet, to_bent)``, to the bit.
+
+    """
+    t, v, a, p00, p01, p02, p11, p12, p22 = quiet
+    u, w, b, r00, r01, r02, r11, r12, r22 = bent
+    dt, dv, da = u - t, w - v, b - a
+    d00, d01, d02, d11, d12, d22 = r00 - p00, r01 - p01, r02 - p02, r11 - p11, r12 - p12, r22 - p22
+    apart = to_quiet * (1.0 - to_quiet)
+    at, av = apart * dt, apart * dv
+    other = to_bent * (1.0 - to_bent)
+    ot, ov = other * dt, other * dv
+    return (
+        (
+            t + to_quiet * dt,
+            v + to_quiet * dv,
+            a + to_quiet * da,
+            p00 + to_quiet * d00 + at * dt,
+            p01 + to_quiet * d01 + at * dv,
+            p02 + to_quiet * d02 + at * da,
+            p11 + to_quiet * d11 + av * dv,
+            p12 + to_quiet * d12 + av * da,
+            p22 + to_quiet * d22 + apart * da * da,
+        ),
+        (
+            u - to_bent * dt,
+            w - to_bent * dv,
+            b - to_bent * da,
+            r00 - to_bent * d00 + ot * dt,
+            r01 - to_bent * d01 + ot * dv,
+            r02 - to_bent * d02 + ot * da,
+            r11 - to_bent * d11 + ov * dv,
+            r12 - to_bent * d12 + ov * da,
+            r22 - to_bent * d22 + other * da * da,
+        ),
+    )
+
+
 def predict(state: State, dt: float, lag: float, power: float) -> State:
     """
     Carry a state over a time step: constant acceleration that decays and wanders.

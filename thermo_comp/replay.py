@@ -38,6 +38,8 @@ from .status import CompensatorConfig, Counters
 
 OUTPUT_TOPIC = 'imu/data_raw'
 REGIME_TOPIC = 'regime/dynamic'
+#: Messages corrected at once: enough that what is done per block costs little beside them.
+BLOCK_MESSAGES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -235,7 +237,8 @@ def replay(
         total = reader.info.topics[reader.topics['accel']][1]
         flags: list[tuple[int, bool]] = []
         with BagWriter(output, metadata=metadata, overwrite=overwrite) as writer:
-            for item in corrected_blocks(compensator, reader.blocks(raw=keep_inputs)):
+            blocks = reader.blocks(raw=keep_inputs, n_messages=BLOCK_MESSAGES)
+            for item in corrected_blocks(compensator, blocks):
                 _write_block(writer, item, frame_id)
                 if keep_inputs:
                     _write_inputs(writer, item.block, reader)

@@ -25,7 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import erf, exp, inf, isfinite, nan, sqrt
 
-from .modes import NOWHERE, State, blend, correct, predict
+from .modes import NOWHERE, State, blend, correct, mix, predict
 
 OUTLIER_SIGMAS = 6.0  # innovations beyond this limit count less ...
 OUTLIER_LIMITS = 5.0  # ... and beyond this many limits not at all ...
@@ -218,8 +218,12 @@ class Thermometer:
         bending = self.bending
         prior_bending = bending * (1.0 - to_quiet) + (1.0 - bending) * to_bending
         prior_quiet = 1.0 - prior_bending
-        quiet = blend(self._quiet, self._bent, bending * to_quiet / prior_quiet)
-        bent = blend(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
+        quiet, bent = mix(
+            self._quiet,
+            self._bent,
+            bending * to_quiet / prior_quiet,
+            (1.0 - bending) * to_bending / prior_bending,
+        )
         quiet = predict(quiet, dt, lag, self._quiet_power)
         bent = predict(bent, dt, lag, self._bending_power)
 

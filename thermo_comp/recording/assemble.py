@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from .columns import Block, Floats, ImuColumns, Ints, RawMessages, Role
 from .wire import IMU_ACCELERATION, imu_columns
 
-#: A block is given out once it has so many messages; a chunk of usual size has more.
+#: A block is given out once it has so many messages, where nobody wants another number; a chunk
+#: of usual size has more.
 BLOCK_MESSAGES = 1 << 13
 
 
@@ -122,7 +123,11 @@ def join_rows(pieces: list[Rows], width: int) -> Rows:
 
 
 def assemble(
-    parts: Iterable[Part], *, is_imu: bool, names: dict[Role, tuple[str, str]]
+    parts: Iterable[Part],
+    *,
+    is_imu: bool,
+    names: dict[Role, tuple[str, str]],
+    n_messages: int = 0,
 ) -> Iterator[Block]:
     """
     Gather parts into blocks.
@@ -135,6 +140,8 @@ def assemble(
         Whether the accelerometer's messages are sensor_msgs/Imu.
     names : dict of role to (str, str)
         Topic and type per role, for the raw messages.
+    n_messages : int, optional
+        A block is given out once it has so many; 0 = `BLOCK_MESSAGES`.
 
     Yields
     ------
@@ -143,10 +150,11 @@ def assemble(
     """
     waiting: list[Part] = []
     n_waiting = 0
+    n_wanted = n_messages or BLOCK_MESSAGES
     for part in parts:
         waiting.append(part)
         n_waiting += sum(len(rows.rank) for rows in part.values())
-        if n_waiting >= BLOCK_MESSAGES:
+        if n_waiting >= n_wanted:
             yield from _blocks(waiting, is_imu, names)
             waiting, n_waiting = [], 0
     if n_waiting:

@@ -98,7 +98,7 @@ class RecordingReader:
         """
         return dict(self._selection)
 
-    def blocks(self, *, raw: bool = False) -> Iterator[Block]:
+    def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         """
         Read the bag from its beginning in bounded memory.
 
@@ -106,6 +106,8 @@ class RecordingReader:
         ----------
         raw : bool, optional
             Keep the serialized messages in `Block.raw`.
+        n_messages : int, optional
+            About how many messages make a block; 0 = as few as are read at good speed.
 
         Yields
         ------
@@ -120,7 +122,8 @@ class RecordingReader:
         """
         names = {role: (name, self.info.topics[name][0]) for role, name in self._selection.items()}
         parts = self._source.parts(self._selection, raw=raw)
-        yield from assemble(parts, is_imu=self.info.input == 'imu', names=names)
+        is_imu = self.info.input == 'imu'
+        yield from assemble(parts, is_imu=is_imu, names=names, n_messages=n_messages)
 
     def close(self) -> None:
         """
