@@ -24,7 +24,11 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from fault_rig import CONFIG, START_NS, Event, seconds_of
 from geometry_msgs.msg import Vector3Stamped
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, Temperature
@@ -86,6 +90,7 @@ class Bench:
     def __init__(self, node: NodeProcess, context: Context) -> None:
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
+        self._client = self.node.create_client(SetParameters, 'thermo_comp/set_parameters')
         self._loop = WaitLoop(self.node)
         self._imu = self._loop.subscribe(Imu, 'imu/data_raw', QOS)
         self._diagnostics = self._loop.subscribe(DiagnosticArray, '/diagnostics', QOS)
@@ -94,12 +99,33 @@ class Bench:
         self._reports: list[tuple[int, str]] = []
         self._values: dict[str, str] = {}
         self.n_sent = self._n_taken = self._n_reports = 0
-        self._publish = {
-            name: self.node.create_publisher(kind, topic, QOS).handle.publish_raw
-            for name, (kind, topic) in _TOPICS.items()
-        }
+        #: Whether the test itself has ended the node.
+        self.is_ended = False
+        self._publishers: list[Publisher] = []
+        self._open_publishers()
         self._thread = threading.Thread(target=self._loop.run, args=(self._hear,), daemon=True)
         self._thread.start()
+
+    def _open_publishers(self) -> None:
+        self._publish = {}
+        for name, (kind, topic) in _TOPICS.items():
+            publisher = self.node.create_publisher(kind, topic, QOS)
+            self._publishers.append(publisher)
+            self._publish[name] = publisher.handle.publish_raw
+
+    def restart_publishers(self) -> None:
+        """End the drivers and start others, which the node has to find first."""
+        for publisher in self._publishers:
+            self.node.destroy_publisher(publisher)
+        self._publishers.clear()
+        self._open_publishers()
+        pause = threading.Event()
+        for publisher in self._publishers:
+            while not publisher.get_subscription_count():
+                pause.wait(0.01)
+                assert self.process.is_alive, self.process.said
+        # The node's reader knows the writer once it has acknowledged that it has nothing.
+        pause.wait(0.5)
 
     def close(self) -> None:
         self._loop.stop()
@@ -126,6 +152,24 @@ class Bench:
             )
         assert self.process.is_alive, self.process.said
         assert found, f'{what} did not come true; {self._values}'
+
+    def ask(self, **values: Any) -> Any:
+        """Call the node's set_parameters; return the future of the answer."""
+        assert self._client.wait_for_service(TIMEOUT_S)
+        messages = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
+        return self._client.call_async(SetParameters.Request(parameters=messages))
+
+    def set_parameters(self, **values: Any) -> SetParametersResult:
+        """Set parameters of the node and wait for the answer."""
+        future = self.ask(**values)
+        pause = threading.Event()
+        # A callback of the future would wait for the executor, which waits for the next answer.
+        while not future.done():
+            pause.wait(0.001)
+            assert self.process.is_alive, self.process.said
+        return future.result().results[0]
 
     def send(self, events: Iterable[Event]) -> int:
         """Publish messages; return how many samples."""
@@ -233,8 +277,9 @@ def bench(calibration: Path, *parameters: str) -> Iterator[Bench]:
             try:
                 peer.meet()
                 yield peer
-                assert node.is_alive, node.said
-                assert node.stop() == 0
+                if not peer.is_ended:
+                    assert node.is_alive, node.said
+                    assert node.stop() == 0
                 assert 'Traceback' not in node.said, node.said
             finally:
                 peer.close()

@@ -66,10 +66,18 @@ def write_atomically(path: str | Path, content: bytes) -> None:
     Raises
     ------
     OSError
-        If it cannot be written; the old file is then untouched.
+        If it cannot be written, with `path` as its file; the old file is then untouched.
 
     """
     target = Path(path)
+    try:
+        _replace(target, content)
+    except OSError as error:
+        # Not the temporary file, which nobody knows of.
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _replace(target: Path, content: bytes) -> None:
     descriptor, name = tempfile.mkstemp(prefix=f'.{target.name}.', dir=target.parent)
     temporary = Path(name)
     try:

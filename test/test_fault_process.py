@@ -1,0 +1,215 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Faults of processes and files around the node: restarts, signals, reloads, calibration files.
+
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from fault_bench import Bench, Heard, bench
+from fault_rig import CONFIG, RATE_HZ, START_NS, bag, force_at, seconds_of, unit
+
+from thermo_comp.calibration import Unit
+from thermo_comp.calibration_file import SIZE_LIMIT, dump_calibration, save_calibration
+from thermo_comp.compensator import Compensator
+
+SIGMAS = 5.0
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    save_calibration(unit(), tmp_path / 'unit.yaml')
+    return tmp_path / 'unit.yaml'
+
+
+@pytest.fixture
+def node(path: Path) -> Iterator[Bench]:
+    with bench(path) as started:
+        yield started
+
+
+def expected(events: list[Any]) -> np.ndarray:
+    """Return what the compensator gives in a process of its own, sample by sample."""
+    compensator = Compensator(unit(), CONFIG)
+    rows = []
+    for topic, stamp_ns, value in events:
+        if topic == 'counts':
+            rows.append(compensator.process(stamp_ns, *value))
+        else:
+            getattr(compensator, f'push_{topic}')(stamp_ns, value)
+    return np.array([row for row in rows if row is not None])
+
+
+def sigmas(heard: Heard) -> float:
+    """Return the largest error in the standard deviations that it was published with."""
+    seconds = (heard.stamp_ns - START_NS) * 1e-9
+    sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
+    return float((np.abs(heard.force - force_at(seconds)) / sd).max())
+
+
+def test_a_publisher_restarts(node: Bench) -> None:
+    events = bag(duration_s=100.0)
+    first = node.play([e for e in events if seconds_of(e[1]) < 50.0])
+    node.restart_publishers()
+    second = node.play([e for e in events if seconds_of(e[1]) >= 50.0])
+    table = expected(events)
+    np.testing.assert_array_equal(np.concatenate((first.force, second.force)), table[:, :3])
+    assert second.values['lost'] == '0'
+
+
+def test_the_node_is_killed_and_restarts_in_the_ramp(path: Path) -> None:
+    events = [e for e in bag() if seconds_of(e[1]) < 300.0]
+    undisturbed = expected(events)
+    with bench(path) as node:
+        before = node.play([e for e in events if seconds_of(e[1]) < 90.0])
+        assert sigmas(before) < SIGMAS
+        assert before.values['regime'] == 'dynamic'
+        assert node.process.stop(signal.SIGKILL) == -signal.SIGKILL
+        assert 'Traceback' not in node.process.said
+        node.is_ended = True
+    with bench(path) as node:
+        first = node.play([e for e in events if 90.0 <= seconds_of(e[1]) < 91.0])
+        assert first.values['regime'] == 'unknown'
+        assert first.values['memory settled'] == 'False'
+        rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
+    n = len(first.force)
+    # Honest: what it has not seen is in the covariance.
+    at = round(90.0 * RATE_HZ)
+    assert (first.covariance[:, 0, 0] > 4.0 * undisturbed[at : at + n, 3].max()).all()
+    assert max(sigmas(first), sigmas(rest)) < SIGMAS
+    late = rest.stamp_ns > START_NS + 280 * 1_000_000_000
+    np.testing.assert_allclose(
+        rest.force[late], undisturbed[-late.sum() :, :3], rtol=0.0, atol=9.80665e-6
+    )
+
+
+def replaced(path: Path) -> None:
+    path.write_text(dump_calibration(unit(unit=Unit('F-2', 'counts', 8388607.0, 0.08))))
+
+
+def truncated(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-300])
+
+
+def unreadable(path: Path) -> None:
+    if os.geteuid():
+        path.chmod(0)
+    else:
+        # Nothing is locked to root; but no process can read this one at its beginning.
+        path.unlink()
+        path.symlink_to('/proc/self/mem')
+
+
+def huge(path: Path) -> None:
+    os.truncate(path, 1 << 30)
+
+
+def aliases(path: Path) -> None:
+    lines = ['a0: &a0 [x, x, x, x, x, x, x, x, x]']
+    lines += [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, 30)]
+    path.write_text('\n'.join(lines))
+
+
+def directory(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def fifo(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+DAMAGES: dict[Callable[[Path], None], str] = {
+    replaced: "unit.serial: must be 'F-1'",
+    truncated: '',
+    unreadable: 'cannot be read: ',
+    huge: f'at most {SIZE_LIMIT} are accepted',
+    aliases: 'YAML aliases are not accepted',
+    directory: 'cannot be read: ',
+    fifo: 'cannot be read: not a regular file',
+    Path.unlink: 'cannot be read: No such file or directory',
+}
+
+
+def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:
+    events = bag(duration_s=90.0)
+    good = path.read_bytes()
+    heard = []
+    with bench(path, 'serial:=F-1') as node:
+        for k, (damage, reason) in enumerate(DAMAGES.items()):
+            bad = tmp_path / f'bad{k}.yaml'
+            bad.write_bytes(good)
+            result = node.set_parameters(calibration_file=str(bad))
+            assert result.successful, result.reason
+            damage(bad)
+            begin, end = 10.0 * k, 10.0 * (k + 1)
+            heard.append(node.play([e for e in events if begin <= seconds_of(e[1]) < end]))
+            result = node.set_parameters(calibration_file=str(bad))
+            assert not result.successful
+            assert result.reason.startswith(f'{bad}: ')
+            assert reason in result.reason
+            assert '\n' not in result.reason
+    # All the while the calibration that was read runs on.
+    n = sum(len(one.force) for one in heard)
+    table = expected(events)[:n, :3]
+    np.testing.assert_allclose(
+        np.concatenate([one.force for one in heard]), table, rtol=0.0, atol=1e-9
+    )
+    assert n == sum(e[0] == 'counts' for e in events if seconds_of(e[1]) < 80.0)
+
+
+def test_a_thousand_reloads_at_1_khz(tmp_path: Path) -> None:
+    path = tmp_path / 'fast.yaml'
+    fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
+    save_calibration(fast, path)
+    events = bag(rate_hz=1000.0, duration_s=30.0)
+    n_reloads = 1000
+    with bench(path) as node:
+        answers: list[bool] = []
+        node.take()
+
+        future = node.ask(calibration_file=str(path))
+        begin, n, n_samples = time.monotonic(), 0, 0
+        while len(answers) < n_reloads and n < len(events):
+            # In real time, as a driver does.
+            while n < len(events) and seconds_of(events[n][1]) < time.monotonic() - begin:
+                n_samples += node.send([events[n]])
+                n += 1
+            if future.done():
+                answers.append(future.result().results[0].successful)
+                future = node.ask(calibration_file=str(path))
+            time.sleep(0.0005)
+        node.settle()
+        heard = node.take()
+        assert int(heard.values['sample rate [Hz]'].split('.')[0]) > 0
+    assert (len(answers), all(answers)) == (n_reloads, True)
+    assert len(heard.force) == n_samples
+    seconds = (heard.stamp_ns - START_NS) * 1e-9
+    sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
+    # So many samples that five standard deviations of noise are one sample in a million.
+    assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_samples_flow(path: Path, number: int) -> None:
+    with bench(path) as node:
+        heard = node.play(bag(duration_s=20.0))
+        node.send(bag(duration_s=40.0, start_s=20.0))
+        assert node.process.stop(number) == 0
+        assert node.process.said == ''
+        node.is_ended = True
+    assert sigmas(heard) < SIGMAS
