@@ -70,7 +70,7 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-test: setup.py setup.cfg pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install -qq --disable-pip-version-check \
-	  -e '.[ros,test,parquet,px4,ardupilot]'
+	  -e '.[ros,test,parquet,px4,ardupilot,fleet]'
 	@touch $(VENV)/.installed $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed-test

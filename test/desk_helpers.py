@@ -69,6 +69,11 @@ class Desk:
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
             self._cli('simulate', *program, '-o', path, '-q')
+        elif name == 'bags/fleet':
+            pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
+            from fleet_helpers import write_unit
+
+            write_unit(path / 'unit42', 42)
         elif name == 'log.csv':
             rng = np.random.default_rng(3)
             rows = [
@@ -119,6 +124,8 @@ class Desk:
         for word in words:
             if '/' not in word and word not in outputs:
                 self._make(word)
+        if 'bags/fleet' in words:
+            self._make('bags/fleet')
         for path in [*self._ready.iterdir(), *(self._ready / 'bags').iterdir()]:
             name = path.relative_to(self._ready)
             if path.name != 'bags' and str(name) not in outputs:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import Cli
@@ -18,7 +19,20 @@ from typer.main import get_command
 
 from thermo_comp.cli.app import app
 
-COMMANDS = get_command(app).commands
+
+def leaves(group: Any, prefix: str = '') -> dict[str, Any]:
+    """
+    Return every command by the words that call it, those of groups included.
+
+    """
+    found: dict[str, Any] = {}
+    for name, one in group.commands.items():
+        inner = hasattr(one, 'commands')
+        found |= leaves(one, f'{prefix}{name} ') if inner else {f'{prefix}{name}': one}
+    return found
+
+
+COMMANDS = leaves(get_command(app))
 # `demo` runs whole in test_readme and test_cli_demo.
 EXAMPLES = [
     line.strip()
@@ -38,8 +52,15 @@ def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Desk:
 
 
 def test_every_command_has_an_example() -> None:
-    with_example = {one.split()[1] for one in EXAMPLES}
+    with_example = {
+        name
+        for name in COMMANDS
+        if any(one.startswith(f'thermo_comp {name} ') for one in EXAMPLES)
+    }
     assert with_example == set(COMMANDS) - {'demo'}
+    assert all(f'thermo_comp {name} ' in (one.help or '') for name, one in COMMANDS.items()), (
+        'an example of another command'
+    )
 
 
 @pytest.mark.parametrize('example', EXAMPLES)

@@ -54,6 +54,7 @@ LAYERS = {
     'fit_sources': 3,
     'report': 3,
     'convert': 3,
+    'fleet': 3,
     'ros': 4,
     'cli': 4,
     '__main__': 4,
@@ -72,7 +73,10 @@ HOMES = {
     'matplotlib': {'report'},
     'pyulog': {'convert'},
     'pymavlink': {'convert'},
-    'pyarrow': {'convert'},
+    'pyarrow': {'convert', 'fleet'},
+    'dask': {'fleet'},
+    'distributed': {'fleet'},
+    'fsspec': {'fleet'},
     'typer': {'cli', '__main__'},
     'rich': {'cli', '__main__'},
 }
@@ -191,7 +195,7 @@ def test_node_starts_without_the_offline_libraries() -> None:
 
 
 def test_help_starts_without_the_heavy_libraries() -> None:
-    heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'pydantic', 'rclpy')
+    heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'pydantic', 'rclpy', 'dask')
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
 
 

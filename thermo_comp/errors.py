@@ -69,6 +69,13 @@ class RecordingError(ThermoCompError):
         super().__init__(': '.join(part for part in (self.path, topic, message) if part))
 
 
+class FleetError(ThermoCompError):
+    """
+    A fleet that cannot be fitted as a whole: no bags, no scheduler, a missing library.
+
+    """
+
+
 class FitError(ThermoCompError):
     """
     Data that cannot carry the fit asked of it; the text says what is missing and what to record.

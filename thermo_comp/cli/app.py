@@ -23,6 +23,7 @@ from . import (
     evaluate,
     exchange,
     fit,
+    fleet,
     info,
     output,
     partial,
@@ -68,6 +69,7 @@ def _top(
 
 
 app.command()(fit.fit)
+app.add_typer(fleet.app)
 app.command()(evaluate.evaluate)
 app.command()(partial.partial)
 app.command()(replay.replay)

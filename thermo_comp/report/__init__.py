@@ -13,7 +13,7 @@ from .evidence import Evidence
 from .fitted import evidence_of_fit
 from .gather import OpenedBag, evidence_of_bags, open_bag
 from .verdict import Verdict, judge
-from .write import write_report
+from .write import render_report, write_report
 
 __all__ = [
     'Evidence',
@@ -23,5 +23,6 @@ __all__ = [
     'evidence_of_fit',
     'judge',
     'open_bag',
+    'render_report',
     'write_report',
 ]

@@ -44,7 +44,11 @@ _COMPARISON_WINDOW_S = 60.0
 
 
 def evidence_of_fit(
-    result: FitResult, *, paths: Sequence[str | Path] = (), program: str | None = None
+    result: FitResult,
+    *,
+    paths: Sequence[str | Path] = (),
+    program: str | None = None,
+    is_brief: bool = False,
 ) -> Evidence:
     """
     Gather what a fit has to show.
@@ -58,11 +62,13 @@ def evidence_of_fit(
         chamber's program.
     program : str or None, optional
         The chamber's program, as `simulation.parse_cyclogram` reads it.
+    is_brief : bool, optional
+        Leave out what only figures show: the verdict stays the same, at a fraction of the work.
 
     Returns
     -------
     Evidence
-        For `write_report`.
+        For `write_report`, or, if brief, for `judge`.
 
     Raises
     ------
@@ -74,24 +80,13 @@ def evidence_of_fit(
     """
     calibration = result.calibration
     table = result.table
-    index = best_bag(result.bags)
-    bag = result.bags[index]
-    span_ns = span_of(bag)
-    trace, _ = thermal_trace(bag.board, bag.case, span_ns, calibration.detector)
     return Evidence(
         serial=calibration.unit.serial,
         unit=calibration.unit.input,
         gravity=calibration.gravity_m_s2,
         calibration=calibration,
         bags=tuple(bag_facts(one) for one in result.bags),
-        shown=ShownBag(
-            index=index,
-            start_ns=span_ns[0],
-            board=bag.board,
-            case=bag.case,
-            trace=trace,
-            cyclogram=_program(paths, index, program),
-        ),
+        shown=None if is_brief else _shown(result, paths, program),
         windows=Windows(
             bag=table.bag,
             position=table.position,
@@ -99,7 +94,7 @@ def evidence_of_fit(
             mean=table.mean,
             board=table.t + calibration.reference_temperature_c,
             is_dynamic=table.is_dynamic,
-            forces=_ladder(result),
+            forces=_ends(result) if is_brief else _ladder(result),
         ),
         candidates=_candidates(result),
         findings=tuple(one.message for one in result.findings if _is_reservation(one)),
@@ -113,6 +108,21 @@ def _is_reservation(finding: Finding) -> bool:
     return finding.level == 'advice' and finding.name != 'positions'
 
 
+def _shown(result: FitResult, paths: Sequence[str | Path], program: str | None) -> ShownBag:
+    index = best_bag(result.bags)
+    bag = result.bags[index]
+    span_ns = span_of(bag)
+    trace, _ = thermal_trace(bag.board, bag.case, span_ns, result.calibration.detector)
+    return ShownBag(
+        index=index,
+        start_ns=span_ns[0],
+        board=bag.board,
+        case=bag.case,
+        trace=trace,
+        cyclogram=_program(paths, index, program),
+    )
+
+
 def _program(paths: Sequence[str | Path], index: int, program: str | None) -> Cyclogram | None:
     if program is not None:
         return parse_cyclogram(program)
@@ -121,10 +131,20 @@ def _program(paths: Sequence[str | Path], index: int, program: str | None) -> Cy
     return None
 
 
-def _ladder(result: FitResult) -> dict[str, Array]:
+def _ends(result: FitResult) -> dict[str, Array]:
+    """
+    Correct with the constants alone, and with the calibration.
+
+    """
     solution, table = result.solution, result.table
     raw = (table.mean - solution.bias[:, 0]) / solution.scale[:, 0] @ solution.misalignment.T
-    forces = {RAW: np.asarray(raw)}
+    return {RAW: np.asarray(raw), CHOSEN: _corrected(table, solution)}
+
+
+def _ladder(result: FitResult) -> dict[str, Array]:
+    solution, table = result.solution, result.table
+    ends = _ends(result)
+    forces = {RAW: ends[RAW]}
     coarse = table.coarsened(_COMPARISON_WINDOW_S)
     with_misalignment = bool(np.any(solution.skew))
     constant = constant_calibration(position_means(coarse), solution.gravity, with_misalignment)
@@ -137,7 +157,7 @@ def _ladder(result: FitResult) -> dict[str, Array]:
             freedom = Freedom(misalignment=with_misalignment)
             first = regress(coarse, start, freedom).solution
             forces[name] = _corrected(table, regress(table, first, freedom).solution)
-    forces[CHOSEN] = _corrected(table, solution)
+    forces[CHOSEN] = ends[CHOSEN]
     return forces
 
 

@@ -3,9 +3,8 @@
 """
 Owns the page: evidence, verdict and figures as one HTML document that needs nothing else.
 
-Whatever comes from a bag or a calibration is text that somebody else wrote: it passes through
-`html.escape` on its way into the page, and the page's own policy forbids it to run or load
-anything.
+Whatever comes from a bag or a calibration is text that somebody else wrote: it is escaped on its
+way into the page.
 
 """
 
@@ -14,21 +13,17 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Sequence
 from html import escape
-from pathlib import Path
 
 from .. import __version__
 from ..calibration import AXES, Calibration
 from ..metrics import MICRO_G
 from .evidence import CHOSEN, SECTIONS, Evidence
+from .html import document, figure, table
 from .inertial import SCHULER_PEAK_PER_MICRO_G, TIMES_S, position_error, schuler_peak
 from .plates import DrawnPlate
 from .text import number
 from .verdict import Verdict
 
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
-# A table of at most so many rows is not torn apart in print.
-_SHORT = 16
-_STYLE = Path(__file__).with_name('page.css')
 _WORDS = {
     'good': 'Verdict: holds',
     'reserved': 'Verdict: holds, with reservations',
@@ -70,18 +65,9 @@ def render_page(
         The HTML document.
 
     """
-    policy = _POLICY
-    if script:
-        policy += f"; script-src 'nonce-{nonce}'; connect-src 'self'"
     is_certificate = evidence.calibration is not None
     title = 'Thermal calibration certificate' if is_certificate else 'Thermal test record'
     parts = [
-        '<!DOCTYPE html>',
-        '<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{escape(evidence.serial)}: {title}</title>',
-        f'<style>{_STYLE.read_text(encoding="utf-8")}</style></head><body>',
         f'<h1>{title}</h1>',
         f'<p class="under">Unit {escape(evidence.serial)}</p>',
         f'<p class="notice">{escape(notice)}</p>' if notice else '',
@@ -90,17 +76,15 @@ def render_page(
         _statistics(evidence),
         _inertial(evidence),
         '<h2>Figures</h2>' if plates else '',
-        *(_figure(plate) for plate in plates),
+        *(figure(plate) for plate in plates),
         _axes(evidence.calibration),
         _terms(evidence.calibration),
         _candidates(evidence),
         _positions(evidence),
         _bags(evidence),
         _footer(),
-        f'<script nonce="{nonce}">{script}</script>' if script else '',
-        '</body></html>\n',
     ]
-    return '\n'.join(part for part in parts if part)
+    return document(f'{evidence.serial}: {title}', parts, script=script, nonce=nonce)
 
 
 def _verdict(verdict: Verdict) -> str:
@@ -148,37 +132,6 @@ def _ranges(temperature: tuple[float, float], rate: tuple[float, float]) -> str:
     )
 
 
-def _table(
-    headings: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    *,
-    texts: int = 1,
-    caption: str = '',
-    chosen: Sequence[bool] = (),
-) -> str:
-    """
-    Write a table whose first `texts` columns are text and whose others are numbers.
-
-    """
-
-    def cells(row: Sequence[str], tag: str) -> str:
-        return ''.join(
-            f'<{tag}{"" if i < texts else " class=number"}>{escape(cell)}</{tag}>'
-            for i, cell in enumerate(row)
-        )
-
-    body = ''.join(
-        f'<tr{" class=chosen" if i < len(chosen) and chosen[i] else ""}>{cells(row, "td")}</tr>'
-        for i, row in enumerate(rows)
-    )
-    kind = 'scroll short' if len(rows) <= _SHORT else 'scroll'
-    note = f'<p class="note">{escape(caption)}</p>' if caption else ''
-    return (
-        f'{note}<div class="{kind}"><table><thead><tr>{cells(headings, "th")}</tr></thead>'
-        f'<tbody>{body}</tbody></table></div>'
-    )
-
-
 def _statistics(evidence: Evidence) -> str:
     statistics = evidence.statistics
     if not any(sections['all'].n for sections in statistics.values()):
@@ -192,7 +145,7 @@ def _statistics(evidence: Evidence) -> str:
                     (section, rung, *map(number, (one.rms, one.peak, one.mean)), str(one.n))
                 )
                 chosen.append(rung == CHOSEN)
-    return '<h2>What is left of |g|</h2>' + _table(
+    return '<h2>What is left of |g|</h2>' + table(
         ('section', 'correction', 'RMS, µg', 'largest, µg', 'mean, µg', 'windows'),
         rows,
         texts=2,
@@ -219,7 +172,7 @@ def _inertial(evidence: Evidence) -> str:
                 )
     if not rows:
         return ''
-    return '<h2>What it means to an inertial navigator</h2>' + _table(
+    return '<h2>What it means to an inertial navigator</h2>' + table(
         (
             'correction',
             'regime',
@@ -231,15 +184,6 @@ def _inertial(evidence: Evidence) -> str:
         texts=2,
         caption='Position error if the RMS residual were the constant error b of a horizontal '
         f'axis: b t²/2, and at most {SCHULER_PEAK_PER_MICRO_G:.1f} m per µg in a Schuler period.',
-    )
-
-
-def _figure(plate: DrawnPlate) -> str:
-    return (
-        f'<figure id="figure-{plate.number}"><div class="wide">{plate.wide}</div>'
-        f'<div class="narrow">{plate.narrow}</div>'
-        f'<figcaption><strong>{plate.number}. {escape(plate.question)}</strong> '
-        f'{escape(plate.reading)}</figcaption></figure>'
     )
 
 
@@ -265,7 +209,7 @@ def _axes(calibration: Calibration | None) -> str:
             strict=True,
         )
     ]
-    return '<h2>The unit at the reference temperature</h2>' + _table(
+    return '<h2>The unit at the reference temperature</h2>' + table(
         (
             'axis',
             f'scale factor, {unit} per m/s²',
@@ -316,7 +260,7 @@ def _terms(calibration: Calibration | None) -> str:
             ]
     if not rows:
         return ''
-    return '<h2>Terms while the temperature changes</h2>' + _table(
+    return '<h2>Terms while the temperature changes</h2>' + table(
         ('regime', 'axis', 'term', 'bias, µg', 'scale, ppm'), rows, texts=3
     )
 
@@ -324,7 +268,7 @@ def _terms(calibration: Calibration | None) -> str:
 def _candidates(evidence: Evidence) -> str:
     if not evidence.candidates:
         return ''
-    return '<h2>Candidate models</h2>' + _table(
+    return '<h2>Candidate models</h2>' + table(
         ('model', 'parameters', 'fitted, µg', 'held out, µg'),
         [
             (
@@ -346,7 +290,7 @@ def _positions(evidence: Evidence) -> str:
         return ''
     rungs = list(evidence.residuals)
     shown = [rungs[0], rungs[-1]] if len(rungs) > 1 else rungs
-    return '<h2>Positions</h2>' + _table(
+    return '<h2>Positions</h2>' + table(
         ('no.', 'bag', 'rest, min', 'up x', 'up y', 'up z', *(f'{r}, µg RMS' for r in shown)),
         [
             (
@@ -385,11 +329,11 @@ def _bags(evidence: Evidence) -> str:
         headings = ''.join(
             f'<th{" class=number" if i else ""}>{name}</th>' for i, name in enumerate(head)
         )
-        table = (
+        listed = (
             '<p class="note">With the SHA-256 of each.</p><div class="scroll"><table><thead><tr>'
             f'{headings}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
         )
-        return f'<h2>Bags of this report</h2>{table}{_sources(evidence)}'
+        return f'<h2>Bags of this report</h2>{listed}{_sources(evidence)}'
     return _sources(evidence)
 
 

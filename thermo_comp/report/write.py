@@ -19,6 +19,27 @@ from .plates import drawn_plates, png_files
 from .verdict import Verdict, judge
 
 
+def render_report(evidence: Evidence) -> tuple[str, Verdict]:
+    """
+    Make a certificate for whoever writes it.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        What it is about.
+
+    Returns
+    -------
+    page : str
+        The HTML document.
+    verdict : Verdict
+        What it says.
+
+    """
+    verdict = judge(evidence)
+    return render_page(evidence, verdict, drawn_plates(evidence)), verdict
+
+
 def write_report(
     subject: FitResult | Evidence,
     path: str | Path,
@@ -61,8 +82,7 @@ def write_report(
     evidence = subject
     if isinstance(evidence, FitResult):
         evidence = evidence_of_fit(evidence, paths=paths, program=program)
-    verdict = judge(evidence)
-    page = render_page(evidence, verdict, drawn_plates(evidence))
+    page, verdict = render_report(evidence)
     if figures is not None:
         folder = Path(figures)
         folder.mkdir(parents=True, exist_ok=True)

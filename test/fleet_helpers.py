@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns small fleets: units that are simulated in a hundredth of a second, and fitted in a half.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from thermo_comp.fitting import FitOptions
+from thermo_comp.fleet import FleetOptions
+from thermo_comp.recording import BagWriter
+from thermo_comp.simulation import STANDARD_GRAVITY, parse_cyclogram, positions, simulate
+from thermo_comp.simulation import unit_preset as preset
+
+#: Half an hour over 36 K; the ramps of a freezer, not of a chamber.
+PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
+#: One set: the smallest fit that there is, for tests that are about everything around it.
+OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='quadratic'), certificates=False)
+
+
+def write_unit(
+    folder: Path,
+    seed: int,
+    n_bags: int = 6,
+    *,
+    serial: str | None = None,
+    test: int = 0,
+    metadata: dict[str, str] | None = None,
+    names: Sequence[str] | None = None,
+) -> list[Path]:
+    """
+    Simulate one thermal test of one unit, one bag per position.
+
+    """
+    unit = preset('mems', seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for number, up in enumerate(positions(n_bags, 1)):
+        run = simulate(
+            unit,
+            PROGRAM,
+            up,
+            rate_hz=1.0,
+            temperature_rate_hz=0.5,
+            seed=1000 * seed + 100 * test + number,
+            start_ns=1_767_225_600_000_000_000 + test * 30 * 86400 * 10**9,
+        )
+        path = folder / (names[number] if names else f'{number + 1:02d}.mcap')
+        facts = {'serial': unit.serial if serial is None else serial, **(metadata or {})}
+        with BagWriter(path, metadata={k: v for k, v in facts.items() if v}) as bag:
+            bag.write_temperature('temperature/board', run.board_stamp_ns, run.board)
+            bag.write_temperature('temperature/case', run.case_stamp_ns, run.case)
+            counts = run.counts.astype(np.float64)
+            bag.write_counts('accel/counts', run.accel_stamp_ns, counts, 'imu_link')
+        paths.append(path)
+    return paths
+
+
+def damage(path: Path) -> None:
+    """
+    Overwrite some bytes in the middle of a bag, as a bad disk does.
+
+    """
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 3
+    content[middle : middle + 64] = bytes(64)
+    path.write_bytes(content)

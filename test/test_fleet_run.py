@@ -1,0 +1,239 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A fleet comes through what happens to fleets: bad bags, refusals, dead workers, interruptions.
+
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fleet_helpers import OPTIONS, damage, write_unit
+
+from thermo_comp.calibration_file import load_calibration
+from thermo_comp.cli.app import run as run_command
+from thermo_comp.errors import FleetError
+from thermo_comp.fitting import FitOptions
+from thermo_comp.fleet import COLUMNS, FleetOptions, fit_fleet, read_parquet
+from thermo_comp.fleet.discovery import find_units
+from thermo_comp.fleet.engine import Job, connected, run
+from thermo_comp.fleet.ledger import Ledger
+from thermo_comp.fleet.storage import Storage
+from thermo_comp.recording import Topics
+
+pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
+pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
+
+
+@pytest.fixture(scope='module')
+def client() -> Iterator[Any]:
+    """
+    Start two workers, once for this file.
+
+    """
+    with connected(None, 2) as client:
+        yield client
+
+
+def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """
+    Return all files of a folder, with the time of their last change.
+
+    """
+    return {
+        str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
+        for path in sorted(folder.rglob('*'))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope='module')
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """
+    Write three units: one with a corrupt bag among good ones, one of too few positions.
+
+    """
+    folder = tmp_path_factory.mktemp('fleet') / 'bags'
+    write_unit(folder / 'A' / 'good', 1)
+    damage(write_unit(folder / 'A' / 'torn', 2, 7)[2])
+    write_unit(folder / 'B' / 'few', 3, 3)
+    return folder
+
+
+def test_the_rest_finishes_and_a_second_run_does_nothing(
+    client: Any, fleet: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / 'out'
+    told: list[str] = []
+    result = fit_fleet(
+        str(fleet),
+        out,
+        OPTIONS,
+        client=client,
+        tell=lambda _n, _total, row: told.append(str(row['name'])),
+    )
+    assert sorted(told) == ['A/good', 'A/torn', 'B/few']
+    assert result.n_done == 3
+    rows = {str(row['name']): row for row in result.rows}
+    assert {name: row['verdict'] for name, row in rows.items()} == {
+        'A/good': 'reserved',
+        'A/torn': 'reserved',
+        'B/few': 'refused',
+    }
+    assert rows['A/torn']['n_left_out'] == 1
+    assert load_calibration(out / 'units/A/torn/calibration.yaml').unit.serial == 'mems-0002'
+    assert not (out / 'units/B/few/calibration.yaml').exists()
+
+    assert [row['name'] for row in read_parquet(result.parquet)] == list(rows)
+    assert read_parquet(result.parquet)[0] == rows['A/good']
+    with result.csv.open(newline='') as file:
+        table = list(csv.DictReader(file))
+    assert list(table[0]) == [column.name for column in COLUMNS]
+    assert float(table[0]['bias_x_ug']) == rows['A/good']['bias_x_ug']
+
+    before = contents(out / 'units')
+    again = fit_fleet(str(fleet), out, OPTIONS, client=None, scheduler='tcp://nobody:1')
+    assert again.n_done == 0
+    assert again.rows == result.rows
+    assert contents(out / 'units') == before
+
+    # Only touched: it is hashed again, but not fitted again.
+    bag = fleet / 'A/good/01.mcap'
+    os.utime(bag, ns=(0, 0))
+    touched = fit_fleet(str(fleet), out, OPTIONS, client=client)
+    assert touched.n_done == 1
+    assert touched.rows == result.rows
+    after = contents(out / 'units')
+    assert {name for name in before if before[name] != after[name]} == {'A/good/result.json'}
+
+    # A result that somebody edited does not count.
+    (out / 'units/B/few').rename(out / 'units/B/other')
+    (out / 'units/A/torn/calibration.yaml').write_text('edited')
+    ledger = Ledger(out)
+    found = {unit.name: ledger.look_up(unit, OPTIONS) for unit in find_units(Storage(str(fleet)))}
+    assert {name for name, known in found.items() if known} == {'A/good'}
+
+
+def test_fewer_units_than_threads_are_cut_into_bags_with_the_same_result(
+    client: Any, fleet: Path
+) -> None:
+    units = [one for one in find_units(Storage(str(fleet))) if one.name == 'A/torn']
+    outcomes = []
+    for by_bag in (True, False):
+        ((_, outcome),) = run(client, str(fleet), [Job(units[0])], OPTIONS, by_bag=by_bag)
+        assert outcome is not None
+        outcomes.append(outcome)
+    first, second = outcomes
+    assert {**first.row, 'cpu_s': 0, 'calibration_sha256': ''} == {
+        **second.row,
+        'cpu_s': 0,
+        'calibration_sha256': '',
+    }
+
+
+def test_a_killed_worker_loses_nothing(client: Any, tmp_path: Path) -> None:
+    for seed in range(1, 5):
+        write_unit(tmp_path / 'bags' / f'u{seed}', seed)
+    killed: list[int] = []
+
+    def kill(_n: int, _total: int, _row: object) -> None:
+        # Both workers are in the middle of a unit whenever one has come back.
+        if not killed:
+            killed.append(min(client.run(os.getpid).values()))
+            os.kill(killed[0], signal.SIGKILL)
+
+    result = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', OPTIONS, client=client, tell=kill)
+    assert killed
+    assert [row['name'] for row in result.rows] == [f'u{seed}' for seed in range(1, 5)]
+    assert {row['verdict'] for row in result.rows} == {'reserved'}
+
+
+def test_an_interrupted_run_goes_on_where_it_was(client: Any, fleet: Path, tmp_path: Path) -> None:
+    out = tmp_path / 'out'
+
+    def stop(_n: int, _total: int, _row: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_fleet(str(fleet), out, OPTIONS, client=client, tell=stop)
+    assert not (out / 'fleet.csv').exists()
+    assert len(list(out.rglob('result.json'))) == 1
+    # A unit whose files were being written when the power went.
+    (out / 'units/A/good').mkdir(parents=True, exist_ok=True)
+    (out / 'units/A/good/result.json').write_text('{"format": 1,')
+    result = fit_fleet(str(fleet), out, OPTIONS, client=client)
+    assert len(result.rows) == 3
+    assert result.n_done in (2, 3)
+    assert json.loads((out / 'units/A/good/result.json').read_text())['is_final']
+
+
+def test_a_scheduler_that_is_not_there(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('thermo_comp.fleet.engine._WAIT_S', 0.5)
+    with pytest.raises(FleetError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers there'):
+        fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
+
+
+def test_a_fleet_without_dask_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
+    assert capsys.readouterr().err == (
+        "thermo_comp: error: a fleet needs Dask: pip install 'thermo_comp[fleet]' (distributed "
+        'is not installed)\n'
+    )
+
+
+def command(folder: Path, out: Path, *options: str) -> int:
+    """
+    Run the command in this process, return its exit code.
+
+    """
+    return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
+
+
+def test_the_command_s_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(tmp_path, tmp_path / 'out') == 2
+    assert 'give --gravity, or --latitude and --height' in capsys.readouterr().err
+    assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 2
+    assert '`gravity` must be positive' in capsys.readouterr().err
+    assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
+    said = capsys.readouterr().err
+    assert 'no bag in it' in said
+    assert len(said.splitlines()) == 1
+
+
+def test_a_unit_without_a_calibration_leaves_exit_code_1(
+    client: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_unit(tmp_path / 'bags' / 'u', 1, 2)
+    same = FleetOptions(FitOptions(gravity=9.81), Topics())
+    fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', same, client=client)
+    arguments = (tmp_path / 'bags', tmp_path / 'out', '--gravity', '9.81')
+    assert command(*arguments) == 1
+    said = capsys.readouterr()
+    assert '- u: 2 still positions, need 6' in said.out
+    assert '0 of 1 tests calibrated, 0 of them in this run' in said.out
+    assert said.err == ''
+    assert command(*arguments, '--json') == 1
+    data = json.loads(capsys.readouterr().out)
+    assert (data['n_fitted'], data['n_done'], data['verdicts']) == (0, 0, {'refused': 1})
+
+
+def test_options_are_part_of_a_result(client: Any, fleet: Path, tmp_path: Path) -> None:
+    few = fleet / 'B'
+    fit_fleet(str(few), tmp_path / 'out', OPTIONS, client=client)
+    other = replace(OPTIONS, fit=replace(OPTIONS.fit, min_still_s=4.0))
+    assert fit_fleet(str(few), tmp_path / 'out', other, client=client).n_done == 1

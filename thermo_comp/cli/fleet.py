@@ -1,0 +1,198 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns ``thermo_comp fleet``: the thermal tests of many units, on all the processors there are.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from . import options
+from .output import Output, micro_g
+
+if TYPE_CHECKING:
+    from ..fleet import FleetResult, Row
+
+app = typer.Typer(
+    name='fleet',
+    help='Fit many units, and see what they tell together.',
+    context_settings={'help_option_names': ['-h', '--help']},
+)
+
+
+@app.callback()
+def _fleet() -> None:
+    """
+    Fit many units, and see what they tell together.
+
+    """
+
+
+@app.command()
+def fit(
+    folder: Annotated[
+        str, typer.Argument(help='DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR')
+    ],
+    output: Annotated[
+        Path, typer.Option('--output', '-o', help='Folder of the results; goes on where it was.')
+    ],
+    gravity: options.Gravity = None,
+    latitude: options.Latitude = None,
+    height: options.Height = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help='Dask scheduler (tcp://HOST:PORT), instead of this machine alone.'),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help='Processes on this machine; all processors.', min=1)
+    ] = None,
+    certificates: Annotated[bool, typer.Option(help='Write a certificate for each unit.')] = True,
+    earlier: Annotated[
+        list[Path] | None,
+        typer.Option(help='fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
+    ] = None,
+    model: Annotated[
+        str, typer.Option(help='auto, golovach (the paper), quadratic (one set), or a candidate.')
+    ] = 'auto',
+    full_scale: Annotated[
+        float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
+    ] = None,
+    reference_temperature: Annotated[
+        float, typer.Option(help='Reference temperature [degC].')
+    ] = 20.0,
+    min_still: Annotated[float, typer.Option(help='Shortest still interval used [s].')] = 3.0,
+    allow: Annotated[
+        list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
+    ] = None,
+    input_: options.InputOption = options.InputChoice.auto,
+    counts_topic: options.CountsTopic = 'accel/counts',
+    imu_topic: options.ImuTopic = 'imu/uncompensated',
+    board_topic: options.BoardTopic = 'temperature/board',
+    case_topic: options.CaseTopic = 'temperature/case',
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Fit every unit below a folder.
+
+    Each folder of bags is one thermal test of one unit; bags that lie in
+    DIR itself are sorted by the serial in them. Results go to OUT/units,
+    the table of all to OUT/fleet.parquet and .csv, what it tells to
+    OUT/fleet.html. A second run does only what is missing or has changed.
+    Exit code 1 if a unit has no calibration.
+
+    Example:
+      thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
+
+    """
+    from ..fitting import FitOptions
+    from ..fleet import FleetOptions, fit_fleet, read_parquet
+
+    out = Output(as_json, quiet)
+    gravity = options.place(gravity, latitude, height)
+    if gravity is None:
+        raise options.usage('give --gravity, or --latitude and --height')
+    try:
+        settings = FleetOptions(
+            fit=FitOptions(
+                gravity=gravity,
+                model=model,
+                full_scale=full_scale,
+                reference_temperature=reference_temperature,
+                min_still_s=min_still,
+                allow=tuple(allow or ()),
+            ),
+            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            input=input_.value,
+            certificates=certificates,
+        )
+    except ValueError as mistake:
+        raise options.usage(str(mistake)) from mistake
+    before = [row for path in earlier or () for row in read_parquet(path)]
+    with out.progress('fitting', total=1.0) as done:
+        result = fit_fleet(
+            folder,
+            output,
+            settings,
+            scheduler=scheduler,
+            n_workers=workers,
+            earlier=before,
+            tell=lambda n, total, _row: done(n / total),
+        )
+    _say(out, result)
+    if result.n_fitted < len(result.rows):
+        raise typer.Exit(1)
+
+
+def _say(out: Output, result: FleetResult) -> None:
+    summary = result.summary
+    out.table(
+        ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
+        [
+            (
+                _short(str(row['name'])),
+                _short(str(row['serial'])),
+                row['verdict'],
+                _micro_g(row, 'static_ug'),
+                _micro_g(row, 'dynamic_ug'),
+                f'{row["n_bags"]}-{row["n_left_out"]}' if row['n_left_out'] else row['n_bags'],
+            )
+            for row in result.rows
+        ],
+        title='|f| - g at rest, RMS',
+    )
+    for row in result.rows:
+        for said in ('problem', 'left_out'):
+            if row[said]:
+                out.line(f'- {row["name"]}: {row[said]}')
+    for outlier in summary.outliers:
+        out.line(
+            f'- {outlier.name}: {outlier.label} {outlier.value:.4g} {outlier.unit}, median '
+            f'{outlier.middle:.4g}: {outlier.z:+.1f} sd'
+        )
+    for drift in summary.drifts:
+        if drift.is_significant:
+            worst = drift.worst
+            out.line(
+                f'- {drift.serial}: {worst.label} changed by {worst.change:+.4g} {worst.unit} '
+                f'(sd {worst.sd:.2g}) from {drift.earlier} to {drift.later}'
+            )
+    for effect in summary.lot_effects:
+        out.line(f'- lots differ in {effect.label} (by chance: {effect.probability:.1g})')
+    out.line(
+        f'{result.page}: {result.n_fitted} of {len(result.rows)} tests calibrated, '
+        f'{result.n_done} of them in this run'
+    )
+    out.json(
+        {
+            'rows': result.rows,
+            'n_fitted': result.n_fitted,
+            'n_done': result.n_done,
+            'verdicts': summary.verdicts,
+            'outliers': summary.outliers,
+            'drifts': summary.drifts,
+            'lot_effects': summary.lot_effects,
+            'parquet': result.parquet,
+            'csv': result.csv,
+            'page': result.page,
+        }
+    )
+
+
+def _micro_g(row: Row, name: str) -> str:
+    value = row[name]
+    return micro_g(value) if isinstance(value, float) else '-'
+
+
+def _short(name: str, limit: int = 22) -> str:
+    """
+    Keep the end of a long name, which tells units apart, so that the table fits 80 columns.
+
+    """
+    clean = ''.join(c if c.isprintable() else ' ' for c in name)
+    return clean if len(clean) <= limit else f'~{clean[1 - limit :]}'

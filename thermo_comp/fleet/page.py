@@ -1,0 +1,272 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the fleet's page: what a lab has to act on first, the whole table last.
+
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Callable, Sequence
+from html import escape
+from urllib.parse import quote
+
+import numpy as np
+
+from .. import __version__
+from ..report.html import document, figure, table
+from ..report.text import number
+from .plates import fleet_plates
+from .row import FITTED, Cell, Row
+from .summary import Summary
+
+# A list longer than this is for the table's readers.
+_MOST_ROWS = 60
+_MOST_LOTS = 24
+
+
+def render_fleet(
+    rows: Sequence[Row], summary: Summary, certificate_of: Callable[[str], str] | None = None
+) -> str:
+    """
+    Write the page.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        The fleet table.
+    summary : Summary
+        What it tells.
+    certificate_of : callable or None, optional
+        Gives the path of a unit's certificate beside the page; empty where it has none.
+
+    Returns
+    -------
+    str
+        The HTML document.
+
+    """
+    fitted = [row for row in rows if row['verdict'] in FITTED]
+    plates = fleet_plates(fitted, summary)
+    return document(
+        'Fleet report',
+        [
+            '<h1>Fleet report</h1>',
+            f'<p class="under">{len(rows)} thermal tests</p>',
+            _box(rows, summary),
+            _refused(rows, summary),
+            _outliers(summary),
+            _drifts(summary),
+            _lots(summary),
+            '<h2>Figures</h2>' if plates else '',
+            *(figure(plate) for plate in plates),
+            _spreads(summary),
+            _units(rows, certificate_of),
+            _footer(),
+        ],
+    )
+
+
+def _box(rows: Sequence[Row], summary: Summary) -> str:
+    n_fitted = sum(summary.verdicts.get(verdict, 0) for verdict in FITTED)
+    headline = f'{n_fitted} of {len(rows)} tests gave a calibration.'
+    facts = [
+        ', '.join(f'{n} {verdict}' for verdict, n in sorted(summary.verdicts.items())) + '.',
+        _said(len({one.name for one in summary.outliers}), 'unit stands', 'units stand', 'out')
+        if np.isfinite(summary.limit)
+        else 'Too few units to say which stand out.',
+    ]
+    if summary.drifts:
+        n_drifted = sum(one.is_significant for one in summary.drifts)
+        facts.append(
+            f'{len(summary.drifts)} units were tested again: '
+            f'{n_drifted or "none"} changed by more than chance.'
+        )
+    if len(summary.lots) > 1:
+        facts.append(
+            f'{len(summary.lots)} lots: they differ in '
+            + (', '.join(one.label for one in summary.lot_effects) or 'nothing')
+            + '.'
+        )
+    n_left_out = sum(int(row['n_left_out'] or 0) for row in rows)
+    if n_left_out:
+        facts.append(f'{n_left_out} bags were left out.')
+    level = 'good' if n_fitted == len(rows) else 'reserved' if n_fitted else 'poor'
+    return (
+        f'<section class="verdict {level}" aria-label="Summary">'
+        f'<p><strong>{escape(headline)}</strong></p>'
+        + ''.join(f'<p>{escape(fact)}</p>' for fact in facts)
+        + '</section>'
+    )
+
+
+def _said(n: int, one: str, several: str, rest: str) -> str:
+    return f'{n or "No"} {one if n == 1 else several} {rest}.'
+
+
+def _refused(rows: Sequence[Row], summary: Summary) -> str:
+    without = [row for row in rows if row['verdict'] not in FITTED]
+    if not without:
+        return ''
+    reasons = ''
+    if len(summary.problems) < len(without):
+        reasons = table(('reason', 'tests'), [(reason, str(n)) for reason, n in summary.problems])
+    listed = table(
+        ('test', 'serial', 'verdict', 'reason'),
+        [
+            tuple(str(row[name]) for name in ('name', 'serial', 'verdict', 'problem'))
+            for row in without[:_MOST_ROWS]
+        ],
+        texts=4,
+        caption=_more(len(without)),
+    )
+    return f'<h2>Not calibrated</h2>{reasons}{listed}'
+
+
+def _more(n: int) -> str:
+    return f'The first {_MOST_ROWS} of {n}; the others are in fleet.csv.' if n > _MOST_ROWS else ''
+
+
+def _outliers(summary: Summary) -> str:
+    if not summary.outliers:
+        return ''
+    return '<h2>Units that stand out</h2>' + table(
+        ('test', 'serial', 'quantity', 'value', 'median', 'unit', 'distance, sd'),
+        [
+            (
+                one.name,
+                one.serial,
+                one.label,
+                number(one.value),
+                number(one.middle),
+                one.unit,
+                number(one.z),
+            )
+            for one in summary.outliers[:_MOST_ROWS]
+        ],
+        texts=3,
+        caption='Distance from the median in robust standard deviations (median absolute '
+        f'deviation), beyond ±{number(summary.limit)}: a fleet of this size without any oddity '
+        f'has such a unit once in twenty times. {_more(len(summary.outliers))}',
+    )
+
+
+def _drifts(summary: Summary) -> str:
+    if not summary.drifts:
+        return ''
+    ordered = summary.surest_drifts
+    return '<h2>Tested again</h2>' + table(
+        ('serial', 'earlier', 'later', 'surest change in', 'days', 'change', 'unit', 'sd', 'real'),
+        [
+            (
+                one.serial,
+                one.earlier,
+                one.later,
+                one.worst.label,
+                number(one.days),
+                number(one.worst.change),
+                one.worst.unit,
+                number(one.worst.sd),
+                'yes' if one.is_significant else 'no',
+            )
+            for one in ordered[:_MOST_ROWS]
+        ],
+        texts=4,
+        caption='Coefficients at the reference temperature, later minus earlier; sd as the two '
+        f'fits claim it; real: more than chance. {_more(len(ordered))}',
+        chosen=[one.is_significant for one in ordered],
+    )
+
+
+def _lots(summary: Summary) -> str:
+    if not summary.lot_effects:
+        return ''
+    lots = list(summary.lots)[:_MOST_LOTS]
+    return '<h2>Lots that differ</h2>' + table(
+        ('quantity', 'by chance', *(f'{lot} ({summary.lots[lot]})' for lot in lots)),
+        [
+            (
+                f'{one.label}, {one.unit}',
+                f'{one.probability:.1e}',
+                *(number(one.medians[lot]) if lot in one.medians else '–' for lot in lots),
+            )
+            for one in summary.lot_effects
+        ],
+        caption='Median of each lot (number of units); probability that units dealt out by chance '
+        'differ as much, after Kruskal and Wallis.',
+    )
+
+
+def _spreads(summary: Summary) -> str:
+    if not summary.spreads:
+        return ''
+    return '<h2>Spread of the fleet</h2>' + table(
+        ('quantity', 'unit', 'lowest', 'median', 'highest', 'sd', 'units'),
+        [
+            (
+                one.quantity.label,
+                one.quantity.unit,
+                number(float(np.min(one.values))),
+                number(one.middle),
+                number(float(np.max(one.values))),
+                number(one.sd),
+                str(len(one.values)),
+            )
+            for one in summary.spreads
+        ],
+        texts=2,
+        caption='At the reference temperature; scale factors as the deviation from their median. '
+        'sd: 1.4826 times the median absolute deviation.',
+    )
+
+
+def _units(rows: Sequence[Row], certificate_of: Callable[[str], str] | None) -> str:
+    columns = ('static_ug', 'dynamic_ug', 'peak_ug', 'lowest_c', 'highest_c', 'n_positions')
+    links = [
+        certificate_of(str(row['name'])) if certificate_of and row['verdict'] in FITTED else ''
+        for row in rows
+    ]
+    return '<h2>All tests</h2>' + table(
+        (
+            *('test', 'serial', 'lot', 'verdict', 'model'),
+            *(
+                'static, µg',
+                'dynamic, µg',
+                'largest, µg',
+                'from, °C',
+                'to, °C',
+                'positions',
+                'bags',
+            ),
+        ),
+        [
+            (
+                *(str(row[name]) for name in ('name', 'serial', 'lot', 'verdict', 'model')),
+                *(_cell(row[name]) for name in columns),
+                _bags(row),
+            )
+            for row in rows
+        ],
+        texts=5,
+        caption='All columns with all digits: fleet.parquet and fleet.csv.',
+        links=[quote(link) for link in links],
+    )
+
+
+def _cell(cell: Cell) -> str:
+    return '–' if cell is None else number(float(cell))
+
+
+def _bags(row: Row) -> str:
+    n_left_out = row['n_left_out']
+    return f'{row["n_bags"]} − {n_left_out}' if n_left_out else str(row['n_bags'])
+
+
+def _footer() -> str:
+    now = dt.datetime.now(dt.timezone.utc)
+    return (
+        f'<footer>Report made {now:%Y-%m-%d %H:%M} UTC by thermo_comp {escape(__version__)}. '
+        '1 µg = 9.80665·10⁻⁶ m/s². Residuals: |g| − g at rest over windows of ten seconds, on '
+        'each unit’s own bags.</footer>'
+    )

@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the fleet table: which columns a unit has, and what a fit puts into them.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Literal
+
+import numpy as np
+
+from ..calibration import AXES, Calibration
+from ..fitting import FitResult, predicted_sd
+from ..metrics import MICRO_G
+
+Cell = str | int | float | None
+Row = Mapping[str, Cell]
+Kind = Literal['text', 'whole', 'number']
+
+#: What may stand in the column `verdict`: the certificate's words, and two for no calibration.
+FITTED = ('good', 'reserved', 'poor')
+REFUSED, FAILED = 'refused', 'failed'
+
+
+@dataclass(frozen=True)
+class Column:
+    """
+    One column of the fleet table.
+
+    Parameters
+    ----------
+    name : str
+        Its heading, with the unit of measurement.
+    kind : {'text', 'whole', 'number'}
+        What stands in it.
+    meaning : str
+        In words.
+
+    """
+
+    name: str
+    kind: Kind
+    meaning: str
+
+
+def _by_axis(pattern: str, meaning: str) -> list[Column]:
+    return [Column(pattern.format(axis), 'number', f'{axis}: {meaning}') for axis in AXES]
+
+
+_SKEW = (('10', 1, 0), ('20', 2, 0), ('21', 2, 1))
+
+COLUMNS: tuple[Column, ...] = (
+    Column('name', 'text', 'folder of the bags, or serial; the folder of the results'),
+    Column('serial', 'text', "serial in the bags' metadata, else the folder's own name"),
+    Column('lot', 'text', '`lot` in the metadata, else the folder above the unit'),
+    Column('verdict', 'text', 'good, reserved, poor; refused by the fit; failed'),
+    Column('problem', 'text', 'why there is no calibration'),
+    Column('reservations', 'text', 'what the certificate holds against the calibration'),
+    Column('left_out', 'text', 'bags that were left out, each with its reason'),
+    Column('n_bags', 'whole', 'bags found'),
+    Column('n_left_out', 'whole', 'of them left out'),
+    Column('n_positions', 'whole', 'still positions'),
+    Column('n_samples', 'whole', 'accelerometer samples'),
+    Column('n_bytes', 'whole', 'size of the bags'),
+    Column('model', 'text', 'the model of the fit'),
+    Column('start', 'text', 'UTC of the first sample'),
+    Column('hours', 'number', 'length of the bags together'),
+    Column('gravity_m_s2', 'number', 'local gravity used'),
+    Column('reference_temperature_c', 'number', 'T_ref'),
+    Column('lowest_c', 'number', 'lower end of the calibrated range'),
+    Column('highest_c', 'number', 'upper end of the calibrated range'),
+    Column('cooling_k_min', 'number', 'fastest fall of the board in the range'),
+    Column('heating_k_min', 'number', 'fastest rise of the board in the range'),
+    *_by_axis('scale_{}', 'scale factor at T_ref, input units per m/s^2'),
+    *_by_axis('scale_sd_{}_ppm', 'its standard deviation'),
+    *_by_axis('scale_slope_{}_ppm_k', 'slope of the static scale at T_ref'),
+    *_by_axis('bias_{}_ug', 'bias at T_ref in still air'),
+    *_by_axis('bias_sd_{}_ug', 'its standard deviation'),
+    *_by_axis('bias_slope_{}_ug_k', 'slope of the static bias at T_ref'),
+    *(Column(f'm_{name}_urad', 'number', f'M[{i}][{j}]') for name, i, j in _SKEW),
+    *(
+        Column(f'm_sd_{name}_urad', 'number', f'standard deviation of M[{i}][{j}]')
+        for name, i, j in _SKEW
+    ),
+    *_by_axis('noise_{}_ug_sqrt_hz', 'white noise'),
+    Column('lag_1_s', 'number', 'first time constant of the thermal memory'),
+    Column('lag_2_s', 'number', 'second time constant of the thermal memory'),
+    Column('board_lag_s', 'number', 'time constant of the board behind the case'),
+    Column('raw_ug', 'number', '|g| - g at rest, RMS, constants at T_ref only'),
+    Column('static_ug', 'number', '|g| - g at rest, RMS, static regime'),
+    Column('dynamic_ug', 'number', '|g| - g at rest, RMS, dynamic regime'),
+    Column('all_ug', 'number', '|g| - g at rest, RMS'),
+    Column('peak_ug', 'number', '|g| - g at rest, largest window of ten seconds'),
+    Column('cpu_s', 'number', 'processor time of reading and fit'),
+    Column('tool_version', 'text', 'version that fitted it'),
+    Column('calibration_sha256', 'text', 'of calibration.yaml'),
+    Column('key', 'text', 'hash of bags, options and version'),
+)
+
+
+def empty_row(**known: Cell) -> dict[str, Cell]:
+    """
+    Make a row in which only so much is known.
+
+    Parameters
+    ----------
+    **known
+        Cells by column.
+
+    Returns
+    -------
+    dict of str to str, int, float or None
+        All columns in order; texts are empty and numbers None where nothing is known.
+
+    """
+    row: dict[str, Cell] = {
+        column.name: '' if column.kind == 'text' else None for column in COLUMNS
+    }
+    strange = known.keys() - row.keys()
+    if strange:
+        raise ValueError(f'no column {sorted(strange)[0]!r}')
+    return row | known
+
+
+def fitted_cells(result: FitResult) -> dict[str, Cell]:
+    """
+    Take the cells of a fitted unit from its fit.
+
+    Parameters
+    ----------
+    result : FitResult
+        The fit.
+
+    Returns
+    -------
+    dict of str to str, int, float or None
+        Cells by column.
+
+    """
+    calibration = result.calibration
+    residuals = {row.section: row for row in result.residuals}
+    start_ns = min(bag.start_ns for bag in result.bags)
+    cells: dict[str, Cell] = {
+        'n_positions': len(result.positions),
+        'n_samples': sum(bag.n_samples for bag in result.bags),
+        'model': calibration.provenance.model,
+        'start': datetime.fromtimestamp(start_ns // 10**9, timezone.utc).strftime(
+            '%Y-%m-%dT%H:%M:%SZ'
+        ),
+        'hours': sum(bag.end_ns - bag.start_ns for bag in result.bags) * 1e-9 / 3600.0,
+        'raw_ug': residuals['all'].raw.micro_g.rms,
+        'peak_ug': residuals['all'].fitted.micro_g.peak,
+        'tool_version': calibration.provenance.tool_version,
+    }
+    for section in ('static', 'dynamic', 'all'):
+        if residuals[section].fitted.n:
+            cells[f'{section}_ug'] = residuals[section].fitted.micro_g.rms
+    return cells | calibration_cells(calibration)
+
+
+def calibration_cells(calibration: Calibration) -> dict[str, Cell]:
+    """
+    Take the cells that a calibration alone fills.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+
+    Returns
+    -------
+    dict of str to float
+        Cells by column.
+
+    """
+    lowest, highest, cooling, heating = (
+        pick(getattr(part, name)[end] for part in calibration.regime_sets())
+        for name, end, pick in (
+            ('temperature_range_c', 0, min),
+            ('temperature_range_c', 1, max),
+            ('rate_range_k_min', 0, min),
+            ('rate_range_k_min', 1, max),
+        )
+    )
+    sd = predicted_sd(calibration, np.array([calibration.reference_temperature_c]), np.zeros(1))
+    cells: dict[str, Cell] = {
+        'gravity_m_s2': calibration.gravity_m_s2,
+        'reference_temperature_c': calibration.reference_temperature_c,
+        'lowest_c': lowest,
+        'highest_c': highest,
+        'cooling_k_min': cooling,
+        'heating_k_min': heating,
+        'board_lag_s': calibration.board_lag_s,
+    }
+    for i, axis in enumerate(AXES):
+        reference = getattr(calibration.axes, axis)
+        static = getattr(calibration.static, axis)
+        one_ug = reference.scale_factor * MICRO_G
+        cells |= {
+            f'scale_{axis}': reference.scale_factor,
+            f'scale_sd_{axis}_ppm': float(sd.scale[0, 0, i]) * 1e6,
+            f'scale_slope_{axis}_ppm_k': static.scale_function.slope(0.0) * 1e6,
+            f'bias_{axis}_ug': (reference.bias + static.delta) / one_ug,
+            f'bias_sd_{axis}_ug': float(sd.bias[0, 0, i]) / MICRO_G,
+            f'bias_slope_{axis}_ug_k': static.bias_function.slope(0.0) / one_ug,
+            f'noise_{axis}_ug_sqrt_hz': calibration.noise_density_m_s2_sqrt_hz[i] / MICRO_G,
+        }
+    for k, (name, i, j) in enumerate(_SKEW):
+        cells[f'm_{name}_urad'] = calibration.misalignment[i][j] * 1e6
+        cells[f'm_sd_{name}_urad'] = calibration.misalignment_sd[k] * 1e6
+    for k, lag_s in enumerate(calibration.memory_time_constants_s[:2], 1):
+        cells[f'lag_{k}_s'] = lag_s
+    return {name: float(value) for name, value in cells.items() if value is not None}

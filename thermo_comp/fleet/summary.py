@@ -1,0 +1,457 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what a fleet table tells: spreads, units that stand out, drift, lots that differ.
+
+Spreads are robust (median and median absolute deviation), because the units that stand out are in
+them. Every limit is set so that a fleet without anything to find raises an alarm once in twenty.
+
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from ..calibration import AXES
+from .row import FITTED, Row
+
+Array = npt.NDArray[np.float64]
+
+_FALSE_ALARMS = 0.05
+# Fewer units have no spread to stand out of, fewer of a lot no middle.
+_UNITS_NEEDED, _LOT_NEEDED = 8, 4
+# A median absolute deviation knows the spread as well as 0.37 n values do with their squares.
+_MAD_EFFICIENCY = 0.37
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """
+    What units are compared in.
+
+    Parameters
+    ----------
+    column : str
+        Column of the fleet table.
+    label, unit : str
+        For people; the unit is that of what is compared.
+    is_relative : bool, optional
+        Compared as the deviation from the fleet's median in ppm.
+    is_size : bool, optional
+        Positive by nature: compared by its logarithm.
+    sd : str, optional
+        Column of its standard deviation.
+
+    """
+
+    column: str
+    label: str
+    unit: str
+    is_relative: bool = False
+    is_size: bool = False
+    sd: str = ''
+
+
+def _axes(pattern: str, label: str, unit: str, sd: str = '', **kind: bool) -> list[Quantity]:
+    return [
+        Quantity(pattern.format(a), f'{label} {a}', unit, sd=sd.format(a), **kind) for a in AXES
+    ]
+
+
+QUANTITIES: tuple[Quantity, ...] = (
+    *_axes('scale_{}', 'scale factor', 'ppm', 'scale_sd_{}_ppm', is_relative=True),
+    *_axes('scale_slope_{}_ppm_k', 'slope of scale', 'ppm/K'),
+    *_axes('bias_{}_ug', 'bias', 'µg', 'bias_sd_{}_ug'),
+    *_axes('bias_slope_{}_ug_k', 'slope of bias', 'µg/K'),
+    *(
+        Quantity(f'm_{ij}_urad', f'M[{ij[0]}][{ij[1]}]', 'µrad', sd=f'm_sd_{ij}_urad')
+        for ij in ('10', '20', '21')
+    ),
+    *_axes('noise_{}_ug_sqrt_hz', 'noise', 'µg/√Hz', is_size=True),
+    Quantity('static_ug', 'residual, static', 'µg', is_size=True),
+    Quantity('dynamic_ug', 'residual, dynamic', 'µg', is_size=True),
+)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """
+    How a quantity is spread over the fleet.
+
+    Parameters
+    ----------
+    quantity : Quantity
+        Which.
+    names : tuple of str
+        The units that have it.
+    values : ndarray, shape (n,)
+        In the quantity's unit.
+    middle, sd : float
+        Median, and 1.4826 times the median absolute deviation (of a size: that of its logarithm,
+        times the median).
+    z : ndarray, shape (n,)
+        Distance of each unit from the middle in standard deviations; 0 where there is no spread.
+
+    """
+
+    quantity: Quantity
+    names: tuple[str, ...]
+    values: Array
+    middle: float
+    sd: float
+    z: Array
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """
+    A unit that stands out.
+
+    Parameters
+    ----------
+    name, serial : str
+        Which.
+    label : str
+        In what.
+    value, middle, z : float
+        Its value, the fleet's median, and the distance in standard deviations.
+    unit : str
+        Of value and middle.
+
+    """
+
+    name: str
+    serial: str
+    label: str
+    value: float
+    middle: float
+    z: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Change:
+    """
+    One quantity between two tests of a unit.
+
+    Parameters
+    ----------
+    label, unit : str
+        Which quantity.
+    change, sd : float
+        The later minus the earlier, and what the two fits say of its uncertainty.
+
+    """
+
+    label: str
+    unit: str
+    change: float
+    sd: float
+
+    @property
+    def z(self) -> float:
+        """
+        Change over its standard deviation.
+
+        """
+        return self.change / self.sd if self.sd > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class Drift:
+    """
+    What changed between two tests of one unit.
+
+    Parameters
+    ----------
+    serial, earlier, later : str
+        The unit, and the names of its tests.
+    days : float
+        Between their starts; NaN where one is not known.
+    changes : tuple of Change
+        By quantity.
+    is_significant : bool
+        Whether one of them is more than chance.
+
+    """
+
+    serial: str
+    earlier: str
+    later: str
+    days: float
+    changes: tuple[Change, ...]
+    is_significant: bool
+
+    @property
+    def worst(self) -> Change:
+        """
+        The surest change.
+
+        """
+        return max(self.changes, key=lambda one: abs(one.z))
+
+
+@dataclass(frozen=True)
+class LotEffect:
+    """
+    A quantity in which lots differ.
+
+    Parameters
+    ----------
+    label, unit : str
+        Which quantity.
+    probability : float
+        That units dealt out by chance would differ as much (Kruskal and Wallis).
+    medians : dict of str to float
+        Median of each lot.
+
+    """
+
+    label: str
+    unit: str
+    probability: float
+    medians: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """
+    What a fleet table tells.
+
+    Parameters
+    ----------
+    verdicts : dict of str to int
+        Units by verdict.
+    problems : tuple of (str, int)
+        Reasons for no calibration, the frequent first; figures are left out of them.
+    spreads : tuple of Spread
+        By quantity.
+    limit : float
+        Distance in standard deviations beyond which a unit stands out; infinite in a fleet too
+        small to tell.
+    outliers : tuple of Outlier
+        The farthest first.
+    drifts : tuple of Drift
+        By serial and time.
+    lots : dict of str to int
+        Calibrated units by lot.
+    lot_effects : tuple of LotEffect
+        The surest first.
+
+    """
+
+    verdicts: dict[str, int]
+    problems: tuple[tuple[str, int], ...]
+    spreads: tuple[Spread, ...]
+    limit: float
+    outliers: tuple[Outlier, ...]
+    drifts: tuple[Drift, ...]
+    lots: dict[str, int]
+    lot_effects: tuple[LotEffect, ...]
+
+    @property
+    def surest_drifts(self) -> list[Drift]:
+        """
+        Sort the drifts by their surest change.
+
+        """
+        return sorted(self.drifts, key=lambda one: -abs(one.worst.z))
+
+
+def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
+    """
+    Look at a fleet as a whole.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        The fleet table.
+    earlier : sequence of mapping, optional
+        Rows of earlier tables, to see what drifted.
+
+    Returns
+    -------
+    Summary
+        What there is to see.
+
+    """
+    fitted = [row for row in rows if row['verdict'] in FITTED]
+    spreads = tuple(spread for one in QUANTITIES if (spread := spread_of(one, fitted)) is not None)
+    limit = outlier_limit(len(fitted), len(spreads))
+    serials = {str(row['name']): str(row['serial']) for row in fitted}
+    outliers = [
+        Outlier(name, serials[name], one.quantity.label, value, one.middle, z, one.quantity.unit)
+        for one in spreads
+        for name, value, z in zip(one.names, one.values.tolist(), one.z.tolist(), strict=True)
+        if abs(z) > limit
+    ]
+    lots = Counter(str(row['lot']) for row in fitted if row['lot'])
+    return Summary(
+        verdicts=dict(Counter(str(row['verdict']) for row in rows)),
+        problems=tuple(
+            Counter(_pattern(str(row['problem'])) for row in rows if row['problem']).most_common()
+        ),
+        spreads=spreads,
+        limit=limit,
+        outliers=tuple(sorted(outliers, key=lambda one: -abs(one.z))),
+        drifts=tuple(_drifts(fitted, [row for row in earlier if row['verdict'] in FITTED])),
+        lots=dict(sorted(lots.items())),
+        lot_effects=tuple(_lot_effects(fitted, spreads)),
+    )
+
+
+def spread_of(quantity: Quantity, rows: Sequence[Row]) -> Spread | None:
+    """
+    Measure the spread of a quantity.
+
+    Parameters
+    ----------
+    quantity : Quantity
+        Which.
+    rows : sequence of mapping
+        Calibrated units.
+
+    Returns
+    -------
+    Spread or None
+        None where no unit has it.
+
+    """
+    pairs = [(str(row['name']), _number(row[quantity.column])) for row in rows]
+    pairs = [(name, value) for name, value in pairs if np.isfinite(value)]
+    if not pairs:
+        return None
+    values = np.array([value for _, value in pairs])
+    if quantity.is_relative:
+        values = (values / np.median(values) - 1.0) * 1e6
+    middle = float(np.median(values))
+    compared = np.log(np.maximum(values, 1e-12)) if quantity.is_size else values
+    away = compared - np.median(compared)
+    sd = 1.4826 * float(np.median(np.abs(away)))
+    z = away / sd if sd > 0.0 else np.zeros_like(away)
+    return Spread(
+        quantity,
+        tuple(name for name, _ in pairs),
+        values,
+        middle,
+        sd * middle if quantity.is_size else sd,
+        z,
+    )
+
+
+def outlier_limit(n_units: int, n_quantities: int) -> float:
+    """
+    Distance beyond which a unit stands out.
+
+    Parameters
+    ----------
+    n_units, n_quantities : int
+        How many are compared in how much.
+
+    Returns
+    -------
+    float
+        Standard deviations: of Student's t, because the spread is itself estimated; infinite for
+        fewer than eight units.
+
+    """
+    from scipy.stats import t
+
+    if n_units < _UNITS_NEEDED or not n_quantities:
+        return float('inf')
+    share = 0.5 * _FALSE_ALARMS / (n_units * n_quantities)
+    return float(t.isf(share, _MAD_EFFICIENCY * n_units))
+
+
+def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Drift]:
+    by_serial: dict[str, list[tuple[str, str, Row]]] = defaultdict(list)
+    for source, found in (('earlier ', earlier), ('', rows)):
+        for row in found:
+            by_serial[str(row['serial'])].append(
+                (str(row['start']), f'{source}{row["name"]}', row)
+            )
+    pairs = [
+        (serial, before, after)
+        for serial, tests in sorted(by_serial.items())
+        for before, after in pairwise(sorted(tests, key=lambda test: test[:2]))
+        if before[2]['calibration_sha256'] != after[2]['calibration_sha256']
+    ]
+    compared = [quantity for quantity in QUANTITIES if quantity.sd]
+    limit = _normal_limit(len(pairs) * len(compared))
+    drifts = []
+    for serial, (_, name, old), (_, later, new) in pairs:
+        changes = tuple(_change(quantity, old, new) for quantity in compared)
+        drifts.append(
+            Drift(
+                serial,
+                name,
+                later,
+                _days(old, new),
+                changes,
+                any(abs(one.z) > limit for one in changes),
+            )
+        )
+    return drifts
+
+
+def _change(quantity: Quantity, old: Row, new: Row) -> Change:
+    before, after = _number(old[quantity.column]), _number(new[quantity.column])
+    change = (after / before - 1.0) * 1e6 if quantity.is_relative else after - before
+    sd = float(np.hypot(_number(old[quantity.sd]), _number(new[quantity.sd])))
+    return Change(quantity.label, quantity.unit, change, sd if np.isfinite(sd) else 0.0)
+
+
+def _days(old: Row, new: Row) -> float:
+    try:
+        starts = [datetime.fromisoformat(str(row['start']).rstrip('Z')) for row in (old, new)]
+    except ValueError:
+        return float('nan')
+    return (starts[1] - starts[0]).total_seconds() / 86400.0
+
+
+def _lot_effects(rows: Sequence[Row], spreads: Iterable[Spread]) -> list[LotEffect]:
+    from scipy.stats import kruskal
+
+    lot_of = {str(row['name']): str(row['lot']) for row in rows}
+    found = []
+    tested = 0
+    for one in spreads:
+        groups: dict[str, list[float]] = defaultdict(list)
+        for name, value in zip(one.names, one.values.tolist(), strict=True):
+            if lot_of[name]:
+                groups[lot_of[name]].append(value)
+        groups = {lot: group for lot, group in groups.items() if len(group) >= _LOT_NEEDED}
+        if len(groups) < 2 or not one.sd > 0.0:
+            continue
+        tested += 1
+        probability = float(kruskal(*groups.values()).pvalue)
+        medians = {lot: float(np.median(group)) for lot, group in sorted(groups.items())}
+        found.append(LotEffect(one.quantity.label, one.quantity.unit, probability, medians))
+    sure = [one for one in found if one.probability < _FALSE_ALARMS / tested]
+    return sorted(sure, key=lambda one: one.probability)
+
+
+def _normal_limit(n: int) -> float:
+    from scipy.stats import norm
+
+    return float(norm.isf(0.5 * _FALSE_ALARMS / n)) if n else float('inf')
+
+
+def _number(cell: object) -> float:
+    return float(cell) if isinstance(cell, (int, float)) else float('nan')
+
+
+def _pattern(problem: str) -> str:
+    """
+    Leave the figures out of a sentence, so that like reasons count together.
+
+    """
+    return re.sub(r'\d+(?:\.\d+)?', '#', problem)

@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the figures of a fleet: what is left unit by unit, how units differ, who stands out.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from .plates import DrawnPlate
+from .style import (
+    AXIS_LINES,
+    BLACK,
+    BLUE,
+    DYNAMIC_LINE,
+    GREY,
+    NARROW,
+    RED,
+    RUNG_LINES,
+    STATIC_LINE,
+    WIDE,
+    Line,
+    Sheet,
+    drawing,
+    few_ticks,
+    legend_above,
+    log_axis,
+    new_figure,
+    svg,
+)
+from .text import label_text
+
+Array = npt.NDArray[np.float64]
+Draw = Callable[[Sheet], Figure]
+
+# More names than these would lie over each other.
+_MOST_NAMES = 12
+_SECTION_LINES: dict[str, Line] = {
+    'raw': RUNG_LINES['raw'],
+    'static': STATIC_LINE,
+    'dynamic': DYNAMIC_LINE,
+}
+
+
+@dataclass(frozen=True)
+class Panel:
+    """
+    One quantity of all units, axis by axis.
+
+    Parameters
+    ----------
+    title, unit : str
+        What it is.
+    values : sequence of ndarray, shape (n,)
+        Of x, y and z.
+
+    """
+
+    title: str
+    unit: str
+    values: Sequence[Array]
+
+
+def draw_plate(number: int, name: str, question: str, reading: str, draw: Draw) -> DrawnPlate:
+    """
+    Draw one figure for the page.
+
+    Parameters
+    ----------
+    number : int
+        Counted from 1.
+    name, question, reading : str
+        As in `plates.Plate`.
+    draw : callable
+        Draws it on a sheet.
+
+    Returns
+    -------
+    DrawnPlate
+        Ready for the page.
+
+    """
+    with drawing():
+        return DrawnPlate(
+            number=number,
+            name=name,
+            question=question,
+            reading=reading,
+            wide=svg(draw(WIDE), f'f{number}w', question),
+            narrow=svg(draw(NARROW), f'f{number}n', question),
+        )
+
+
+def draw_shares(curves: Mapping[str, Array], sheet: Sheet) -> Figure:
+    """
+    Draw the share of units below each residual, by section.
+
+    Parameters
+    ----------
+    curves : mapping of str to ndarray
+        Residuals [micro-g] of ``raw``, ``static``, ``dynamic``.
+    sheet : Sheet
+        The paper.
+
+    """
+    figure = new_figure(sheet, 2.6)
+    axes = figure.subplots()
+    drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}
+    drawn = {name: values for name, values in drawn.items() if len(values)}
+    for name, values in drawn.items():
+        share = np.arange(1, len(values) + 1) / len(values) * 100.0
+        axes.step(values, share, where='post', label=name, **_SECTION_LINES[name])
+    low = min(float(values[0]) for values in drawn.values())
+    high = max(float(values[-1]) for values in drawn.values())
+    log_axis(axes, low / 1.3, high * 1.3)
+    axes.set_ylim(0.0, 103.0)
+    axes.set_xlabel('|g| − g of a unit, RMS, µg')
+    axes.set_ylabel('units, %')
+    legend_above(axes, sheet)
+    return figure
+
+
+def draw_spreads(panels: Sequence[Panel], sheet: Sheet) -> Figure:
+    """
+    Draw how the coefficients are spread, as the share of units below each value.
+
+    """
+    columns = 1 if sheet.is_narrow else 2
+    n_rows = -(-len(panels) // columns)
+    figure = new_figure(sheet, 0.4 + 1.75 * n_rows)
+    grid = np.atleast_1d(figure.subplots(n_rows, columns)).ravel()
+    for axes, panel in zip(grid, panels, strict=False):
+        for axis, values, line in zip('xyz', panel.values, AXIS_LINES, strict=True):
+            share = (np.arange(len(values)) + 0.5) / max(len(values), 1) * 100.0
+            axes.step(np.sort(values), share, where='mid', label=axis, **line)
+        axes.set_xlabel(f'{panel.title}, {panel.unit}')
+        axes.set_ylabel('units, %')
+        axes.set_ylim(0.0, 100.0)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        few_ticks(axes, 4)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    legend_above(grid[0], sheet, share=1.0 / columns)
+    return figure
+
+
+def draw_distances(
+    labels: Sequence[str],
+    distances: Sequence[Array],
+    names: Sequence[Sequence[str]],
+    limit: float,
+    sheet: Sheet,
+) -> Figure:
+    """
+    Draw every unit's distance from the fleet's middle, quantity by quantity.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        The quantities.
+    distances : sequence of ndarray
+        In standard deviations.
+    names : sequence of sequence of str
+        The units, as in `distances`.
+    limit : float
+        Beyond it a unit is named.
+    sheet : Sheet
+        The paper.
+
+    """
+    figure = new_figure(sheet, 0.6 + 0.19 * len(labels))
+    axes = figure.subplots()
+    far = max((float(np.max(np.abs(z), initial=0.0)) for z in distances), default=0.0)
+    shown = min(max(1.15 * limit, 4.0), 12.0) if np.isfinite(limit) else max(4.0, far)
+    n_named = 0
+    for row, (z, units) in enumerate(zip(distances, names, strict=True)):
+        at = np.clip(z, -1.04 * shown, 1.04 * shown)
+        is_far = np.abs(z) > limit
+        axes.plot(at[~is_far], np.full(int((~is_far).sum()), row), '|', color=GREY, markersize=6)
+        axes.plot(at[is_far], np.full(int(is_far.sum()), row), 'D', color=RED, markersize=3.5)
+        for i in np.flatnonzero(is_far)[: max(_MOST_NAMES - n_named, 0)]:
+            n_named += 1
+            axes.annotate(
+                label_text(units[i], 18),
+                (float(at[i]), row),
+                xytext=(4 if at[i] < 0 else -4, 0),
+                textcoords='offset points',
+                ha='left' if at[i] < 0 else 'right',
+                va='center',
+                fontsize=7,
+            )
+    for edge in (-limit, limit):
+        if np.isfinite(edge):
+            axes.axvline(edge, color=BLACK, linewidth=0.8, linestyle=(0, (5, 2)))
+    axes.set_xlim(-1.1 * shown, 1.1 * shown)
+    axes.set_ylim(len(labels) - 0.4, -0.6)
+    axes.set_yticks(range(len(labels)), labels)
+    axes.grid(visible=True, axis='x')
+    axes.set_xlabel('distance from the median, standard deviations')
+    return figure
+
+
+def draw_lots(title: str, groups: Mapping[str, Array], sheet: Sheet) -> Figure:
+    """
+    Draw one quantity lot by lot.
+
+    """
+    figure = new_figure(sheet, 0.7 + 0.28 * len(groups))
+    axes = figure.subplots()
+    for row, values in enumerate(groups.values()):
+        axes.plot(values, np.full(len(values), row), '|', color=GREY, markersize=8)
+        axes.plot([float(np.median(values))], [row], 'D', color=BLUE, markersize=4.5)
+    axes.set_yticks(range(len(groups)), [label_text(lot, 18) for lot in groups])
+    axes.set_ylim(len(groups) - 0.5, -0.5)
+    axes.set_xlabel(title)
+    axes.xaxis.set_major_locator(MaxNLocator(6))
+    return figure
+
+
+def draw_changes(
+    labels: Sequence[str], panels: Mapping[str, tuple[Array, Array]], sheet: Sheet
+) -> Figure:
+    """
+    Draw what changed between two tests of each unit, axis by axis, with two sd on either side.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        The units.
+    panels : mapping of str to (ndarray, ndarray), shape (n, 3)
+        Changes and standard deviations, by the words of the axis.
+    sheet : Sheet
+        The paper.
+
+    """
+    columns = 1 if sheet.is_narrow else len(panels)
+    height = 0.8 + 0.3 * len(labels)
+    figure = new_figure(sheet, height * (len(panels) if sheet.is_narrow else 1))
+    grid = np.atleast_1d(figure.subplots(len(panels) // columns, columns, sharey=True)).ravel()
+    rows = np.arange(len(labels))
+    marks = ('o', 's', '^')
+    for axes, (words, (change, sd)) in zip(grid, panels.items(), strict=True):
+        for i, axis in enumerate('xyz'):
+            axes.errorbar(
+                change[:, i],
+                rows + 0.2 * (i - 1),
+                xerr=2.0 * sd[:, i],
+                fmt=marks[i],
+                color=AXIS_LINES[i]['color'],
+                markersize=3.5,
+                linewidth=1.0,
+                label=axis,
+            )
+        axes.axvline(0.0, color=BLACK, linewidth=0.5)
+        axes.set_xlabel(words)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+    grid[0].set_yticks(rows, [label_text(label, 18) for label in labels])
+    grid[0].set_ylim(len(labels) - 0.4, -0.6)
+    legend_above(grid[0], sheet, share=1.0 / columns)
+    return figure
