@@ -14,6 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic
 
+import numpy as np
+
 from . import thermal
 from .calibration import AxisReference, AxisSet, Calibration, RegimeSet
 from .functions import Number, hold
@@ -31,6 +33,8 @@ class Regressors(Generic[Number]):
 
     #: T_board - T_ref [K].
     t: Number
+    #: The same, not held.
+    free_t: Number
     #: Gradient [K], rate [K/s], then the memory of each lag [K].
     linear: list[Number]
 
@@ -57,22 +61,27 @@ class SetCorrection:
     ----------
     regime_set : RegimeSet
         The set.
+    other : RegimeSet
+        The other regime's: where this one ends and that one goes on, its curve is followed.
     calibration : Calibration
-        The unit it belongs to.
+        The unit they belong to.
 
     """
 
-    def __init__(self, regime_set: RegimeSet, calibration: Calibration) -> None:
+    def __init__(self, regime_set: RegimeSet, other: RegimeSet, calibration: Calibration) -> None:
         self._reference = calibration.reference_temperature_c
-        self._t_range = tuple(edge - self._reference for edge in regime_set.temperature_range_c)
+        lower, upper = regime_set.temperature_range_c
+        self._t_range = lower - self._reference, upper - self._reference
+        lower, upper = other.temperature_range_c
+        other_range = lower - self._reference, upper - self._reference
         self._gradient_range = regime_set.gradient_range_k
         self._rate_range = tuple(edge / 60.0 for edge in regime_set.rate_range_k_min)
         self._memory_range = regime_set.memory_range_k
         axes = calibration.axes
         self.axes = tuple(
-            AxisCorrection(axis_set, reference)
-            for axis_set, reference in zip(
-                regime_set.axes(), (axes.x, axes.y, axes.z), strict=True
+            AxisCorrection(axis_set, reference, other_set, other_range)
+            for axis_set, other_set, reference in zip(
+                regime_set.axes(), other.axes(), (axes.x, axes.y, axes.z), strict=True
             )
         )
         # Half of each range: the yardstick by which an excess is judged.
@@ -117,7 +126,7 @@ class SetCorrection:
         for m, held in zip(memory, held_memory, strict=True):
             over = over + abs(m - held)
         return (
-            Regressors(held_t, linear),
+            Regressors(held_t, t, linear),
             Excess(t - held_t, gradient - held_gradient, rate - held_rate, over),
         )
 
@@ -145,11 +154,23 @@ class AxisCorrection:
         Its coefficients.
     reference : AxisReference
         The axis at the reference temperature.
+    other : AxisSet
+        The axis in the other regime.
+    other_range : (float, float)
+        Where its functions hold, from the reference [K].
 
     """
 
-    def __init__(self, axis_set: AxisSet, reference: AxisReference) -> None:
+    def __init__(
+        self,
+        axis_set: AxisSet,
+        reference: AxisReference,
+        other: AxisSet,
+        other_range: tuple[float, float],
+    ) -> None:
         self._set = axis_set
+        self._other = other
+        self._other_range = other_range
         self._K = reference.scale_factor
         self._level = reference.bias + axis_set.delta
         self._bias_terms = _present(
@@ -177,6 +198,16 @@ class AxisCorrection:
         relative = self._set.scale_function.value(regressors.t)
         for index, coefficient in self._scale_terms:
             relative = relative + coefficient * values[index]
+        if _differ(regressors.t, regressors.free_t):
+            # Beyond its own range a set goes on as the other does, as far as that one was
+            # calibrated: what the two differ by is held, not what they have in common.
+            here = hold(regressors.free_t, *self._other_range)
+            edge = hold(regressors.t, *self._other_range)
+            other = self._other
+            bias = bias + (other.bias_function.value(here) - other.bias_function.value(edge))
+            relative = relative + (
+                other.scale_function.value(here) - other.scale_function.value(edge)
+            )
         return bias, relative * self._K
 
     def variance(
@@ -271,8 +302,8 @@ class Correction:
     """
 
     def __init__(self, calibration: Calibration) -> None:
-        self.static = SetCorrection(calibration.static, calibration)
-        self.dynamic = SetCorrection(calibration.dynamic, calibration)
+        self.static = SetCorrection(calibration.static, calibration.dynamic, calibration)
+        self.dynamic = SetCorrection(calibration.dynamic, calibration.static, calibration)
         self._K = tuple(
             axis.scale_factor
             for axis in (calibration.axes.x, calibration.axes.y, calibration.axes.z)
@@ -359,6 +390,10 @@ class Correction:
             c = c + doubt * scale_gap * scale_gap + relative * relative * c
             result.append((a, b, c))
         return result
+
+
+def _differ(one: Number, other: Number) -> bool:
+    return bool(np.any(one != other)) if isinstance(one, np.ndarray) else one != other
 
 
 def _present(gradient: float, rate: float, memory: tuple[float, ...]) -> list[tuple[int, float]]:

@@ -38,6 +38,7 @@ from .solution import Solution
 from .sources import FitSource
 from .start import ConstantCalibration, constant_calibration, position_means
 from .table import WindowTable, window_table
+from .two_sets import even_handed
 from .verdict import (
     POSITIONS_FOR_MISALIGNMENT,
     POSITIONS_NEEDED,
@@ -408,7 +409,7 @@ def _refined(table: WindowTable, selector: Selector, name: str, freedom: Freedom
 
     """
     trial = selector.try_model(model_spec(name, table))
-    return regress(table, trial.outcome.solution, freedom)
+    return even_handed(table, regress(table, trial.outcome.solution, freedom), freedom)
 
 
 def board_lag(table: WindowTable) -> float:

@@ -27,6 +27,8 @@ def golovach_spec() -> ModelSpec:
     """
     Give the paper's scheme: static linear, dynamic quadratic, told apart by the flag alone.
 
+    Where the soaks show a bend, the selection gives the static set one, too.
+
     """
     return ModelSpec('golovach', polynomial(1), polynomial(2))
 

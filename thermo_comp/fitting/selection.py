@@ -26,6 +26,7 @@ from .regression import Freedom, Outcome, regress
 from .solution import Solution, predict, regressors
 from .start import ConstantCalibration, starting_solution
 from .table import WindowTable
+from .two_sets import is_worth_a_bend, may_bend
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -235,6 +236,10 @@ class Selector:
         if isinstance(spec.static, Exponential):
             spec = self._best_e_fold(spec, like)
         outcome = self._fit(spec, like)
+        if spec.dynamic is not None and may_bend(self._table):
+            bent = self._fit(replace(spec, static=spec.dynamic), outcome.solution)
+            outcome = bent if is_worth_a_bend(outcome, bent) else outcome
+            spec = outcome.solution.spec
         scale = np.abs(outcome.solution.scale[:, 0])
         fitted = float(np.sqrt(np.mean((outcome.residual / scale) ** 2)))
         squares, counts = np.zeros(N_FOLDS), np.zeros(N_FOLDS)
