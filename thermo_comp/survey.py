@@ -214,7 +214,9 @@ def survey_recording(
     if stamps.n > 1:
         reduced = cells.finish()
         still = still_intervals(reduced, _MIN_STILL_S)
+        # whole cells: the first and the last may reach beyond the samples
         still_s = sum((upper - lower) * reduced.cell_s for lower, upper in still)
+        still_s = min(still_s, stamps.duration_s)
     return Survey(
         info=info,
         n=stamps.n,

@@ -57,9 +57,10 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
         [(name, kind, count) for name, (kind, count) in sorted(found.topics.items())],
     )
     if survey.n:
+        intervals = 'interval' if survey.n_still == 1 else 'intervals'
         out.line(
             f'{survey.n} samples of {found.input}, {survey.rate_hz:.4g} Hz, '
-            f'{survey.duration_s:.1f} s; {survey.n_still} still intervals, {survey.still_s:.1f} s'
+            f'{survey.duration_s:.1f} s; {survey.n_still} still {intervals}, {survey.still_s:.1f} s'
         )
     rows: list[tuple[Cell, ...]] = [
         (
