@@ -60,7 +60,8 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
         intervals = 'interval' if survey.n_still == 1 else 'intervals'
         out.line(
             f'{survey.n} samples of {found.input}, {survey.rate_hz:.4g} Hz, '
-            f'{survey.duration_s:.1f} s; {survey.n_still} still {intervals}, {survey.still_s:.1f} s'
+            f'{survey.duration_s:.1f} s; '
+            f'{survey.n_still} still {intervals}, {survey.still_s:.1f} s'
         )
     rows: list[tuple[Cell, ...]] = [
         (
