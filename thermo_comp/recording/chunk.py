@@ -12,7 +12,7 @@ its end opens the next one.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,16 @@ from . import mcap_records as mcap
 from .mcap_records import ChunkSpan, DamagedError
 from .random_access import RandomAccess
 from .unpack import Region, Stream, open_stream, unpack
-from .walk import ENDS_EARLY, OTHER_RECORD, ZERO_OPCODE, Messages, OnRecord, locate, walk
+from .walk import (
+    ENDS_EARLY,
+    OTHER_RECORD,
+    ZERO_OPCODE,
+    Messages,
+    OnRecord,
+    locate,
+    locate_run,
+    walk,
+)
 from .wire import Bytes
 
 #: Chunks up to this size are taken as a whole, larger ones as a stream.
@@ -90,17 +99,84 @@ def load_chunk(
     """
     record = handle.read_at(span.position, span.length + span.index_length)
     try:
-        if len(record) != span.length + span.index_length:
-            raise DamagedError('the file ends inside it')
-        found, data_at, checksum = mcap.parse_chunk_head(record[:HEAD_BYTES], span.position)
-        if found.length != span.length or found.size != span.size:
-            raise DamagedError('its size is not what the index of the file says')
-        packed = np.frombuffer(record, np.uint8, span.length - data_at, data_at)
-        data = unpack(found.compression, packed, span.size, checksum)
-        index = memoryview(record)[span.length :]
-        return data, locate(data, index, on_record)
+        chunk = _open(record, 0, span)
+        return chunk.data, locate(chunk.data, chunk.index, on_record)
     except DamagedError as error:
         raise DamagedError(f'chunk at byte {span.position}: {error}') from error
+
+
+def load_run(
+    handle: RandomAccess, spans: Sequence[ChunkSpan], on_record: OnRecord
+) -> tuple[Bytes, Messages] | None:
+    """
+    Read whole chunks that stand behind each other in the file as if they were one.
+
+    Parameters
+    ----------
+    handle : RandomAccess
+        The open file.
+    spans : sequence of ChunkSpan
+        Where they stand.
+    on_record : callable of (int, bytes)
+        Is given opcode and content of every record that is no message.
+
+    Returns
+    -------
+    (ndarray of uint8, Messages) or None
+        As for `load_chunk`; None where they have to be loaded one by one: because of a gap
+        between them, of anything unusual, or of damage, which is then found again and said.
+
+    """
+    positions = [span.position - spans[0].position for span in spans]
+    ends = [at + s.length + s.index_length for at, s in zip(positions, spans, strict=True)]
+    if ends[:-1] != positions[1:]:
+        return None
+    record = handle.read_at(spans[0].position, ends[-1])
+    try:
+        chunks = [_open(record, at, span) for at, span in zip(positions, spans, strict=True)]
+        if any(chunk.is_packed for chunk in chunks):
+            data = np.concatenate([chunk.data for chunk in chunks])
+            begins = np.cumsum([0, *(len(chunk.data) for chunk in chunks)]).tolist()
+        else:
+            data = np.frombuffer(record, np.uint8)
+            begins = [chunk.begin for chunk in chunks]
+        areas = [(at, at + len(c.data)) for at, c in zip(begins, chunks, strict=False)]
+        found = locate_run(data, areas, [chunk.index for chunk in chunks], on_record)
+    except DamagedError:
+        return None
+    if found is None:
+        return None
+    messages, first = found
+    is_early = np.minimum.reduceat(messages.log_ns, first) < [span.start_ns for span in spans]
+    is_late = np.maximum.reduceat(messages.log_ns, first) > [span.end_ns for span in spans]
+    return None if is_early.any() or is_late.any() else (data, messages)
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    data: Bytes
+    index: memoryview
+    is_packed: bool
+    #: Where `data` stands among the bytes read, if it is not packed.
+    begin: int
+
+
+def _open(record: bytes, at: int, span: ChunkSpan) -> _Chunk:
+    """
+    Decompress the chunk whose record begins at this place of the bytes read.
+
+    """
+    end = at + span.length + span.index_length
+    if end > len(record):
+        raise DamagedError('the file ends inside it')
+    found, data_at, checksum = mcap.parse_chunk_head(record[at : at + HEAD_BYTES], span.position)
+    if found.length != span.length or found.size != span.size:
+        raise DamagedError('its size is not what the index of the file says')
+    begin = at + data_at
+    packed = np.frombuffer(record, np.uint8, span.length - data_at, begin)
+    data = unpack(found.compression, packed, span.size, checksum)
+    index = memoryview(record)[at + span.length : end]
+    return _Chunk(data, index, found.compression != '', begin)
 
 
 class Windows:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
+from functools import cache
 
 MAGIC = b'\x89MCAP0\r\n'
 #: Opcode and length in front of each record.
@@ -109,6 +110,11 @@ class Statistics:
     counts: dict[int, int] = field(default_factory=dict)
 
 
+@cache
+def _little_endian(layout: str) -> struct.Struct:
+    return struct.Struct('<' + layout)
+
+
 class Cursor:
     """
     Reads values one after the other out of bytes.
@@ -148,8 +154,12 @@ class Cursor:
         Take little-endian integers, described as for `struct`.
 
         """
-        layout = '<' + layout
-        return struct.unpack(layout, self.take(struct.calcsize(layout)))
+        packed = _little_endian(layout)
+        at = self.at
+        self.at = end = at + packed.size
+        if end > len(self.data):
+            raise DamagedError('a record is shorter than its content')
+        return packed.unpack_from(self.data, at)
 
     def text(self) -> str:
         """

@@ -24,7 +24,7 @@ import numpy as np
 
 from ..errors import RecordingError
 from .assemble import Part
-from .chunk import Windows, load_chunk
+from .chunk import Windows, load_chunk, load_run
 from .columns import Role
 from .decode import Decoder, Feed
 from .mcap_records import ChunkSpan, DamagedError
@@ -285,6 +285,9 @@ def _load(handle: RandomAccess, spans: list[ChunkSpan]) -> tuple[Bytes, Messages
     Read chunks that follow each other in log time as if they were one.
 
     """
+    joined = load_run(handle, spans, _ignore) if len(spans) > 1 else None
+    if joined is not None:
+        return joined
     pieces: list[tuple[Bytes, Messages]] = []
     for span in spans:
         data, messages = load_chunk(handle, span, _ignore)

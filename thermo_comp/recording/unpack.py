@@ -11,6 +11,7 @@ what the reader is willing to hold, and output beyond the claim is damage.
 from __future__ import annotations
 
 import zlib
+from contextlib import suppress
 from typing import IO, Protocol, cast
 
 import lz4.frame
@@ -66,6 +67,13 @@ def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
 
 
 def _unpack_zstd(packed: Bytes, size: int) -> Bytes:
+    with suppress(zstandard.ZstdError):
+        # One frame that says how long it is, as all usual writers make it, is taken in one go.
+        if zstandard.frame_content_size(packed.data) == size:
+            whole = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).decompress(
+                packed.data, allow_extra_data=False
+            )
+            return np.frombuffer(whole, np.uint8)
     data = np.empty(size, np.uint8)
     view = data.data
     try:

@@ -24,7 +24,8 @@ from .wire import Bytes, field, gather
 
 #: Bytes of a message record before its serialized message.
 MESSAGE_HEAD_BYTES = 31
-_INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
+#: Log time and offset of one message, 8 bytes each.
+_INDEX_ROW_BYTES = 16
 _PREFIX = struct.Struct('<BQ')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _NOWHERE = np.empty(0, np.int64)
@@ -91,7 +92,7 @@ def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
     """
     hinted = _indexed(index, len(data))
     if hinted is not None:
-        messages = _checked(data, hinted, on_record)
+        messages = _checked(data, hinted, on_record, [(0, len(data))], [0])
         if messages is not None:
             return messages
     messages, end, reason = walk(data, on_record)
@@ -100,9 +101,71 @@ def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
     return messages
 
 
+def locate_run(
+    data: Bytes,
+    areas: list[tuple[int, int]],
+    indexes: list[memoryview],
+    on_record: OnRecord,
+) -> tuple[Messages, Ints] | None:
+    """
+    Find all messages of several whole chunks at once.
+
+    Parameters
+    ----------
+    data : ndarray of uint8
+        The decompressed chunks, in this order, perhaps with other bytes between them.
+    areas : list of (int, int)
+        Where each chunk begins and ends in `data`.
+    indexes : list of memoryview
+        The message index records behind each.
+    on_record : callable of (int, bytes)
+        Is given opcode and content of every record that is no message.
+
+    Returns
+    -------
+    messages : Messages
+        In the order of their places.
+    first : ndarray of int64, shape (len(areas),)
+        The first message of each chunk.
+    None
+        Where the chunks have to be taken one by one: any doubt about one of them.
+
+    """
+    columns: list[Ints] = []
+    for (begin, _), index in zip(areas, indexes, strict=True):
+        found = _index_columns(index)
+        if not found:
+            return None
+        columns += [column + begin for column in found]
+    offsets = np.sort(np.concatenate(columns), kind='stable')
+    begins, ends = np.array(areas, np.int64).T
+    first = np.searchsorted(offsets, begins)
+    after = np.searchsorted(offsets, ends)
+    if (first == after).any() or first[0] or (after[:-1] != first[1:]).any():
+        return None
+    if int(after[-1]) != len(offsets) or int(offsets[-1]) > len(data) - MESSAGE_HEAD_BYTES:
+        return None
+    messages = _checked(data, offsets, on_record, areas, first.tolist())
+    return None if messages is None else (messages, first)
+
+
 def _indexed(index: memoryview, size: int) -> Ints | None:
     """
     Offsets of all messages by the index records; None where these are not usable.
+
+    """
+    columns = _index_columns(index)
+    if not columns:
+        return None
+    offsets = np.sort(np.concatenate(columns), kind='stable')
+    if not len(offsets) or offsets[0] < 0 or offsets[-1] > size - MESSAGE_HEAD_BYTES:
+        return None
+    return offsets
+
+
+def _index_columns(index: memoryview) -> list[Ints] | None:
+    """
+    Offsets of the messages by each index record; None where these are not usable.
 
     """
     columns: list[Ints] = []
@@ -112,25 +175,29 @@ def _indexed(index: memoryview, size: int) -> Ints | None:
         at += _INDEX_HEAD.size
         if opcode != MESSAGE_INDEX:
             raise DamagedError('what follows it is not its message index')
-        if content != length + 6 or length % _INDEX_ROW.itemsize:
+        if content != length + 6 or length % _INDEX_ROW_BYTES:
             return None
         if at + length > len(index):
             return None
-        n_rows = length // _INDEX_ROW.itemsize
-        rows = np.frombuffer(index, _INDEX_ROW, n_rows, at)
-        columns.append(rows['offset'].astype(np.int64))
+        if length:
+            # An offset that no chunk can have comes out negative.
+            rows = (length // _INDEX_ROW_BYTES,)
+            columns.append(np.ndarray(rows, '<i8', index, at + 8, (_INDEX_ROW_BYTES,)))
         at += length
-    if not columns or at != len(index):
-        return None
-    offsets = np.sort(np.concatenate(columns), kind='stable')
-    if not len(offsets) or offsets[0] < 0 or offsets[-1] > size - MESSAGE_HEAD_BYTES:
-        return None
-    return offsets
+    return columns if at == len(index) else None
 
 
-def _checked(data: Bytes, at: Ints, on_record: OnRecord) -> Messages | None:
+def _checked(
+    data: Bytes,
+    at: Ints,
+    on_record: OnRecord,
+    areas: list[tuple[int, int]],
+    first: list[int],
+) -> Messages | None:
     """
-    Read the messages at these places if they tile the data with what is between them.
+    Read the messages at these places if they tile each area with what is between them.
+
+    Each area has messages; those of the area k begin with `first[k]`.
 
     """
     head = gather(data, at, MESSAGE_HEAD_BYTES)
@@ -142,11 +209,19 @@ def _checked(data: Bytes, at: Ints, on_record: OnRecord) -> Messages | None:
     ends = at + size
     ends += MESSAGE_HEAD_BYTES
     between = at[1:] - ends[:-1]
-    breaks = np.flatnonzero(between)
-    if int(ends[-1]) > len(data) or (between[breaks] < 0).any():
+    if (between < 0).any():
         return None
-    gaps = [(0, int(at[0])), (int(ends[-1]), len(data))]
-    gaps[1:1] = zip(ends[breaks].tolist(), at[breaks + 1].tolist(), strict=True)
+    heads = np.array(first[1:], np.int64)
+    between[heads - 1] = 0
+    breaks = np.flatnonzero(between)
+    gaps = list(zip(ends[breaks].tolist(), at[breaks + 1].tolist(), strict=True))
+    last = [*first[1:], len(at)]
+    for (begin, end), low, high in zip(areas, first, last, strict=True):
+        stop = int(ends[high - 1])
+        if stop > end:
+            return None
+        gaps += [(begin, int(at[low])), (stop, end)]
+    gaps.sort()
     found: list[tuple[int, bytes]] = []
     for begin, end in gaps:
         if begin == end:
