@@ -283,3 +283,24 @@ class TestEvaluations:
             writer.write_temperature(TOPICS.board, stamps[::10], np.full(5, 20.0))
             writer.write_counts(TOPICS.counts, stamps, 1000.0 * rng.standard_normal((50, 3)))
         refused(cli, 1, r'no window of 10 s at rest', 'evaluate', tmp_path / 'bag', '-c', unit)
+
+
+def test_a_torn_bag_is_worked_through_and_the_exit_code_tells(
+    cli: Cli, unit: Path, tmp_path: Path
+) -> None:
+    whole = bag(tmp_path / 'whole.mcap').read_bytes()
+    torn = tmp_path / 'torn.mcap'
+    torn.write_bytes(whole[:-100])
+    output = tmp_path / 'out.mcap'
+    for arguments in (
+        ('info', torn),
+        ('replay', torn, '-c', unit, '-o', output),
+        ('evaluate', torn, '-c', unit),
+        ('report', torn, '-c', unit, '-o', tmp_path / 'page.html'),
+    ):
+        finished = cli(*arguments, code=1)
+        said = finished.stdout + finished.stderr
+        assert 'the file is cut off at byte ' in said, said
+        assert 'error' not in finished.stderr
+    assert output.is_file()
+    assert (tmp_path / 'page.html').is_file()

@@ -11,9 +11,12 @@ PROMISE: whatever is published is within five of the standard deviations it was 
 
 from __future__ import annotations
 
+import fault_page
 import numpy as np
 import pytest
 from fault_rig import CONFIG, Inject, bag, chain, force_at, frozen, seconds_of, stop, unit, value
+from fault_rows import ROWS
+from fault_told import TOLD
 
 from thermo_comp.compensator import Compensator
 
@@ -51,3 +54,21 @@ def test_nothing_wrong_is_published(inject: Inject) -> None:
     assert np.array(seconds)[off > SIGMAS].tolist() == []
     # Not by a covariance that covers anything: before the fault it is noise and residual.
     assert sd[450:540].max() < 3e-4
+
+
+def test_the_page_says_what_the_rows_hold() -> None:
+    # python test/fault_page.py
+    assert fault_page.PAGE.read_text(encoding='utf-8') == fault_page.page()
+
+
+def test_every_transient_fault_is_over_within_the_detector_s_settling_time() -> None:
+    back = {row.fault: fault_page.back_s(row) for row in ROWS}
+    late = {fault: s for fault, s in back.items() if s is not None and s > fault_page.settling_s()}
+    assert late == {}
+
+
+def test_the_tests_that_the_page_names_are_there() -> None:
+    folder = fault_page.PAGE.parent.parent / 'test'
+    for told in TOLD:
+        file, _, name = told.test.partition('::')
+        assert f'def {name}(' in (folder / file).read_text(encoding='utf-8'), told.test

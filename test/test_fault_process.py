@@ -182,21 +182,23 @@ def test_a_thousand_reloads_at_1_khz(tmp_path: Path) -> None:
         answers: list[bool] = []
         node.take()
 
-        future = node.ask(calibration_file=str(path))
+        asked = [node.ask(calibration_file=str(path)) for _ in range(20)]
         begin, n, n_samples = time.monotonic(), 0, 0
         while len(answers) < n_reloads and n < len(events):
             # In real time, as a driver does.
             while n < len(events) and seconds_of(events[n][1]) < time.monotonic() - begin:
                 n_samples += node.send([events[n]])
                 n += 1
-            if future.done():
-                answers.append(future.result().results[0].successful)
-                future = node.ask(calibration_file=str(path))
+            answered = [future for future in asked if future.done()]
+            answers += [future.result().results[0].successful for future in answered]
+            asked = [future for future in asked if future not in answered]
+            asked += [node.ask(calibration_file=str(path)) for _ in answered]
             time.sleep(0.0005)
         node.settle()
         heard = node.take()
         assert int(heard.values['sample rate [Hz]'].split('.')[0]) > 0
-    assert (len(answers), all(answers)) == (n_reloads, True)
+    assert len(answers) >= n_reloads
+    assert all(answers)
     assert len(heard.force) == n_samples
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))

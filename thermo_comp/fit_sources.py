@@ -66,6 +66,7 @@ def fit_sources(
                 blocks=_Blocks(path, topics, input),
                 sha256=digest(path),
                 serial=info.metadata.get('serial'),
+                truncated=info.truncated,
             )
         )
     if len(kinds) > 1:

@@ -110,9 +110,11 @@ def evaluate(
         except FitError as why:
             verdict = f'no verdict: {why}'
     result = joined(parts, judged)
+    is_torn = out.torn(part.info for part in parts)
     say(out, result, verdict, bags)
     if result.findings or not (isinstance(verdict, str) or verdict.is_valid):
         raise typer.Exit(1)
+    out.end(is_torn=is_torn)
 
 
 def _part_of(
@@ -137,8 +139,6 @@ def say(out: Output, result: Evaluation, verdict: Assessment | str, bags: Sequen
         The recordings.
 
     """
-    if result.info.truncated:
-        out.note(f'{result.info.path}: {result.info.truncated}')
     rows: list[tuple[Cell, ...]] = []
     for section in ('static', 'dynamic', 'all'):
         for name, statistics in result.statistics.items():

@@ -83,6 +83,9 @@ def fit(
             options.refuse_existing(path, force)
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
     sources, kind = fit_sources(bags, topics, input_.value, serial)
+    torn = [source for source in sources if source.truncated]
+    for source in torn:
+        out.note(f'{source.name}: {source.truncated}')
     try:
         settings = FitOptions(
             gravity=resolve_gravity(gravity, None, None),
@@ -106,6 +109,7 @@ def fit(
     _say(out, result, output, verbose)
     if report is not None:
         out.line(f'{report}: certificate')
+    out.end(is_torn=bool(torn))
 
 
 def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:

@@ -102,6 +102,7 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
             'findings': survey.findings,
         }
     )
+    out.end(is_torn=bool(found.truncated))
 
 
 def _calibration(out: Output, path: Path) -> None:

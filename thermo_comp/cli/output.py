@@ -15,10 +15,15 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from ..recording import RecordingInfo
 
 Cell = str | int | float | None
 
@@ -55,6 +60,25 @@ class Output:
         """
         if not self.quiet:
             print(f'thermo_comp: {text}', file=sys.stderr)
+
+    def torn(self, infos: Iterable[RecordingInfo]) -> bool:
+        """
+        Say of each bag that was cut off where it was; tell whether there is one.
+
+        """
+        found = [info for info in infos if info.truncated]
+        for info in found:
+            self.note(f'{info.path}: {info.truncated}')
+        return bool(found)
+
+    @staticmethod
+    def end(*, is_torn: bool) -> None:
+        """
+        End a command that has done its work; what it read was not whole, if a bag was torn.
+
+        """
+        if is_torn:
+            raise typer.Exit(1)
 
     def json(self, data: Mapping[str, Any]) -> None:
         """

@@ -97,8 +97,7 @@ def _say(out: Output, result: ReplayResult) -> None:
     from ..status import DROPPED
 
     counters = result.counters
-    if result.info.truncated:
-        out.note(f'{result.info.path}: {result.info.truncated}')
+    is_torn = out.torn([result.info])
     dropped = {
         name.removeprefix('n_').replace('_', ' '): n
         for name, n in asdict(counters).items()
@@ -126,3 +125,4 @@ def _say(out: Output, result: ReplayResult) -> None:
             'truncated': result.info.truncated,
         }
     )
+    out.end(is_torn=is_torn)

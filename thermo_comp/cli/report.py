@@ -83,6 +83,7 @@ def report(
         )
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
+    is_torn = out.torn(bag.info for bag in opened)
     verdict = write_report(evidence, output, figures=figures)
     out.line(f'{output}: {verdict.headline}')
     for reservation in verdict.reservations:
@@ -90,6 +91,7 @@ def report(
     out.json({'output': output, 'verdict': verdict})
     if verdict.level == 'poor':
         raise typer.Exit(1)
+    out.end(is_torn=is_torn)
 
 
 def _tell(done: Callable[[float], None], before: int, part: float) -> None:

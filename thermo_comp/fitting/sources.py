@@ -111,6 +111,8 @@ class FitSource:
         Hash of the content, for the provenance.
     serial : str or None, optional
         Unit serial found in the source's metadata.
+    truncated : str or None, optional
+        Where the bag was cut off, if it was.
 
     """
 
@@ -118,3 +120,4 @@ class FitSource:
     blocks: Callable[[], Iterable[SourceBlock]]
     sha256: str | None = None
     serial: str | None = None
+    truncated: str | None = None

@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Outputs that cannot be written, and writers that are killed: the old file or the new one, never
+half; one clear line; what a killed writer left can be read.
+
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from builders import rich_calibration
+from conftest import ROOT, Cli
+
+from thermo_comp.calibration_file import load_calibration, save_calibration
+from thermo_comp.recording import read_recording
+
+FIT = [*sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))]
+HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
+GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
+#: Arguments before and behind the output; the calibration is `unit.yaml` in the working folder.
+COMMANDS = {
+    'unit.yaml': (('fit', *FIT, *GRAVITY, '-f', '-o'), ()),
+    'page.html': (('report', '-c', 'unit.yaml', '-f', '-o'), ()),
+    'bag.mcap': (('replay', HELD_OUT, '-c', 'unit.yaml', '--serial', 'T-1', '-f', '-o'), ()),
+    'bag': (('replay', HELD_OUT, '-c', 'unit.yaml', '--serial', 'T-1', '-f', '-o'), ()),
+}
+CHEAP = ('page.html', 'bag.mcap', 'bag')
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """
+    Return a file system of 4 KiB.
+
+    """
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    command = ['mount', '-t', 'tmpfs', '-o', 'size=4k', 'none', str(disk)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        mounted = False
+    if not mounted:
+        pytest.skip('a small file system can only be mounted by root')
+    yield disk
+    subprocess.run(['umount', str(disk)], check=True)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
+    return tmp_path
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+def test_a_full_disk(small_disk: Path, folder: Path, cli: Cli, name: str) -> None:
+    before, _ = COMMANDS[name]
+    output = small_disk / name
+    finished = cli(*before, output, code=1, cwd=folder)
+    (line,) = finished.stderr.strip().splitlines()[-1:]
+    assert line.startswith('thermo_comp: error: ')
+    assert str(output) in line
+    assert line.endswith('No space left on device')
+    assert list(small_disk.iterdir()) == []
+
+
+@pytest.mark.parametrize('name', CHEAP)
+def test_a_folder_that_is_read_only(folder: Path, cli: Cli, name: str) -> None:
+    if os.geteuid():
+        locked = folder / 'locked'
+        locked.mkdir(mode=0o500)
+    else:
+        locked = Path('/proc')  # closed to root, too
+    before, _ = COMMANDS[name]
+    finished = cli(*before, locked / name, code=1, cwd=folder)
+    (line,) = finished.stderr.strip().splitlines()[-1:]
+    assert line.startswith(f'thermo_comp: error: {locked / name}: ')
+
+
+#: Runs the command and kills itself: when the temporary file has been opened, or right before it
+#: takes the name.
+KILLED = """
+import os, signal, sys
+point, target = sys.argv[1:3]
+seen = []
+def hook(event, arguments):
+    if event == 'os.rename' and str(arguments[1]).endswith(target) and point == 'before':
+        os.kill(os.getpid(), signal.SIGKILL)
+    if seen and point == 'writing' and event != 'os.kill':
+        os.kill(os.getpid(), signal.SIGKILL)
+    if event == 'open' and isinstance(arguments[0], str):
+        name = os.path.basename(arguments[0])
+        is_written = arguments[2] & (os.O_WRONLY | os.O_RDWR)
+        if is_written and name.startswith('.' + target.split('.')[0]):
+            seen.append(name)
+from thermo_comp.cli.app import main
+sys.addaudithook(hook)
+sys.argv[:] = ['thermo_comp', *sys.argv[3:]]
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(
+    ('name', 'point'),
+    [
+        ('unit.yaml', 'before'),
+        ('page.html', 'before'),
+        ('bag.mcap', 'writing'),
+        ('bag.mcap', 'before'),
+    ],
+)
+def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: str) -> None:
+    output = folder / name
+    if not output.exists():
+        output.write_bytes(b'old')
+    old = output.read_bytes()
+    listed = set(folder.iterdir())
+    arguments = [str(word) for word in COMMANDS[name][0]]
+    killed = subprocess.run(
+        [sys.executable, '-c', KILLED, point, name, *arguments, name],
+        cwd=folder,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        check=False,
+    )
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert output.read_bytes() == old
+    (rest,) = set(folder.iterdir()) - listed
+    # What it left bears another name, which no tool takes for the output.
+    assert rest.name.startswith('.')
+    if point == 'before':
+        # It was whole already.
+        if name == 'unit.yaml':
+            assert load_calibration(rest).unit.serial
+        elif name == 'bag.mcap':
+            assert len(read_recording(rest, require=()).columns) == 0
+            assert read_recording(rest, require=()).info.truncated is None
+        else:
+            assert rest.read_bytes().rstrip().endswith(b'</html>')
