@@ -113,9 +113,9 @@ def _refused(rows: Sequence[Row], summary: Summary) -> str:
     if len(summary.problems) < len(without):
         reasons = table(('reason', 'tests'), [(reason, str(n)) for reason, n in summary.problems])
     listed = table(
-        ('test', 'serial', 'verdict', 'reason'),
+        ('reason', 'test', 'serial', 'verdict'),
         [
-            tuple(str(row[name]) for name in ('name', 'serial', 'verdict', 'problem'))
+            tuple(str(row[name]) for name in ('problem', 'name', 'serial', 'verdict'))
             for row in without[:_MOST_ROWS]
         ],
         texts=4,

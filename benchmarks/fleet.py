@@ -1,0 +1,368 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the cost of a fleet: scaling, what the scheduler adds, what crosses the network, what is lost.
+
+Units are simulated and written to bags once (``--folder`` keeps them), and really fitted. Workers
+are processes of one thread, as the command starts them.
+
+    python benchmarks/fleet.py scaling              strong and weak, 1 and 2 workers
+    python benchmarks/fleet.py overhead             500 small units: idle workers, scheduler's time
+    python benchmarks/fleet.py kill --units 200     200 x 12 bags, a worker killed twice
+    python benchmarks/fleet.py paper                100 workers, from the figures of `overhead`
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import os
+import resource
+import shutil
+import signal
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermo_comp.fitting import FitOptions
+from thermo_comp.fleet import FleetOptions, fit_fleet
+from thermo_comp.fleet.discovery import find_units
+from thermo_comp.fleet.engine import Job, connected, run
+from thermo_comp.fleet.row import Row
+from thermo_comp.fleet.storage import Storage
+from thermo_comp.recording import BagWriter
+from thermo_comp.simulation import (
+    STANDARD_GRAVITY,
+    parse_cyclogram,
+    positions,
+    simulate,
+    unit_preset,
+)
+
+#: An hour over 35 K at a sample per second, so that hundreds of units are simulated in minutes.
+PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
+#: The smallest thermal test that fits: what a scheduler has the least time for.
+SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
+N_LOTS = 4
+
+
+def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
+    """
+    Simulate units, one bag per position; those that are there already are kept.
+
+    """
+    chamber = parse_cyclogram(program)
+    for seed in range(1, n_units + 1):
+        unit = unit_preset('mems', seed)
+        done = folder / f'lot-{1 + seed % N_LOTS}' / unit.serial
+        if done.is_dir():
+            continue
+        made = folder / f'.{unit.serial}'
+        shutil.rmtree(made, ignore_errors=True)
+        made.mkdir(parents=True)
+        for number, up in enumerate(positions(n_bags, 1)):
+            run = simulate(
+                unit,
+                chamber,
+                up,
+                rate_hz=RATE_HZ,
+                temperature_rate_hz=TEMPERATURE_HZ,
+                seed=1000 * seed + number,
+            )
+            with BagWriter(
+                made / f'{number + 1:02d}.mcap', metadata={'serial': unit.serial}
+            ) as bag:
+                bag.write_temperature('temperature/board', run.board_stamp_ns, run.board)
+                bag.write_temperature('temperature/case', run.case_stamp_ns, run.case)
+                counts = run.counts.astype(np.float64)
+                bag.write_counts('accel/counts', run.accel_stamp_ns, counts, 'imu_link')
+        done.parent.mkdir(parents=True, exist_ok=True)
+        made.rename(done)
+    return folder
+
+
+def jobs_of(folder: Path, n_units: int) -> list[Job]:
+    """
+    Find the units of a fleet; each comes again under another name where there are too few.
+
+    """
+    found = find_units(Storage(str(folder)))
+    return [Job(found[i % len(found)]) for i in range(n_units)]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """
+    One run.
+
+    Parameters
+    ----------
+    seconds : float
+        From the first task sent to the last result.
+    tasks : tuple of float
+        How long each task took its worker [s].
+    own_cpu_s : float
+        Processor time of this process: client and scheduler.
+    n_bytes : int
+        Written to any connection by any of the processes.
+    cpu_s : float
+        Processor time of the workers at the units.
+
+    """
+
+    seconds: float
+    tasks: tuple[float, ...]
+    own_cpu_s: float
+    n_bytes: int
+    cpu_s: float
+
+    def busy(self, n_workers: int) -> float:
+        """
+        Return the part of their time in which the workers had something to do.
+
+        """
+        return sum(self.tasks) / (n_workers * self.seconds)
+
+
+def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -> Measured:
+    """
+    Fit units on a cluster that has started and fitted before.
+
+    """
+    jobs = jobs_of(folder, n_units)
+    with connected(None, n_workers) as client:
+        count_bytes()
+        client.run(count_bytes)
+        list(run(client, str(folder), jobs[: 2 * n_workers], options))
+        client.get_task_stream()
+        before = bytes_written() + sum(client.run(bytes_written).values())
+        cpu, began, started = process_cpu(), time.perf_counter(), time.time()
+        outcomes = list(run(client, str(folder), jobs, options))
+        seconds, own = time.perf_counter() - began, process_cpu() - cpu
+        n_bytes = bytes_written() + sum(client.run(bytes_written).values()) - before
+        tasks = tuple(
+            part['stop'] - part['start']
+            for task in client.get_task_stream(start=started)
+            for part in task['startstops']
+            if part['action'] == 'compute'
+        )
+    assert len(outcomes) == n_units
+    assert len(tasks) == n_units
+    assert all(one is not None and one.calibration for _, one in outcomes)
+    cpu_s = sum(float(one.row['cpu_s'] or 0.0) for _, one in outcomes if one is not None)
+    return Measured(seconds, tasks, own, n_bytes, cpu_s)
+
+
+def process_cpu() -> float:
+    """
+    Return this process' processor time, with that of its threads.
+
+    """
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def count_bytes() -> None:
+    """
+    Count, from now on, what this process writes to its connections.
+
+    """
+    from distributed.comm.tcp import TCP
+
+    if hasattr(TCP, 'n_written'):
+        return
+    TCP.n_written = 0
+    plain: Callable[..., Any] = TCP.write
+
+    async def counted(self: Any, *args: Any, **keys: Any) -> Any:
+        n_bytes = await plain(self, *args, **keys)
+        TCP.n_written += n_bytes
+        return n_bytes
+
+    TCP.write = counted
+
+
+def bytes_written() -> int:
+    """
+    Return what `count_bytes` has counted.
+
+    """
+    from distributed.comm.tcp import TCP
+
+    return int(TCP.n_written)
+
+
+def scaling(folder: Path, n_units: int, repeats: int) -> None:
+    """
+    Compare one worker with two, on the same units and on twice as many.
+
+    """
+    write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
+    options = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY), certificates=False)
+    print(f'{n_units} units x 12 bags, model auto; load {loads()}')
+    print(
+        '| run | strong: 1 worker s | 2 workers s | speed-up | free cores | weak: half on 1 s | x |'
+    )
+    print('|---|---|---|---|---|---|---|')
+    found: list[tuple[float, float, float]] = []
+    for number in range(repeats):
+        one, two, half = (
+            measure(folder / 'fleet', units, workers, options)
+            for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
+        )
+        # What other programs take of the processors slows two workers more than one. Two workers
+        # with a processor each lose only what they wait, and what their fits cost more side by
+        # side (caches, memory); neither depends on who else runs.
+        free = 2.0 * two.busy(2) / one.busy(1) * one.cpu_s / two.cpu_s
+        found.append((one.seconds / two.seconds, free, 2.0 * half.seconds / two.seconds))
+        print(
+            f'| {number + 1} | {one.seconds:.1f} | {two.seconds:.1f} | {found[-1][0]:.2f} '
+            f'| {free:.2f} | {half.seconds:.1f} | {found[-1][2]:.2f} |',
+            flush=True,
+        )
+    strong, free, weak = (statistics.median(column) for column in zip(*found, strict=True))
+    print(
+        f'median: strong {strong:.2f} x, with a free core each {free:.2f} x; weak {weak:.2f} x '
+        f'the throughput; load {loads()}'
+    )
+
+
+def overhead(folder: Path, n_units: int) -> Measured:
+    """
+    Measure what is lost between the tasks of many small units.
+
+    """
+    write_fleet(folder / 'small', 20, SMALL_BAGS, SMALL_PROGRAM)
+    fit = FitOptions(gravity=STANDARD_GRAVITY, model='quadratic')
+    found = measure(folder / 'small', n_units, 2, FleetOptions(fit, certificates=False))
+    busy = sum(found.tasks)
+    print(f'{n_units} units x {SMALL_BAGS} bags, model quadratic, 2 workers; load {loads()}')
+    print(f'elapsed {found.seconds:.1f} s, tasks {busy:.1f} s on both workers')
+    print(f'idle workers: {100.0 * (1.0 - busy / (2.0 * found.seconds)):.2f} % of their time')
+    print(
+        f'scheduler and client: {1e3 * found.own_cpu_s / n_units:.2f} ms of processor time per '
+        f'unit, {100.0 * found.own_cpu_s / busy:.2f} % of the tasks'
+    )
+    print(f'network: {found.n_bytes / n_units / 1e3:.1f} kB per unit, all connections together')
+    return found
+
+
+def kill(folder: Path, n_units: int) -> int:
+    """
+    Kill a worker twice in a run, each time in the middle of a unit; count the rows.
+
+    """
+    write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
+    fleet = Path(tempfile.mkdtemp(prefix='fleet-', dir=folder))
+    for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:
+        (fleet / unit.name).parent.mkdir(exist_ok=True)
+        (fleet / unit.name).symlink_to(folder / 'fleet' / unit.name)
+    options = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY), certificates=False)
+    killed: list[int] = []
+    print(f'load {loads()}', flush=True)
+    try:
+        with connected(None, 2) as client:
+
+            def tell(n: int, total: int, _row: Row) -> None:
+                if n in (total // 4, total // 2):
+                    killed.append(max(client.run(os.getpid).values()))
+                    os.kill(killed[-1], signal.SIGKILL)
+
+            began = time.perf_counter()
+            result = fit_fleet(str(fleet), fleet / '.out', options, client=client, tell=tell)
+            seconds = time.perf_counter() - began
+    finally:
+        shutil.rmtree(fleet)
+    n_lost = n_units - result.n_fitted
+    cpu_s = sum(float(row['cpu_s'] or 0.0) for row in result.rows)
+    print(
+        f'{n_units} units x 12 bags: {seconds:.0f} s, {len(killed)} workers killed, '
+        f'{len(result.rows)} rows, {n_lost} lost; {cpu_s:.0f} s of processor time in the fits; '
+        f'load {loads()}'
+    )
+    print(f'verdicts {result.summary.verdicts}; outliers {len(result.summary.outliers)}')
+    return n_lost + (len(result.rows) != n_units)
+
+
+def paper(folder: Path) -> None:
+    """
+    Estimate a hundred workers: tasks as measured, one scheduler that sends them one by one.
+
+    """
+    found = overhead(folder, 100)
+    per_task = found.own_cpu_s / len(found.tasks)
+    kilobytes = found.n_bytes / len(found.tasks) / 1e3
+    print('| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
+    print('|---|---|---|---|---|---|---|')
+    for stretch in (1.0, 10.0, 100.0):
+        tasks = np.array(found.tasks) * stretch
+        for n_units, n_workers in ((500, 2), (500, 100), (5000, 100), (5000, 1000)):
+            drawn = np.random.default_rng(1).choice(tasks, n_units)
+            seconds = makespan(drawn, n_workers, per_task)
+            print(
+                f'| {tasks.mean():.1f} | {n_units} | {n_workers} | {seconds:.1f} '
+                f'| {100.0 * drawn.sum() / n_workers / seconds:.0f} % '
+                f'| {100.0 * n_units * per_task / seconds:.1f} % '
+                f'| {n_units * kilobytes / 1e3 / seconds:.2f} |'
+            )
+
+
+def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: float) -> float:
+    """
+    Play a run: each worker gets the next task when it is free and the scheduler has time.
+
+    """
+    free = [0.0] * n_workers
+    scheduler = end = 0.0
+    for task in tasks:
+        scheduler = max(scheduler, heapq.heappop(free)) + per_task
+        heapq.heappush(free, scheduler + float(task))
+        end = max(end, scheduler + float(task))
+    return end
+
+
+def loads() -> str:
+    """
+    Return the machine's load averages.
+
+    """
+    return ' '.join(f'{load:.1f}' for load in os.getloadavg())
+
+
+def main() -> int:
+    """
+    Run one part.
+
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument('part', choices=['scaling', 'overhead', 'kill', 'paper'])
+    parser.add_argument('--units', type=int, help='instead of 16, 500 and 200')
+    parser.add_argument('--repeats', type=int, default=3)
+    parser.add_argument('--folder', type=Path, help='where the bags are kept')
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = (options.folder or Path(scratch)).absolute()
+        folder.mkdir(parents=True, exist_ok=True)
+        if options.part == 'scaling':
+            scaling(folder, options.units or 16, options.repeats)
+        elif options.part == 'overhead':
+            overhead(folder, options.units or 500)
+        elif options.part == 'paper':
+            paper(folder)
+        else:
+            return kill(folder, options.units or 200)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A fleet table tells what is there to tell, and nothing where there is nothing.
+
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from thermo_comp.errors import FleetError
+from thermo_comp.fleet.ledger import Ledger
+from thermo_comp.fleet.page import render_fleet
+from thermo_comp.fleet.row import COLUMNS, Row, empty_row
+from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
+from thermo_comp.fleet.table import read_parquet, to_csv, to_parquet
+
+MONDAY = datetime(2026, 1, 5)
+
+
+def fleet_of(
+    n: int,
+    rng: np.random.Generator,
+    *,
+    lots: Sequence[str] = ('',),
+    day: float = 0.0,
+    like: Sequence[Row] = (),
+) -> list[Row]:
+    """
+    Draw a fleet: every quantity normal (sizes log-normal), or around that of an earlier test.
+
+    """
+    rows = []
+    for i in range(n):
+        cells = {}
+        for quantity in QUANTITIES:
+            noise = float(rng.standard_normal())
+            if like:
+                before = float(like[i][quantity.column])
+                sd = float(like[i][quantity.sd]) if quantity.sd else 0.0
+                per_unit = abs(before) * 1e-6 if quantity.is_relative else 1.0
+                # What two tests of one unit differ by: the noise of this one, see `sds`.
+                cells[quantity.column] = before + noise * sd * per_unit
+            elif quantity.is_relative:
+                cells[quantity.column] = 300.0 * (1.0 + 1e-3 * noise)
+            elif quantity.is_size:
+                cells[quantity.column] = 4.0 * np.exp(0.1 * noise)
+            else:
+                cells[quantity.column] = 50.0 * noise
+        sds = {quantity.sd: 2.0 for quantity in QUANTITIES if quantity.sd}
+        rows.append(
+            empty_row(
+                name=f'{lots[i % len(lots)]}/u{i:03d}@{day:g}',
+                serial=f'S{i:03d}',
+                lot=lots[i % len(lots)],
+                verdict='good',
+                model='linear',
+                start=f'{MONDAY + timedelta(days=day):%Y-%m-%dT%H:%M:%SZ}',
+                raw_ug=300.0,
+                peak_ug=9.0,
+                n_bags=12,
+                n_left_out=0,
+                n_positions=12,
+                lowest_c=5.0,
+                highest_c=35.0,
+                calibration_sha256=f'{day}-{i}',
+                **sds,
+                **cells,
+            )
+        )
+    return rows
+
+
+class TestOutliers:
+    def test_one_unit_stands_out_in_one_thing(self, rng: np.random.Generator) -> None:
+        rows = fleet_of(100, rng)
+        rows[17] = {**rows[17], 'bias_y_ug': 50.0 * 12.0}
+        (found,) = summarise(rows).outliers
+        assert (found.serial, found.label, found.unit) == ('S017', 'bias y', 'µg')
+        assert found.value == 600.0
+        assert found.z == pytest.approx(12.0, rel=0.3)
+
+    def test_a_twelfth_of_bad_units_does_not_hide_them(self, rng: np.random.Generator) -> None:
+        rows = fleet_of(60, rng)
+        for i in range(5):
+            rows[i] = {**rows[i], 'dynamic_ug': 40.0}
+        assert {one.serial for one in summarise(rows).outliers} == {f'S{i:03d}' for i in range(5)}
+
+    @pytest.mark.parametrize('n', [10, 40])
+    def test_a_fleet_without_oddities_alarms_once_in_twenty(
+        self, n: int, rng: np.random.Generator
+    ) -> None:
+        n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
+        # 60 x 0.05 = 3 on average; twelve happens once in 30000.
+        assert n_alarms < 12
+
+    def test_a_small_fleet_has_no_outliers(self, rng: np.random.Generator) -> None:
+        rows = fleet_of(6, rng)
+        rows[0] = {**rows[0], 'bias_y_ug': 1e6}
+        assert summarise(rows).outliers == ()
+        assert outlier_limit(6, 20) == float('inf')
+
+    def test_alike_units_have_no_spread_to_stand_out_of(self, rng: np.random.Generator) -> None:
+        rows = [{**row, 'm_10_urad': 0.0} for row in fleet_of(20, rng)]
+        spread = next(one for one in summarise(rows).spreads if one.quantity.column == 'm_10_urad')
+        assert (spread.sd, set(spread.z.tolist())) == (0.0, {0.0})
+
+
+class TestDrift:
+    def test_what_changed_between_two_tests(self, rng: np.random.Generator) -> None:
+        first = fleet_of(10, rng)
+        second = fleet_of(10, rng, day=30.0, like=first)
+        second[3] = {**second[3], 'bias_x_ug': float(first[3]['bias_x_ug']) + 40.0}
+        drifts = {one.serial: one for one in summarise([*second, *first]).drifts}
+        assert len(drifts) == 10
+        assert [serial for serial, one in drifts.items() if one.is_significant] == ['S003']
+        found = drifts['S003']
+        assert (found.worst.label, found.worst.unit, found.days) == ('bias x', 'µg', 30.0)
+        assert found.worst.change == pytest.approx(40.0)
+        assert found.worst.sd == pytest.approx(2.0 * np.sqrt(2.0))
+        assert (found.earlier, found.later) == ('/u003@0', '/u003@30')
+
+    def test_a_scale_factor_drifts_in_ppm(self, rng: np.random.Generator) -> None:
+        first = fleet_of(2, rng)
+        second = fleet_of(2, rng, day=7.0, like=first)
+        second[0] = {**second[0], 'scale_z': float(first[0]['scale_z']) * (1.0 + 90e-6)}
+        drift = next(one for one in summarise(first + second).drifts if one.serial == 'S000')
+        assert (drift.worst.label, drift.worst.unit) == ('scale factor z', 'ppm')
+        assert drift.worst.change == pytest.approx(90.0)
+
+    def test_an_earlier_table_counts(self, rng: np.random.Generator, tmp_path: Path) -> None:
+        first = fleet_of(3, rng)
+        (tmp_path / 'fleet.parquet').write_bytes(to_parquet(first))
+        before = read_parquet(tmp_path / 'fleet.parquet')
+        assert before == first
+        later = fleet_of(3, rng, day=90.0, like=first)
+        drifts = summarise(later, before).drifts
+        assert [one.earlier for one in drifts] == [f'earlier /u00{i}@0' for i in range(3)]
+        # The same calibrations again, found a second time, are no drift.
+        assert summarise(first, before).drifts == ()
+
+
+class TestLots:
+    def test_a_lot_of_other_parts(self, rng: np.random.Generator) -> None:
+        rows = [
+            {**row, 'bias_slope_z_ug_k': float(row['bias_slope_z_ug_k']) + 120.0}
+            if row['lot'] == 'C'
+            else row
+            for row in fleet_of(60, rng, lots='ABC')
+        ]
+        summary = summarise(rows)
+        assert summary.lots == {'A': 20, 'B': 20, 'C': 20}
+        (effect,) = summary.lot_effects
+        assert effect.label == 'slope of bias z'
+        assert effect.probability < 1e-4
+        assert effect.medians['C'] - effect.medians['A'] == pytest.approx(120.0, abs=60.0)
+
+    def test_lots_that_are_alike(self, rng: np.random.Generator) -> None:
+        n_alarms = sum(
+            bool(summarise(fleet_of(30, rng, lots='AB')).lot_effects) for _ in range(40)
+        )
+        # 40 x 0.05 = 2 on average; nine happens once in 7000.
+        assert n_alarms < 9
+
+
+def hostile(rng: np.random.Generator) -> list[Row]:
+    """
+    Draw a fleet whose bags were written by somebody who dislikes us.
+
+    """
+    evil = '<script>alert(1)</script>"&$x_1$'
+    first = fleet_of(12, rng, lots=('A', evil))
+    rows = [*first, *fleet_of(12, rng, lots=('A', evil), day=400.0, like=first)]
+    rows = [
+        {**row, 'serial': f'{evil}{row["serial"]}', 'name': f'{evil}{row["name"]}'} for row in rows
+    ]
+    rows[0] = {**rows[0], 'bias_x_ug': 1e5}
+    rows[1] = empty_row(name=evil, serial=evil, verdict='refused', problem=f'3.5 {evil}')
+    return rows
+
+
+class TestPage:
+    def test_nothing_of_the_bags_is_markup(self, rng: np.random.Generator) -> None:
+        rows = hostile(rng)
+        page = render_fleet(rows, summarise(rows), lambda name: f'units/{name}/certificate.html')
+        assert '<script' not in page
+        assert '&lt;script&gt;alert(1)' in page
+        for heading in ('Not calibrated', 'Units that stand out', 'Tested again', 'All tests'):
+            assert f'<h2>{heading}</h2>' in page
+        links = re.findall(r'<a href="([^"]*)"', page)
+        assert len(links) == 23
+        assert all(re.fullmatch(r"[\w./%'()~-]+", link) for link in links)
+
+    def test_it_needs_no_network(self, rng: np.random.Generator) -> None:
+        rows = fleet_of(9, rng)
+        page = render_fleet(rows, summarise(rows))
+        assert re.findall(r'\b(?:src|href)="(?!#)[^"]*"', page) == []
+        assert "default-src 'none'" in page
+        assert page.count('<figure') == 3
+
+    def test_a_fleet_without_a_calibration(self) -> None:
+        rows = [empty_row(name='u', serial='u', verdict='failed', problem='x: damaged')]
+        page = render_fleet(rows, summarise(rows))
+        assert '0 of 1 tests gave a calibration.' in page
+        assert '<figure' not in page
+
+
+class TestTable:
+    def test_a_spreadsheet_runs_nothing(self) -> None:
+        text = to_csv([empty_row(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)])
+        heading, line = text.splitlines()
+        assert heading.split(',') == [column.name for column in COLUMNS]
+        cells = dict(zip(heading.split(','), line.split(','), strict=True))
+        assert (cells['name'], cells['serial']) == ("'=cmd()", "'-1")
+        assert (cells['n_bags'], cells['raw_ug'], cells['lag_1_s']) == ('3', '-1.5', '')
+
+    def test_what_is_no_fleet_table(self, tmp_path: Path) -> None:
+        (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')
+        with pytest.raises(FleetError, match=r'x\.parquet: no fleet table'):
+            read_parquet(tmp_path / 'x.parquet')
+        pa = pytest.importorskip('pyarrow')
+        from pyarrow import parquet
+
+        parquet.write_table(pa.table({'a': [1]}), tmp_path / 'y.parquet')
+        with pytest.raises(FleetError, match='lacks the columns serial and verdict'):
+            read_parquet(tmp_path / 'y.parquet')
+
+    def test_the_page_of_the_docs_lists_every_column(self) -> None:
+        text = (ROOT / 'docs' / 'fleet.md').read_text()
+        listed = re.findall(r'^\| `(\w+)` \| (\w+) \| (.*) \|$', text, re.MULTILINE)
+        assert [(name, kind, meaning.replace('\\|', '|')) for name, kind, meaning in listed] == [
+            (column.name, column.kind, column.meaning) for column in COLUMNS
+        ]
+
+    def test_a_strange_column_is_a_mistake(self) -> None:
+        with pytest.raises(ValueError, match="no column 'colour'"):
+            empty_row(colour='red')
+
+
+@pytest.mark.parametrize(
+    'name', ['../../etc', '.', '..', 'a/../b', '/abs', 'a\0b', 'x' * 300, 'ü/ß', 'a b', '']
+)
+def test_no_name_leads_out_of_the_results(name: str, tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path / 'out')
+    folder = ledger.folder_of(name)
+    folder.mkdir(parents=True)
+    inside = (tmp_path / 'out' / 'units').resolve()
+    assert inside in folder.resolve().parents
+
+
+def test_results_need_a_folder(tmp_path: Path) -> None:
+    (tmp_path / 'file').touch()
+    with pytest.raises(FleetError, match='file: cannot be made'):
+        Ledger(tmp_path / 'file')
