@@ -208,9 +208,7 @@ def scaling(folder: Path, n_units: int, repeats: int) -> None:
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     options = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY), certificates=False)
     print(f'{n_units} units x 12 bags, model auto; load {loads()}')
-    print(
-        '| run | strong: 1 worker s | 2 workers s | speed-up | free cores | weak: half on 1 s | x |'
-    )
+    print('| run | strong: 1 worker s | 2 workers s | x | free cores x | weak, half: 1 s | x |')
     print('|---|---|---|---|---|---|---|')
     found: list[tuple[float, float, float]] = []
     for number in range(repeats):
