@@ -5,7 +5,7 @@ Owns the measurement of the offline run: reading, compensating and writing a bag
 
 Ours is the library as `thermo_comp replay` uses it. The peer is what one would write with
 rosbags: read and deserialize each message, correct it with the same compensator one by one,
-serialize and write it. All bags hold 400 Hz of counts and two temperatures at 1 Hz.
+serialize and write it; both write chunks packed with zstd. All bags hold 400 Hz of counts and two temperatures at 1 Hz.
 
     python benchmarks/replay.py --hours 24        # the day: read, compensate, linear in length
     python benchmarks/replay.py --gigabytes 10    # peak memory of a replay of a large bag
@@ -133,10 +133,10 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
     zero, unknown = vector(0.0, 0.0, 0.0), np.array([-1.0, *[0.0] * 8])
     compensator = Compensator(calibration())
     n = 0
-    with (
-        Reader(path) as reader,
-        Writer(output, version=9, storage_plugin=StoragePlugin.MCAP) as writer,
-    ):
+    target = Writer(output, version=9, storage_plugin=StoragePlugin.MCAP)
+    # Chunks compressed as ours are.
+    target.set_compression(Writer.CompressionMode.STORAGE, Writer.CompressionFormat.ZSTD)
+    with Reader(path) as reader, target as writer:
         out = writer.add_connection('/imu/data_raw', imu_type.__msgtype__, typestore=store)
         for connection, log_ns, data in reader.messages():
             message = store.deserialize_cdr(data, connection.msgtype)

@@ -128,24 +128,37 @@ class StampedRecords:
         self.channel = channel
         self.log_ns = log_ns
         self._stamp_ns = stamp_ns
-        self._frame_id = frame_id
-        self._pieces = pieces
-        self._payload = _stamped_layout(frame_id, n_numbers)
-        n_bytes = RECORD_HEAD.itemsize + self._payload.itemsize
+        payload = _stamped_layout(frame_id, n_numbers)
+        n_bytes = RECORD_HEAD.itemsize + payload.itemsize
         self.size = np.broadcast_to(np.int64(n_bytes), log_ns.shape)
         self._layout = layout(
-            n_bytes, head=(RECORD_HEAD, 0), payload=(self._payload, RECORD_HEAD.itemsize)
+            n_bytes, head=(RECORD_HEAD, 0), payload=(payload, RECORD_HEAD.itemsize)
         )
+        # What all records have in common is written once, and copied with the rest.
+        common: list[Piece] = []
+        self._varying: list[Piece] = []
+        for column, values in pieces:
+            is_common = len(values) and values.strides[0] == 0
+            (common if is_common else self._varying).append((column, values))
+        pattern: NDArray[Any] = np.zeros(1, self._layout)
+        _fill_head(pattern, channel, np.zeros(1, np.int64))
+        _fill_frame(pattern['payload'], frame_id)
+        _fill_numbers(pattern['payload'], [(column, values[:1]) for column, values in common])
+        self._pattern = pattern.view((np.void, n_bytes))[0]
 
     def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
         """
         Build the records of the chosen messages.
 
         """
-        rows: NDArray[Any] = np.zeros(len(chosen), self._layout)
-        _fill_head(rows, self.channel, self.log_ns[chosen])
-        pieces = [(column, values[chosen]) for column, values in self._pieces]
-        _fill_stamped(rows['payload'], self._stamp_ns[chosen], self._frame_id, pieces)
+        which = _run(chosen)
+        rows: NDArray[Any] = np.empty(len(chosen), self._layout)
+        rows.view((np.void, self._layout.itemsize))[:] = self._pattern
+        rows['head']['log'] = self.log_ns[which]
+        rows['head']['publish'] = self.log_ns[which]
+        payload = rows['payload']
+        _fill_stamps(payload, self._stamp_ns[which])
+        _fill_numbers(payload, [(column, values[which]) for column, values in self._varying])
         yield slice(None), _as_void(rows)
 
 
@@ -333,7 +346,9 @@ def stamped_payloads(stamp_ns: Ints, frame_id: str, numbers: Floats) -> Bytes:
     """
     payload = _stamped_layout(frame_id, numbers.shape[1])
     rows: NDArray[Any] = np.zeros(len(stamp_ns), payload)
-    _fill_stamped(rows, stamp_ns, frame_id, [(0, numbers)])
+    _fill_frame(rows, frame_id)
+    _fill_stamps(rows, stamp_ns)
+    _fill_numbers(rows, [(0, numbers)])
     return rows.view(np.uint8).reshape(len(stamp_ns), payload.itemsize)
 
 
@@ -351,18 +366,35 @@ def _stamped_layout(frame_id: str, n_numbers: int) -> np.dtype[Any]:
     )
 
 
-def _fill_stamped(
-    rows: NDArray[Any], stamp_ns: Ints, frame_id: str, pieces: Sequence[Piece]
-) -> None:
+def _fill_frame(rows: NDArray[Any], frame_id: str) -> None:
     characters = frame_id.encode() + b'\0'
     rows['order'] = 1
-    rows['sec'] = stamp_ns // _NS
-    rows['nanosec'] = stamp_ns % _NS
     rows['length'] = len(characters)
     rows['frame'] = np.void(characters)
+
+
+def _fill_stamps(rows: NDArray[Any], stamp_ns: Ints) -> None:
+    seconds = stamp_ns // _NS
+    rows['sec'] = seconds
+    rows['nanosec'] = stamp_ns - seconds * _NS
+
+
+def _fill_numbers(rows: NDArray[Any], pieces: Sequence[Piece]) -> None:
     numbers = rows['numbers']
     for column, values in pieces:
-        numbers[:, column : column + values.shape[1]] = values
+        for k, value in enumerate(values.T, column):
+            numbers[:, k] = value
+
+
+def _run(chosen: Ints) -> Ints | slice:
+    """
+    Say the same as a slice, where rising places stand one behind the other.
+
+    """
+    first, last = int(chosen[0]), int(chosen[-1])
+    if last - first + 1 != len(chosen) or (chosen[1:] < chosen[:-1]).any():
+        return chosen
+    return slice(first, last + 1)
 
 
 def _fill_head(rows: NDArray[Any], channel: int, log_ns: Ints) -> None:
