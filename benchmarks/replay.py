@@ -5,7 +5,8 @@ Owns the measurement of the offline run: reading, compensating and writing a bag
 
 Ours is the library as `thermo_comp replay` uses it. The peer is what one would write with
 rosbags: read and deserialize each message, correct it with the same compensator one by one,
-serialize and write it; both write chunks packed with zstd. All bags hold 400 Hz of counts and two temperatures at 1 Hz.
+serialize and write it. Both write chunks packed with zstd. All bags hold 400 Hz of counts and two
+temperatures at 1 Hz.
 
     python benchmarks/replay.py --hours 24        # the day: read, compensate, linear in length
     python benchmarks/replay.py --gigabytes 10    # peak memory of a replay of a large bag
@@ -123,7 +124,13 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
     Do the same message by message with rosbags.
 
     """
-    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+    from rosbags.rosbag2 import (
+        CompressionFormat,
+        CompressionMode,
+        Reader,
+        StoragePlugin,
+        Writer,
+    )
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -135,7 +142,7 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
     n = 0
     target = Writer(output, version=9, storage_plugin=StoragePlugin.MCAP)
     # Chunks compressed as ours are.
-    target.set_compression(Writer.CompressionMode.STORAGE, Writer.CompressionFormat.ZSTD)
+    target.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with Reader(path) as reader, target as writer:
         out = writer.add_connection('/imu/data_raw', imu_type.__msgtype__, typestore=store)
         for connection, log_ns, data in reader.messages():
