@@ -4,12 +4,15 @@
 # make demo   sets up .venv, plays the sample bag over DDS into the node, prints the table
 # make test   sets up .venv, runs the whole test suite
 # make lint   ruff, mypy --strict and the layering test
+# make nightly  the properties, ten thousand examples each
+# make fuzz   the fuzz targets, FUZZ_SECONDS (60) each
 # make docs   builds the documentation as a site, in site/
 # make clean  removes .venv and everything made
 
 PYTHON ?= python3
 VENV ?= .venv
 JOBS ?= 2
+FUZZ_SECONDS ?= 60
 PYTEST_ARGS ?=
 
 # The newest interpreter that the ROS wheels are published for, unless PYTHON is good enough.
@@ -23,7 +26,7 @@ unexport COLCON_PREFIX_PATH
 unexport LD_LIBRARY_PATH
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test lint docs clean help
+.PHONY: demo test lint nightly fuzz docs clean help
 .DEFAULT_GOAL := help
 
 help:
@@ -40,6 +43,12 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy --strict thermo_comp
 	$(BIN)/python -m pytest test/test_layers.py
+
+nightly: $(VENV)/.installed-test
+	$(BIN)/python -m pytest --hypothesis-profile=nightly -n $(JOBS) test/test_properties.py
+
+fuzz: $(VENV)/.installed-fuzz
+	$(BIN)/python fuzz/run.py all --seconds $(FUZZ_SECONDS)
 
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir site
@@ -75,6 +84,10 @@ $(VENV)/.installed-test: setup.py setup.cfg pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-dev: $(VENV)/.installed-test
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+$(VENV)/.installed-fuzz: $(VENV)/.installed
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[ros,fuzz]'
 	@touch $@
 
 $(VENV)/.installed-docs: setup.py setup.cfg pyproject.toml | $(BIN)/python

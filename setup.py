@@ -33,6 +33,7 @@ EXTRAS = {
     'fleet': ['dask>=2024.1', 'distributed>=2024.1', 'fsspec>=2023.6', 'pyarrow>=14'],
     'test': ['pytest>=7.4', 'pytest-xdist>=3.4', 'hypothesis>=6.98'],
     'dev': ['ruff>=0.15', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs', 'pre-commit>=3.5'],
+    'fuzz': ['atheris>=3.0'],
     'docs': ['mkdocs-material>=9.5'],
 }
 

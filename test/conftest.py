@@ -17,6 +17,7 @@ from typing import Protocol
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -31,6 +32,10 @@ os.environ.pop('ROS_STATIC_PEERS', None)
 # A shell starts what runs in the background deaf to SIGINT, and children inherit that.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# For `make nightly`; tests that say how often they run are not touched.
+settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
 class Cli(Protocol):

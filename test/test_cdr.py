@@ -154,6 +154,7 @@ def test_what_no_layout_fits_goes_through_rclpy(kind: Any, override: str) -> Non
     'bad',
     [
         b'',
+        b'\0',
         b'\0\1',
         cdr('<', (1, 2), 'imu', [1.0, 2.0]),
         b'\0\1\0\0' + b'\xff' * 60,
@@ -167,6 +168,16 @@ def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad: bytes) -> None
     assert len(written) == 2
     assert written[0] == written[1]
     assert converter.n_malformed == 1
+
+
+def test_the_first_message_may_be_any_bytes() -> None:
+    # WHY: found by fuzzing: a first message of one byte fitted the layout that knows nothing yet.
+    # PROMISE: counted, and the stream goes on.
+    for n in range(40):
+        converter = SampleConverter(Vector3Stamped)
+        good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
+        assert len(convert(converter, bytes(n), good)) == 1
+        assert converter.n_malformed == 1
 
 
 def test_dropped_samples_give_nothing() -> None:

@@ -23,7 +23,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import erf, exp, inf, isfinite, nan, sqrt
+from math import erf, exp, inf, nan, sqrt
 
 from .modes import NOWHERE, State, blend, correct, mix, predict
 
@@ -35,6 +35,8 @@ QUIET_SHARE = 5e-3  # quiet acceleration wander / bending one, of a sensor witho
 CELL_SHARE = 0.2  # the same where wide cells hide slow changes
 CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells ...
 WIDE_CELL_SIGMAS = 8.5  # ... that noise never crosses: six sds of a difference
+#: What is outside is no temperature of an instrument [degC]; nor is NaN.
+COLDEST, HOTTEST = -273.15, 1000.0
 HORIZON_INTERVALS = 5.0  # extrapolation is linear up to here, then held
 NOISE_MEMORY = 200.0  # surprises over which the declared noise is judged
 
@@ -193,10 +195,10 @@ class Thermometer:
         Returns
         -------
         bool
-            False when it was not used: not finite, not newer than the last one, or an outlier.
+            False when it was not used: no temperature, not newer than the last one, an outlier.
 
         """
-        if not isfinite(reading_c):
+        if not COLDEST <= reading_c <= HOTTEST:
             self.n_rejected += 1
             return False
         if self.stamp_ns is None:

@@ -74,7 +74,11 @@ class _Layout:
         return bytes(buffer)
 
 
-_UNKNOWN = _Layout(Struct('<1x').unpack, b'', b'', bytearray(), 0, None, False)
+def _unpack_nothing(_data: bytes) -> tuple[Any, ...]:
+    raise StructError
+
+
+_UNKNOWN = _Layout(_unpack_nothing, b'', b'', bytearray(), 0, None, False)
 
 
 class SampleConverter:

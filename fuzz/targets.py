@@ -1,0 +1,266 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what is fuzzed: the three doors through which bytes of strangers come, and what must hold.
+
+Each target takes any bytes and raises where a promise is broken; its seeds are small and whole, so
+that the fuzzer begins behind the first checks.
+
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import lz4.frame
+import zstandard
+
+from thermo_comp.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
+from thermo_comp.calibration_file import dump_calibration, parse_calibration
+from thermo_comp.compensator import Compensator
+from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.functions import Polynomial
+from thermo_comp.recording import open_mcap
+
+START_NS = 1_767_225_600_000_000_000
+MAGIC = b'\x89MCAP0\r\n'
+
+
+@dataclass(frozen=True)
+class Target:
+    """
+    A door.
+
+    """
+
+    check: Callable[[bytes], None]
+    seeds: list[bytes]
+    max_length: int
+
+
+def small_calibration() -> Calibration:
+    """
+    Make a unit of a few terms.
+
+    """
+    axis = AxisSet(Polynomial((0.0, 0.5)), Polynomial((1.0, 1e-5)))
+    sets = RegimeSet(x=axis, y=axis, z=axis, temperature_range_c=(5, 35), rate_range_k_min=(-1, 1))
+    return Calibration(
+        format_version=1,
+        unit=Unit('T-1', 'counts', 32767.0, 0.01),
+        reference_temperature_c=20.0,
+        gravity_m_s2=9.80665,
+        axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
+        static=sets,
+        dynamic=sets,
+        noise_density_m_s2_sqrt_hz=(1e-4, 1e-4, 1e-4),
+    )
+
+
+UNIT = small_calibration()
+#: One for all inputs: to make it takes longer than most inputs.
+COMPENSATOR = Compensator(UNIT)
+
+
+def check_calibration(data: bytes) -> None:
+    """
+    Any bytes are a calibration, or one clear line; a calibration survives its round trip.
+
+    """
+    try:
+        value = parse_calibration(data, 'fuzz.yaml')
+    except CalibrationError as error:
+        text = str(error)
+        assert text.startswith('fuzz.yaml: '), text
+        assert '\n' not in text, text
+        return
+    assert parse_calibration(dump_calibration(value).encode()) == value
+    row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
+    assert row is None  # no temperature yet
+
+
+#: Every key that is required, and no other: what is short is tried often.
+_FUNCTIONS = (
+    '{bias_function: {kind: polynomial, coefficients: [0]}, '
+    'scale_function: {kind: polynomial, coefficients: [1]}}'
+)
+_SET = f'{{temperature_range_c: [5, 35], rate_range_k_min: [-1, 1], x: {_FUNCTIONS}'
+_SET += f', y: {_FUNCTIONS}, z: {_FUNCTIONS}}}'
+_AXIS = '{scale_factor: 300, bias: 0}'
+SMALLEST = f"""\
+format_version: 1
+unit: {{serial: T, input: counts, full_scale: 9999, cycle_time_s: 0.01}}
+reference_temperature_c: 20
+gravity_m_s2: 9.8
+axes: {{x: {_AXIS}, y: {_AXIS}, z: {_AXIS}}}
+static: {_SET}
+dynamic: {_SET}
+noise_density_m_s2_sqrt_hz: [1, 1, 1]
+""".encode()
+
+
+class MemoryFile:
+    """
+    A file that is nowhere.
+
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.size = len(data)
+
+    def read_at(self, at: int, n_bytes: int) -> bytes:
+        """
+        Read as `pread` does.
+
+        """
+        return self._data[at : at + n_bytes]
+
+    def close(self) -> None:
+        """
+        Forget nothing.
+
+        """
+
+
+def check_mcap(data: bytes) -> None:
+    """
+    Any bytes are a bag, or one clear line; no more comes out than can have been in it.
+
+    """
+    with suppress(RecordingError):
+        try:
+            with open_mcap([Path('fuzz.mcap')], lambda _: MemoryFile(data), require=()) as reader:
+                n = sum(
+                    len(block) + len(block.board) + len(block.case) for block in reader.blocks()
+                )
+                # A message is 22 bytes at least, and zstd makes at most 30 kB of a byte.
+                assert n <= 1000 * len(data), n
+        except RecordingError as error:
+            assert '\n' not in str(error), error
+            raise
+
+
+def check_cdr(data: bytes) -> None:
+    """
+    Any messages: what the node would publish is a whole, finite Imu message.
+
+    """
+    # ROS is needed for this target only.
+    from geometry_msgs.msg import Vector3Stamped
+    from rclpy.serialization import deserialize_message
+    from sensor_msgs.msg import Imu
+
+    from thermo_comp.ros.conversions import SampleConverter, read_temperature
+
+    compensator = COMPENSATOR
+    compensator.reset()
+    compensator.push_board(0, 20.0)
+    converters = [SampleConverter(Vector3Stamped), SampleConverter(Imu, 'body')]
+    at = 0
+    while at + 2 <= len(data):
+        kind, length = data[at], data[at + 1]
+        message = data[at + 2 : at + 2 + length * 2]
+        at += 2 + length * 2
+        if kind % 4 > 1:
+            reading = read_temperature(message)
+            if reading is not None:
+                push = compensator.push_board if kind % 4 == 2 else compensator.push_case
+                push(*reading)
+            continue
+        for written in converters[kind % 4].convert([message], compensator.process):
+            imu = deserialize_message(written, Imu)
+            force = imu.linear_acceleration
+            covariance = imu.linear_acceleration_covariance
+            assert all(map(math.isfinite, (force.x, force.y, force.z, *covariance)))
+            assert min(covariance[0], covariance[4], covariance[8]) > 0.0
+    compensator.flush(1 << 62)
+    assert compensator.counters.n_in >= compensator.counters.n_out
+
+
+def _record(opcode: int, content: bytes) -> bytes:
+    return struct.pack('<BQ', opcode, len(content)) + content
+
+
+def _text(text: str) -> bytes:
+    return struct.pack('<I', len(text)) + text.encode()
+
+
+def cdr(stamp_ns: int, *numbers: float) -> bytes:
+    """
+    Serialize a stamped message of doubles.
+
+    """
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    head = struct.pack('<4siII', b'\0\1\0\0', sec, nanosec, 4) + b'imu\0'
+    return head + bytes(-(len(head) - 4) % 8) + struct.pack(f'<{len(numbers)}d', *numbers)
+
+
+_KINDS = (
+    ('accel/counts', 'geometry_msgs/msg/Vector3Stamped', 3),
+    ('temperature/board', 'sensor_msgs/msg/Temperature', 2),
+    ('imu/uncompensated', 'sensor_msgs/msg/Imu', 37),
+)
+
+
+def _bag(compression: str) -> bytes:
+    heads, messages = b'', b''
+    for number, (topic, kind, width) in enumerate(_KINDS, 1):
+        heads += _record(3, struct.pack('<H', number) + _text(kind) + _text('ros2msg') + _text(''))
+        heads += _record(
+            4, struct.pack('<HH', number, number) + _text(topic) + _text('cdr') + _text('')
+        )
+        for k in range(3):
+            log_ns = START_NS + 10 * k + number
+            content = cdr(log_ns, *range(k, k + width))
+            messages += _record(5, struct.pack('<HIQQ', number, k, log_ns, log_ns) + content)
+    plain = heads + messages
+    packed = {'': plain, 'zstd': zstandard.compress(plain), 'lz4': lz4.frame.compress(plain)}
+    body = struct.pack('<QQQI', START_NS, START_NS + 30, len(plain), 0) + _text(compression)
+    content = packed[compression]
+    chunk = _record(6, body + struct.pack('<Q', len(content)) + content)
+    end = _record(15, bytes(4)) + _record(2, bytes(20))
+    return MAGIC + _record(1, _text('ros2') + _text('')) + heads + chunk + end + MAGIC
+
+
+def _messages() -> list[bytes]:
+    rows = [
+        (2, cdr(START_NS, 20.0, 0.0)),
+        (3, cdr(START_NS, 21.0, 0.0)),
+        (0, cdr(START_NS + 1, 10.0, 20.0, 2900.0)),
+        (0, cdr(START_NS + 2, 11.0, 20.0, 2901.0)),
+        (1, cdr(START_NS + 3, *map(float, range(37)))),
+    ]
+    rows.append((0, b'\0\0\0\0' + bytes(12) + bytes(28)))
+    seed = b''
+    for kind, message in rows:
+        padded = message + bytes(len(message) % 2)
+        seed += bytes([kind, len(padded) // 2]) + padded
+    return [seed]
+
+
+def targets() -> dict[str, Target]:
+    """
+    Return the targets by name.
+
+    """
+    return {
+        'calibration': Target(
+            check_calibration,
+            [
+                SMALLEST,
+                b'{unit: {serial: a}}',
+                b'a: &a [*a]',
+                b'[' * 20,
+                b'a: 1e5',
+            ],
+            1600,
+        ),
+        'mcap': Target(check_mcap, [_bag(''), _bag('zstd'), _bag('lz4')], 4096),
+        'cdr': Target(check_cdr, _messages(), 600),
+    }

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The fuzz targets without a fuzzer: their seeds, whole, cut and changed, keep the promises.
+
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+sys.path.insert(0, str(ROOT / 'fuzz'))
+
+from pathlib import Path
+
+import targets
+
+from thermo_comp.calibration_file import parse_calibration
+from thermo_comp.recording import open_mcap
+
+TARGETS = targets.targets()
+
+
+@pytest.mark.parametrize('name', TARGETS)
+def test_seeds_and_what_is_near_them(name: str, rng: np.random.Generator) -> None:
+    target = TARGETS[name]
+    for seed in target.seeds:
+        assert len(seed) <= target.max_length
+        target.check(seed)
+        for cut in range(0, len(seed), max(1, len(seed) // 10)):
+            target.check(seed[:cut])
+        for _ in range(10):
+            changed = bytearray(seed)
+            changed[int(rng.integers(len(seed)))] = int(rng.integers(256))
+            target.check(bytes(changed))
+
+
+def test_seeds_are_behind_the_first_checks() -> None:
+    assert parse_calibration(TARGETS['calibration'].seeds[0]).unit.serial == 'T'
+    for seed in TARGETS['mcap'].seeds:
+        file: Any = targets.MemoryFile(seed)
+        with open_mcap([Path('seed.mcap')], lambda _, file=file: file, require=()) as reader:
+            assert reader.info.truncated is None
+            (block,) = reader.blocks()
+        assert (len(block), len(block.board)) == (3, 3)
+    before = targets.COMPENSATOR.counters.n_out
+    TARGETS['cdr'].check(TARGETS['cdr'].seeds[0])
+    assert targets.COMPENSATOR.counters.n_out >= before + 2
