@@ -26,12 +26,12 @@ from thermo_comp.errors import FleetError
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet import COLUMNS, FleetOptions, fit_fleet, read_parquet
 from thermo_comp.fleet.discovery import find_units
-from thermo_comp.fleet.engine import Job, connected, run
+from thermo_comp.fleet.engine import Job, connected, outcome_of, run
 from thermo_comp.fleet.ledger import Ledger
 from thermo_comp.fleet.storage import Storage
 from thermo_comp.recording import Topics
 
-pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
+distributed = pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
 pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
 
 
@@ -177,12 +177,72 @@ def test_an_interrupted_run_goes_on_where_it_was(client: Any, fleet: Path, tmp_p
     assert json.loads((out / 'units/A/good/result.json').read_text())['is_final']
 
 
-def test_a_scheduler_that_is_not_there(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+class TestScheduler:
+    def test_nobody_answers(
+        self, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr('thermo_comp.fleet.engine._WAIT_S', 0.5)
+        with pytest.raises(FleetError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers'):
+            fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
+
+    def test_it_has_no_worker(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr('thermo_comp.fleet.engine._WAIT_S', 0.5)
+        with (
+            distributed.LocalCluster(
+                n_workers=0, processes=False, protocol='tcp', dashboard_address='127.0.0.1:0'
+            ) as cluster,
+            pytest.raises(FleetError, match='has no worker'),
+            connected(cluster.scheduler_address),
+        ):
+            pass
+
+    def test_it_is_used_as_it_is(
+        self, client: Any, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        address = client.cluster.scheduler_address
+        few = str(fleet / 'B')
+        result = fit_fleet(few, tmp_path / 'out', OPTIONS, scheduler=address)
+        assert [row['verdict'] for row in result.rows] == ['refused']
+        # A worker of another version would fit something else under the same key.
+        monkeypatch.setattr('thermo_comp.fleet.engine.__version__', '9.9')
+        with pytest.raises(FleetError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
+            fit_fleet(few, tmp_path / 'other', OPTIONS, scheduler=address)
+
+
+class _Future:
+    """
+    A task that has ended in some way.
+
+    """
+
+    def __init__(self, status: str, error: Exception | None = None) -> None:
+        self.status, self._error = status, error
+
+    def exception(self) -> Exception | None:
+        return self._error
+
+
+@pytest.mark.parametrize(
+    ('future', 'problem'),
+    [
+        (
+            _Future('error', distributed.KilledWorker('task', None, 3)),
+            'its worker died 4 times at it: too little memory?',
+        ),
+        (_Future('error', MemoryError('no\n room')), 'MemoryError: no room'),
+        (_Future('lost'), 'the scheduler was lost'),
+    ],
+)
+def test_a_task_that_ends_badly_is_a_row_to_be_done_again(
+    future: _Future, problem: str, fleet: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr('thermo_comp.fleet.engine._WAIT_S', 0.5)
-    with pytest.raises(FleetError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers there'):
-        fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
+    unit = find_units(Storage(str(fleet)))[0]
+    outcome = outcome_of(future, unit)
+    assert outcome is not None
+    ledger = Ledger(tmp_path)
+    row = ledger.store(unit, OPTIONS, outcome)
+    assert (row['name'], row['verdict'], row['problem']) == ('A/good', 'failed', problem)
+    assert ledger.look_up(unit, OPTIONS) is None
 
 
 def test_a_fleet_without_dask_says_what_to_install(

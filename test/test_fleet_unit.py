@@ -104,7 +104,7 @@ class TestTree:
         assert all(a is b for a, b in zip(parts[0], statistics, strict=True))
 
     @settings(
-        max_examples=4,
+        max_examples=3,
         deadline=None,
         suppress_health_check=[HealthCheck.function_scoped_fixture],
     )
@@ -177,6 +177,15 @@ class TestRow:
         assert (row['verdict'], row['n_bags'], row['n_left_out']) == ('reserved', 8, 1)
         assert row['left_out'].startswith('u/04.mcap: damaged: ')
         assert '1 of 8 bags are left out: u/04.mcap' in row['reservations']
+        assert row['n_positions'] == 7
+
+    def test_a_bag_that_was_cut_off_is_read_up_to_there(self, tmp_path: Path) -> None:
+        paths = write_unit(tmp_path / 'u', 2, 7)
+        content = paths[2].read_bytes()
+        paths[2].write_bytes(content[:-300])
+        row = processed(tmp_path).row
+        assert (row['verdict'], row['n_left_out'], row['n_torn']) == ('reserved', 0, 1)
+        assert '03.mcap: the file is cut off at byte' in row['reservations']
         assert row['n_positions'] == 7
 
     def test_what_the_fit_refuses(self, tmp_path: Path) -> None:

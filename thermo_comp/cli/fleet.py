@@ -84,7 +84,7 @@ def fit(
     DIR itself are sorted by the serial in them. Results go to OUT/units,
     the table of all to OUT/fleet.parquet and .csv, what it tells to
     OUT/fleet.html. A second run does only what is missing or has changed.
-    Exit code 1 if a unit has no calibration.
+    Exit code 1 if a unit has no calibration, or not of all of its bags.
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
@@ -125,7 +125,7 @@ def fit(
             tell=lambda n, total, _row: done(n / total),
         )
     _say(out, result)
-    if result.n_fitted < len(result.rows):
+    if not result.is_whole:
         raise typer.Exit(1)
 
 
@@ -150,6 +150,8 @@ def _say(out: Output, result: FleetResult) -> None:
         for said in ('problem', 'left_out'):
             if row[said]:
                 out.line(f'- {row["name"]}: {row[said]}')
+        if row['n_torn']:
+            out.line(f'- {row["name"]}: {row["reservations"]}')
     for outlier in summary.outliers:
         out.line(
             f'- {outlier.name}: {outlier.label} {outlier.value:.4g} {outlier.unit}, median '

@@ -112,6 +112,7 @@ def connected(
                     processes=True,
                     dashboard_address='127.0.0.1:0',
                     host='127.0.0.1',
+                    preload=['thermo_comp.fleet.worker'],
                 ) as cluster,
                 Client(cluster) as client,
             ):
@@ -213,7 +214,7 @@ def run(
     waiting.clear()
     for future in done:
         unit = units.pop(future.key)
-        yield unit, _outcome(future, unit)
+        yield unit, outcome_of(future, unit)
         future.release()
 
 
@@ -248,9 +249,21 @@ def _one_bag(url: str, bag: Any, options: FleetOptions) -> Any:
     return (reduce_found(url, bag, options.fit, options.topics, options.input),)
 
 
-def _outcome(future: Any, unit: FoundUnit) -> UnitOutcome | None:
+def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome | None:
     """
     Take a task's result, or the words for what became of it.
+
+    Parameters
+    ----------
+    future : distributed.Future
+        The task, ended somehow.
+    unit : FoundUnit
+        What it was about.
+
+    Returns
+    -------
+    UnitOutcome or None
+        As `process_unit` gives it; a failure to be done again where it gave none.
 
     """
     from distributed import KilledWorker

@@ -64,6 +64,7 @@ COLUMNS: tuple[Column, ...] = (
     Column('left_out', 'text', 'bags that were left out, each with its reason'),
     Column('n_bags', 'whole', 'bags found'),
     Column('n_left_out', 'whole', 'of them left out'),
+    Column('n_torn', 'whole', 'bags that were cut off, and are read up to there'),
     Column('n_positions', 'whole', 'still positions'),
     Column('n_samples', 'whole', 'accelerometer samples'),
     Column('n_bytes', 'whole', 'size of the bags'),

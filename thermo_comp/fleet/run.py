@@ -60,6 +60,16 @@ class FleetResult:
         """
         return sum(row['verdict'] in FITTED for row in self.rows)
 
+    @property
+    def is_whole(self) -> bool:
+        """
+        Whether every unit has a calibration, from all of its bags.
+
+        """
+        return self.n_fitted == len(self.rows) and not any(
+            row['n_left_out'] or row['n_torn'] for row in self.rows
+        )
+
 
 def fit_fleet(
     url: str,

@@ -231,6 +231,7 @@ def conclude(
         lot=next((one.lot for one in good if one.lot), unit.lot),
         n_bags=len(statistics),
         n_left_out=len(bad),
+        n_torn=sum(bool(one.note) for one in good),
         left_out='; '.join(one.problem for one in bad),
         n_bytes=sum(one.n_bytes for one in statistics),
         tool_version=__version__,
