@@ -163,6 +163,16 @@ class TestLots:
         assert effect.probability < 1e-4
         assert effect.medians['C'] - effect.medians['A'] == pytest.approx(120.0, abs=60.0)
 
+    def test_a_unit_that_was_tested_twice_counts_once(self, rng: np.random.Generator) -> None:
+        rows = fleet_of(8, rng, lots='AB')
+        again = [
+            row for day in range(1, 6) for row in fleet_of(8, rng, lots='AB', day=day, like=rows)
+        ]
+        # Four units of each lot, however often they were measured, cannot tell lots apart.
+        summary = summarise(rows + again)
+        assert summary.lots == {'A': 4, 'B': 4}
+        assert summary.lot_effects == ()
+
     def test_lots_that_are_alike(self, rng: np.random.Generator) -> None:
         n_alarms = sum(
             bool(summarise(fleet_of(30, rng, lots='AB')).lot_effects) for _ in range(40)

@@ -242,7 +242,7 @@ class Summary:
     drifts : tuple of Drift
         By serial and time.
     lots : dict of str to int
-        Calibrated units by lot.
+        Calibrated units by lot, each once.
     lot_effects : tuple of LotEffect
         The surest first.
 
@@ -293,7 +293,9 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         for name, value, z in zip(one.names, one.values.tolist(), one.z.tolist(), strict=True)
         if abs(z) > limit
     ]
-    lots = Counter(str(row['lot']) for row in fitted if row['lot'])
+    # A unit that was tested twice is still one unit of its lot.
+    latest = {str(row['serial']): row for row in sorted(fitted, key=lambda row: str(row['start']))}
+    lots = Counter(str(row['lot']) for row in latest.values() if row['lot'])
     return Summary(
         verdicts=dict(Counter(str(row['verdict']) for row in rows)),
         problems=tuple(
@@ -304,7 +306,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         outliers=tuple(sorted(outliers, key=lambda one: -abs(one.z))),
         drifts=tuple(_drifts(fitted, [row for row in earlier if row['verdict'] in FITTED])),
         lots=dict(sorted(lots.items())),
-        lot_effects=tuple(_lot_effects(fitted, spreads)),
+        lot_effects=tuple(_lot_effects(list(latest.values()), spreads)),
     )
 
 
@@ -420,13 +422,13 @@ def _days(old: Row, new: Row) -> float:
 def _lot_effects(rows: Sequence[Row], spreads: Iterable[Spread]) -> list[LotEffect]:
     from scipy.stats import kruskal
 
-    lot_of = {str(row['name']): str(row['lot']) for row in rows}
+    lot_of = {str(row['name']): str(row['lot']) for row in rows if row['lot']}
     found = []
     tested = 0
     for one in spreads:
         groups: dict[str, list[float]] = defaultdict(list)
         for name, value in zip(one.names, one.values.tolist(), strict=True):
-            if lot_of[name]:
+            if name in lot_of:
                 groups[lot_of[name]].append(value)
         groups = {lot: group for lot, group in groups.items() if len(group) >= _LOT_NEEDED}
         if len(groups) < 2 or not one.sd > 0.0:
