@@ -11,6 +11,7 @@ alarms, about one in 20 h, which is more than ours has. Seeded: one command, one
 
     python benchmarks/regime.py --quick            # seconds
     python benchmarks/regime.py --workers 2        # some minutes
+    python benchmarks/regime.py regret             # what a wrong flag costs, alone
 
 """
 
@@ -19,172 +20,38 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import time
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from multiprocessing.pool import Pool
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
-from regime_rules import (
-    BOARD_LAG_S,
-    RIPPLE_C,
-    RIVALS,
-    SENSORS,
-    Array,
-    Scene,
-    known_signature_delays,
-    read,
-    temperatures,
+from regime_figures import plot_regret, plot_rules
+from regime_regret import judge_unit, regret_table, switch_table
+from regime_rules import RIVALS, SENSORS, Scene, known_signature_delays, read, temperatures
+from regime_runs import (
+    OURS,
+    Job,
+    Outcome,
+    cost,
+    ours,
+    rng_of,
+    run_scenes,
+    run_soak,
+    settings,
+    tuned,
 )
 
-from thermo_comp.regime import DetectorSettings, Regime, RegimeDetector
-from thermo_comp.thermometer import Thermometer, ThermometerSettings
+from thermo_comp.regime import Regime
+from thermo_comp.simulation import UNIT_NAMES
 
-SEGMENT_H = 2.5
 SOAK_H = 5.0
-OURS = 'ours'
 # ramps per scene, by the rate of the readings [Hz]: ten times the readings, ten times the work
-RAMPS = {10.0: 2, 1.0: 10, 0.1: 20}
+RAMPS = {10.0: 2, 1.0: 6, 0.1: 10}
 TUNING_H = 20.0
-SETTLE_S = 1800.0
-
-
-@dataclass
-class Outcome:
-    """
-    What a rule made of the ramps of one scene.
-
-    """
-
-    delays: list[float]
-    missed: int
-    flips: int
-    early: int
-    flagged: float
-    n: int
 
 
 Rows = list[list[str]]
-Job = tuple[tuple[Scene, ...], int, float, int, bool]
 Matrix = list[tuple[Scene, dict[str, Outcome]]]
-
-
-def settings(scene: Scene) -> DetectorSettings:
-    """
-    Shipped defaults, with the sensor and the unit's lags filled in.
-
-    """
-    case = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s)
-    board = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s + BOARD_LAG_S)
-    return DetectorSettings(ripple_c=RIPPLE_C, case=case, board=board)
-
-
-def rng_of(seed: int, purpose: int, scene: Scene) -> np.random.Generator:
-    """
-    Make the generator of one scene, the same in whichever order scenes run.
-
-    """
-    return np.random.default_rng([seed, purpose, *(round(1e6 * v) for v in vars(scene).values())])
-
-
-def ours(scene: Scene, case: Array, board: Array) -> npt.NDArray[np.int8]:
-    """
-    Flag of the shipped detector at each reading: 1 dynamic, 0 static, -1 unknown.
-
-    """
-    detector_settings = settings(scene)
-    case_thermometer = Thermometer(detector_settings.case)
-    board_thermometer = Thermometer(detector_settings.board)
-    detector = RegimeDetector(detector_settings)
-    step_ns = round(1e9 / scene.rate_hz)
-    flags = np.empty(len(case), np.int8)
-    regime = Regime.UNKNOWN
-    for k, (c, b) in enumerate(zip(case.tolist(), board.tolist(), strict=True)):
-        board_thermometer.update(k * step_ns, b)
-        if case_thermometer.update(k * step_ns, c):
-            regime = detector.update(k * step_ns, case_thermometer, board_thermometer)
-        flags[k] = regime
-    return flags
-
-
-def judge(flags: Iterable[tuple[Array, npt.NDArray[np.bool_]]], duration: float) -> Outcome:
-    """
-    Delay, flips and flagged share of ramps from 0 to `duration`.
-
-    """
-    outcome = Outcome([], 0, 0, 0, 0.0, 0)
-    for t, flag in flags:
-        outcome.n += 1
-        inside = flag[(t >= 0.0) & (t < duration)]
-        times = t[(t >= 0.0) & (t < duration)]
-        outcome.flagged += float(inside.mean())
-        if flag[np.searchsorted(t, 0.0) - 1]:
-            outcome.early += 1
-            continue
-        if not inside.any():
-            outcome.missed += 1
-            continue
-        onset = int(np.argmax(inside))
-        outcome.delays.append(float(times[onset]))
-        outcome.flips += bool((~inside[onset:]).any())
-    outcome.flagged /= max(outcome.n, 1)
-    return outcome
-
-
-def run_scenes(job: Job) -> list[tuple[Scene, dict[str, Outcome]]]:
-    """
-    All rules over `n` ramps of each scene of one sensor, the rivals tuned on its soak first.
-
-    """
-    scenes, n, hours, seed, is_rippled = job
-    rng = rng_of(seed, 3, scenes[0])
-    thresholds = dict.fromkeys(RIVALS if hours else (), 0.0)
-    for _ in range(round(hours / SEGMENT_H)):
-        t = np.arange(0.0, 3600.0 * SEGMENT_H, 1.0 / scenes[0].rate_hz)
-        soak = read(temperatures(scenes[0], t, 0.0, rng)[0], scenes[0], rng)
-        for name in thresholds:
-            peak = RIVALS[name](scenes[0], soak)[t > SETTLE_S].max()
-            thresholds[name] = max(thresholds[name], float(peak))
-    return [(scene, run_ramps(scene, n, thresholds, seed, is_rippled)) for scene in scenes]
-
-
-def run_ramps(
-    scene: Scene, n: int, thresholds: dict[str, float], seed: int, is_rippled: bool
-) -> dict[str, Outcome]:
-    """
-    Ours, and the rivals at their thresholds, over `n` ramps of one scene.
-
-    """
-    rng = rng_of(seed, 5, scene)
-    # long enough for three edges of the coarsest sensor
-    edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
-    duration = min(max(edges_s, 2400.0), 7200.0)
-    t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)
-    flags: dict[str, list[tuple[Array, npt.NDArray[np.bool_]]]] = {OURS: []}
-    for _ in range(n):
-        case, board = temperatures(scene, t, duration, rng, RIPPLE_C if is_rippled else 0.0)
-        readings = read(case, scene, rng)
-        flags[OURS].append((t, ours(scene, readings, read(board, scene, rng)) == Regime.DYNAMIC))
-        for name, threshold in thresholds.items():
-            flags.setdefault(name, []).append((t, RIVALS[name](scene, readings) > threshold))
-    return {name: judge(each, duration) for name, each in flags.items()}
-
-
-def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
-    """
-    Count openings, switches and the decided share of one soak, shipped detector.
-
-    """
-    scene, hours, seed = job
-    rng = rng_of(seed, 7, scene)
-    t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)
-    case, board = temperatures(scene, t, 0.0, rng)
-    flag = ours(scene, read(case, scene, rng), read(board, scene, rng))
-    known = flag[flag >= 0]
-    switches = int(np.count_nonzero(np.diff(known)))
-    return scene.sensor, int(np.count_nonzero(np.diff(known) == 1)), switches, len(known) / len(t)
 
 
 def quantiles(delays: list[float]) -> tuple[float, float]:
@@ -195,40 +62,6 @@ def quantiles(delays: list[float]) -> tuple[float, float]:
     if not delays:
         return np.inf, np.inf
     return float(np.median(delays)), float(np.percentile(delays, 95))
-
-
-def cost() -> dict[str, float]:
-    """
-    CPU microseconds per reading, best of three, and those of one numpy scalar call.
-
-    """
-    scene = Scene(0.5, 900.0, 0.001, 0.0, 1.0)
-    rng = np.random.default_rng(0)
-    t = np.arange(-7200.0, 7200.0)
-    case, board = (read(x, scene, rng).tolist() for x in temperatures(scene, t, 3600.0, rng))
-    best = dict.fromkeys(('thermometer', 'thermometer + detector', 'numpy scalar call'), np.inf)
-
-    def keep(name: str, begin: float, n: int) -> None:
-        best[name] = min(best[name], (time.process_time() - begin) / n * 1e6)
-
-    value = np.float64(2.0)
-    for _ in range(3):
-        own = settings(scene)
-        one, other, detector = Thermometer(own.case), Thermometer(own.board), RegimeDetector(own)
-        begin = time.process_time()
-        for k, reading in enumerate(board):
-            other.update(k * 10**9, reading)
-        keep('thermometer', begin, len(board))
-        begin = time.process_time()
-        for k, reading in enumerate(case):
-            one.update(k * 10**9, reading)
-            detector.update(k * 10**9, one, other)
-        keep('thermometer + detector', begin, len(case))
-        begin = time.process_time()
-        for _ in range(100_000):
-            np.sqrt(value)
-        keep('numpy scalar call', begin, 100_000)
-    return best
 
 
 def cost_table() -> Rows:
@@ -414,6 +247,93 @@ def scene_table(matrix: Matrix, lag: float) -> Rows:
     return rows
 
 
+def draw_rules(seed: int, folder: Path) -> None:
+    """
+    Draw one ramp under every rule.
+
+    """
+    scene = Scene(0.5, 900.0, 0.01, 0.0, 1.0)
+    rng = rng_of(seed, 11, scene)
+    t = np.arange(-2700.0, 10800.0)
+    case, board = temperatures(scene, t, 3600.0, rng)
+    readings = read(case, scene, rng)
+    flags = {OURS: ours(scene, readings, read(board, scene, rng)) == Regime.DYNAMIC}
+    for name, threshold in tuned(scene, TUNING_H, seed).items():
+        flags[name] = RIVALS[name](scene, readings) > threshold
+    plot_rules(t, case, board, flags, folder)
+
+
+Tables = Iterator[tuple[str, Rows]]
+
+
+def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
+    """
+    Run the ramp that the requirement names.
+
+    """
+    rows = onset_table(pool, arguments.quick, arguments.seed)
+    yield 'Onset of 0.5 K/min behind 15 min at 1 Hz', rows
+
+
+def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
+    """
+    Count switches in soak.
+
+    """
+    hours = 25.0 if arguments.quick else arguments.soak_hours
+    yield 'Switches in soak with ripple and drift, 1 Hz', soak_table(pool, hours, arguments.seed)
+
+
+def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
+    """
+    Run all rules over all scenes.
+
+    """
+    n_ramps = arguments.ramps
+    hours = 0.0 if n_ramps else TUNING_H
+    matrix = run_matrix(pool, arguments.quick, arguments.seed, n_ramps, hours)
+    yield 'Ramps by rate of the readings', rate_table(matrix)
+    if n_ramps:
+        return
+    yield 'The matrix by rule', rule_table(matrix)
+    for lag in sorted({scene.lag_s for scene, _ in matrix}):
+        title = 'Median onset delay in s (share of the ramp flagged), lag {:g} min'
+        yield title.format(lag / 60.0), scene_table(matrix, lag)
+    if arguments.figures:
+        draw_rules(arguments.seed, arguments.figures)
+
+
+def part_cost(_pool: Pool, _arguments: argparse.Namespace) -> Tables:
+    """
+    Time a reading.
+
+    """
+    yield 'Cost', cost_table()
+
+
+def part_regret(pool: Pool, arguments: argparse.Namespace) -> Tables:
+    """
+    Put simulated units under the flag.
+
+    """
+    jobs = [(name, arguments.seed) for name in UNIT_NAMES]
+    units = pool.map(judge_unit, jobs, chunksize=1)
+    yield 'Regret of the flag, two sets of the model golovach', regret_table(units)
+    yield 'Crossing over', switch_table(units)
+    if arguments.figures:
+        plot_regret(units, arguments.figures)
+
+
+REGRET = 'regret'
+PARTS: dict[str, Callable[[Pool, argparse.Namespace], Tables]] = {
+    'onset': part_onset,
+    'soak': part_soak,
+    'matrix': part_matrix,
+    'cost': part_cost,
+    REGRET: part_regret,
+}
+
+
 def main() -> None:
     """
     Run the parts and print their tables.
@@ -422,37 +342,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument('--quick', action='store_true', help='a small version, some seconds')
+    parser.add_argument('parts', nargs='*', help=f'all by default: {", ".join(PARTS)}')
+    parser.add_argument('--quick', action='store_true', help='small versions, some seconds')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--workers', type=int, default=1, help='processes')
-    parser.add_argument('--soak-hours', type=float, default=1000.0)
-    parser.add_argument('--ramps', type=int, help='per scene, of ours alone, and no other table')
+    parser.add_argument('--soak-hours', type=float, default=1100.0)
+    parser.add_argument('--ramps', type=int, help='matrix: so many per scene, of ours alone')
+    parser.add_argument('--figures', metavar='FOLDER', type=Path, help='draw there, too')
     parser.add_argument('--json', metavar='FILE', help='every table, machine-readable')
     arguments = parser.parse_args()
-    is_quick, seed = arguments.quick, arguments.seed
+    parts = arguments.parts or [part for part in PARTS if not (arguments.quick and part == REGRET)]
+    if not set(parts) <= set(PARTS):
+        parser.error(f'parts are {", ".join(PARTS)}')
     figures: dict[str, Rows] = {}
-
-    def show(title: str, rows: Rows) -> None:
-        figures[title] = rows
-        table(title, rows)
-
     with multiprocessing.Pool(arguments.workers) as pool:
-        if arguments.ramps:
-            matrix = run_matrix(pool, is_quick, seed, arguments.ramps, 0.0)
-            show('Ramps by rate of the readings', rate_table(matrix))
-        else:
-            show('Onset of 0.5 K/min behind 15 min at 1 Hz', onset_table(pool, is_quick, seed))
-            hours = 25.0 if is_quick else arguments.soak_hours
-            show('Switches in soak with ripple and drift, 1 Hz', soak_table(pool, hours, seed))
-            matrix = run_matrix(pool, is_quick, seed, None, TUNING_H)
-            show('Ramps by rate of the readings', rate_table(matrix))
-            show('The matrix by rule', rule_table(matrix))
-            for lag in sorted({scene.lag_s for scene, _ in matrix}):
-                title = 'Median onset delay in s (share of the ramp flagged), lag {:g} min'
-                show(title.format(lag / 60.0), scene_table(matrix, lag))
-            show('Cost', cost_table())
+        for part in parts:
+            for title, rows in PARTS[part](pool, arguments):
+                figures[title] = rows
+                table(title, rows)
     if arguments.json:
-        text = json.dumps({'seed': seed, 'quick': is_quick, 'tables': figures}, indent=1)
+        text = json.dumps({'seed': arguments.seed, 'tables': figures}, indent=1)
         Path(arguments.json).write_text(text + '\n', encoding='utf-8')
 
 

@@ -296,7 +296,7 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
 
 
 def test_switch_makes_no_step():
-    # The sets differ by 5 counts = 17 mg; over 30 s at 100 Hz that is 5.7 ug a sample.
+    # The sets differ by 5 counts = 1.7 mg: at the longest over 300 s, at 100 Hz 0.057 ug a sample.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
     compensator = Compensator(
         unit, CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
@@ -312,7 +312,18 @@ def test_switch_makes_no_step():
     steps = np.abs(np.diff(outputs))
     assert outputs[0] == 0.0
     assert outputs[-1] == pytest.approx(-5.0 / 300.0)
-    assert steps.max() <= 5.0 / 300.0 / 3000.0 * 1.001
+    assert steps.max() <= 5.0 / 300.0 / 30000.0 * 1.001
+
+
+@pytest.mark.parametrize(
+    ('delta', 'given_s', 'expected_s'),
+    # 0.3 counts / 300 = 1e-3 m/s^2 = 102 ug
+    [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
+)
+def test_sets_that_differ_take_longer(delta, given_s, expected_s):
+    unit = calibration(dynamic=regime_set(axis_set(delta=delta)))
+    compensator = Compensator(unit, CompensatorConfig(transition_time_s=given_s))
+    assert compensator.tracker.config.transition_time_s == pytest.approx(expected_s)
 
 
 def test_swap_takes_effect_between_two_samples():
@@ -404,7 +415,8 @@ def test_empty_block():
 
 
 def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
-    unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
+    # 0.025 counts = 8.5 ug: what neither time stretches
+    unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
     compensator = Compensator(
         unit,
         CompensatorConfig(
@@ -416,7 +428,7 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
         compensator.push_board(k * SECOND_NS, 20.0)
         compensator.push_case(k * SECOND_NS, 20.0 + (k - 1200) / 30.0)
     stamp = 1200 * SECOND_NS
-    while compensator.process(stamp, 0.0, 0.0, 1.0)[0] > -2.0 / 300.0:
+    while compensator.process(stamp, 0.0, 0.0, 1.0)[0] > -0.01 / 300.0:
         stamp += SECOND_NS // 10
     before = compensator.process(stamp + 1, 0.0, 0.0, 1.0)[0]
     compensator.reconfigure(replace(compensator.config, transition_time_s=50.0))

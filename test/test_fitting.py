@@ -176,6 +176,33 @@ def test_the_compensator_does_what_the_fit_promised(chosen: FitResult) -> None:
     assert found.rms == pytest.approx(chosen.positions[3].residual_rms / MICRO_G, rel=0.05)
 
 
+def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> None:
+    # An INS at rest beside it must not notice: at most 1 ug and 0.3 sd of the mean from one
+    # second to the next, and 1e-5 m/s within a second.
+    def forces(weight: float | None) -> npt.NDArray[np.float64]:
+        compensator = Compensator(golovach.calibration)
+        if weight is not None:
+            compensator.tracker.weight_at = lambda _stamp_ns: weight  # type: ignore[method-assign]
+        blocks = source_of(UNIT, positions(1, 5)[0], 905).blocks()
+        found = [compensator.process_block(CausalBlock.of(block)) for block in blocks]
+        assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
+        return np.concatenate([each.specific_force for each in found])
+
+    # The noise is in all three alike, and what the weight moves along the gap is left.
+    output, static, dynamic = forces(None), forces(0.0), forces(1.0)
+    gap = dynamic - static
+    size = np.linalg.norm(gap, axis=1)
+    weight = np.sum((output - static) * gap, axis=1) / size**2
+    per_second = round(RATE_HZ)
+    moved = np.abs(weight[per_second:] - weight[:-per_second]) * size[per_second:]
+    assert weight[0] == pytest.approx(0.0, abs=1e-6)
+    assert weight.max() == pytest.approx(1.0, abs=1e-6)
+    jump = moved.max() / MICRO_G
+    assert jump < min(1.0, 0.3 * min(UNIT.noise_density))
+    # constant acceleration for a second, at the most
+    assert moved.max() * 1.0 < 1e-5
+
+
 def test_a_unit_as_it_was_is_still_valid(chosen: FitResult) -> None:
     told: list[float] = []
     found = assess(chosen.calibration, sources_of(UNIT, 6, 7), progress=told.append)

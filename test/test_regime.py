@@ -315,6 +315,25 @@ def test_direction_follows_a_reversal():
     assert directions[7199.0] == -1
 
 
+def test_a_held_reading_does_not_turn_the_direction():
+    # WHY: a sensor that measures every 30 s and is published every second makes a staircase,
+    # whose flat parts and steps look like turns.
+    settings = detector_settings(0.001, 0.0625, 300.0)
+    case, board = Thermometer(settings.case), Thermometer(settings.board)
+    detector = RegimeDetector(settings)
+    rng = np.random.default_rng(1)
+    t = np.arange(-2400.0, 6000.0)
+    truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)
+    held = [np.repeat(read(x, 0.001, 0.0625, rng)[::30], 30).tolist() for x in truths]
+    seen = set()
+    for k, (c, b) in enumerate(zip(*held, strict=True)):
+        board.update(k * SECOND_NS, b)
+        case.update(k * SECOND_NS, c)
+        detector.update(k * SECOND_NS, case, board)
+        seen.add((detector.regime, detector.direction))
+    assert seen == {(UNKNOWN, 0), (STATIC, 0), (DYNAMIC, 1)}
+
+
 def test_a_start_in_a_ramp_is_dynamic():
     changes = run_once([(-9000.0, 0.5), (1800.0, 0.0)])
     assert [regime for _, regime, _ in changes] == [DYNAMIC, STATIC]

@@ -90,7 +90,7 @@ class Compensator:
 
     def _thermal_config(self) -> ThermalConfig:
         return ThermalConfig(
-            self.config.transition_time_s,
+            self.correction.gentle_transition(self.config.transition_time_s),
             self.config.case_timeout_s,
             self.calibration.board_lag_s,
             self.config.temperature_timeout_s,

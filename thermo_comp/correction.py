@@ -20,6 +20,11 @@ from . import thermal
 from .calibration import AxisReference, AxisSet, Calibration, RegimeSet
 from .functions import Number, hold
 
+#: While the sets cross over, the output moves no faster than this [m/s^3] (1 ug per second) ...
+GENTLE_RATE = 9.80665e-6
+#: ... unless that took more than this many transition times.
+LONGEST_TRANSITION = 10.0
+_GAP_TEMPERATURES = 33
 #: (bias, scale) of one axis.
 BiasScale = tuple[Number, Number]
 
@@ -70,6 +75,7 @@ class SetCorrection:
 
     def __init__(self, regime_set: RegimeSet, other: RegimeSet, calibration: Calibration) -> None:
         self._reference = calibration.reference_temperature_c
+        self.temperature_range_c = regime_set.temperature_range_c
         lower, upper = regime_set.temperature_range_c
         self._t_range = lower - self._reference, upper - self._reference
         lower, upper = other.temperature_range_c
@@ -308,6 +314,8 @@ class Correction:
             axis.scale_factor
             for axis in (calibration.axes.x, calibration.axes.y, calibration.axes.z)
         )
+        self._gravity = calibration.gravity_m_s2
+        self._n_lags = len(calibration.memory_time_constants_s)
         #: Variance of the noise of one sample [m^2/s^4].
         self.noise = tuple(
             density * density / calibration.unit.cycle_time_s
@@ -339,6 +347,44 @@ class Correction:
             bias_d, scale_d = axis_d.bias_scale(dynamic)
             result.append((rest * bias_s + weight * bias_d, rest * scale_s + weight * scale_d))
         return result
+
+    def gentle_transition(self, given_s: float) -> float:
+        """
+        Stretch a transition time to what an INS would overlook.
+
+        Parameters
+        ----------
+        given_s : float
+            The time over which the sets are to cross over [s]; 0 = a hard switch.
+
+        Returns
+        -------
+        float
+            The time that the difference of the two sets needs, in soaks [s].
+
+        """
+        needed = self._largest_gap() / GENTLE_RATE
+        return min(max(given_s, needed), LONGEST_TRANSITION * given_s)
+
+    def _largest_gap(self) -> float:
+        """
+        Bound what the two sets differ by at rest, without thermal terms [m/s^2].
+
+        """
+        lower = min(self.static.temperature_range_c[0], self.dynamic.temperature_range_c[0])
+        upper = max(self.static.temperature_range_c[1], self.dynamic.temperature_range_c[1])
+        board = np.linspace(lower, upper, _GAP_TEMPERATURES)
+        nil = np.zeros_like(board)
+        state = (board, *[nil] * (thermal.MEMORY - 1 + 2 * self._n_lags))
+        static, _ = self.static.regressors(state)
+        dynamic, _ = self.dynamic.regressors(state)
+        square, relative = nil, nil
+        for K, axis_s, axis_d in zip(self._K, self.static.axes, self.dynamic.axes, strict=True):
+            bias_s, scale_s = axis_s.bias_scale(static)
+            bias_d, scale_d = axis_d.bias_scale(dynamic)
+            square = square + ((bias_d - bias_s) / K) ** 2
+            relative = np.maximum(relative, np.abs((scale_d - scale_s) / K))
+        return float(np.max(np.sqrt(square) + self._gravity * relative))
 
     def variance(self, state: tuple[Number, ...]) -> list[tuple[Number, Number, Number]]:
         """

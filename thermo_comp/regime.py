@@ -123,6 +123,7 @@ class RegimeDetector:
         self.settings = settings
         self._relaxed_rate = settings.relaxed_rate_k_min / 60.0
         self._dwell_ns = round(settings.dwell_s * 1e9)
+        self._turn_ns = self._dwell_ns // 2
         self._forget_ns = round(1e9 * max(settings.case.lag_s, settings.board.lag_s))
         test = (
             settings.smallest_ramp_k_min / 60.0,
@@ -146,6 +147,7 @@ class RegimeDetector:
         self._stamp_ns: int | None = None
         self._calm_ns: int | None = None
         self._held_until_ns: int | None = None
+        self._turning_ns: int | None = None
         self._is_grown = False
         self._case_onset.reset()
         self._board_onset.reset()
@@ -208,9 +210,7 @@ class RegimeDetector:
                 if direction:
                     self._open(stamp_ns, direction, lead)
         else:
-            direction = _obvious(lead, onset.swing)
-            if direction:
-                self.direction = direction
+            self._turn(stamp_ns, _obvious(lead, onset.swing))
         if (
             self.regime != Regime.STATIC
             and self._calm_ns is not None
@@ -226,9 +226,25 @@ class RegimeDetector:
             self.switched_ns = stamp_ns
         return self.regime
 
+    def _turn(self, stamp_ns: int, direction: int) -> None:
+        """
+        Follow the direction once it has lasted: a reading that is held makes the rate a staircase.
+
+        """
+        if direction == self.direction or not direction:
+            self._turning_ns = None
+        elif self._turning_ns is None:
+            self._turning_ns = stamp_ns
+        if self._turning_ns is not None and (
+            self.direction == 0 or stamp_ns - self._turning_ns >= self._turn_ns
+        ):
+            self.direction = direction
+            self._turning_ns = None
+
     def _open(self, stamp_ns: int, direction: int, lead: Thermometer) -> None:
         self.regime = Regime.DYNAMIC
         self.direction = direction
+        self._turning_ns = None
         self.switched_ns = stamp_ns
         self._is_grown = False
         # An onset is seen long before the rate has grown: give the ramp time to show.

@@ -23,7 +23,8 @@ class CompensatorConfig:
     Parameters
     ----------
     transition_time_s : float
-        Time over which the sets cross over after a switch [s]; 0 = the paper's hard switch.
+        Time over which the sets cross over after a switch [s], stretched where they differ much
+        (`Correction.gentle_transition`); 0 = the paper's hard switch.
     temperature_timeout_s : float
         Age of the board temperature at which nothing is published any more [s].
     case_timeout_s : float

@@ -216,14 +216,16 @@ def _corrected(
     first_position: int,
     window_s: float,
 ) -> _Corrected:
+    correction = Correction(calibration)
     thermal = ThermalConfig(
-        config.transition_time_s, config.case_timeout_s, calibration.board_lag_s
+        correction.gentle_transition(config.transition_time_s),
+        config.case_timeout_s,
+        calibration.board_lag_s,
     )
     tracker = ThermalTracker(calibration.detector, calibration.memory_time_constants_s, thermal)
     step_s = max(window_s / 10.0, 1.0)
     start_s, states = thermal_states(bag, tracker, step_s)
     grid = start_s + step_s * np.arange(len(states))
-    correction = Correction(calibration)
     M = np.array(calibration.misalignment)
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     K = np.array([axis.scale_factor for axis in axes])

@@ -68,7 +68,8 @@ class NodeConfig:
     )
     transition_time: float = _parameter(
         _DEFAULTS.transition_time_s,
-        'Time over which the sets cross over at a switch [s]; 0 switches at once.',
+        'Time over which the sets cross over at a switch [s], up to ten times as long where the '
+        'output would move faster than 1 ug per second; 0 switches at once.',
         (0.0, 3600.0),
     )
     temperature_timeout: float = _parameter(

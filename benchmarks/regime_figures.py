@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the figures of docs/regime.md, drawn from what benchmarks/regime.py has computed.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+from regime_regret import PROGRAMS, Unit
+
+Array = npt.NDArray[np.float64]
+BLUE, RED, GREEN, GREY = '#0072b2', '#d55e00', '#009e73', '#808080'
+
+
+def plot_rules(
+    t: Array, case: Array, board: Array, flags: Mapping[str, npt.NDArray[np.bool_]], folder: Path
+) -> None:
+    """
+    Draw one ramp and its relaxation: temperatures, derivatives of the case, the flag of each rule.
+
+    """
+    minutes = t / 60.0
+    rate = np.gradient(case, t) * 60.0
+    bend = np.gradient(rate, t) * 60.0
+    figure = Figure(figsize=(9.0, 6.6), dpi=110, layout='constrained')
+    top, middle, low = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2.2, 2.2))
+    top.plot(minutes, case, color=RED, lw=1.2, ls='--', label='T_case')
+    top.plot(minutes, board, color='black', lw=1.4, label='T_board')
+    top.set_ylabel('temperature, °C')
+    top.legend(frameon=False, fontsize=8)
+    middle.plot(minutes, rate, color=BLUE, lw=1.2, label='dT_case/dt, K/min')
+    middle.plot(minutes, 10.0 * bend, color=GREEN, lw=1.2, ls=':', label='10 d²T_case/dt², K/min²')
+    middle.set_ylabel('derivatives (true)')
+    middle.legend(frameon=False, fontsize=8)
+    for row, flag in enumerate(flags.values()):
+        at = len(flags) - 1 - row
+        colour = GREY if row else 'black'
+        low.fill_between(minutes, at, at + 0.8, where=flag, color=colour, lw=0, step='post')
+    low.set_yticks([len(flags) - 0.6 - row for row in range(len(flags))], list(flags))
+    low.set(xlabel='time since the onset, min', ylim=(-0.1, len(flags)))
+    low.set_title('dynamic according to', loc='left', fontsize=10)
+    for axes in (top, middle, low):
+        axes.grid(visible=True, color='#e4e4e4')
+        axes.set_axisbelow(True)
+    save(figure, folder / 'regime_rules.png')
+
+
+def plot_regret(units: list[Unit], folder: Path) -> None:
+    """
+    Draw the error in truth of one unseen bag of each unit under the three flags.
+
+    """
+    figure = Figure(figsize=(9.0, 2.3 * len(units)), dpi=110, layout='constrained')
+    for axes, unit in zip(figure.subplots(len(units), 1, sharex=True), units, strict=True):
+        bag = next(one for one in unit.bags if one.program == PROGRAMS[1])
+        minutes = bag.time / 60.0
+        axes.fill_between(
+            minutes, 0.0, 1.0, where=bag.flag == 1, color='#e8e8e8', lw=0,
+            transform=axes.get_xaxis_transform(),
+        )  # fmt: skip
+        axes.plot(minutes, bag.static, color=BLUE, lw=1.0, label='static set')
+        axes.plot(minutes, bag.dynamic, color=RED, lw=1.0, ls='--', label='dynamic set')
+        axes.plot(minutes, bag.ours, color='black', lw=1.6, ls=':', label='under our flag (grey)')
+        axes.set_ylabel('|f| - g, µg')
+        axes.set_title(unit.name, loc='left', fontsize=10)
+    figure.axes[0].legend(loc='upper right', fontsize=8, frameon=False, ncols=3)
+    figure.axes[-1].set_xlabel('time, min')
+    save(figure, folder / 'regime_regret.png')
+
+
+def save(figure: Figure, path: Path) -> None:
+    """
+    Write a figure; the same numbers give the same file.
+
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, metadata={'Software': None})

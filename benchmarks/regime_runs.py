@@ -1,0 +1,198 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the runs of benchmarks/regime.py: a detector or a rule over ramps and soaks, and its cost.
+
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from regime_rules import BOARD_LAG_S, RIPPLE_C, RIVALS, Array, Scene, read, temperatures
+
+from thermo_comp.regime import DetectorSettings, Regime, RegimeDetector
+from thermo_comp.thermometer import Thermometer, ThermometerSettings
+
+SEGMENT_H = 2.5
+OURS = 'ours'
+SETTLE_S = 1800.0
+Job = tuple[tuple[Scene, ...], int, float, int, bool]
+
+
+@dataclass
+class Outcome:
+    """
+    What a rule made of the ramps of one scene.
+
+    """
+
+    delays: list[float]
+    missed: int
+    flips: int
+    early: int
+    flagged: float
+    n: int
+
+
+def settings(scene: Scene) -> DetectorSettings:
+    """
+    Shipped defaults, with the sensor and the unit's lags filled in.
+
+    """
+    case = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s)
+    board = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s + BOARD_LAG_S)
+    return DetectorSettings(ripple_c=RIPPLE_C, case=case, board=board)
+
+
+def rng_of(seed: int, purpose: int, scene: Scene) -> np.random.Generator:
+    """
+    Make the generator of one scene, the same in whichever order scenes run.
+
+    """
+    return np.random.default_rng([seed, purpose, *(round(1e6 * v) for v in vars(scene).values())])
+
+
+def ours(scene: Scene, case: Array, board: Array) -> npt.NDArray[np.int8]:
+    """
+    Flag of the shipped detector at each reading: 1 dynamic, 0 static, -1 unknown.
+
+    """
+    detector_settings = settings(scene)
+    case_thermometer = Thermometer(detector_settings.case)
+    board_thermometer = Thermometer(detector_settings.board)
+    detector = RegimeDetector(detector_settings)
+    step_ns = round(1e9 / scene.rate_hz)
+    flags = np.empty(len(case), np.int8)
+    regime = Regime.UNKNOWN
+    for k, (c, b) in enumerate(zip(case.tolist(), board.tolist(), strict=True)):
+        board_thermometer.update(k * step_ns, b)
+        if case_thermometer.update(k * step_ns, c):
+            regime = detector.update(k * step_ns, case_thermometer, board_thermometer)
+        flags[k] = regime
+    return flags
+
+
+def judge(flags: Iterable[tuple[Array, npt.NDArray[np.bool_]]], duration: float) -> Outcome:
+    """
+    Delay, flips and flagged share of ramps from 0 to `duration`.
+
+    """
+    outcome = Outcome([], 0, 0, 0, 0.0, 0)
+    for t, flag in flags:
+        outcome.n += 1
+        inside = flag[(t >= 0.0) & (t < duration)]
+        times = t[(t >= 0.0) & (t < duration)]
+        outcome.flagged += float(inside.mean())
+        if flag[np.searchsorted(t, 0.0) - 1]:
+            outcome.early += 1
+            continue
+        if not inside.any():
+            outcome.missed += 1
+            continue
+        onset = int(np.argmax(inside))
+        outcome.delays.append(float(times[onset]))
+        outcome.flips += bool((~inside[onset:]).any())
+    outcome.flagged /= max(outcome.n, 1)
+    return outcome
+
+
+def tuned(scene: Scene, hours: float, seed: int) -> dict[str, float]:
+    """
+    Threshold of each rival: the largest value of its statistic in some hours of soak.
+
+    """
+    rng = rng_of(seed, 3, scene)
+    thresholds = dict.fromkeys(RIVALS if hours else (), 0.0)
+    for _ in range(round(hours / SEGMENT_H)):
+        t = np.arange(0.0, 3600.0 * SEGMENT_H, 1.0 / scene.rate_hz)
+        soak = read(temperatures(scene, t, 0.0, rng)[0], scene, rng)
+        for name in thresholds:
+            peak = RIVALS[name](scene, soak)[t > SETTLE_S].max()
+            thresholds[name] = max(thresholds[name], float(peak))
+    return thresholds
+
+
+def run_scenes(job: Job) -> list[tuple[Scene, dict[str, Outcome]]]:
+    """
+    All rules over `n` ramps of each scene of one sensor, the rivals tuned on its soak first.
+
+    """
+    scenes, n, hours, seed, is_rippled = job
+    thresholds = tuned(scenes[0], hours, seed)
+    return [(scene, run_ramps(scene, n, thresholds, seed, is_rippled)) for scene in scenes]
+
+
+def run_ramps(
+    scene: Scene, n: int, thresholds: dict[str, float], seed: int, is_rippled: bool
+) -> dict[str, Outcome]:
+    """
+    Ours, and the rivals at their thresholds, over `n` ramps of one scene.
+
+    """
+    rng = rng_of(seed, 5, scene)
+    # long enough for three edges of the coarsest sensor
+    edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
+    duration = min(max(edges_s, 2400.0), 7200.0)
+    t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)
+    flags: dict[str, list[tuple[Array, npt.NDArray[np.bool_]]]] = {OURS: []}
+    for _ in range(n):
+        case, board = temperatures(scene, t, duration, rng, RIPPLE_C if is_rippled else 0.0)
+        readings = read(case, scene, rng)
+        flags[OURS].append((t, ours(scene, readings, read(board, scene, rng)) == Regime.DYNAMIC))
+        for name, threshold in thresholds.items():
+            flags.setdefault(name, []).append((t, RIVALS[name](scene, readings) > threshold))
+    return {name: judge(each, duration) for name, each in flags.items()}
+
+
+def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
+    """
+    Count openings, switches and the decided share of one soak, shipped detector.
+
+    """
+    scene, hours, seed = job
+    rng = rng_of(seed, 7, scene)
+    t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)
+    case, board = temperatures(scene, t, 0.0, rng)
+    flag = ours(scene, read(case, scene, rng), read(board, scene, rng))
+    known = flag[flag >= 0]
+    switches = int(np.count_nonzero(np.diff(known)))
+    return scene.sensor, int(np.count_nonzero(np.diff(known) == 1)), switches, len(known) / len(t)
+
+
+def cost() -> dict[str, float]:
+    """
+    CPU microseconds per reading, best of three, and those of one numpy scalar call.
+
+    """
+    scene = Scene(0.5, 900.0, 0.001, 0.0, 1.0)
+    rng = np.random.default_rng(0)
+    t = np.arange(-7200.0, 7200.0)
+    case, board = (read(x, scene, rng).tolist() for x in temperatures(scene, t, 3600.0, rng))
+    best = dict.fromkeys(('thermometer', 'thermometer + detector', 'numpy scalar call'), np.inf)
+
+    def keep(name: str, begin: float, n: int) -> None:
+        best[name] = min(best[name], (time.process_time() - begin) / n * 1e6)
+
+    value = np.float64(2.0)
+    for _ in range(3):
+        own = settings(scene)
+        one, other, detector = Thermometer(own.case), Thermometer(own.board), RegimeDetector(own)
+        begin = time.process_time()
+        for k, reading in enumerate(board):
+            other.update(k * 10**9, reading)
+        keep('thermometer', begin, len(board))
+        begin = time.process_time()
+        for k, reading in enumerate(case):
+            one.update(k * 10**9, reading)
+            detector.update(k * 10**9, one, other)
+        keep('thermometer + detector', begin, len(case))
+        begin = time.process_time()
+        for _ in range(100_000):
+            np.sqrt(value)
+        keep('numpy scalar call', begin, 100_000)
+    return best
