@@ -155,7 +155,12 @@ class SensorGuard:
         self._other_then = nan
         self.is_revived = self.fault in (Fault.STILL, Fault.FROZEN)
         age = (stamp_ns - own.stamp_ns) * 1e-9
-        if self._n_used >= SETTLED_READINGS and not self.is_revived:
+        # A reading that is near anything the estimate may have come to is no step: the usual case.
+        is_near = (
+            self.fault == Fault.NONE
+            and abs(celsius - own.temperature) + abs(own.rate) * age < LARGEST_STEP
+        )
+        if self._n_used >= SETTLED_READINGS and not (is_near or self.is_revived):
             expected, _, variance = own.at(stamp_ns)
             step = celsius - expected
             possible = LARGEST_STEP + 2.0 * self._quantum + LARGEST_RATE * age

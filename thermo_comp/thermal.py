@@ -138,7 +138,7 @@ class ThermalTracker:
     ) -> None:
         self.settings = detector
         self.memory_time_constants_s = memory_time_constants_s
-        self.config = config or ThermalConfig()
+        self._configure(config or ThermalConfig())
         self.board = Thermometer(detector.board)
         self.case = Thermometer(detector.case)
         self.detector = RegimeDetector(detector)
@@ -146,6 +146,11 @@ class ThermalTracker:
         self.case_guard = SensorGuard(self.case, self.board, 0.0)
         self.lead = LeadWatch(self.case, self.board, detector.relaxed_rate_k_min)
         self._clear()
+
+    def _configure(self, config: ThermalConfig) -> None:
+        self.config = config
+        #: How long nobody may have watched before the regime is not known any more [s].
+        self._unwatched_s = max(UNWATCHED_SHARE * self.settings.case.lag_s, config.case_timeout_s)
 
     def _clear(self) -> None:
         #: Stamp of the newest reading that was used, None before the first.
@@ -180,7 +185,7 @@ class ThermalTracker:
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
-        self.config = config
+        self._configure(config)
         self.board_guard.lag_s = config.board_lag_s
 
     def is_case_live(self, stamp_ns: int) -> bool:
@@ -320,8 +325,7 @@ class ThermalTracker:
             self._target = target
 
     def _is_unwatched(self, decided_ns: int, stamp_ns: int) -> bool:
-        limit_s = max(UNWATCHED_SHARE * self.settings.case.lag_s, self.config.case_timeout_s)
-        return (stamp_ns - decided_ns) * 1e-9 > limit_s
+        return (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s
 
     def _forget_memory(self) -> None:
         n_lags = len(self.memory_time_constants_s)
