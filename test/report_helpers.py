@@ -93,7 +93,7 @@ def certificate() -> str:
         return page.read_text(encoding='utf-8')
 
 
-def write_bag(path: Path, position: int = 0, **metadata: str) -> Path:
+def write_bag(path: Path, position: int = 0, frame_id: str = 'imu_link', **metadata: str) -> Path:
     """
     Write a position's run as a bag.
 
@@ -107,5 +107,5 @@ def write_bag(path: Path, position: int = 0, **metadata: str) -> Path:
     with BagWriter(path, metadata=facts) as writer:
         writer.write_temperature('temperature/board', one.board_stamp_ns, one.board)
         writer.write_temperature('temperature/case', one.case_stamp_ns, one.case)
-        writer.write_counts('accel/counts', one.accel_stamp_ns, one.counts, 'imu_link')
+        writer.write_counts('accel/counts', one.accel_stamp_ns, one.counts, frame_id)
     return path

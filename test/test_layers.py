@@ -23,6 +23,7 @@ LAYERS = {
     '__init__': 0,
     'errors': 0,
     'files': 1,
+    'plain_yaml': 1,
     'functions': 1,
     'modes': 1,
     'thermometer': 1,

@@ -208,7 +208,9 @@ def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
     # WHY: a certificate is opened in a browser, and a bag is written by anybody.
     # WHAT: names, serials, notes and hashes stay text, in the page and in its drawings.
     evil = '<script>alert("x")</script>'
-    bag = write_bag(tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", serial=evil)
+    bag = write_bag(
+        tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", frame_id=evil, serial=evil
+    )
     calibration = fitted().calibration
     provenance = replace(
         calibration.provenance,

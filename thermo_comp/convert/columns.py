@@ -16,9 +16,13 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import RecordingError
+from ..files import read_bounded
+from ..plain_yaml import load_plain_yaml
 from .table import Column
 
 STANDARD_GRAVITY = 9.80665
+#: A map takes some kB.
+_SIZE_LIMIT = 1 << 20
 _STAMP_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -208,11 +212,13 @@ def load_column_map(path: str | Path) -> ColumnMap:
 
     """
     try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        data = load_plain_yaml(read_bounded(path, _SIZE_LIMIT).decode())
     except OSError as failure:
         raise RecordingError(failure.strerror or str(failure), path=path) from failure
     except UnicodeDecodeError as failure:
         raise RecordingError('a column map is YAML text in UTF-8', path=path) from failure
+    except ValueError as failure:
+        raise RecordingError(str(failure), path=path) from failure
     except yaml.YAMLError as failure:
         reason = ' '.join(str(failure).split())
         raise RecordingError(f'not valid YAML ({reason})', path=path) from failure

@@ -16,6 +16,7 @@ import yaml
 
 from ..errors import RecordingError
 from ..files import read_bounded
+from ..plain_yaml import load_plain_yaml
 from .definitions import offered_qos
 
 _VERSION = 9
@@ -182,7 +183,7 @@ def read_metadata(directory: Path) -> Description | None:
     if not text.strip():
         return None
     try:
-        content = yaml.safe_load(text)['rosbag2_bagfile_information']
+        content = load_plain_yaml(text)['rosbag2_bagfile_information']
         files = tuple(directory / PurePath(str(name)).name for name in _names(content))
         description = Description(
             storage=str(content['storage_identifier']),

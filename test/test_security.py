@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Bytes of strangers stay bytes, and the node asks the network for what it needs and no more.
+
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+import yaml
+from builders import calibration
+from conftest import ROOT
+
+from thermo_comp.calibration import Unit
+from thermo_comp.calibration_file import save_calibration
+from thermo_comp.errors import RecordingError
+from thermo_comp.plain_yaml import load_plain_yaml
+from thermo_comp.recording import BagWriter, inspect_recording
+
+NODE = 'thermo_comp'
+
+
+def allowed() -> dict[str, set[str]]:
+    """Read the full names that the policy allows, by what may be done with them."""
+    root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
+    (profile,) = root.iter('profile')
+    assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
+    found: dict[str, set[str]] = {}
+    for group in profile:
+        ((what, verdict),) = group.attrib.items()
+        assert verdict == 'ALLOW'
+        names = [(one.text or '').replace('~', f'/{NODE}') for one in group]
+        found[what] = {name if name.startswith('/') else f'/{name}' for name in names}
+    return found
+
+
+def test_the_policy_allows_what_the_node_opens_and_no_more(tmp_path: Path) -> None:
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    from ros_helpers import node_in_thread
+
+    opened: dict[str, set[str]] = {'publish': set(), 'subscribe': set(), 'reply': set()}
+    for word in ('counts', 'imu'):
+        path = tmp_path / f'{word}.yaml'
+        unit = Unit('T-1', 'm/s^2', 160.0, 0.01)
+        save_calibration(calibration(unit=unit) if word == 'imu' else calibration(), path)
+        arguments = ['-p', f'calibration_file:={path}', '-p', f'input:={word}']
+        with node_in_thread(*arguments) as node:
+            ros = node.node
+            for what, names in (
+                ('publish', ros.get_publisher_names_and_types_by_node(NODE, '/')),
+                ('subscribe', ros.get_subscriber_names_and_types_by_node(NODE, '/')),
+                ('reply', ros.get_service_names_and_types_by_node(NODE, '/')),
+            ):
+                opened[what] |= {name for name, _ in names}
+            assert ros.get_client_names_and_types_by_node(NODE, '/') == []
+    assert opened == allowed()
+
+
+BOMB = '\n'.join(
+    ['a0: &a0 {k: v}']
+    + [f'a{k}: &a{k} {{<<: [{", ".join([f"*a{k - 1}"] * 9)}]}}' for k in range(1, 30)]
+)
+
+
+def test_metadata_of_a_bag_is_no_bomb(tmp_path: Path) -> None:
+    # WHY: merge keys of aliases multiply, 30 lines of them to 10^28 entries.
+    bag = tmp_path / 'bag'
+    with BagWriter(bag) as writer:
+        writer.write_temperature('temperature/board', [1], [20.0])
+    metadata = bag / 'metadata.yaml'
+    metadata.write_text(f'{metadata.read_text()}\n{BOMB}\n')
+    with pytest.raises(RecordingError, match='not valid YAML'):
+        inspect_recording(bag)
+
+
+def test_metadata_of_a_bag_leads_nowhere_else(tmp_path: Path) -> None:
+    secret = tmp_path / 'secret.mcap'
+    with BagWriter(secret) as writer:
+        writer.write_temperature('temperature/board', [1], [20.0])
+    bag = tmp_path / 'bag'
+    with BagWriter(bag) as writer:
+        writer.write_temperature('temperature/case', [1], [30.0])
+    metadata = bag / 'metadata.yaml'
+    (name,) = (file.name for file in bag.glob('*.mcap'))
+    for elsewhere in (str(secret), '../secret.mcap'):
+        changed = metadata.read_text().replace(f'- {name}', f'- {elsewhere}', 1)
+        assert elsewhere in changed
+        metadata.write_text(changed)
+        with pytest.raises(RecordingError, match=r'secret\.mcap of the bag is missing'):
+            inspect_recording(bag)
+        metadata.write_text(metadata.read_text().replace(f'- {elsewhere}', f'- {name}', 1))
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('a: &x 1\nb: *x', 'aliases'),
+        ('[' * 60 + ']' * 60, 'nested deeper than 50'),
+        ('a: !!python/object/apply:os.system [ls]', 'could not determine'),
+        ('a: [', 'expected the node content|did not find'),
+    ],
+)
+def test_yaml_of_strangers(text: str, message: str) -> None:
+    with pytest.raises(yaml.YAMLError, match=message):
+        load_plain_yaml(text)
+
+
+def test_plain_yaml_is_read() -> None:
+    assert load_plain_yaml('a: [1, 2.5, x]\nb: {c: null}') == {
+        'a': [1, 2.5, 'x'],
+        'b': {'c': None},
+    }
