@@ -246,7 +246,7 @@ def memory(folder: Path, gigabytes: float) -> None:
 
     """
     path, output = folder / 'large.mcap', folder / 'large_out.mcap'
-    per_sample = 105  # bytes of one counts message in an uncompressed MCAP, roughly
+    per_sample = 99  # bytes of one counts message in an uncompressed MCAP, roughly
     write_bag(path, int(gigabytes * 1e9 / per_sample), 'none')
     size = path.stat().st_size
     code = (
