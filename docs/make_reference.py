@@ -79,6 +79,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
 | case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
 | temperature or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
+| a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
 | a temperature that jumps as no part can | its readings are not used until they are possible again or the sensor has been lost |
 | a temperature that stands still while the other moves | its readings are not used: held, then lost |
 | both temperatures the same to the bit for 5 s | used, with a covariance that grows, WARN |

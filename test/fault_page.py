@@ -130,7 +130,9 @@ def page() -> str:
     for row in ROWS:
         seconds = back[row.fault]
         when = 'it stays' if seconds is None else f'{seconds:.0f} s'
-        cells = (row.fault, row.injection, row.does, _diagnostics(row), when)
+        begin, end = row.blind
+        blind = f'; cannot be known, and is wrong, for {end - begin:.0f} s' if end > begin else ''
+        cells = (row.fault, row.injection, row.does + blind, _diagnostics(row), when)
         parts.append(
             f'| {" | ".join(map(_cell, cells))} | `test_faults.py::test_row[{row.fault}]` |\n'
         )
