@@ -13,14 +13,11 @@ and change what runs between two wake-ups.
 from __future__ import annotations
 
 import gc
-import signal
 import sys
-import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from copy import copy
-from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -32,6 +29,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
@@ -43,6 +41,7 @@ from .conversions import SampleConverter, read_temperature
 from .diagnostics import Snapshot, Traffic, build
 from .loading import check, load
 from .parameters import NodeConfig, ParameterError
+from .signals import SignalWatch
 from .waitloop import RawPublisher, RawSubscription, RCLError, WaitLoop, undeclared_overrides
 
 NODE_NAME = 'thermo_comp'
@@ -420,35 +419,24 @@ def main(args: list[str] | None = None) -> int:
         text = problem + USAGE + parameters.parameters_help()
         print(text, file=sys.stdout if is_help else sys.stderr)
         return 0 if is_help else 2
-    is_running = threading.Event()
-
-    def interrupt(_number: int, _frame: Any) -> None:
-        # Once the loop runs it sees the signal itself; nothing is to be interrupted half-way.
-        if not is_running.is_set():
-            raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, interrupt)
-    try:
-        rclpy.init(args=args)
-        _serve(is_running)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except RCLError:
-        # A signal during start-up pulls the context away under what is being built.
-        if rclpy.ok():
-            raise
-    except ThermoCompError as error:
-        print(f'thermo_comp_node: {error}', file=sys.stderr)
-        return 1
-    finally:
-        rclpy.try_shutdown()
+    with SignalWatch() as signals:
+        try:
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            _serve(signals)
+        except ExternalShutdownException:
+            pass
+        except ThermoCompError as error:
+            print(f'thermo_comp_node: {error}', file=sys.stderr)
+            return 1
+        finally:
+            rclpy.try_shutdown()
     return 0
 
 
-def _serve(is_running: threading.Event) -> None:
+def _serve(signals: SignalWatch) -> None:
     node = CompensationNode()
     try:
-        is_running.set()
+        signals.on_signal(node.stop)
         # What start-up left behind is never looked at again by the garbage collector.
         gc.collect()
         gc.freeze()
