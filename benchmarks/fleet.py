@@ -7,9 +7,8 @@ Units are simulated and written to bags once (``--folder`` keeps them), and real
 are processes of one thread, as the command starts them.
 
     python benchmarks/fleet.py scaling              strong and weak, 1 and 2 workers
-    python benchmarks/fleet.py overhead             500 small units: idle workers, scheduler's time
+    python benchmarks/fleet.py overhead             500 small units, and 100 workers on paper
     python benchmarks/fleet.py kill --units 200     200 x 12 bags, a worker killed twice
-    python benchmarks/fleet.py paper                100 workers, from the figures of `overhead`
 
 """
 
@@ -52,6 +51,7 @@ PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
 #: The smallest thermal test that fits: what a scheduler has the least time for.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
 N_LOTS = 4
+_REST_S = 4.0
 
 
 def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
@@ -111,6 +111,8 @@ class Measured:
         How long each task took its worker [s].
     own_cpu_s : float
         Processor time of this process: client and scheduler.
+    rest_cpu : float
+        The part of a processor that it takes with nothing to do: heartbeats, watching.
     n_bytes : int
         Written to any connection by any of the processes.
     cpu_s : float
@@ -121,8 +123,17 @@ class Measured:
     seconds: float
     tasks: tuple[float, ...]
     own_cpu_s: float
+    rest_cpu: float
     n_bytes: int
     cpu_s: float
+
+    @property
+    def per_task_s(self) -> float:
+        """
+        Return what one task costs client and scheduler.
+
+        """
+        return max(self.own_cpu_s - self.rest_cpu * self.seconds, 0.0) / len(self.tasks)
 
     def busy(self, n_workers: int) -> float:
         """
@@ -143,6 +154,9 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
         client.run(count_bytes)
         list(run(client, str(folder), jobs[: 2 * n_workers], options))
         client.get_task_stream()
+        cpu, began = process_cpu(), time.perf_counter()
+        time.sleep(_REST_S)
+        rest_cpu = (process_cpu() - cpu) / (time.perf_counter() - began)
         before = bytes_written() + sum(client.run(bytes_written).values())
         cpu, began, started = process_cpu(), time.perf_counter(), time.time()
         outcomes = list(run(client, str(folder), jobs, options))
@@ -158,7 +172,7 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
     assert len(tasks) == n_units
     assert all(one is not None and one.calibration for _, one in outcomes)
     cpu_s = sum(float(one.row['cpu_s'] or 0.0) for _, one in outcomes if one is not None)
-    return Measured(seconds, tasks, own, n_bytes, cpu_s)
+    return Measured(seconds, tasks, own, rest_cpu, n_bytes, cpu_s)
 
 
 def process_cpu() -> float:
@@ -200,14 +214,15 @@ def bytes_written() -> int:
     return int(TCP.n_written)
 
 
-def scaling(folder: Path, n_units: int, repeats: int) -> None:
+def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
     """
     Compare one worker with two, on the same units and on twice as many.
 
     """
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
-    options = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY), certificates=False)
-    print(f'{n_units} units x 12 bags, model auto; load {loads()}')
+    fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
+    options = FleetOptions(fit, certificates=False)
+    print(f'{n_units} units x 12 bags, model {model}; load {loads()}')
     print('| run | strong: 1 worker s | 2 workers s | x | free cores x | weak, half: 1 s | x |')
     print('|---|---|---|---|---|---|---|')
     found: list[tuple[float, float, float]] = []
@@ -233,9 +248,9 @@ def scaling(folder: Path, n_units: int, repeats: int) -> None:
     )
 
 
-def overhead(folder: Path, n_units: int) -> Measured:
+def overhead(folder: Path, n_units: int) -> None:
     """
-    Measure what is lost between the tasks of many small units.
+    Measure what is lost between the tasks of many small units, and what follows for many workers.
 
     """
     write_fleet(folder / 'small', 20, SMALL_BAGS, SMALL_PROGRAM)
@@ -246,14 +261,15 @@ def overhead(folder: Path, n_units: int) -> Measured:
     print(f'elapsed {found.seconds:.1f} s, tasks {busy:.1f} s on both workers')
     print(f'idle workers: {100.0 * (1.0 - busy / (2.0 * found.seconds)):.2f} % of their time')
     print(
-        f'scheduler and client: {1e3 * found.own_cpu_s / n_units:.2f} ms of processor time per '
-        f'unit, {100.0 * found.own_cpu_s / busy:.2f} % of the tasks'
+        f"scheduler and client: {100.0 * found.own_cpu_s / busy:.2f} % of the tasks' processor "
+        f'time; {1e3 * found.per_task_s:.2f} ms per unit, and {100.0 * found.rest_cpu:.1f} % of a '
+        'processor at rest'
     )
     print(f'network: {found.n_bytes / n_units / 1e3:.1f} kB per unit, all connections together')
-    return found
+    paper(found)
 
 
-def kill(folder: Path, n_units: int) -> int:
+def kill(folder: Path, n_units: int, model: str) -> int:
     """
     Kill a worker twice in a run, each time in the middle of a unit; count the rows.
 
@@ -263,7 +279,8 @@ def kill(folder: Path, n_units: int) -> int:
     for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:
         (fleet / unit.name).parent.mkdir(exist_ok=True)
         (fleet / unit.name).symlink_to(folder / 'fleet' / unit.name)
-    options = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY), certificates=False)
+    fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
+    options = FleetOptions(fit, certificates=False)
     killed: list[int] = []
     print(f'load {loads()}', flush=True)
     try:
@@ -282,7 +299,7 @@ def kill(folder: Path, n_units: int) -> int:
     n_lost = n_units - result.n_fitted
     cpu_s = sum(float(row['cpu_s'] or 0.0) for row in result.rows)
     print(
-        f'{n_units} units x 12 bags: {seconds:.0f} s, {len(killed)} workers killed, '
+        f'{n_units} units x 12 bags, {model}: {seconds:.0f} s, {len(killed)} workers killed, '
         f'{len(result.rows)} rows, {n_lost} lost; {cpu_s:.0f} s of processor time in the fits; '
         f'load {loads()}'
     )
@@ -290,27 +307,31 @@ def kill(folder: Path, n_units: int) -> int:
     return n_lost + (len(result.rows) != n_units)
 
 
-def paper(folder: Path) -> None:
+def paper(found: Measured) -> None:
     """
     Estimate a hundred workers: tasks as measured, one scheduler that sends them one by one.
 
     """
-    found = overhead(folder, 100)
-    per_task = found.own_cpu_s / len(found.tasks)
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
-    print('| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
+    print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')
-    for stretch in (1.0, 10.0, 100.0):
-        tasks = np.array(found.tasks) * stretch
-        for n_units, n_workers in ((500, 2), (500, 100), (5000, 100), (5000, 1000)):
-            drawn = np.random.default_rng(1).choice(tasks, n_units)
-            seconds = makespan(drawn, n_workers, per_task)
-            print(
-                f'| {tasks.mean():.1f} | {n_units} | {n_workers} | {seconds:.1f} '
-                f'| {100.0 * drawn.sum() / n_workers / seconds:.0f} % '
-                f'| {100.0 * n_units * per_task / seconds:.1f} % '
-                f'| {n_units * kilobytes / 1e3 / seconds:.2f} |'
-            )
+    for unit_s, n_units, n_workers in (
+        (1.0, 500, 100),
+        (1.0, 5000, 100),
+        (10.0, 500, 100),
+        (10.0, 5000, 100),
+        (10.0, 5000, 1000),
+        (100.0, 5000, 1000),
+    ):
+        tasks = np.array(found.tasks) * unit_s / statistics.mean(found.tasks)
+        drawn = np.random.default_rng(1).choice(tasks, n_units)
+        seconds = makespan(drawn, n_workers, found.per_task_s)
+        print(
+            f'| {unit_s:g} | {n_units} | {n_workers} | {seconds:.0f} '
+            f'| {100.0 * drawn.sum() / n_workers / seconds:.0f} % '
+            f'| {100.0 * n_units * found.per_task_s / seconds:.0f} % '
+            f'| {n_units * kilobytes / 1e3 / seconds:.2f} |'
+        )
 
 
 def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: float) -> float:
@@ -343,22 +364,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument('part', choices=['scaling', 'overhead', 'kill', 'paper'])
+    parser.add_argument('part', choices=['scaling', 'overhead', 'kill'])
     parser.add_argument('--units', type=int, help='instead of 16, 500 and 200')
     parser.add_argument('--repeats', type=int, default=3)
+    parser.add_argument('--model', default='auto', help='of scaling and kill')
     parser.add_argument('--folder', type=Path, help='where the bags are kept')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = (options.folder or Path(scratch)).absolute()
         folder.mkdir(parents=True, exist_ok=True)
         if options.part == 'scaling':
-            scaling(folder, options.units or 16, options.repeats)
+            scaling(folder, options.units or 16, options.repeats, options.model)
         elif options.part == 'overhead':
             overhead(folder, options.units or 500)
-        elif options.part == 'paper':
-            paper(folder)
         else:
-            return kill(folder, options.units or 200)
+            return kill(folder, options.units or 200, options.model)
     return 0
 
 
