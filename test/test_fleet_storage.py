@@ -225,6 +225,13 @@ class TestDiscovery:
         found = find_units(Storage(str(fleet)))
         assert [bag.name for one in found for bag in one.bags] == ['unit/1.mcap']
 
+    def test_a_relative_path_is_the_same_for_every_process(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        assert Storage('bags').address == str(tmp_path / 'bags')
+        assert Storage('memory://bags').address == 'memory://bags'
+
     def test_nothing_there(self, tmp_path: Path) -> None:
         with pytest.raises(FleetError, match='no bag in it; expected DIR/UNIT/BAG'):
             find_units(Storage(str(tmp_path)))

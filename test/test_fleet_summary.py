@@ -23,6 +23,8 @@ from thermo_comp.fleet.row import COLUMNS, Row, empty_row
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
 from thermo_comp.fleet.table import read_parquet, to_csv, to_parquet
 
+pa = pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
+
 MONDAY = datetime(2026, 1, 5)
 
 
@@ -235,7 +237,6 @@ class TestTable:
         (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')
         with pytest.raises(FleetError, match=r'x\.parquet: no fleet table'):
             read_parquet(tmp_path / 'x.parquet')
-        pa = pytest.importorskip('pyarrow')
         from pyarrow import parquet
 
         parquet.write_table(pa.table({'a': [1]}), tmp_path / 'y.parquet')

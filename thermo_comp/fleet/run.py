@@ -130,7 +130,7 @@ def fit_fleet(
             jobs.append(Job(unit, known.key if known is not None else ''))
 
     def work(on: Any) -> None:
-        for unit, outcome in run(on, url, jobs, options):
+        for unit, outcome in run(on, storage.address, jobs, options):
             row = ledger.store(unit, options, outcome)
             rows[unit.name] = row
             if tell is not None:

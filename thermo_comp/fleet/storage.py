@@ -100,6 +100,14 @@ class Storage:
         """
         return str(self._root).rstrip('/').rpartition('/')[2]
 
+    @property
+    def address(self) -> str:
+        """
+        Return what another process must be told to find the folder, wherever it was started.
+
+        """
+        return str(self._root) if self.is_local else self.url
+
     def local_path(self, name: str) -> Path:
         """
         Return the path of a file of this machine.
