@@ -46,7 +46,7 @@ from thermo_comp.simulation import UNIT_NAMES
 
 SOAK_H = 5.0
 # ramps per scene, by the rate of the readings [Hz]: ten times the readings, ten times the work
-RAMPS = {10.0: 2, 1.0: 6, 0.1: 10}
+RAMPS = {10.0: 1, 1.0: 6, 0.1: 10}
 TUNING_H = 20.0
 
 

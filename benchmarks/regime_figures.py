@@ -70,7 +70,8 @@ def plot_regret(units: list[Unit], folder: Path) -> None:
         axes.plot(minutes, bag.ours, color='black', lw=1.6, ls=':', label='under our flag (grey)')
         axes.set_ylabel('|f| - g, µg')
         axes.set_title(unit.name, loc='left', fontsize=10)
-    figure.axes[0].legend(loc='upper right', fontsize=8, frameon=False, ncols=3)
+    lines = figure.axes[0].get_lines()
+    figure.legend(handles=lines, loc='outside upper right', fontsize=8, frameon=False, ncols=3)
     figure.axes[-1].set_xlabel('time, min')
     save(figure, folder / 'regime_regret.png')
 

@@ -35,7 +35,7 @@ Array = npt.NDArray[np.float64]
 MICRO_G = 1e-6 * STANDARD_GRAVITY
 N_POSITIONS = 12
 N_JUDGED = 2
-RATE_HZ = 5
+RATE_HZ = 2
 # the fit's own program, and one that it has not seen
 PROGRAMS = ('chamber', 'held-out')
 

@@ -30,6 +30,7 @@ TUNING = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4,
 CELL_NOISE_SHARE = 0.4  # noise in a filter's own variance when cells make it come in bunches
 SETTLING = 5.0  # memories until a filter's noise is the formula's
 LONGEST_HALF_SWING_S = 600.0  # a ripple turns faster
+LARGEST_BASELINE = 0.25  # of the smallest ramp: as far as a baseline follows a rate
 SWING_MARGIN = 1.25  # on a swing of the rate about its trend ...
 SWING_SIGMAS = 3.0  # ... beyond what the noise makes of it
 SWING_MEMORY_LAGS = 10.0  # and how slowly it is forgotten
@@ -67,6 +68,7 @@ class OnsetTest:
         false_alarms: float,
     ) -> None:
         self._largest_swing = 0.5 * smallest_rate
+        self._largest_baseline = LARGEST_BASELINE * smallest_rate
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
@@ -299,7 +301,10 @@ class OnsetTest:
         """
         limit = self.swing + self._doubt
         share = dt / (dt + self._baseline_s)
-        self._baseline += share * min(max(rate - self._baseline, -limit), limit)
+        # A ramp that matters must not become the baseline, however slowly it shows.
+        farthest = max(self._largest_baseline, abs(self._baseline))
+        moved = self._baseline + share * min(max(rate - self._baseline, -limit), limit)
+        self._baseline = min(max(moved, -farthest), farthest)
         self._doubt -= share * self._doubt
 
     def _learn_swing(self, dt: float) -> None:

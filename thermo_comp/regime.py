@@ -200,10 +200,12 @@ class RegimeDetector:
             self._calm_ns = stamp_ns
 
         if not is_dynamic:
-            if departure and self.regime == Regime.STATIC:
+            speed = OBVIOUS_SHARE * self._relaxed_rate
+            # Two wide cells crossed in a row are a ramp even where no soak has been seen.
+            is_crossing = lead.settings.has_wide_cells and departure * lead.rate > speed
+            if departure and (self.regime == Regime.STATIC or is_crossing):
                 self._open(stamp_ns, departure, lead)
             elif not is_calm and (self.regime == Regime.STATIC or lead.n_in_row > FIRST_READINGS):
-                speed = OBVIOUS_SHARE * self._relaxed_rate
                 direction = _obvious(lead, speed)
                 if direction == 0 and board is not None and board.is_ready:
                     direction = _obvious(board, speed)
