@@ -222,7 +222,7 @@ def _spreads(summary: Summary) -> str:
 
 
 def _units(rows: Sequence[Row], certificate_of: Callable[[str], str] | None) -> str:
-    columns = ('static_ug', 'dynamic_ug', 'peak_ug', 'lowest_c', 'highest_c', 'n_positions')
+    columns = ('static_ug', 'dynamic_ug', 'peak_ug')
     links = [
         certificate_of(str(row['name'])) if certificate_of and row['verdict'] in FITTED else ''
         for row in rows
@@ -230,28 +230,31 @@ def _units(rows: Sequence[Row], certificate_of: Callable[[str], str] | None) -> 
     return '<h2>All tests</h2>' + table(
         (
             *('test', 'serial', 'lot', 'verdict', 'model'),
-            *(
-                'static, µg',
-                'dynamic, µg',
-                'largest, µg',
-                'from, °C',
-                'to, °C',
-                'positions',
-                'bags',
-            ),
+            *('static', 'dynamic', 'largest', '°C', 'rests', 'bags'),
         ),
         [
             (
                 *(str(row[name]) for name in ('name', 'serial', 'lot', 'verdict', 'model')),
                 *(_cell(row[name]) for name in columns),
+                _range(row),
+                str(row['n_positions'] or '–'),
                 _bags(row),
             )
             for row in rows
         ],
         texts=5,
-        caption='All columns with all digits: fleet.parquet and fleet.csv.',
+        caption='|g| − g at rest in µg: RMS in the static and the dynamic regime, largest window; '
+        'calibrated board temperatures; still positions. All columns with all digits: '
+        'fleet.parquet and fleet.csv.',
         links=[quote(link) for link in links],
     )
+
+
+def _range(row: Row) -> str:
+    lowest, highest = row['lowest_c'], row['highest_c']
+    if not isinstance(lowest, float) or not isinstance(highest, float):
+        return '–'
+    return f'{lowest:.0f} to {highest:.0f}'.replace('-', '−')
 
 
 def _cell(cell: Cell) -> str:
