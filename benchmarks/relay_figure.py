@@ -51,7 +51,7 @@ def draw(measured: list[dict[str, Any]], path: Path) -> None:
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
         axes.minorticks_off()
         axes.grid(visible=True, which='major', color='0.9')
-    figure.legend(loc='outside upper center', ncols=4, fontsize=8, frameon=False)
+    figure.legend(loc='outside upper center', ncols=4, fontsize=8, frameon=False, handlelength=3.5)
     figure.savefig(path, dpi=130)
 
 
