@@ -65,6 +65,7 @@ TAIL = """
 
 - Any bytes as a calibration file, any sequence of messages: [properties and
   fuzzing](security.md#properties-and-fuzzing).
+- Hours at full rate: [the soak](benchmarks.md#the-soak).
 - A calibration that has aged shows while the platform stands: |f| against gravity, with its
   uncertainty, in the diagnostics (`gravity residual`, `gravity residual sd`); WARN beyond five
   standard deviations, and beyond `gravity_tolerance` nothing is published (`test_health.py`).
