@@ -20,7 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.pool import Pool
 from pathlib import Path
 
@@ -155,7 +155,14 @@ def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
     return rows
 
 
-def run_matrix(pool: Pool, is_quick: bool, seed: int, n_ramps: int | None, hours: float) -> Matrix:
+def run_matrix(
+    pool: Pool,
+    is_quick: bool,
+    seed: int,
+    rates: Sequence[float],
+    n_ramps: int | None,
+    hours: float,
+) -> Matrix:
     """
     All rules over all scenes; `hours` of soak tune the rivals, 0 leaves them out.
 
@@ -170,7 +177,7 @@ def run_matrix(pool: Pool, is_quick: bool, seed: int, n_ramps: int | None, hours
             seed,
             True,
         )
-        for rate in ((1.0, 0.1) if is_quick else RAMPS)
+        for rate in rates
         for lag in lags
         for noise, quantum in SENSORS
     ]
@@ -291,7 +298,8 @@ def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
     """
     n_ramps = arguments.ramps
     hours = 0.0 if n_ramps else TUNING_H
-    matrix = run_matrix(pool, arguments.quick, arguments.seed, n_ramps, hours)
+    rates = arguments.rates or ((1.0, 0.1) if arguments.quick else tuple(RAMPS))
+    matrix = run_matrix(pool, arguments.quick, arguments.seed, rates, n_ramps, hours)
     yield 'Ramps by rate of the readings', rate_table(matrix)
     if n_ramps:
         return
@@ -347,6 +355,9 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--workers', type=int, default=1, help='processes')
     parser.add_argument('--soak-hours', type=float, default=1100.0)
+    parser.add_argument(
+        '--rates', type=float, nargs='+', choices=RAMPS, help='matrix: readings, Hz'
+    )
     parser.add_argument('--ramps', type=int, help='matrix: so many per scene, of ours alone')
     parser.add_argument('--figures', metavar='FOLDER', type=Path, help='draw there, too')
     parser.add_argument('--json', metavar='FILE', help='every table, machine-readable')
