@@ -34,7 +34,7 @@ _SAMPLES, _OUTPUT = 'accel/counts', 'imu/data_raw'
 _RATE = 1000.0
 
 # Column headings and the models behind them: one set for all temperatures; the paper's two sets
-# (static linear, dynamic quadratic); what the fit chooses, which is what the node runs.
+# (a static and a dynamic polynomial); what the fit chooses, which is what the node runs.
 _MODELS = {'one set': 'quadratic', 'two sets': 'golovach', 'node': 'auto'}
 
 
@@ -220,7 +220,7 @@ def _say(out: Output, result: Evaluation, model: str) -> None:
         rows,
         title=f'|g| error in ug over {result.window_s:g} s, RMS / max',
     )
-    out.line('one set: one quadratic for all; two sets: static linear, dynamic quadratic, as in')
+    out.line('one set: one quadratic for all; two sets: static and dynamic polynomials, as in')
     out.line(f'the paper; node: the two sets that the fit chose on held-out sections, {model}')
 
 

@@ -27,8 +27,8 @@ class FitOptions:
     gravity : float
         Local gravity; see `gravity.resolve_gravity`.
     model : str, optional
-        ``auto``, ``golovach`` (static linear, dynamic quadratic, as in the paper), or a
-        candidate's name such as ``quadratic+gradient+memory2``.
+        ``auto``, ``golovach`` (the paper: static linear, quadratic where the soaks bend;
+        dynamic quadratic), or a candidate's name such as ``quadratic+gradient+memory2``.
     serial : str or None, optional
         Unit serial; None takes the sources'.
     input : {'counts', 'm/s^2'}, optional
