@@ -40,7 +40,7 @@ def test_the_shown_commands_give_the_shown_output(tmp_path: Path, cli: Cli) -> N
 
 def test_commands_that_are_not_run_here_exist() -> None:
     known = {c.name or c.callback.__name__ for c in app.registered_commands if c.callback}
-    known |= {group.name for group in app.registered_groups}
+    known |= {group.typer_instance.info.name for group in app.registered_groups}
     named = set(re.findall(r'(?:^|^\$ |`)thermo_comp (\w+)', README, re.MULTILINE))
     assert named <= known, named - known
     assert {c for c in known if f'`thermo_comp {c}' in README} == known
