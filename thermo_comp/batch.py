@@ -282,8 +282,7 @@ def _good(full_scale: float, samples: Floats) -> Mask:
     # One look at the extremes settles the usual case; a NaN fails both comparisons.
     if -full_scale < np.min(samples) and np.max(samples) < full_scale:
         return np.ones(len(samples), dtype=bool)
-    good: Mask = ((-full_scale < samples) & (samples < full_scale)).all(axis=1)
-    return good
+    return np.asarray(((-full_scale < samples) & (samples < full_scale)).all(axis=1))
 
 
 def _judge(
