@@ -220,9 +220,11 @@ class Soak:
         memory: list[tuple[float, float]] = []
         latency: list[tuple[float, float, float]] = []
         n_reloads = n_sent = 0
+        n_all = round(seconds * self.rate)
         begin = time.monotonic()
-        while (now := time.monotonic() - begin) < seconds:
-            self.send(int(now * self.rate) + 1 - n_sent)
+        while n_sent < n_all:
+            now = time.monotonic() - begin
+            self.send(min(int(now * self.rate) + 1, n_all) - n_sent)
             n_sent = self.n_sent - self.n_sent_before
             if now >= len(memory):
                 memory.append((now, _resident_kib(self.process.process.pid)))
