@@ -21,6 +21,8 @@ def fit_sources(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     serial: str | None = None,
+    *,
+    hashed: bool = True,
 ) -> tuple[list[FitSource], Input]:
     """
     Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
@@ -35,6 +37,8 @@ def fit_sources(
         What is read.
     serial : str or None, optional
         The unit as the user knows it; it wins over what the bags say.
+    hashed : bool, optional
+        Whether the bags' hashes are wanted, which takes reading each of them once.
 
     Returns
     -------
@@ -64,7 +68,7 @@ def fit_sources(
             FitSource(
                 name=path.name,
                 blocks=_Blocks(path, topics, input),
-                sha256=digest(path),
+                sha256=digest(path) if hashed else None,
                 serial=info.metadata.get('serial'),
                 truncated=info.truncated,
             )

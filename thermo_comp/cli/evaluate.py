@@ -96,7 +96,8 @@ def evaluate(
             for number, bag in enumerate(bags)
         ]
         _, judged = models[0]
-        sources, _ = fit_sources(bags, topics, input_for(judged, input_.value), serial)
+        kind = input_for(judged, input_.value)
+        sources, _ = fit_sources(bags, topics, kind, serial, hashed=False)
         verdict: Assessment | str
         try:
             verdict = assess(
