@@ -32,6 +32,7 @@ LAYERS = {
     'metrics': 1,
     'calibration': 2,
     'calibration_file': 2,
+    'axis_correction': 2,
     'correction': 2,
     'batch': 2,
     'reading_queue': 2,

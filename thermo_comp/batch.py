@@ -11,7 +11,7 @@ the operations of `Compensator.process` in their order.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -31,24 +31,11 @@ TIME_JUMP_NS = 1_000_000_000
 _UNIQUE = [0, 1, 2, 4, 5, 8]
 
 
-class _Segment(NamedTuple):
-    """
-    A run of samples over which the correction is linear in time.
-
-    """
-
-    start_ns: int
-    #: Its samples are first..after - 1.
-    first: int
-    after: int
-    #: Not the rest of one that the end of the block before has cut.
-    is_new: bool
-    #: Held back because the samples come too fast; and what the rate adds to their noise.
-    is_too_fast: bool
-    noise_excess: float
-    #: The thermal states at both ends.
-    state: tuple[float, ...]
-    end_state: tuple[float, ...]
+#: A run of samples over which the correction is linear in time: its start [ns]; its samples, the
+#: first and the one after the last; whether it is new, not the rest of one that the end of the
+#: block before has cut; whether it is held back because the samples come too fast; what their
+#: rate adds to their noise; the thermal states at both ends.
+_Segment = tuple[int, int, int, bool, bool, float, tuple[float, ...], tuple[float, ...]]
 
 
 def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
@@ -204,16 +191,16 @@ def _add_segments(
         after = first + fresh
     while first < after:
         stamp_ns = stamps.item(first)
-        start_ns = updated_ns + (stamp_ns - updated_ns) // SEGMENT_NS * SEGMENT_NS
+        start_ns = stamp_ns - (stamp_ns - updated_ns) % SEGMENT_NS
         end_ns = start_ns + SEGMENT_NS
         if last_ns < end_ns:
             stop = after
         else:
             stop = first + int(np.searchsorted(stamps[first:after], end_ns, 'left'))
         is_new = compensator.open_segment(start_ns, n_seen + first, stamp_ns)
-        is_too_fast = (is_new or compensator.is_refusing) and compensator.rate_refuses
+        is_too_fast = compensator.rate_refuses and (is_new or compensator.is_refusing)
         segments.append(
-            _Segment(
+            (
                 start_ns,
                 first,
                 stop,
@@ -242,13 +229,13 @@ def _apply(
     starts = tuple(np.array(states).T.copy())
     ends = tuple(np.array(end_states).T.copy())
     at_start = compensator.correction.bias_scale(starts)
-    at_end = compensator.correction.bias_scale(ends)
+    at_end, variances = compensator.correction.evaluate(ends)
     columns: list[Floats] = []
     for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
         columns += [bias, bias_end - bias, scale, scale_end - scale]
     excess = np.array(noise_excess)
     correction = compensator.correction
-    for (a, b, c), noise in zip(correction.variance(ends), correction.noise, strict=True):
+    for (a, b, c), noise in zip(variances, correction.noise, strict=True):
         columns += (a + excess * noise, b, c)
     first = np.array(firsts)
     counts = np.array(afters) - first

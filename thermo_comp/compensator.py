@@ -61,6 +61,8 @@ class Compensator:
         self.config = config or CompensatorConfig()
         self.counters = Counters()
         self._queue = ReadingQueue()
+        #: Age of the board temperature beyond which nothing is published.
+        self.timeout_ns = _timeout_ns(self.config)
         self._flags: list[tuple[int, bool]] = []
         self._n_applied = 0
         self._segment_key: tuple[int, int] | None = None
@@ -75,6 +77,7 @@ class Compensator:
         self.calibration = calibration
         self.correction = Correction(calibration)
         self._full_scale = self._limit = calibration.unit.full_scale
+        self._counts_cycles = calibration.unit.input == 'counts'
         self.rate = RateWatch(calibration.unit.cycle_time_s)
         self.gravity = self._gravity_monitor()
         # To the noise of one sample comes that of rounding to whole counts, twice 1/12 count^2
@@ -228,7 +231,7 @@ class Compensator:
         Whether samples are held back because they cannot be conversions of the calibrated cycle.
 
         """
-        return self.rate.is_too_fast and self.calibration.unit.input == 'counts'
+        return self.rate.is_too_fast and self._counts_cycles
 
     def _advance(self, stamp_ns: int) -> bool:
         """
@@ -267,15 +270,17 @@ class Compensator:
 
         """
         self._n_applied += 1
+        tracker = self.tracker
         if kind == 0:
-            if self.tracker.board_reading(stamp_ns, celsius):
+            if tracker.board_reading(stamp_ns, celsius):
                 self.counters.n_board += 1
             else:
                 self._count_rejected(kind)
-        elif self.tracker.case_reading(stamp_ns, celsius):
+        elif tracker.case_reading(stamp_ns, celsius):
             self.counters.n_case += 1
-            if self.tracker.detector.regime != Regime.UNKNOWN:
-                self._flags.append((stamp_ns, self.tracker.detector.regime == Regime.DYNAMIC))
+            regime = tracker.detector.regime
+            if regime is not Regime.UNKNOWN:
+                self._flags.append((stamp_ns, regime is Regime.DYNAMIC))
         else:
             self._count_rejected(kind)
 
@@ -346,14 +351,11 @@ class Compensator:
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def _evaluate(self, start_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        start = self.tracker.sample(start_ns)
-        end = self.tracker.sample(start_ns + SEGMENT_NS)
+        at_start = self.correction.bias_scale(self.tracker.sample(start_ns))
+        at_end, variance = self.correction.evaluate(self.tracker.sample(start_ns + SEGMENT_NS))
         linear: list[float] = [start_ns]
-        for (bias, scale), (bias_end, scale_end) in zip(
-            self.correction.bias_scale(start), self.correction.bias_scale(end), strict=True
-        ):
+        for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
             linear += (bias, bias_end - bias, scale, scale_end - scale)
-        variance = self.correction.variance(end)
         excess = self.noise_excess
         flat: list[float] = []
         for (a, b, c), noise in zip(variance, self.correction.noise, strict=True):
@@ -367,14 +369,6 @@ class Compensator:
         """
         flags, self._flags = self._flags, []
         return flags
-
-    @property
-    def timeout_ns(self) -> int:
-        """
-        Age of the board temperature beyond which nothing is published.
-
-        """
-        return int(self.config.temperature_timeout_s * 1e9)
 
     def process_block(self, block: AccelBlock) -> CompensatedBlock:
         """
@@ -458,6 +452,7 @@ class Compensator:
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckWatch(config.stuck_timeout_s)
         self.config = config
+        self.timeout_ns = _timeout_ns(config)
         self.gravity = self._gravity_monitor()
         self._segment_key = None
         self.tracker.reconfigure(self._thermal_config(), self.now_ns)
@@ -497,3 +492,7 @@ class Compensator:
 
         """
         return snapshot(self)
+
+
+def _timeout_ns(config: CompensatorConfig) -> int:
+    return int(config.temperature_timeout_s * 1e9)

@@ -11,13 +11,11 @@ force before the misalignment, its error variance is ``v(x) = a + b x + c x^2``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Generic
-
 import numpy as np
 
 from . import thermal
-from .calibration import AxisReference, AxisSet, Calibration, RegimeSet
+from .axis_correction import AxisCorrection, BiasScale, Excess, Regressors, Variance
+from .calibration import Calibration, RegimeSet
 from .functions import Number, hold
 
 #: While the sets cross over, the output moves no faster than this [m/s^3] (1 ug per second) ...
@@ -25,37 +23,6 @@ GENTLE_RATE = 9.80665e-6
 #: ... unless that took more than this many transition times.
 LONGEST_TRANSITION = 10.0
 _GAP_TEMPERATURES = 33
-#: (bias, scale) of one axis.
-BiasScale = tuple[Number, Number]
-
-
-@dataclass(frozen=True, slots=True)
-class Regressors(Generic[Number]):
-    """
-    What the terms of one set multiply, held at the edges of that set's ranges.
-
-    """
-
-    #: T_board - T_ref [K].
-    t: Number
-    #: The same, not held.
-    free_t: Number
-    #: Gradient [K], rate [K/s], then the memory of each lag [K].
-    linear: list[Number]
-
-
-@dataclass(frozen=True, slots=True)
-class Excess(Generic[Number]):
-    """
-    How far a thermal state lies outside the calibrated ranges; 0 inside.
-
-    """
-
-    #: [K], [K], [K/s] and, the farthest of the lags, [K]; signed like the excess.
-    temperature: Number
-    gradient: Number
-    rate: Number
-    memory: Number
 
 
 class SetCorrection:
@@ -132,7 +99,7 @@ class SetCorrection:
         for m, held in zip(memory, held_memory, strict=True):
             over = over + abs(m - held)
         return (
-            Regressors(held_t, t, linear),
+            Regressors(held_t, t, linear, not _is_all(held_t, t)),
             Excess(t - held_t, gradient - held_gradient, rate - held_rate, over),
         )
 
@@ -149,151 +116,24 @@ class SetCorrection:
             + excess.memory / memory
         )
 
-
-class AxisCorrection:
-    """
-    One axis of one set, ready to be evaluated.
-
-    Parameters
-    ----------
-    axis_set : AxisSet
-        Its coefficients.
-    reference : AxisReference
-        The axis at the reference temperature.
-    other : AxisSet
-        The axis in the other regime.
-    other_range : (float, float)
-        Where its functions hold, from the reference [K].
-
-    """
-
-    def __init__(
-        self,
-        axis_set: AxisSet,
-        reference: AxisReference,
-        other: AxisSet,
-        other_range: tuple[float, float],
-    ) -> None:
-        self._set = axis_set
-        self._other = other
-        self._other_range = other_range
-        self._K = reference.scale_factor
-        self._level = reference.bias + axis_set.delta
-        self._bias_terms = _present(
-            axis_set.gradient.bias, axis_set.rate.bias, axis_set.memory.bias
-        )
-        self._scale_terms = _present(
-            axis_set.gradient.scale, axis_set.rate.scale, axis_set.memory.scale
-        )
-        rows = axis_set.covariance
-        n_bias = axis_set.n_bias_parameters
-        entries = [(i, j, value) for i, row in enumerate(rows) for j, value in enumerate(row)]
-        self._bias_form = [(i, j, _twice(i, j, v)) for i, j, v in entries if v and i < n_bias]
-        self._cross_form = [(i, j, v) for i, j, v in entries if v and j < n_bias <= i]
-        self._scale_form = [(i, j, _twice(i, j, v)) for i, j, v in entries if v and j >= n_bias]
-
-    def bias_scale(self, regressors: Regressors[Number]) -> BiasScale[Number]:
+    def bias_scale(self, regressors: Regressors[Number]) -> list[BiasScale[Number]]:
         """
-        Evaluate the bias [input units] and the scale [input units per m/s^2].
+        Evaluate bias and scale of the three axes.
 
         """
-        values = regressors.linear
-        bias = self._set.bias_function.value(regressors.t) + self._level
-        for index, coefficient in self._bias_terms:
-            bias = bias + coefficient * values[index]
-        relative = self._set.scale_function.value(regressors.t)
-        for index, coefficient in self._scale_terms:
-            relative = relative + coefficient * values[index]
-        if _differ(regressors.t, regressors.free_t):
-            # Beyond its own range a set goes on as the other does, as far as that one was
-            # calibrated: what the two differ by is held, not what they have in common.
-            here = hold(regressors.free_t, *self._other_range)
-            edge = hold(regressors.t, *self._other_range)
-            other = self._other
-            bias = bias + (other.bias_function.value(here) - other.bias_function.value(edge))
-            relative = relative + (
-                other.scale_function.value(here) - other.scale_function.value(edge)
-            )
-        return bias, relative * self._K
+        return [axis.bias_scale(regressors) for axis in self.axes]
 
     def variance(
         self,
         regressors: Regressors[Number],
         state: tuple[Number, ...],
         excess: Excess[Number],
-    ) -> tuple[Number, Number, Number]:
+    ) -> list[Variance[Number]]:
         """
-        Evaluate (a, b, c) of the error variance: parameters, thermometers, memory, residual.
-
-        Parameters
-        ----------
-        regressors : Regressors
-            The held state.
-        state : tuple of float or of ndarray
-            The state itself, with its variances.
-        excess : Excess
-            How far outside the ranges it is.
-
-        Returns
-        -------
-        a, b, c : float or ndarray
-            ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
+        Evaluate the error variance of the three axes; see `AxisCorrection.variance`.
 
         """
-        axis_set: AxisSet = self._set
-        K: float = self._K
-        one = regressors.t * 0.0 + 1.0
-        linear = regressors.linear[: 2 + len(axis_set.memory.bias)]
-        phi = [one]
-        phi.extend(axis_set.bias_function.basis(regressors.t))
-        phi.extend(linear)
-        phi.append(one)
-        phi.extend(axis_set.scale_function.basis(regressors.t))
-        phi.extend(linear)
-        a = one * axis_set.residual_sd_m_s2**2
-        for i, j, value in self._bias_form:
-            a = a + value / (K * K) * phi[i] * phi[j]
-        b = one * 0.0
-        for i, j, value in self._cross_form:
-            b = b + 2.0 * value / K * phi[i] * phi[j]
-        c = one * 0.0
-        for i, j, value in self._scale_form:
-            c = c + value * phi[i] * phi[j]
-        # Errors of the thermal state itself, through the derivatives of bias / K and of scale.
-        bias_slope = axis_set.bias_function.slope(regressors.t)
-        scale_slope = axis_set.scale_function.slope(regressors.t)
-        gradient = axis_set.gradient
-        sources: list[tuple[Number, Number, Number]] = [
-            (
-                state[thermal.VAR_BOARD] + excess.temperature * excess.temperature,
-                (bias_slope - gradient.bias) / K,
-                scale_slope - gradient.scale,
-            ),
-            (
-                state[thermal.VAR_GRADIENT] + excess.gradient * excess.gradient,
-                one * gradient.bias / K,
-                one * gradient.scale,
-            ),
-            (
-                excess.rate * excess.rate,
-                one * axis_set.rate.bias / K,
-                one * axis_set.rate.scale,
-            ),
-        ]
-        sources += [
-            (variance + excess.memory * excess.memory, one * bias / K, one * scale)
-            for variance, bias, scale in zip(
-                state[thermal.MEMORY + 1 :: 2],
-                axis_set.memory.bias,
-                axis_set.memory.scale,
-                strict=False,
-            )
-        ]
-        for variance, on_bias, on_scale in sources:
-            a = a + variance * on_bias * on_bias
-            b = b + 2.0 * variance * on_bias * on_scale
-            c = c + variance * on_scale * on_scale
-        return a, b, c
+        return [axis.variance(regressors, state, excess) for axis in self.axes]
 
 
 class Correction:
@@ -337,16 +177,22 @@ class Correction:
             Per axis, in input units and input units per m/s^2.
 
         """
-        static, _ = self.static.regressors(state)
-        dynamic, _ = self.dynamic.regressors(state)
         weight = state[thermal.WEIGHT]
-        rest = 1.0 - weight
-        result = []
-        for axis_s, axis_d in zip(self.static.axes, self.dynamic.axes, strict=True):
-            bias_s, scale_s = axis_s.bias_scale(static)
-            bias_d, scale_d = axis_d.bias_scale(dynamic)
-            result.append((rest * bias_s + weight * bias_d, rest * scale_s + weight * scale_d))
-        return result
+        alone = self._alone(weight)
+        if alone is not None:
+            return alone.bias_scale(alone.regressors(state)[0])
+        static = self.static.bias_scale(self.static.regressors(state)[0])
+        dynamic = self.dynamic.bias_scale(self.dynamic.regressors(state)[0])
+        return _blend(weight, static, dynamic)
+
+    def _alone(self, weight: Number) -> SetCorrection | None:
+        """
+        Find the set that counts alone, which is the usual case; None while both do.
+
+        """
+        if _is_all(weight, 0.0):
+            return self.static
+        return self.dynamic if _is_all(weight, 1.0) else None
 
     def gentle_transition(self, given_s: float) -> float:
         """
@@ -376,19 +222,26 @@ class Correction:
         board = np.linspace(lower, upper, _GAP_TEMPERATURES)
         nil = np.zeros_like(board)
         state = (board, *[nil] * (thermal.MEMORY - 1 + 2 * self._n_lags))
-        static, _ = self.static.regressors(state)
-        dynamic, _ = self.dynamic.regressors(state)
+        static = self.static.bias_scale(self.static.regressors(state)[0])
+        dynamic = self.dynamic.bias_scale(self.dynamic.regressors(state)[0])
         square, relative = nil, nil
-        for K, axis_s, axis_d in zip(self._K, self.static.axes, self.dynamic.axes, strict=True):
-            bias_s, scale_s = axis_s.bias_scale(static)
-            bias_d, scale_d = axis_d.bias_scale(dynamic)
+        for K, (bias_s, scale_s), (bias_d, scale_d) in zip(self._K, static, dynamic, strict=True):
             square = square + ((bias_d - bias_s) / K) ** 2
             relative = np.maximum(relative, np.abs((scale_d - scale_s) / K))
         return float(np.max(np.sqrt(square) + self._gravity * relative))
 
-    def variance(self, state: tuple[Number, ...]) -> list[tuple[Number, Number, Number]]:
+    def variance(self, state: tuple[Number, ...]) -> list[Variance[Number]]:
         """
-        Evaluate the coefficients of each axis' error variance, noise of one sample included.
+        Evaluate the coefficients of each axis' error variance; see `evaluate`.
+
+        """
+        return self.evaluate(state)[1]
+
+    def evaluate(
+        self, state: tuple[Number, ...]
+    ) -> tuple[list[BiasScale[Number]], list[Variance[Number]]]:
+        """
+        Evaluate bias, scale and error variance of each axis, noise of one sample included.
 
         The variance of a blend is at most the blend of the variances; to it comes what the two
         sets disagree by, while the regime is unknown, while they cross over, and in proportion
@@ -402,49 +255,66 @@ class Correction:
 
         Returns
         -------
+        list of (bias, scale)
+            Per axis, in input units and input units per m/s^2.
         list of (a, b, c)
             Per axis, ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
 
         """
+        weight, unknown = state[thermal.WEIGHT], state[thermal.UNKNOWN]
+        alone = self._alone(weight)
+        if alone is not None and _is_all(unknown, 0.0):
+            regressors, excess = alone.regressors(state)
+            if _is_all(alone.relative_excess(excess), 0.0):
+                variances = alone.variance(regressors, state, excess)
+                return alone.bias_scale(regressors), [
+                    (a + noise, b, c)
+                    for (a, b, c), noise in zip(variances, self.noise, strict=True)
+                ]
         static, excess_s = self.static.regressors(state)
         dynamic, excess_d = self.dynamic.regressors(state)
-        weight = state[thermal.WEIGHT]
         rest = 1.0 - weight
         relative = rest * self.static.relative_excess(excess_s)
         relative = relative + weight * self.dynamic.relative_excess(excess_d)
-        doubt = state[thermal.UNKNOWN] + weight * rest + relative * relative
-        rest, weight = (
-            rest + state[thermal.UNKNOWN] * weight,
-            weight + state[thermal.UNKNOWN] * rest,
-        )
+        doubt = unknown + weight * rest + relative * relative
+        values_s, values_d = self.static.bias_scale(static), self.dynamic.bias_scale(dynamic)
+        share_s, share_d = rest + unknown * weight, weight + unknown * rest
+        variances_s = self.static.variance(static, state, excess_s)
+        variances_d = self.dynamic.variance(dynamic, state, excess_d)
+        variances = [
+            (
+                share_s * a_s + share_d * a_d,
+                share_s * b_s + share_d * b_d,
+                share_s * c_s + share_d * c_d,
+            )
+            for (a_s, b_s, c_s), (a_d, b_d, c_d) in zip(variances_s, variances_d, strict=True)
+        ]
         result = []
-        for K, noise, axis_s, axis_d in zip(
-            self._K, self.noise, self.static.axes, self.dynamic.axes, strict=True
+        for K, noise, (a, b, c), (bias_s, scale_s), (bias_d, scale_d) in zip(
+            self._K, self.noise, variances, values_s, values_d, strict=True
         ):
-            a_s, b_s, c_s = axis_s.variance(static, state, excess_s)
-            a_d, b_d, c_d = axis_d.variance(dynamic, state, excess_d)
-            bias_s, scale_s = axis_s.bias_scale(static)
-            bias_d, scale_d = axis_d.bias_scale(dynamic)
             bias_gap = (bias_d - bias_s) / K
             scale_gap = (scale_d - scale_s) / K
-            a = rest * a_s + weight * a_d
             # Far outside, the residual of the fit says nothing any more: it grows with the excess.
-            a = a + noise + doubt * bias_gap * bias_gap + relative * relative * a
-            b = rest * b_s + weight * b_d
-            b = b + 2.0 * doubt * bias_gap * scale_gap + relative * relative * b
-            c = rest * c_s + weight * c_d
-            c = c + doubt * scale_gap * scale_gap + relative * relative * c
-            result.append((a, b, c))
-        return result
+            result.append(
+                (
+                    a + noise + doubt * bias_gap * bias_gap + relative * relative * a,
+                    b + 2.0 * doubt * bias_gap * scale_gap + relative * relative * b,
+                    c + doubt * scale_gap * scale_gap + relative * relative * c,
+                )
+            )
+        return _blend(weight, values_s, values_d), result
 
 
-def _differ(one: Number, other: Number) -> bool:
-    return bool(np.any(one != other)) if isinstance(one, np.ndarray) else one != other
+def _blend(
+    weight: Number, static: list[BiasScale[Number]], dynamic: list[BiasScale[Number]]
+) -> list[BiasScale[Number]]:
+    rest = 1.0 - weight
+    return [
+        (rest * bias_s + weight * bias_d, rest * scale_s + weight * scale_d)
+        for (bias_s, scale_s), (bias_d, scale_d) in zip(static, dynamic, strict=True)
+    ]
 
 
-def _present(gradient: float, rate: float, memory: tuple[float, ...]) -> list[tuple[int, float]]:
-    return [(i, c) for i, c in enumerate((gradient, rate, *memory)) if c]
-
-
-def _twice(i: int, j: int, value: float) -> float:
-    return value if i == j else 2.0 * value
+def _is_all(value: Number, wanted: Number | float) -> bool:
+    return bool((value == wanted).all()) if isinstance(value, np.ndarray) else value == wanted

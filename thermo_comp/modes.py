@@ -96,19 +96,20 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
     half = 0.5 * dt * dt
     decay = 1.0 / (1.0 + dt / lag)
     grown = power * dt
-    p12 += dt * p22
-    p02 += dt * p12 - half * p22
-    cross = p01 + dt * p11 + half * (p12 - dt * p22)
-    p00 += dt * (p01 + cross) + half * (p02 - dt * p12 + half * p22 + p02)
+    wander = grown * half
+    # the transition times the covariance, above its diagonal
+    c01 = p01 + dt * p11 + half * p12
+    c02 = p02 + dt * p12 + half * p22
+    c12 = p12 + dt * p22
     return (
         t + dt * v + half * a,
         v + dt * a,
         decay * a,
-        p00 + grown * half * half / 5.0,
-        cross + dt * p02 + grown * half * dt / 4.0,
-        decay * p02 + grown * half / 3.0,
-        p11 + dt * (p12 + p12 - dt * p22) + grown * dt * dt / 3.0,
-        decay * p12 + grown * dt / 2.0,
+        p00 + dt * (p01 + c01) + half * (p02 + c02 + 0.2 * wander),
+        c01 + dt * (c02 + 0.25 * wander),
+        decay * c02 + wander / 3.0,
+        p11 + dt * (p12 + c12) + wander / 1.5,
+        decay * c12 + 0.5 * dt * grown,
         decay * decay * p22 + grown,
     )
 
@@ -157,6 +158,37 @@ def correct(state: State, measured: float, variance: float) -> tuple[State, floa
         ),
         innovation,
         spread,
+    )
+
+
+def merge(one: State, other: State, share: float) -> tuple[float, float, float, float, float]:
+    """
+    Mix two states as `blend` does, without what concerns the acceleration.
+
+    Parameters
+    ----------
+    one, other : tuple of float
+        The states.
+    share : float
+        Share of the other one, 0..1.
+
+    Returns
+    -------
+    tuple of float
+        Temperature, rate; then P00, P01, P11.
+
+    """
+    t, v, _, p00, p01, _, p11, _, _ = one
+    u, w, _, r00, r01, _, r11, _, _ = other
+    u -= t
+    w -= v
+    apart = share * (1.0 - share)
+    return (
+        t + share * u,
+        v + share * w,
+        p00 + share * (r00 - p00) + apart * u * u,
+        p01 + share * (r01 - p01) + apart * u * w,
+        p11 + share * (r11 - p11) + apart * w * w,
     )
 
 

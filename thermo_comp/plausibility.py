@@ -64,6 +64,10 @@ class Fault(Enum):
     STEP = 'jumped'
 
 
+#: Looked at with every reading.
+_NO_FAULT = Fault.NONE
+
+
 class SensorGuard:
     """
     Judges one sensor's readings by its past and by the other sensor.
@@ -139,8 +143,9 @@ class SensorGuard:
 
         """
         own = self.own
+        own_ns, fault = own.stamp_ns, self.fault
         self.is_revived = False
-        if own.stamp_ns is None or stamp_ns <= own.stamp_ns or not isfinite(celsius):
+        if own_ns is None or stamp_ns <= own_ns or not isfinite(celsius):
             return True  # the first one, or one that the estimator itself rejects
         if celsius == own.reading:
             self._n_same += 1
@@ -153,14 +158,16 @@ class SensorGuard:
                 self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
-        self.is_revived = self.fault in (Fault.STILL, Fault.FROZEN)
-        age = (stamp_ns - own.stamp_ns) * 1e-9
+        age = (stamp_ns - own_ns) * 1e-9
         # A reading that is near anything the estimate may have come to is no step: the usual case.
-        is_near = (
-            self.fault == Fault.NONE
+        if (
+            fault is _NO_FAULT
             and abs(celsius - own.temperature) + abs(own.rate) * age < LARGEST_STEP
-        )
-        if self._n_used >= SETTLED_READINGS and not (is_near or self.is_revived):
+        ):
+            self._n_used += 1
+            return True
+        self.is_revived = fault is Fault.STILL or fault is Fault.FROZEN
+        if self._n_used >= SETTLED_READINGS and not self.is_revived:
             expected, _, variance = own.at(stamp_ns)
             step = celsius - expected
             possible = LARGEST_STEP + 2.0 * self._quantum + LARGEST_RATE * age
@@ -168,7 +175,7 @@ class SensorGuard:
                 self.fault = Fault.STEP
                 self.step = step
                 return False
-            if self.fault == Fault.STEP:
+            if fault is Fault.STEP:
                 # Possible after so long, but not where it was expected.
                 self.is_revived = abs(step) > self._largest_noise + _SIGMAS * sqrt(variance)
         self.fault = Fault.NONE
@@ -180,11 +187,12 @@ class SensorGuard:
         Note how the other sensor has moved since this one last changed; call after its readings.
 
         """
-        now_ns = self._other.stamp_ns
-        moved = self._other.temperature - self._other_then
+        other = self._other
+        now_ns = other.stamp_ns
+        moved = other.temperature - self._other_then
         if now_ns is None or not isfinite(moved):
             # The first time since this sensor's reading changed.
-            self._other_then = self._other.temperature
+            self._other_then = other.temperature
             self._expected = self._moved = 0.0
             self._seen_ns = now_ns
             return
@@ -320,7 +328,7 @@ class LeadWatch:
         """
         case, board = self._case, self._board
         calm = self._calm_rate
-        if is_static or (abs(case.rate) < calm and abs(board.rate) < calm):
+        if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):
             self._calm = (case.temperature, board.temperature)
             self._n_for = self._n_against = 0
             self.doubt = 0.0

@@ -180,12 +180,13 @@ class RegimeDetector:
         if self._stamp_ns is not None and stamp_ns - self._stamp_ns > self._forget_ns:
             self.reset()
         self._stamp_ns = stamp_ns
-        is_dynamic = self.regime == Regime.DYNAMIC
+        regime = self.regime
+        is_dynamic = regime is Regime.DYNAMIC
         departure = onset.update(
             stamp_ns, lead, 1.0 if not is_dynamic else (0.0 if self._is_grown else 0.25)
         )
         if not lead.is_ready:
-            return self.regime
+            return regime
 
         is_calm = self._case_calm.update(stamp_ns, case, self._case_onset, onset.swing)
         if not self._board_calm.update(stamp_ns, board, self._board_onset, onset.swing):
@@ -202,10 +203,12 @@ class RegimeDetector:
         if not is_dynamic:
             speed = OBVIOUS_SHARE * self._relaxed_rate
             # Two wide cells crossed in a row are a ramp even where no soak has been seen.
-            is_crossing = lead.settings.has_wide_cells and departure * lead.rate > speed
-            if departure and (self.regime == Regime.STATIC or is_crossing):
+            is_static = regime is Regime.STATIC
+            if departure and (
+                is_static or (lead.settings.has_wide_cells and departure * lead.rate > speed)
+            ):
                 self._open(stamp_ns, departure, lead)
-            elif not is_calm and (self.regime == Regime.STATIC or lead.n_in_row > FIRST_READINGS):
+            elif not is_calm and (is_static or lead.n_in_row > FIRST_READINGS):
                 direction = _obvious(lead, speed)
                 if direction == 0 and board is not None and board.is_ready:
                     direction = _obvious(board, speed)
@@ -214,8 +217,8 @@ class RegimeDetector:
         else:
             self._turn(stamp_ns, _obvious(lead, onset.swing))
         if (
-            self.regime != Regime.STATIC
-            and self._calm_ns is not None
+            self._calm_ns is not None
+            and self.regime is not Regime.STATIC
             and stamp_ns - self._calm_ns
             >= self._dwell_ns * (1.0 + 2.0 * onset.swing / self._relaxed_rate)
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
@@ -286,9 +289,8 @@ class _CalmTest:
         Follow the rate of the sensor; a lost or stale one has no say.
 
         """
-        if sensor is None or sensor.stamp_ns is None:
-            return True
-        if stamp_ns - sensor.stamp_ns > self._stale_ns:
+        seen_ns = None if sensor is None else sensor.stamp_ns
+        if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True
         if not sensor.is_ready:
             self._stamp_ns = None
@@ -307,9 +309,14 @@ class _CalmTest:
         changed = sensor.changed_ns
         if self._still_ns and changed is not None and stamp_ns - changed > self._still_ns:
             return True
-        room = min(relaxed + onset.swing, 1.25 * relaxed) - SURE_SIGMAS * doubt
-        ahead = max(relaxed, 3.0 * lead_swing)
-        return -room < rate < room and abs(3.0 * rate - 2.0 * self._mean) < ahead
+        swing = onset.swing
+        room = relaxed + (swing if swing < 0.25 * relaxed else 0.25 * relaxed)
+        room -= SURE_SIGMAS * doubt
+        if not -room < rate < room:
+            return False
+        ahead = 3.0 * rate - 2.0 * self._mean
+        limit = max(relaxed, 3.0 * lead_swing)
+        return -limit < ahead < limit
 
 
 def _obvious(sensor: Thermometer, rate: float) -> int:

@@ -140,7 +140,9 @@ def _may_stand_still(samples: npt.NDArray[np.float64]) -> bool:
 
     """
     probes = samples[:: STUCK_SAMPLES // 2]
-    return bool((probes[1:] == probes[:-1]).all(axis=1).any())
+    # Most differ in any one component already.
+    same = np.flatnonzero(probes[1:, 0] == probes[:-1, 0])
+    return bool((probes[same + 1, 1:] == probes[same, 1:]).all(axis=1).any())
 
 
 class RateWatch:
@@ -189,15 +191,20 @@ class RateWatch:
             The stamp.
 
         """
-        if self._last is None:
-            self._last = self._window = (n_seen, stamp_ns)
-            return
-        n, dt = n_seen - self._last[0], (stamp_ns - self._last[1]) * 1e-9
+        last = self._last
         self._last = (n_seen, stamp_ns)
+        if last is None:
+            self._window = self._last
+            return
+        n, dt = n_seen - last[0], (stamp_ns - last[1]) * 1e-9
         level = self._level + n - LARGEST_RATE * dt / self._cycle_s
-        # Twice the allowance at most, so that a long excess is soon forgiven.
-        self._level = min(max(level, 0.0), 2.0 * self._allowance)
-        self.is_too_fast = self._level > self._allowance
+        if level <= 0.0:
+            self._level = 0.0
+            self.is_too_fast = False
+        else:
+            # Twice the allowance at most, so that a long excess is soon forgiven.
+            self._level = min(level, 2.0 * self._allowance)
+            self.is_too_fast = self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
         if dt >= _WINDOW_S:
             self.ratio = n * self._cycle_s / dt

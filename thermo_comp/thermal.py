@@ -149,6 +149,7 @@ class ThermalTracker:
 
     def _configure(self, config: ThermalConfig) -> None:
         self.config = config
+        self._case_timeout_s = config.case_timeout_s
         #: How long nobody may have watched before the regime is not known any more [s].
         self._unwatched_s = max(UNWATCHED_SHARE * self.settings.case.lag_s, config.case_timeout_s)
 
@@ -194,7 +195,7 @@ class ThermalTracker:
 
         """
         seen = self.case.stamp_ns
-        return seen is not None and (stamp_ns - seen) * 1e-9 <= self.config.case_timeout_s
+        return seen is not None and (stamp_ns - seen) * 1e-9 <= self._case_timeout_s
 
     def board_reading(self, stamp_ns: int, celsius: float) -> bool:
         """
@@ -233,7 +234,7 @@ class ThermalTracker:
             is_gap = has_restarted and dt > self.settings.board.lag_s
             if is_anew or is_gap:
                 self._forget_memory()
-            else:
+            elif self._memory:
                 self._step_memory(dt, change)
             if is_anew or guard.is_revived or (has_restarted and not is_gap):
                 guard.note_jump(stamp_ns, change)
@@ -274,16 +275,17 @@ class ThermalTracker:
             case.reset()
         if not case.update(stamp_ns, celsius):
             return False
-        if before_ns is not None:
+        if before_ns is not None and (is_anew or case.n_restarts != n_restarts):
             is_gap = (stamp_ns - before_ns) * 1e-9 > self.settings.case.lag_s
-            if is_anew or (case.n_restarts != n_restarts and not is_gap):
+            if is_anew or not is_gap:
                 guard.note_jump(stamp_ns, case.temperature - before)
         self.board_guard.watch_other()
         self._note(stamp_ns)
-        if guard.fault != Fault.STILL or self.detector.regime != Regime.DYNAMIC:
+        detector = self.detector
+        if guard.fault is not Fault.STILL or detector.regime is not Regime.DYNAMIC:
             # One that stands still does not tell that a ramp has ended.
             self._decide(stamp_ns, case)
-        self.lead.update(self.detector.regime == Regime.STATIC)
+        self.lead.update(detector.regime is Regime.STATIC)
         return True
 
     @staticmethod
@@ -318,7 +320,7 @@ class ThermalTracker:
             self.detector.reset()
             self.lead.reset()
         regime = self.detector.update(stamp_ns, case, board)
-        target = 1.0 if regime == Regime.DYNAMIC else 0.0
+        target = 1.0 if regime is Regime.DYNAMIC else 0.0
         if target != self._target:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
@@ -347,8 +349,10 @@ class ThermalTracker:
         Weight of the dynamic set at a stamp, moving linearly over the transition time.
 
         """
+        if self._weight == self._target:
+            return self._target
         duration = self.config.transition_time_s
-        if self._weight == self._target or duration == 0.0:
+        if duration == 0.0:
             return self._target
         moved = max((stamp_ns - self._weight_ns) * 1e-9, 0.0) / duration
         if self._target > self._weight:
@@ -377,15 +381,7 @@ class ThermalTracker:
             case, _, var_gradient = self.case.at(stamp_ns)
             gradient = case - board
         else:
-            lag = self.config.board_lag_s
-            gradient = lag * rate
-            # Nor has anybody seen what the case did since the board was last read.
-            unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
-            var_gradient = (
-                (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2
-                + lag * lag * self.board.var_rate
-                + unseen * unseen
-            )
+            gradient, var_gradient = self._lost_gradient(stamp_ns, rate)
         if self._is_doubted:
             var_board += self.board_guard.doubt(stamp_ns)
             var_gradient += self.case_guard.doubt(stamp_ns)
@@ -394,16 +390,33 @@ class ThermalTracker:
                 var_board += gradient * gradient
             else:
                 var_board += self.lead.doubt
-        is_unknown = (
-            self._decided_ns is None
-            or self.detector.regime == Regime.UNKNOWN
-            or self._is_unwatched(self._decided_ns, stamp_ns)
+        decided_ns = self._decided_ns
+        is_known = (
+            decided_ns is not None
+            and self.detector.regime is not Regime.UNKNOWN
+            and (stamp_ns - decided_ns) * 1e-9 <= self._unwatched_s
         )
-        unknown = 1.0 if is_unknown else 0.0
+        unknown = 0.0 if is_known else 1.0
         state = (board, var_board, rate, gradient, var_gradient, self.weight_at(stamp_ns), unknown)
         if not self._memory:
             return state
         return state + self._memory_at(stamp_ns, board)
+
+    def _lost_gradient(self, stamp_ns: int, rate: float) -> tuple[float, float]:
+        """
+        Guess the gradient from the board's rate, while the case sensor is lost.
+
+        """
+        lag = self.config.board_lag_s
+        gradient = lag * rate
+        # Nor has anybody seen what the case did since the board was last read.
+        unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
+        variance = (
+            (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2
+            + lag * lag * self.board.var_rate
+            + unseen * unseen
+        )
+        return gradient, variance
 
     def _memory_at(self, stamp_ns: int, board: float) -> tuple[float, ...]:
         dt = (stamp_ns - (self.board.stamp_ns or 0)) * 1e-9

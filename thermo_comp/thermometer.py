@@ -25,7 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import erf, exp, inf, nan, sqrt
 
-from .modes import NOWHERE, State, blend, correct, mix, predict
+from .modes import NOWHERE, State, blend, correct, merge, mix, predict
 
 OUTLIER_SIGMAS = 6.0  # innovations beyond this limit count less ...
 OUTLIER_LIMITS = 5.0  # ... and beyond this many limits not at all ...
@@ -146,8 +146,7 @@ class Thermometer:
         noise, quantum = settings.noise_sd_c, settings.quantum_c
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
-        self.noise_factor = 1.0
-        self._noise_scale = 1.0  # its square
+        self._noise_scale = 1.0  # the square of the noise factor
         self._n_turns = 8.0  # surprises it rests on
         self._has_cells = settings.has_cells
         self._quantum = quantum
@@ -167,9 +166,9 @@ class Thermometer:
         self.stamp_ns: int | None = None
         self.changed_ns: int | None = None
         self.reading = nan
-        self.temperature = self.rate = self.acceleration = nan
-        self.var_temperature = self.var_rate = self.var_acceleration = inf
-        self.interval_s = nan
+        self.temperature = self.rate = nan
+        self.var_temperature = self.var_rate = inf
+        self.interval_s = self._horizon_s = nan
         self.n_in_row = 0
         self.is_ready = False
         self.measured = nan
@@ -245,9 +244,12 @@ class Thermometer:
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-            self.noise_factor = sqrt(self._noise_scale)
-        limit = OUTLIER_SIGMAS * sqrt(spread) + 5.0 * self._bend * dt * dt + 1.5 * self._quantum
-        if abs(surprise) > limit:
+        # The usual case first: what is inside the sigmas is inside the limit, which has more.
+        if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
+            limit := OUTLIER_SIGMAS * sqrt(spread)
+            + 5.0 * self._bend * dt * dt
+            + 1.5 * self._quantum
+        ):
             self._n_strange = 1 if is_turning else self._n_strange + 1
             if self._n_strange >= RESTART_READINGS:
                 self.n_restarts += 1
@@ -273,7 +275,9 @@ class Thermometer:
             evidence = 0.5 * (
                 innovation * innovation / s - bent_innovation * bent_innovation / bent_s
             )
-            odds = prior_bending * sqrt(s / bent_s) * exp(min(max(evidence, -30.0), 30.0))
+            if not -30.0 < evidence < 30.0:
+                evidence = 30.0 if evidence > 0.0 else -30.0
+            odds = prior_bending * sqrt(s / bent_s) * exp(evidence)
             bending = odds / (prior_quiet + odds)
         else:
             bending = prior_bending
@@ -284,14 +288,10 @@ class Thermometer:
         (
             self.temperature,
             self.rate,
-            self.acceleration,
             self.var_temperature,
             self._covariance,
-            _,
             self.var_rate,
-            _,
-            self.var_acceleration,
-        ) = blend(quiet, bent, bending)
+        ) = merge(quiet, bent, bending)
         self.measured = measured
         self.measured_variance = noise
         if reading_c != self.reading:
@@ -299,7 +299,9 @@ class Thermometer:
             self.reading = reading_c
         self.stamp_ns = stamp_ns
         self.n_in_row += 1
-        self.interval_s = self.interval_s + 0.05 * (dt - self.interval_s) if self.is_ready else dt
+        interval = self.interval_s + 0.05 * (dt - self.interval_s) if self.is_ready else dt
+        self.interval_s = interval
+        self._horizon_s = HORIZON_INTERVALS * interval
         self.is_ready = True
         self.n_used += 1
         return True
@@ -324,17 +326,18 @@ class Thermometer:
             return nan, nan, inf
         if not self.is_ready:
             return self.temperature, self.rate, self.var_temperature
-        ahead = (stamp_ns - self.stamp_ns) * 1e-9
-        horizon = HORIZON_INTERVALS * self.interval_s
-        dt = ahead if -horizon <= ahead <= horizon else (horizon if ahead > 0.0 else -horizon)
-        variance = self.var_temperature + dt * (2.0 * self._covariance + dt * self.var_rate)
-        beyond = ahead - dt
-        if beyond:
+        dt = ahead = (stamp_ns - self.stamp_ns) * 1e-9
+        horizon = self._horizon_s
+        rate = self.rate
+        unknown = 0.0
+        if not -horizon <= ahead <= horizon:
             # The rate is not known to hold, and a ramp may begin that nobody sees.
+            dt = horizon if ahead > 0.0 else -horizon
+            beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
-            squared = self.var_rate + self.rate * self.rate + unseen * unseen
-            variance += beyond * beyond * squared
-        return self.temperature + dt * self.rate, self.rate, variance
+            unknown = beyond * beyond * (self.var_rate + rate * rate + unseen * unseen)
+        variance = self.var_temperature + dt * (2.0 * self._covariance + dt * self.var_rate)
+        return self.temperature + dt * rate, rate, variance + unknown
 
     def beyond(self, stamp_ns: int) -> float:
         """
@@ -344,19 +347,44 @@ class Thermometer:
         if self.stamp_ns is None or not self.is_ready:
             return 0.0
         ahead = (stamp_ns - self.stamp_ns) * 1e-9
-        return max(ahead - HORIZON_INTERVALS * self.interval_s, 0.0)
+        return max(ahead - self._horizon_s, 0.0)
+
+    @property
+    def acceleration(self) -> float:
+        """
+        Estimate of the second derivative [K/s^2].
+
+        """
+        return blend(self._quiet, self._bent, self.bending)[2]
+
+    @property
+    def var_acceleration(self) -> float:
+        """
+        Variance of the second derivative [K^2/s^4].
+
+        """
+        if self.stamp_ns is None:
+            return inf
+        return blend(self._quiet, self._bent, self.bending)[8]
+
+    @property
+    def noise_factor(self) -> float:
+        """
+        Noise found / noise declared, at least 1.
+
+        """
+        return sqrt(self._noise_scale)
 
     def _start(self, stamp_ns: int, reading_c: float) -> None:
         self.reset()
         self.stamp_ns = self.changed_ns = stamp_ns
         self.reading = self.measured = self.temperature = reading_c
-        self.rate = self.acceleration = 0.0
+        self.rate = 0.0
         noise = self._flat * self._noise_scale
         self.var_temperature = self.measured_variance = noise
         self.var_rate = self._rate_sd**2
-        self.var_acceleration = self._bend**2
         self._quiet = self._bent = (
-            reading_c, 0.0, 0.0, noise, 0.0, 0.0, self.var_rate, 0.0, self.var_acceleration
+            reading_c, 0.0, 0.0, noise, 0.0, 0.0, self.var_rate, 0.0, self._bend**2
         )  # fmt: skip
         self.n_in_row = 1
         self.n_used += 1
