@@ -20,7 +20,7 @@ from .blocks import Floats, Stamps
 Ints = npt.NDArray[np.int64]
 
 #: Samples corrected at a time.
-PIECE = 8192
+PIECE = 12288
 
 
 class Lines:
@@ -45,7 +45,7 @@ class Lines:
         self._ends = np.cumsum(counts)
         self._begins = self._ends - counts
         self._rows = slice(0, 0)
-        self._counts: Ints | None = None
+        self._counts: Ints = counts
 
     def select(self, begin: int, end: int) -> None:
         """
@@ -55,53 +55,53 @@ class Lines:
         low = int(np.searchsorted(self._ends, begin, 'right'))
         high = int(np.searchsorted(self._ends, end, 'left')) + 1
         self._rows = slice(low, high)
-        if high == low + 1:
-            self._counts = None
-        else:
-            ends = np.minimum(self._ends[self._rows], end)
-            self._counts = ends - np.maximum(self._begins[self._rows], begin)
+        ends = np.minimum(self._ends[self._rows], end)
+        self._counts = ends - np.maximum(self._begins[self._rows], begin)
 
     def spread(self, column: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """
-        Repeat the value of each selected segment for each of its samples.
+        Repeat the value of each selected segment for each of its samples, in an array of its own.
 
         """
-        values = column[self._rows]
-        return values if self._counts is None else np.repeat(values, self._counts)
+        return np.repeat(column[self._rows], self._counts)
 
     def age(self, stamps: Stamps) -> Floats:
         """
         Time since the beginning of each sample's segment [s].
 
         """
-        age: Floats = (stamps - self.spread(self._start_ns)) * 1e-9
+        start_ns = self.spread(self._start_ns)
+        age: Floats = np.subtract(stamps, start_ns, out=start_ns) * 1e-9
         return age
 
-    def corrected(self, axis: int, raw: Floats, dt: Floats) -> Floats:
+    def corrected(self, axis: int, raw: Floats, dt: Floats, out: Floats | None = None) -> Floats:
         """
         Take bias and scale from the samples of one axis.
 
         """
         bias, bias_slope, scale, scale_slope = self._columns[4 * axis : 4 * axis + 4]
-        value: Floats = self.spread(bias_slope) * dt
+        value: Floats = self.spread(bias_slope)
+        value *= dt
         value += self.spread(bias)
         np.subtract(raw, value, out=value)
-        divisor = self.spread(scale_slope) * dt
+        divisor = self.spread(scale_slope)
+        divisor *= dt
         divisor += self.spread(scale)
-        value /= divisor
-        return value
+        result: Floats = np.divide(value, divisor, out=value if out is None else out)
+        return result
 
-    def variance(self, axis: int, x: Floats) -> Floats:
+    def variance(self, axis: int, x: Floats, out: Floats | None = None) -> Floats:
         """
         Error variance of one axis.
 
         """
         a, b, c = self._columns[12 + 3 * axis : 15 + 3 * axis]
-        value: Floats = x * self.spread(c)
+        value: Floats = self.spread(c)
+        value *= x
         value += self.spread(b)
         value *= x
-        value += self.spread(a)
-        return value
+        result: Floats = np.add(value, self.spread(a), out=value if out is None else out)
+        return result
 
 
 def correct(
@@ -161,19 +161,19 @@ def _correct(
 ) -> None:
     yx, zx, zy, var_yx, var_zx, var_zy = misalignment
     dt = lines.age(stamps)
-    x, y, z = (lines.corrected(axis, samples[:, axis], dt) for axis in range(3))
-    vx, vy, vz = (lines.variance(axis, value) for axis, value in enumerate((x, y, z)))
-    force[0] = x
+    x = lines.corrected(0, samples[:, 0], dt, out=force[0])
+    y, z = (lines.corrected(axis, samples[:, axis], dt) for axis in (1, 2))
+    vx = lines.variance(0, x, out=covariance[0])
+    vy, vz = lines.variance(1, y), lines.variance(2, z)
     np.add(np.multiply(x, yx, out=dt), y, out=force[1])
     third = zx * x
     third += np.multiply(y, zy, out=dt)
     np.add(third, z, out=force[2])
-    covariance[0] = vx
     cxy = np.multiply(vx, yx, out=covariance[1])
     cxz = np.multiply(vx, zx, out=covariance[2])
     covariance[3] = cxy
     covariance[6] = cxz
-    xx = np.multiply(x, x, out=x)
+    xx = np.multiply(x, x, out=z)
     value = np.multiply(cxy, yx, out=third)
     value += vy
     np.add(value, np.multiply(xx, var_yx, out=dt), out=covariance[4])
