@@ -29,6 +29,7 @@ SIZE_LIMIT = 1 << 20
 DEPTH_LIMIT = 12
 #: Digits of the longest integer accepted; a float64 needs no more.
 _INTEGER_DIGITS = 20
+_NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)')
 
 _ADAPTER: TypeAdapter[Calibration] = TypeAdapter(Calibration)
 _BASE: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
@@ -318,6 +319,11 @@ def _first_problem(error: ValidationError) -> tuple[str, str | None]:
     for part in location:
         key += f'[{part}]' if isinstance(part, int) else f'.{part}' if key else str(part)
     message = problem['msg'].removeprefix('Value error, ')
+    # What two keys have to do with each other is checked where both are known, and named there.
+    named = _NAMED_FIRST.fullmatch(message)
+    if named and problem['type'] == 'value_error':
+        key += f'.{named["key"]}' if key else named['key']
+        message = named['rest']
     shown = problem.get('input')
     if problem['type'] == 'missing':
         message = 'this key is missing'
