@@ -176,7 +176,8 @@ def check_cdr(data: bytes) -> None:
                 push = compensator.push_board if kind % 4 == 2 else compensator.push_case
                 push(*reading)
             continue
-        for written in converters[kind % 4].convert([message], compensator.process):
+        written = converters[kind % 4].convert(message, compensator.process)
+        if written is not None:
             imu = deserialize_message(written, Imu)
             force = imu.linear_acceleration
             covariance = imu.linear_acceleration_covariance

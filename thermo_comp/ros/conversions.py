@@ -16,7 +16,7 @@ the next multiple of 8 counted from the end of the encapsulation, float64 values
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from struct import Struct
 from struct import error as StructError  # noqa: N812
@@ -37,8 +37,7 @@ _LAYOUTS_KEPT = 64
 # What rclpy raises for bytes that are not the message, or for a name that is not UTF-8.
 _UNREADABLE = (RuntimeError, ValueError)
 
-_STAMP = Struct('<iI')
-_FORCE = Struct('<12d')
+_ENCAPSULATION = b'\0\1\0\0'
 _NO_GYRO = Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
 _FOREIGN = Struct('>25Q')
 _NATIVE = Struct('<25Q')
@@ -54,31 +53,48 @@ class _Layout:
     unpack: Callable[[bytes], tuple[Any, ...]]
     encapsulation: bytes
     name: bytes
-    buffer: bytearray
-    body: int
+    pack: Callable[..., bytes]
+    frame: bytes
     passed: slice | None
     is_foreign: bool
 
     def write(self, data: bytes, sec: int, nanosec: int, result: tuple[float, ...]) -> bytes:
-        fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
-        buffer, body = self.buffer, self.body
-        _STAMP.pack_into(buffer, 4, sec, nanosec)
+        block = _NO_GYRO
         if self.passed is not None:
             block = data[self.passed]
             if self.is_foreign:
                 block = _NATIVE.pack(*_FOREIGN.unpack(block))
-            buffer[body : body + 8 * _PASSED] = block
-        _FORCE.pack_into(
-            buffer, body + 8 * _PASSED, fx, fy, fz, c00, c01, c02, c01, c11, c12, c02, c12, c22
+        fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
+        return self.pack(
+            _ENCAPSULATION,
+            sec,
+            nanosec,
+            self.frame,
+            block,
+            fx,
+            fy,
+            fz,
+            c00,
+            c01,
+            c02,
+            c01,
+            c11,
+            c12,
+            c02,
+            c12,
+            c22,
         )
-        return bytes(buffer)
 
 
 def _unpack_nothing(_data: bytes) -> tuple[Any, ...]:
     raise StructError
 
 
-_UNKNOWN = _Layout(_unpack_nothing, b'', b'', bytearray(), 0, None, False)
+def _pack_nothing(*_values: Any) -> bytes:
+    raise StructError
+
+
+_UNKNOWN = _Layout(_unpack_nothing, b'', b'', _pack_nothing, b'', None, False)
 
 
 class SampleConverter:
@@ -106,43 +122,40 @@ class SampleConverter:
         #: Messages that took the way through rclpy's deserialization.
         self.n_fallback = 0
 
-    def convert(self, messages: Iterable[bytes], process: Process) -> Iterator[bytes]:
+    def convert(self, data: bytes, process: Process) -> bytes | None:
         """
-        Compensate samples one by one.
+        Compensate one sample.
 
         Parameters
         ----------
-        messages : iterable of bytes
-            Serialized samples, oldest first.
+        data : bytes
+            The serialized sample.
         process : callable
-            Called once for each readable sample with its stamp [ns] and three components.
+            Called once if it is readable, with its stamp [ns] and three components.
 
-        Yields
-        ------
-        bytes
-            A serialized Imu for each sample that `process` did not drop.
+        Returns
+        -------
+        bytes or None
+            A serialized Imu; None if the sample is not readable or `process` dropped it.
 
         """
         layout = self._layout
-        for data in messages:
-            try:
-                encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
-                is_known = name == layout.name and encapsulation == layout.encapsulation
-            except StructError:
-                is_known = False
-            if not is_known:
-                found = self._layout_of(data)
-                if found is None:
-                    written = self._convert_message(data, process)
-                    if written is not None:
-                        yield written
-                    continue
-                self._layout = layout = found
-                encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
-            result = process(sec * 1_000_000_000 + nanosec, x, y, z)
-            if result is not None:
-                self.last_result = result
-                yield layout.write(data, sec, nanosec, result)
+        try:
+            encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
+            is_known = name == layout.name and encapsulation == layout.encapsulation
+        except StructError:
+            is_known = False
+        if not is_known:
+            found = self._layout_of(data)
+            if found is None:
+                return self._convert_message(data, process)
+            self._layout = layout = found
+            encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
+        result = process(sec * 1_000_000_000 + nanosec, x, y, z)
+        if result is None:
+            return None
+        self.last_result = result
+        return layout.write(data, sec, nanosec, result)
 
     def _layout_of(self, data: bytes) -> _Layout | None:
         """
@@ -174,16 +187,16 @@ class SampleConverter:
         pattern = Struct(f'{order}4siI{4 + length}s{padding + skip}x3d{rest}x')
         name = data[12 : 16 + length]
         frame = self._frame_id.encode() + b'\0' if self._frame_id else name[4:]
-        head = Struct(f'<4x8xI{len(frame)}s{-(12 + len(frame)) % 8}x')
-        buffer = bytearray(head.pack(len(frame), frame) + _NO_GYRO + bytes(8 * (_IMU - _PASSED)))
-        buffer[:4] = b'\0\1\0\0'
+        gap = -(12 + len(frame)) % 8
+        head = Struct('<I').pack(len(frame)) + frame + bytes(gap)
+        imu = Struct(f'<4siI{len(head)}s{8 * _PASSED}s12d')
         start = 16 + length + padding
         layout = _Layout(
             pattern.unpack,
             data[:4],
             name,
-            buffer,
-            head.size,
+            imu.pack,
+            head,
             slice(start, start + skip) if is_imu else None,
             order == '>',
         )
@@ -198,7 +211,7 @@ class SampleConverter:
         except (StructError, *_UNREADABLE):
             return None
         # Not compared: the bytes of padding, which are whatever rclpy found in memory.
-        end, body = 16 + len(frame), head.size
+        end, body = 16 + len(frame), 12 + len(head)
         is_written = written[:end] == expected[:end] and written[body:] == expected[body:]
         return layout if is_read and is_written else None
 

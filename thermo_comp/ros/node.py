@@ -57,6 +57,10 @@ FLAG_QOS = QoSProfile(
 )
 DIAGNOSTICS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
+#: Samples that come more often than this are taken some at a time [s]: none waits as long as an
+#: INS at 2 kHz for its next one, and at 10 kHz the node takes a fourth off its CPU time.
+REST_S = 0.2e-3
+
 #: After so long without samples [s] readings take effect without them, but for those not older
 #: than the newest by this: a sample that Fast DDS has to repeat can be 3 s late.
 IDLE_S = 5.0
@@ -125,7 +129,7 @@ class CompensationNode:
         self._converter = SampleConverter(_INPUTS[self._config.input][0], self._config.frame_id)
         self._level = b''
         self._last_samples = time.monotonic()
-        self._loop = WaitLoop(self.node)
+        self._loop = WaitLoop(self.node, REST_S)
         self._open_topics()
         self._reported = self._snapshot()
         self._prepared = (self._config, self._loaded)
@@ -212,9 +216,11 @@ class CompensationNode:
         Work through everything that has arrived.
 
         """
-        messages, received_ns = self._samples.drain()
+        messages, received_ns = self._samples.drain(is_paced=True)
         for subscription, push in self._temperatures:
-            self._take_readings(subscription, push)
+            readings = subscription.drain()
+            if readings[0]:
+                self._take_readings(*readings, push)
         if not messages:
             return
         if self._readings:
@@ -222,9 +228,9 @@ class CompensationNode:
         self._relay(messages)
 
     def _take_readings(
-        self, subscription: RawSubscription, push: Callable[[int, float], None]
+        self, messages: list[bytes], received_ns: list[int], push: Callable[[int, float], None]
     ) -> None:
-        for data, received in zip(*subscription.drain(), strict=True):
+        for data, received in zip(messages, received_ns, strict=True):
             reading = read_temperature(data)
             if reading is None:
                 self._n_malformed += 1
@@ -252,12 +258,14 @@ class CompensationNode:
         return messages[start:]
 
     def _relay(self, messages: Iterable[bytes]) -> None:
-        publish = self._publish
-        for data in self._converter.convert(messages, self._compensator.process):
-            try:
-                publish(data)
-            except RCLError:  # noqa: PERF203  costs nothing unless raised
-                self._count_unpublished()
+        convert, process = self._converter.convert, self._compensator.process
+        for data in messages:
+            frame = convert(data, process)
+            if frame is not None:
+                try:
+                    self._publish(frame)
+                except RCLError:
+                    self._count_unpublished()
         self._publish_flags()
 
     def _publish_flags(self) -> None:

@@ -8,7 +8,8 @@ times the compensation itself. Here the subscriptions of the hot path are kept f
 one wait set is reused, and a wake-up empties their queues. Everything else of the node (services,
 timers, other subscriptions, middleware events) is served by an ordinary executor, which is asked
 only when the wait set says that one of these is ready; while samples flow, the wait set holds them
-now and then only.
+now and then only. Messages that come faster than anybody waits for them may gather a little, so
+that one wake-up serves several.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message` and `publish_raw` of the handles, `SignalHandlerGuardCondition`, and the node's
@@ -41,8 +42,9 @@ from rclpy.subscription import Subscription
 #: The most messages taken in one go, so that a flood cannot keep the rest of the node waiting.
 DRAIN_LIMIT = 4096
 
-#: While samples flow, services and timers are looked after this often [ns].
-OTHERS_PERIOD_NS = 20_000_000
+#: While samples flow, services and timers are looked after this often [ns]: a wake-up that holds
+#: them costs twice one that does not.
+OTHERS_PERIOD_NS = 50_000_000
 
 RCLError = rclpy_implementation.RCLError
 
@@ -73,12 +75,21 @@ class RawSubscription:
         self._message_type = subscription.msg_type
         self._take: Callable[[Any, bool], Any] = subscription.handle.take_message
         self._sequence: int | None = None
+        self._newest_ns = 0
         #: Messages that were sent and did not get here, as far as one publisher numbers them.
         self.n_lost = 0
+        #: What lay between the last two messages, on average over one drain [ns].
+        self.interval_ns = 0
 
-    def drain(self) -> tuple[list[bytes], list[int]]:
+    def drain(self, *, is_paced: bool = False) -> tuple[list[bytes], list[int]]:
         """
         Take what waits in the queue, oldest first, at most `DRAIN_LIMIT` messages.
+
+        Parameters
+        ----------
+        is_paced : bool, optional
+            Do not look whether there is another message before its turn, going by the last two:
+            one that comes early is there at the next wake-up. For subscriptions that wake.
 
         Returns
         -------
@@ -88,18 +99,26 @@ class RawSubscription:
             When the middleware got each of them; comparable between subscriptions.
 
         """
-        take, message_type = self._take, self._message_type
         messages: list[bytes] = []
         received_ns: list[int] = []
-        while len(messages) < DRAIN_LIMIT:
-            taken = take(message_type, True)
-            if taken is None:
-                break
+        take, message_type = self._take, self._message_type
+        taken = take(message_type, True)
+        if taken is None:
+            return messages, received_ns
+        before_ns = newest_ns = self._newest_ns
+        while taken is not None:
             message, info = taken
             messages.append(message)
-            received_ns.append(info['received_timestamp'])
-        if messages:
-            self._count_lost(info['publication_sequence_number'], len(messages))
+            received = info['received_timestamp']
+            received_ns.append(received)
+            interval_ns, newest_ns = received - newest_ns, received
+            is_early = is_paced and time.time_ns() - received < interval_ns
+            if is_early or len(messages) == DRAIN_LIMIT:
+                break
+            taken = take(message_type, True)
+        self._newest_ns = newest_ns
+        self.interval_ns = (newest_ns - before_ns) // len(messages)
+        self._count_lost(info['publication_sequence_number'], len(messages))
         return messages, received_ns
 
     def _count_lost(self, sequence: int | None, n_taken: int) -> None:
@@ -134,9 +153,30 @@ class _Entities:
     """
 
     wait_set: Any
-    fill_hot: list[tuple[Callable[[Any], Any], Any]]
+    hot: list[Any]
     fill: list[tuple[Callable[[Any], Any], Any]]
     other_subscriptions: range
+
+    def fill_hot(self) -> None:
+        """
+        Leave just the hot subscriptions in the wait set.
+
+        """
+        wait_set = self.wait_set
+        # One that was ready is in there still, and is not put in anew.
+        if len(self.hot) != 1 or not wait_set.is_ready('subscription', 0):
+            wait_set.clear_entities()
+            for handle in self.hot:
+                wait_set.add_subscription(handle)
+
+    def fill_all(self) -> None:
+        """
+        Put everything into the wait set.
+
+        """
+        self.wait_set.clear_entities()
+        for add, handle in self.fill:
+            add(handle)
 
     def is_other_ready(self) -> bool:
         """
@@ -162,11 +202,14 @@ class WaitLoop:
     ----------
     node : rclpy.node.Node
         The node to serve. It must not be added to another executor.
+    rest_s : float, optional
+        Messages that come more often than this gather for so long after each wake-up [s].
 
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, rest_s: float = 0.0) -> None:
         self._node = node
+        self._rest_s = rest_s
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._stop_guard = GuardCondition(None, None, context=node.context)
@@ -292,7 +335,7 @@ class WaitLoop:
             0,
             self._node.context.handle,
         )
-        hot = [(wait_set.add_subscription, one.subscription.handle) for one in self._hot]
+        hot = [one.subscription.handle for one in self._hot]
         fill = [(wait_set.add_subscription, one.handle) for one in (*raw, *others)]
         fill += [(wait_set.add_guard_condition, one.handle) for one in guards]
         fill += [(wait_set.add_timer, one.handle) for one in timers]
@@ -306,19 +349,24 @@ class WaitLoop:
         Wait and serve until the entities change or the loop is to stop.
 
         """
-        clear, wait = entities.wait_set.clear_entities, entities.wait_set.wait
+        wait = entities.wait_set.wait
+        rest_s, rest_ns = self._rest_s, int(self._rest_s * 1e9)
         now_ns, others_due_ns = time.monotonic_ns, 0
+        is_full = True
         while not (self._is_stopping or self._is_stale):
-            clear()
             left_ns = others_due_ns - now_ns()
-            if left_ns > 0 and entities.fill_hot:
-                for add, handle in entities.fill_hot:
-                    add(handle)
+            if left_ns > 0 and self._hot:
+                if is_full:
+                    entities.wait_set.clear_entities()
+                    is_full = False
+                entities.fill_hot()
                 wait(left_ns)
                 on_data()
+                if self._hot[0].interval_ns < rest_ns:
+                    time.sleep(rest_s)
                 continue
-            for add, handle in entities.fill:
-                add(handle)
+            entities.fill_all()
+            is_full = True
             wait(-1)
             on_data()
             others_due_ns = now_ns() + OTHERS_PERIOD_NS
