@@ -152,6 +152,7 @@ TEXT = dump_calibration(rich_calibration())
         ),
         ('    - [1.0e-08]', '    - [-1.0e-08]', 'static.x.covariance', 'negative variance'),
         ('    - [1.0e-08]', '    - [1.0e-30]', 'static.x.covariance', 'positive semidefinite'),
+        ('    - [1.0e-08]', '    - [1.0e-320]', 'static.x.covariance', 'positive semidefinite'),
         ('    - [1.0e-08]\n', '', 'static.x.covariance', 'rows of a lower triangle'),
         (
             'smallest_ramp_k_min: ',

@@ -390,8 +390,11 @@ def _check_covariance(rows: tuple[tuple[float, ...], ...], expected: int) -> Non
         raise ValueError('`covariance` must not have a negative variance')
     # Scaled to correlations first: entries in counts^2 and in relative^2 differ by 10 decades.
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    correlation = (matrix + matrix.T - np.diag(diagonal)) / np.outer(scale, scale)
-    if not np.linalg.eigvalsh(correlation)[0] > -1e-6:
+    with np.errstate(over='ignore'):
+        correlation = (matrix + np.tril(matrix, -1).T) / scale / scale[:, np.newaxis]
+    # Eigenvalues exist of what is finite; beyond 1 there is no correlation anyway.
+    is_bounded = np.abs(correlation).max(initial=0.0) < 2.0
+    if not (is_bounded and np.linalg.eigvalsh(correlation)[0] > -1e-6):
         raise ValueError('`covariance` must be positive semidefinite')
 
 
