@@ -20,7 +20,7 @@ from builders import rich_calibration
 from conftest import ROOT, Cli
 
 from thermo_comp.calibration_file import load_calibration, save_calibration
-from thermo_comp.recording import read_recording
+from thermo_comp.recording import BagWriter, read_recording
 
 FIT = [*sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))]
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
@@ -32,7 +32,6 @@ COMMANDS = {
     'bag.mcap': (('replay', HELD_OUT, '-c', 'unit.yaml', '--serial', 'T-1', '-f', '-o'), ()),
     'bag': (('replay', HELD_OUT, '-c', 'unit.yaml', '--serial', 'T-1', '-f', '-o'), ()),
 }
-CHEAP = ('page.html', 'bag.mcap', 'bag')
 
 
 @pytest.fixture
@@ -72,7 +71,7 @@ def test_a_full_disk(small_disk: Path, folder: Path, cli: Cli, name: str) -> Non
     assert list(small_disk.iterdir()) == []
 
 
-@pytest.mark.parametrize('name', CHEAP)
+@pytest.mark.parametrize('name', COMMANDS)
 def test_a_folder_that_is_read_only(folder: Path, cli: Cli, name: str) -> None:
     if os.geteuid():
         locked = folder / 'locked'
@@ -145,3 +144,37 @@ def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: st
             assert read_recording(rest, require=()).info.truncated is None
         else:
             assert rest.read_bytes().rstrip().endswith(b'</html>')
+
+
+def rewritten(torn: Path, whole: Path) -> None:
+    """Write what can be read of a torn bag as a whole one, message by message in their order."""
+    found = read_recording(torn).columns
+    with BagWriter(whole) as bag:
+        bag.write_temperature('temperature/board', found.board_stamp_ns, found.board)
+        bag.write_temperature('temperature/case', found.case_stamp_ns, found.case)
+        bag.write_counts('accel/counts', found.accel_stamp_ns, found.accel, found.frame_id)
+
+
+def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder: Path, cli: Cli) -> None:
+    torn, whole = folder / 'torn.mcap', folder / 'whole.mcap'
+    torn.write_bytes(FIT[0].read_bytes()[:400_000])
+    rewritten(torn, whole)
+    results = []
+    for bag, code in ((torn, 1), (whole, 0)):
+        output = folder / f'{bag.stem}.yaml'
+        finished = cli('fit', bag, *FIT[1:], *GRAVITY, '-o', output, code=code)
+        results.append((finished.stderr, load_calibration(output)))
+    (said, from_torn), (nothing, from_whole) = results
+    assert 'torn.mcap: the file is cut off at byte 400000: ' in said
+    assert 'torn.mcap' not in nothing
+    assert 'Traceback' not in said
+    for name in ('axes', 'misalignment', 'static', 'dynamic'):
+        assert getattr(from_torn, name) == getattr(from_whole, name)
+
+
+def test_a_fit_of_a_bag_that_holds_nothing_any_more(folder: Path, cli: Cli) -> None:
+    torn = folder / 'torn.mcap'
+    torn.write_bytes(FIT[0].read_bytes()[:2000])
+    finished = cli('fit', torn, *FIT[1:], *GRAVITY, '-o', folder / 'new.yaml', code=1)
+    assert 'torn.mcap: ' in finished.stderr
+    assert 'Traceback' not in finished.stderr
