@@ -269,3 +269,61 @@ def test_quality_of_service_is_open_to_overrides(node: Node) -> None:
     reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')
     assert ReliabilityPolicy[reliability.value.upper()] is ReliabilityPolicy.RELIABLE
     loop.close()
+
+
+def test_a_paced_drain_leaves_nothing_behind_for_long(node: Node, peer: Peer) -> None:
+    """What comes in bursts, against any expectation of the next message, is all taken in order."""
+    running = Running(node)
+    paced = running.raw
+
+    def take() -> None:
+        messages, received_ns = paced.drain(is_paced=True)
+        with running.news:
+            running.messages += messages
+            running.received_ns += received_ns
+            running.news.notify_all()
+
+    running.take = take  # type: ignore[method-assign]
+    running.thread = threading.Thread(target=running.loop.run, args=(take,), daemon=True)
+    with running:
+        publisher = peer.publisher(Vector3Stamped, 'samples')
+        pause = threading.Event()
+        for k in range(300):
+            publisher.publish(Vector3Stamped())
+            if k % 30 == 0:
+                pause.wait(0.02)
+        running.wait_for(lambda: len(running.messages) == 300)
+    assert running.received_ns == sorted(running.received_ns)
+    assert paced.interval_ns > 0
+
+
+@pytest.mark.parametrize(('rest_s', 'is_resting'), [(1000.0, True), (1e-9, False)])
+def test_only_messages_that_crowd_gather(
+    node: Node, peer: Peer, monkeypatch: pytest.MonkeyPatch, rest_s: float, is_resting: bool
+) -> None:
+    rests: list[float] = []
+    monkeypatch.setattr('thermo_comp.ros.waitloop.time.sleep', rests.append)
+    loop = WaitLoop(node, rest_s)
+    raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=2000))
+    n_taken = 0
+    news = threading.Condition()
+
+    def take() -> None:
+        nonlocal n_taken
+        with news:
+            n_taken += len(raw.drain(is_paced=True)[0])
+            news.notify_all()
+
+    thread = threading.Thread(target=loop.run, args=(take,), daemon=True)
+    thread.start()
+    publisher = peer.publisher(Vector3Stamped, 'samples')
+    for n_sent in range(1, 6):
+        publisher.publish(Vector3Stamped())
+        with news:
+            assert news.wait_for(lambda n=n_sent: n_taken == n, TIMEOUT)
+    loop.stop()
+    thread.join(TIMEOUT)
+    assert not thread.is_alive()
+    loop.close()
+    assert bool(rests) == is_resting
+    assert set(rests) <= {rest_s}

@@ -362,7 +362,8 @@ class WaitLoop:
                 entities.fill_hot()
                 wait(left_ns)
                 on_data()
-                if self._hot[0].interval_ns < rest_ns:
+                # No interval at all: the middleware does not tell the time.
+                if 0 < self._hot[0].interval_ns < rest_ns:
                     time.sleep(rest_s)
                 continue
             entities.fill_all()
