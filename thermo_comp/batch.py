@@ -31,11 +31,48 @@ TIME_JUMP_NS = 1_000_000_000
 _UNIQUE = [0, 1, 2, 4, 5, 8]
 
 
-#: A run of samples over which the correction is linear in time: its start [ns]; its samples, the
-#: first and the one after the last; whether it is new, not the rest of one that the end of the
-#: block before has cut; whether it is held back because the samples come too fast; what their
-#: rate adds to their noise; the thermal states at both ends.
-_Segment = tuple[int, int, int, bool, bool, float, tuple[float, ...], tuple[float, ...]]
+class _Segments:
+    """
+    Runs of samples over which the correction is linear in time, as columns.
+
+    Lists of numbers, not a list of runs: objects that stay keep the garbage collector busy.
+
+    """
+
+    __slots__ = (
+        'after',
+        'end_states',
+        'first',
+        'is_new',
+        'is_too_fast',
+        'noise_excess',
+        'start_ns',
+        'states',
+    )
+
+    def __init__(self) -> None:
+        self.start_ns: list[int] = []
+        #: Their samples are first..after - 1.
+        self.first: list[int] = []
+        self.after: list[int] = []
+        #: Not the rest of one that the end of the block before has cut.
+        self.is_new: list[bool] = []
+        #: Held back because the samples come too fast; and what the rate adds to their noise.
+        self.is_too_fast: list[bool] = []
+        self.noise_excess: list[float] = []
+        #: The thermal states at both ends, one behind the other.
+        self.states: list[float] = []
+        self.end_states: list[float] = []
+
+    def ends(self) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
+        """
+        Give the thermal states at the beginnings and at the ends, as columns.
+
+        """
+        n = len(self.start_ns)
+        states = np.array(self.states).reshape(n, -1)
+        end_states = np.array(self.end_states).reshape(n, -1)
+        return tuple(states.T.copy()), tuple(end_states.T.copy())
 
 
 def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
@@ -111,8 +148,8 @@ def _run_thermal_side(
     stamps: Stamps,
     kept_before: Stamps | None,
     n_seen: int,
-) -> list[_Segment]:
-    segments: list[_Segment] = []
+) -> _Segments:
+    segments = _Segments()
     n_samples = len(stamps)
     # A reading takes effect at the first sample that is not before it and that comes after it.
     pending = compensator.take_pending()
@@ -167,7 +204,7 @@ def _run_thermal_side(
 
 def _add_segments(
     compensator: Compensator,
-    segments: list[_Segment],
+    segments: _Segments,
     stamps: Stamps,
     first: int,
     after: int,
@@ -199,53 +236,45 @@ def _add_segments(
             stop = first + int(np.searchsorted(stamps[first:after], end_ns, 'left'))
         is_new = compensator.open_segment(start_ns, n_seen + first, stamp_ns)
         is_too_fast = compensator.rate_refuses and (is_new or compensator.is_refusing)
-        segments.append(
-            (
-                start_ns,
-                first,
-                stop,
-                is_new,
-                is_too_fast,
-                compensator.noise_excess,
-                tracker.sample(start_ns),
-                tracker.sample(end_ns),
-            )
-        )
+        segments.start_ns.append(start_ns)
+        segments.first.append(first)
+        segments.after.append(stop)
+        segments.is_new.append(is_new)
+        segments.is_too_fast.append(is_too_fast)
+        segments.noise_excess.append(compensator.noise_excess)
+        segments.states += tracker.sample(start_ns)
+        segments.end_states += tracker.sample(end_ns)
         first = stop
 
 
 def _apply(
     compensator: Compensator,
-    segments: list[_Segment],
+    segments: _Segments,
     index: npt.NDArray[np.int64],
     stamps: Stamps,
     samples: Floats,
 ) -> CompensatedBlock:
-    if not segments:
+    if not segments.first:
         return CompensatedBlock(index[:0], stamps[:0], np.empty((0, 3)), np.empty((0, 9)))
-    start_ns, firsts, afters, is_new, is_too_fast, noise_excess, states, end_states = zip(
-        *segments, strict=True
-    )
-    starts = tuple(np.array(states).T.copy())
-    ends = tuple(np.array(end_states).T.copy())
+    starts, ends = segments.ends()
     at_start = compensator.correction.bias_scale(starts)
     at_end, variances = compensator.correction.evaluate(ends)
     columns: list[Floats] = []
     for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
         columns += [bias, bias_end - bias, scale, scale_end - scale]
-    excess = np.array(noise_excess)
+    excess = np.array(segments.noise_excess)
     correction = compensator.correction
     for (a, b, c), noise in zip(variances, correction.noise, strict=True):
         columns += (a + excess * noise, b, c)
-    first = np.array(firsts)
-    counts = np.array(afters) - first
+    first = np.array(segments.first)
+    counts = np.array(segments.after) - first
     source = _covered(first, counts, len(stamps))
     if source is not None:
         index, stamps, samples = index[source], stamps[source], samples[source]
-    lines = Lines(np.array(start_ns, dtype=np.int64), columns, counts)
+    lines = Lines(np.array(segments.start_ns, dtype=np.int64), columns, counts)
     force, covariance = correct(lines, compensator.misalignment, stamps, samples)
     keep = _good(compensator.calibration.unit.full_scale, samples)
-    _judge(compensator, is_new, is_too_fast, counts, stamps, samples, force, covariance, keep)
+    _judge(compensator, segments, counts, stamps, samples, force, covariance, keep)
     if not keep.all():
         index, stamps = index[keep], stamps[keep]
         force, covariance = force[keep], covariance[keep]
@@ -274,8 +303,7 @@ def _good(full_scale: float, samples: Floats) -> Mask:
 
 def _judge(
     compensator: Compensator,
-    is_new: tuple[bool, ...],
-    is_too_fast: tuple[bool, ...],
+    segments: _Segments,
     counts: npt.NDArray[np.int64],
     stamps: Stamps,
     samples: Floats,
@@ -294,9 +322,8 @@ def _judge(
         is_good = keep.copy()
         keep &= ~is_stuck
     begins = np.cumsum(counts) - counts
-    is_refuted = _refuted(
-        compensator, is_new, is_too_fast, begins, stamps, force, covariance, keep
-    )
+    is_refuted = _refuted(compensator, segments, begins, stamps, force, covariance, keep)
+    is_too_fast = segments.is_too_fast
     compensator.is_refusing = is_too_fast[-1] or is_refuted[-1]
     n_kept = int(np.count_nonzero(keep))
     if n_kept == len(keep) and not any(is_too_fast) and not any(is_refuted):
@@ -306,7 +333,7 @@ def _judge(
     # segment has been looked at like any other.
     is_fast_row = np.repeat(is_too_fast, counts)
     is_held_row = np.repeat(is_refuted, counts)
-    first = begins[np.array(is_refuted) & np.array(is_new)]
+    first = begins[np.array(is_refuted) & np.array(segments.is_new)]
     is_held_row[first] = False
     counters.n_too_fast += int(np.count_nonzero(is_fast_row))
     counters.n_refuted += int(np.count_nonzero(is_held_row))
@@ -325,8 +352,7 @@ def _judge(
 
 def _refuted(
     compensator: Compensator,
-    is_new: tuple[bool, ...],
-    is_too_fast: tuple[bool, ...],
+    segments: _Segments,
     begins: npt.NDArray[np.int64],
     stamps: Stamps,
     force: Floats,
@@ -344,8 +370,8 @@ def _refuted(
         force[begins].tolist(),
         covariance[begins][:, _UNIQUE].tolist(),
         keep[begins].tolist(),
-        is_new,
-        is_too_fast,
+        segments.is_new,
+        segments.is_too_fast,
         strict=True,
     )
     for stamp_ns, mean, spread, is_kept, is_new_one, is_fast in firsts:

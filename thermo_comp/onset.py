@@ -195,9 +195,9 @@ class OnsetTest:
         if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
         # Back towards rest is no departure: the band reaches from the baseline to zero.
-        swing = self.swing + self._doubt
-        high = max(self._baseline, 0.0) + swing
-        low = min(self._baseline, 0.0) - swing
+        baseline, swing = self._baseline, self.swing + self._doubt
+        high = baseline + swing if baseline > 0.0 else swing
+        low = baseline - swing if baseline < 0.0 else -swing
         if self._by_edges:
             departure = self._watch_edges(stamp_ns, sensor, low, high)
         else:
@@ -299,22 +299,31 @@ class OnsetTest:
         Let the baseline follow what the rate has been over a while, at most a swing per memory.
 
         """
-        limit = self.swing + self._doubt
+        baseline, doubt = self._baseline, self._doubt
+        limit = self.swing + doubt
         share = dt / (dt + self._baseline_s)
+        step = rate - baseline
+        if not -limit <= step <= limit:
+            step = limit if step > 0.0 else -limit
+        moved = baseline + share * step
         # A ramp that matters must not become the baseline, however slowly it shows.
-        farthest = max(self._largest_baseline, abs(self._baseline))
-        moved = self._baseline + share * min(max(rate - self._baseline, -limit), limit)
-        self._baseline = min(max(moved, -farthest), farthest)
-        self._doubt -= share * self._doubt
+        farthest = self._largest_baseline
+        if not -farthest <= moved <= farthest:
+            farthest = max(farthest, abs(baseline))
+            moved = min(max(moved, -farthest), farthest)
+        self._baseline = moved
+        self._doubt = doubt - share * doubt
 
     def _learn_swing(self, dt: float) -> None:
         """
         Learn how far the rate swings about its trend, from two quick half swings in a row.
 
         """
-        self._trend += dt / (dt + self._baseline_s) * (self.rate - self._trend)
+        rate = self.rate
+        trend = self._trend
+        self._trend = trend = trend + dt / (dt + self._baseline_s) * (rate - trend)
         self.swing += dt / (dt + self._swing_memory_s) * (self._ripple_rate - self.swing)
-        apart = self.rate - self._trend
+        apart = rate - trend
         if (apart > 0.0) == self._is_above:
             self._peak = max(self._peak, abs(apart))
             return

@@ -337,10 +337,10 @@ class LeadWatch:
             return
         by_case, by_board = case.temperature - self._calm[0], board.temperature - self._calm[1]
         direction = 1.0 if by_case + by_board > 0.0 else -1.0
-        case_rate, board_rate = direction * case.rate, direction * board.rate
-        slow, fast = min(case_rate, board_rate), max(case_rate, board_rate)
+        slow, fast = direction * case.rate, direction * board.rate
+        if slow > fast:
+            slow, fast = fast, slow
         noise = _SIGMAS * sqrt(case.var_temperature + board.var_temperature)
-        largest = max(abs(by_case), abs(by_board))
         lead = direction * (by_case - by_board)
         if lead > -noise - self._quanta:
             self.doubt = 0.0
@@ -349,7 +349,7 @@ class LeadWatch:
         is_telling = (
             slow > LEAD_RATE_SHARE * fast
             and abs(lead) > self._margin + noise
-            and abs(lead) > LEAD_SHARE * largest
+            and abs(lead) > LEAD_SHARE * max(abs(by_case), abs(by_board))
         )
         if not is_telling:
             return
