@@ -16,6 +16,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import cast
@@ -179,13 +180,28 @@ def _read(
     )
     ordered = [chunks[row] for row in order]
     if is_overlapping:
-        loaded = _loaded(pool, survey.handle, [[span] for span in ordered])
-        yield from in_log_order(_placed(loaded, decoder, ordered, order))
+        jobs = [_Job([span], row * _PLACES) for span, row in zip(ordered, order, strict=True)]
+        following = [*(span.start_ns for span in ordered[1:]), None]
+        parts = _decoded(pool, survey.handle, decoder, jobs)
+        yield from in_log_order(zip(parts, following, strict=True))
     else:
-        for data, messages in _loaded(pool, survey.handle, _grouped(ordered)):
-            part = decoder.part(data, messages, None)
-            if part:
-                yield part
+        jobs = [_Job(group, None) for group in _grouped(ordered)]
+        yield from filter(None, _decoded(pool, survey.handle, decoder, jobs))
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """
+    Chunks that are read as one, and their place as `Decoder.part` takes it.
+
+    """
+
+    spans: list[ChunkSpan]
+    place: int | None
+
+    @property
+    def size(self) -> int:
+        return sum(span.size for span in self.spans)
 
 
 def _grouped(spans: Sequence[ChunkSpan]) -> list[list[ChunkSpan]]:
@@ -238,38 +254,28 @@ def _in_file_order(survey: Survey, decoder: Decoder) -> Iterator[Part]:
                 yield part
 
 
-def _placed(
-    loaded: Iterator[tuple[Bytes, Messages]],
-    decoder: Decoder,
-    ordered: list[ChunkSpan],
-    order: list[int],
-) -> Iterator[tuple[Part, int | None]]:
-    following = [*(span.start_ns for span in ordered[1:]), None]
-    for (data, messages), row, next_ns in zip(loaded, order, following, strict=True):
-        yield decoder.part(data, messages, row * _PLACES), next_ns
-
-
-def _loaded(
-    pool: ThreadPoolExecutor, handle: RandomAccess, groups: Sequence[list[ChunkSpan]]
-) -> Iterator[tuple[Bytes, Messages]]:
+def _decoded(
+    pool: ThreadPoolExecutor, handle: RandomAccess, decoder: Decoder, jobs: Sequence[_Job]
+) -> Iterator[Part]:
     """
-    Read and decompress ahead in threads; most of what they do needs no interpreter lock.
+    Read, decompress and decode ahead in threads; most of what they do needs no interpreter lock.
 
+    What one thread has decompressed it decodes, too: then the bytes are in its processor's cache.
     The pool belongs to the source, not to this generator: a generator that is given up is closed
     by the garbage collector, anywhere, where waiting for a thread may be a deadlock.
 
     """
-    waiting: deque[tuple[int, Future[tuple[Bytes, Messages]]]] = deque()
+    waiting: deque[tuple[int, Future[Part]]] = deque()
     n_ahead = 0
-    following = iter(groups)
+    following = iter(jobs)
     upcoming = next(following, None)
     try:
         while waiting or upcoming is not None:
             while upcoming is not None:
-                size = sum(span.size for span in upcoming)
+                size = upcoming.size
                 if waiting and (len(waiting) == _N_AHEAD or n_ahead + size > _AHEAD_BYTES):
                     break
-                waiting.append((size, pool.submit(_load, handle, upcoming)))
+                waiting.append((size, pool.submit(_decode, handle, decoder, upcoming)))
                 n_ahead += size
                 upcoming = next(following, None)
             size, future = waiting.popleft()
@@ -278,6 +284,10 @@ def _loaded(
     finally:
         for _, future in waiting:
             future.cancel()
+
+
+def _decode(handle: RandomAccess, decoder: Decoder, job: _Job) -> Part:
+    return decoder.part(*_load(handle, job.spans), job.place)
 
 
 def _load(handle: RandomAccess, spans: list[ChunkSpan]) -> tuple[Bytes, Messages]:

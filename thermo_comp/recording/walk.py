@@ -238,7 +238,8 @@ def _messages(at: Ints, size: Ints, head: NDArray[np.void]) -> Messages:
     log_ns = field(head, 15, '<i8').astype(np.int64)
     if len(log_ns) and int(np.min(log_ns)) < 0:
         raise DamagedError('a message has a log time beyond the year 2262')
-    return Messages(at, size, field(head, 9, '<u2'), log_ns)
+    # Copied: each role looks at all of them.
+    return Messages(at, size, field(head, 9, '<u2').astype(np.uint16), log_ns)
 
 
 def walk(

@@ -12,14 +12,15 @@ All three input types are a std_msgs/Header followed by nothing but float64 numb
 
 and in ROS 1 a sequence number stands in place of the encapsulation, the string has no NUL and
 nothing is aligned. Only `frame_id` makes the size vary, so two gathers per message (the fixed
-head, then the numbers) read any mixture of lengths.
+head, then the numbers) read any mixture of lengths; short messages of one length, the usual case,
+are gathered as a whole.
 
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +31,14 @@ from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED
 
 Bytes = NDArray[np.uint8]
 Encoding = Literal['cdr', 'ros1']
+Size = TypeVar('Size', int, Ints)
 
 #: How many float64 numbers follow the header of each type.
 N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
 
 HEAD_BYTES = 16
+#: Messages up to this length are gathered as a whole where all have the same.
+_SHORT_BYTES = 128
 _MAX_PADDING = 7
 _NS = 1_000_000_000
 
@@ -50,6 +54,8 @@ class Stamped:
     numbers : ndarray, shape (n, k)
     frame_start, frame_size : ndarray of int64, shape (n,)
         Where the characters of `frame_id` stand in the buffer.
+    rows : ndarray of void, shape (n,), or None
+        The messages, where they and their `frame_id` are equally long and short.
 
     """
 
@@ -57,6 +63,7 @@ class Stamped:
     numbers: Floats
     frame_start: Ints
     frame_size: Ints
+    rows: NDArray[Any] | None = None
 
 
 def gather(buffer: Bytes, at: Ints, n_bytes: int) -> NDArray[Any]:
@@ -171,7 +178,9 @@ def decode_stamped(
     n_numbers = N_NUMBERS[kind]
     if len(start) and int(np.min(size)) < HEAD_BYTES + 8 * n_numbers:
         raise _misfit(kind)
-    head = gather(buffer, start, HEAD_BYTES)
+    length = int(size[0]) if len(size) else 0
+    is_short = length <= _SHORT_BYTES and bool((size == length).all())
+    head = gather(buffer, start, length if is_short and length else HEAD_BYTES)
     orders = _byte_orders(head) if encoding == 'cdr' else ['<']
     if len(orders) == 1:
         return _decode(buffer, start, size, head, orders[0], n_numbers, encoding, n_wanted)
@@ -225,22 +234,42 @@ def _decode(
     stamp_ns = seconds.astype(np.int64)
     stamp_ns *= _NS
     stamp_ns += field(head, 8, f'{order}u4')
-    frame_size = field(head, 12, f'{order}u4').astype(np.int64)
-    body = frame_size + HEAD_BYTES
-    if encoding == 'cdr':
-        body += 3  # (12 + length + 7) // 8 * 8, counted from after the encapsulation
-        body &= -8
-        body += 4
+    n_taken = n_numbers if n_wanted is None else n_wanted
+    sizes = field(head, 12, f'{order}u4')
+    if head.dtype.itemsize > HEAD_BYTES and (sizes == sizes[0]).all():
+        first_size, length = int(sizes[0]), head.dtype.itemsize
+        at = int(_body(first_size, encoding))
+        if not 0 <= length - (at + 8 * n_numbers) <= _MAX_PADDING:
+            raise _misfit('a header and its numbers')
+        values: Floats = np.ndarray(
+            (len(head), n_taken), f'{order}f8', head.data, offset=at, strides=(length, 8)
+        )
+        frame_size = np.broadcast_to(np.int64(first_size), len(head))
+        return Stamped(
+            stamp_ns, values.astype(np.float64, 'C'), start + HEAD_BYTES, frame_size, head
+        )
+    frame_size = sizes.astype(np.int64)
+    body = _body(frame_size, encoding)
     # Unsigned on purpose: too few bytes wrap around to far too many.
     padding = (size - (body + 8 * n_numbers)).view(np.uint64)
     if len(padding) and int(np.max(padding)) > _MAX_PADDING:
         raise _misfit('a header and its numbers')
     body += start
-    n_taken = n_numbers if n_wanted is None else n_wanted
     numbers = gather(buffer, body, 8 * n_taken).view(f'{order}f8').reshape(len(start), n_taken)
     return Stamped(
         stamp_ns, numbers.astype(np.float64, copy=False), start + HEAD_BYTES, frame_size
     )
+
+
+def _body(frame_size: Size, encoding: Encoding) -> Size:
+    """
+    Say where the numbers begin in a message.
+
+    """
+    if encoding != 'cdr':
+        return frame_size + HEAD_BYTES
+    # (12 + length + 7) // 8 * 8, counted from after the encapsulation
+    return (frame_size + (HEAD_BYTES + 3) & -8) + 4
 
 
 def _misfit(kind: str) -> RecordingError:
@@ -270,9 +299,12 @@ def frame_runs(buffer: Bytes, messages: Stamped) -> list[tuple[int, str]]:
     first_size = int(size[0])
     if first_size == 0 and not size.any():
         return [(0, '')]
+    if messages.rows is not None and _all_equal(messages.rows, HEAD_BYTES, first_size):
+        at = int(start[0])
+        return [(0, _text(buffer[at : at + first_size].tobytes()))]
     if (size == first_size).all():
         texts = gather(buffer, start, first_size)
-        if _all_equal(texts):
+        if _all_equal(texts, 0, first_size):
             return [(0, _text(texts[0].tobytes()))]
         rows: list[bytes] = [row.tobytes() for row in texts]
     else:
@@ -291,15 +323,15 @@ def frame_runs(buffer: Bytes, messages: Stamped) -> list[tuple[int, str]]:
     return runs
 
 
-def _all_equal(texts: NDArray[Any]) -> bool:
+def _all_equal(rows: NDArray[Any], offset: int, size: int) -> bool:
     """
-    Tell whether all rows have the bytes of the first one, compared word by word.
+    Tell whether all rows have the same bytes at a place, compared word by word.
 
     """
-    offset = 0
-    while offset < texts.itemsize:
-        width = next(w for w in (8, 4, 2, 1) if offset + w <= texts.itemsize)
-        words = field(texts, offset, f'u{width}')
+    end = offset + size
+    while offset < end:
+        width = next(w for w in (8, 4, 2, 1) if offset + w <= end)
+        words = field(rows, offset, f'u{width}')
         if (words != words[0]).any():
             return False
         offset += width
