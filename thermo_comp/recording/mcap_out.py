@@ -48,6 +48,8 @@ MAGIC = b'\x89MCAP0\r\n'
 #: Name of the metadata record that holds the writer's key-value pairs.
 METADATA_NAME = 'thermo_comp'
 
+#: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
+_ZSTD_LEVEL = -1
 _MAX_PACKING = 2
 # Versions of mcap differ in which of its methods are typed.
 _new_builder: Callable[[], Any] = RecordBuilder
@@ -367,7 +369,7 @@ def _compressor(
     compression: Literal['none', 'lz4', 'zstd'], level: int | None
 ) -> Callable[[Bytes], bytes | memoryview]:
     if compression == 'zstd':
-        compressor = zstandard.ZstdCompressor(level=1 if level is None else level)
+        compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL if level is None else level)
         return lambda data: compressor.compress(data.data)
     if compression == 'lz4':
         return lambda data: bytes(

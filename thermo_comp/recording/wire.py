@@ -212,7 +212,11 @@ def _byte_orders(head: NDArray[Any]) -> list[str]:
     first = field(head, 0, '>u2')
     if not len(first):
         return ['<']
-    low, high = int(first.min()), int(first.max())
+    low = high = int(first[0])
+    # Equal in any byte order, which saves turning each.
+    same = field(head, 0, 'u2')
+    if (same != same[0]).any():
+        low, high = int(first.min()), int(first.max())
     if high > 1:
         raise RecordingError(
             f'serialized with representation {high:#06x}, only plain CDR (0 or 1) is read'
