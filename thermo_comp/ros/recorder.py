@@ -3,8 +3,9 @@
 """
 Owns the recorder of the node's output: live topics into a bag that any rosbag2 tool opens.
 
-The bag's log time is the header stamp, and for a flag the newest stamp before it, as in what
-`replay` writes; so a bag that was played faster than real time is recorded in its own time.
+The bag's log time is the stamp of an Imu, and for anything else the newest such stamp before it,
+as in what `replay` writes; so a bag that was played faster than real time is recorded in its own
+time, whatever the clock on the wall says meanwhile.
 
 """
 
@@ -77,7 +78,7 @@ class Recorder:
         self._failure: RecordingError | None = None
         self._newest: dict[str, bytes] = {}
         self._newest_ns: int | None = None
-        # Flags that came before any stamp.
+        # What came before any stamp.
         self._early: dict[str, list[bytes]] = {}
 
     def __enter__(self) -> Recorder:
@@ -131,7 +132,7 @@ class Recorder:
 
     def newest(self, name: str) -> Any | None:
         """
-        Return the newest message of a topic.
+        Return the newest message of a topic, recorded or still waiting for a stamp.
 
         Parameters
         ----------
@@ -211,25 +212,28 @@ class Recorder:
         Write what has arrived.
 
         """
-        new: dict[str, list[bytes]] = {}
+        new: dict[str, int] = {}
         for name, subscription in self._subscriptions.items():
-            messages = self._early.pop(name, []) + subscription.drain()[0]
+            fresh = subscription.drain()[0]
+            messages = self._early.pop(name, []) + fresh
             times = [self._log_time(name, data) for data in messages]
             if self._newest_ns is None:
                 self._early[name] = messages
             elif messages:
                 stamps = np.array(times, np.int64)
                 self._writer.write_raw(name, _type_name(self._topics[name]), stamps, messages)
-                new[name] = messages
+                new[name] = len(messages)
+            if fresh:
+                self._newest[name] = fresh[-1]
+                new.setdefault(name, 0)
         if new:
             with self._changed:
-                for name, messages in new.items():
-                    self._counts[name] += len(messages)
-                    self._newest[name] = messages[-1]
+                for name, n_messages in new.items():
+                    self._counts[name] += n_messages
                 self._changed.notify_all()
 
     def _log_time(self, name: str, data: bytes) -> int | None:
-        if self._topics[name] is not Bool:
+        if self._topics[name] is Imu:
             sec, nanosec = _STAMP.unpack_from(data, 4)
             self._newest_ns = sec * 1_000_000_000 + nanosec
         return self._newest_ns
