@@ -49,6 +49,10 @@ class Traffic:
     n_flags: int = 0
     #: Samples that took the slow way through rclpy's deserialization.
     n_fallback: int = 0
+    #: Publishers that the node has found on its inputs.
+    n_sample_publishers: int = 0
+    n_board_publishers: int = 0
+    n_case_publishers: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +299,7 @@ def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[
         if entry.name != 'n_out'
     ]
     values += [
-        (entry.name.removeprefix('n_'), str(getattr(now.traffic, entry.name)))
+        (entry.name.removeprefix('n_').replace('_', ' '), str(getattr(now.traffic, entry.name)))
         for entry in fields(Traffic)
     ]
     return [

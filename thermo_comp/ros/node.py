@@ -287,12 +287,17 @@ class CompensationNode:
 
     def _snapshot(self) -> Snapshot:
         last, converter = self._converter.last_result, self._converter
+        inputs = (self._samples, *(subscription for subscription, _ in self._temperatures))
+        found = [one.subscription.get_publisher_count() for one in inputs]
         traffic = Traffic(
             n_lost=self._n_lost,
             n_unpublished=self._n_unpublished,
             n_malformed=self._n_malformed + converter.n_malformed,
             n_flags=self._n_flags,
             n_fallback=self._n_fallback + converter.n_fallback,
+            n_sample_publishers=found[0],
+            n_board_publishers=found[1],
+            n_case_publishers=found[2],
         )
         variances = None if last is None else (last[3], last[6], last[8])
         return Snapshot(self._compensator.status, traffic, variances)

@@ -18,7 +18,7 @@ full.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -48,7 +48,7 @@ CLOCK_PERIOD = 0.01
 NAP = 0.1
 #: Time between two looks at what is acknowledged; that takes Fast DDS some 5 ms [s].
 ACKNOWLEDGEMENT_NAP = 0.0005
-#: Time the subscribers are given to find the player too; nothing tells when they have [s].
+#: Time the subscribers are given to find the player too where nobody tells when they have [s].
 SETTLING = 0.3
 #: How long a subscriber may leave a window unacknowledged [s].
 PATIENCE = 30.0
@@ -84,6 +84,7 @@ def play(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     ros_args: Sequence[str] = (),
+    is_found: Callable[[Collection[Role]], bool] | None = None,
     throttle: Callable[[int], None] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> PlayReport:
@@ -108,6 +109,9 @@ def play(
         Which accelerometer topic of the bag is played.
     ros_args : sequence of str, optional
         ROS arguments, such as ``['-r', '__ns:=/imu0']``.
+    is_found : callable, optional
+        Tells whether the subscribers have found the player's topics of these roles; what is sent
+        before that can come late. A little time is given to them if not given.
     throttle : callable, optional
         Called with the number of samples sent after each `WINDOW`; may block for a while.
     progress : callable, optional
@@ -138,7 +142,7 @@ def play(
         rclpy.init(args=['--ros-args', *ros_args], context=context)
         try:
             player = _Player(context, reader, rate, clock, throttle)
-            player.wait_for_subscribers(wait_s)
+            player.wait_for_subscribers(wait_s, is_found)
             n_done = 0
             while n_loops == 0 or n_done < n_loops:
                 player.play_once(progress)
@@ -182,9 +186,11 @@ class _Player:
         self._started = time.monotonic()
         self._next_clock = 0.0
 
-    def wait_for_subscribers(self, wait_s: float) -> None:
+    def wait_for_subscribers(
+        self, wait_s: float, is_found: Callable[[Collection[Role]], bool] | None
+    ) -> None:
         """
-        Wait until every topic has a subscriber, or for so long.
+        Wait until every topic has a subscriber which knows of it, or for so long.
 
         """
         deadline = time.monotonic() + wait_s
@@ -199,7 +205,10 @@ class _Player:
                 for end in self._node.get_subscriptions_info_by_topic(one.topic_name)
             )
         ]
-        if wait_s > 0.0:
+        if is_found is not None:
+            while not is_found(self._publishers) and time.monotonic() < deadline:
+                time.sleep(min(NAP, 0.02))
+        elif wait_s > 0.0:
             time.sleep(SETTLING)
         self._started = time.monotonic()
 

@@ -18,14 +18,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
 
 from ..errors import ThermoCompError
-from ..recording import Input, Topics
+from ..recording import Input, Role, Topics
 from .player import PlayReport, play
 from .recorder import OUTPUTS, Recorder
 
@@ -42,6 +42,11 @@ IN_FLIGHT = 1000
 
 _TOPICS = {**OUTPUTS, 'diagnostics': DiagnosticArray}
 _ACCOUNT = ('-p', 'diagnostics_period:=0.1')
+_PUBLISHERS: dict[Role, str] = {
+    'accel': 'sample publishers',
+    'board': 'board publishers',
+    'case': 'case publishers',
+}
 _INPUTS = ('accel/counts', 'imu/uncompensated', 'temperature/board', 'temperature/case')
 
 
@@ -244,7 +249,9 @@ def round_trip(
             rate=rate,
             topics=topics,
             input=input,
+            wait_s=DISCOVERY_S,
             ros_args=ros_args,
+            is_found=lambda roles: _is_found(recorder, roles),
             throttle=_Throttle(recorder),
             progress=progress,
         )
@@ -252,6 +259,22 @@ def round_trip(
         if not node.is_alive:
             raise ThermoCompError(f'the node ended: {node.said}')
         return RoundTrip(played, recorder.counts, account)
+
+
+def _account(recorder: Recorder) -> dict[str, str]:
+    diagnostics = recorder.newest('diagnostics')
+    if diagnostics is None:
+        return {}
+    return {one.key: one.value for one in diagnostics.status[0].values}
+
+
+def _is_found(recorder: Recorder, roles: Collection[Role]) -> bool:
+    """
+    Tell whether the node has found the player, by what it says itself.
+
+    """
+    account = _account(recorder)
+    return all(account.get(_PUBLISHERS[role], '0') != '0' for role in roles)
 
 
 def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
@@ -263,9 +286,7 @@ def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
     account: dict[str, str] = {}
 
     def is_complete(counts: Mapping[str, int]) -> bool:
-        diagnostics = recorder.newest('diagnostics')
-        if diagnostics is not None:
-            account.update((one.key, one.value) for one in diagnostics.status[0].values)
+        account.update(_account(recorder))
         expected = [account.get(key, '') for key in ('samples in', 'samples out', 'flags')]
         found = [n_sent, counts['imu/data_raw'], counts['regime/dynamic']]
         return expected == [str(count) for count in found] or time.monotonic() > deadline
