@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set
+from builders import axis_set, calibration, regime_set, rich_calibration
 from fitting_truth import GRAVITY, Truth, table_of, without_memory
 
 from thermo_comp.correction import Correction
@@ -116,3 +116,34 @@ def test_arrays_get_the_bits_of_floats():
     bias, scale = correction.bias_scale(state(board, weight))[0]
     for k, one in enumerate(board.tolist()):
         assert correction.bias_scale(state(one, float(weight[k])))[0] == (bias[k], scale[k])
+
+
+def test_a_set_alone_is_what_the_blend_says_of_it(rng):
+    # WHY: where one set counts alone the other one is not evaluated at all.
+    # WHAT: a column in which both count somewhere is evaluated in full; each of its rows alone
+    # must give the same bits, inside and outside the ranges, the regime known or not.
+    unit = rich_calibration()
+    correction = Correction(unit)
+    n = 200
+    columns = [
+        rng.uniform(-5.0, 45.0, n),
+        np.full(n, 1e-4),
+        rng.uniform(-0.02, 0.02, n),
+        rng.uniform(-3.0, 3.0, n),
+        np.full(n, 1e-4),
+        rng.choice([0.0, 1.0, 0.25], n),
+        rng.choice([0.0, 0.0, 1.0], n),
+    ]
+    for _ in unit.memory_time_constants_s:
+        columns += [rng.uniform(-3.0, 3.0, n), np.full(n, 1e-3)]
+    values, variances = correction.evaluate(tuple(columns))
+    n_alone = 0
+    for k in range(n):
+        row = tuple(float(column[k]) for column in columns)
+        n_alone += row[5] != 0.25 and row[6] == 0.0
+        assert correction.bias_scale(row) == [(bias[k], scale[k]) for bias, scale in values]
+        assert correction.evaluate(row) == (
+            [(bias[k], scale[k]) for bias, scale in values],
+            [(a[k], b[k], c[k]) for a, b, c in variances],
+        )
+    assert n_alone > n / 4
