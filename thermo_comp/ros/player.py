@@ -39,9 +39,8 @@ from ..recording.encode import stamped_payloads
 
 NODE_NAME = 'thermo_comp_player'
 
-#: Samples under way at most.
+#: Messages of a topic under way at most; so many are kept to be sent again.
 WINDOW = 200
-TEMPERATURE_DEPTH = 10
 #: Wall time between two messages on `/clock` [s].
 CLOCK_PERIOD = 0.01
 #: The longest nap, so that an interrupt is heeded [s].
@@ -53,6 +52,11 @@ SETTLING = 0.3
 #: How long a subscriber may leave a window unacknowledged [s].
 PATIENCE = 30.0
 
+_QOS = QoSProfile(
+    depth=WINDOW,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
 _NAMES: dict[Role, str] = {'board': 'temperature/board', 'case': 'temperature/case'}
 _ACCEL = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
 
@@ -175,7 +179,7 @@ class _Player:
             role: self._node.create_publisher(
                 accel_type if role == 'accel' else Temperature,
                 accel_name if role == 'accel' else _NAMES[role],
-                _qos(WINDOW if role == 'accel' else TEMPERATURE_DEPTH),
+                _QOS,
             )
             for role in reader.topics
         }
@@ -232,9 +236,9 @@ class _Player:
                     self._tell_time(log_ns)
                 self._publishers[role].publish(data)
                 self._n_sent[role] += 1
-                if role == 'accel' and self._n_sent[role] % WINDOW == 0:
+                if self._n_sent[role] % WINDOW == 0:
                     self._await_acknowledgement(role)
-                    if self._throttle is not None:
+                    if role == 'accel' and self._throttle is not None:
                         self._throttle(self._n_sent[role])
             if progress is not None:
                 progress(min(1.0, (sum(self._n_sent.values()) - n_before) / max(1, self._total)))
@@ -283,14 +287,6 @@ class _Player:
                     f'{publisher.topic_name}: a subscriber took nothing for {PATIENCE:g} s'
                 )
             time.sleep(ACKNOWLEDGEMENT_NAP)
-
-
-def _qos(depth: int) -> QoSProfile:
-    return QoSProfile(
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
 
 
 def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, Role, bytes]]:
