@@ -34,8 +34,10 @@ from std_msgs.msg import Bool
 from thermo_comp.errors import RecordingError, ThermoCompError
 from thermo_comp.recording import BagWriter, ImuColumns, Topics, read_recording
 from thermo_comp.ros import player
-from thermo_comp.ros.player import WINDOW, play
+from thermo_comp.ros.player import play
 from thermo_comp.ros.recorder import Recorder, record
+
+WINDOW = player.WINDOW['accel']
 
 START_NS = 1_767_225_600_000_000_000
 CYCLE_NS = 2_500_000

@@ -7,11 +7,11 @@ Whatever the topics are called in the bag, they go out under the node's own rela
 remappings and a namespace apply as to a sensor driver. The messages are those of the bag, byte
 for byte, in the bag's order; ROS 1 messages are rewritten in CDR.
 
-Flow control: after `WINDOW` samples the player waits until every reliable subscriber has
-acknowledged them, so no more than that is ever under way, which fits into the queues of the
-transport. Fast DDS asks for acknowledgement with every message only while the publisher's history
-is full, and otherwise every 3 s; hence the small histories, which transient-local durability keeps
-full.
+Flow control: after `WINDOW` messages of a topic the player waits until every reliable subscriber
+has acknowledged them, so no more than that is ever under way, which fits into the queues of the
+transport, and none is overwritten before it has arrived. Fast DDS asks for acknowledgement with
+every message only while the publisher's history is full, and otherwise every 3 s; hence the small
+histories, which transient-local durability keeps full.
 
 """
 
@@ -40,7 +40,7 @@ from ..recording.encode import stamped_payloads
 NODE_NAME = 'thermo_comp_player'
 
 #: Messages of a topic under way at most; so many are kept to be sent again.
-WINDOW = 200
+WINDOW: dict[Role, int] = {'accel': 200, 'board': 50, 'case': 50}
 #: Wall time between two messages on `/clock` [s].
 CLOCK_PERIOD = 0.01
 #: The longest nap, so that an interrupt is heeded [s].
@@ -52,11 +52,6 @@ SETTLING = 0.3
 #: How long a subscriber may leave a window unacknowledged [s].
 PATIENCE = 30.0
 
-_QOS = QoSProfile(
-    depth=WINDOW,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 _NAMES: dict[Role, str] = {'board': 'temperature/board', 'case': 'temperature/case'}
 _ACCEL = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
 
@@ -117,7 +112,7 @@ def play(
         Tells whether the subscribers have found the player's topics of these roles; what is sent
         before that can come late. A little time is given to them if not given.
     throttle : callable, optional
-        Called with the number of samples sent after each `WINDOW`; may block for a while.
+        Called with the number of samples sent after each window; may block for a while.
     progress : callable, optional
         Called with the fraction done, now and then.
 
@@ -179,7 +174,7 @@ class _Player:
             role: self._node.create_publisher(
                 accel_type if role == 'accel' else Temperature,
                 accel_name if role == 'accel' else _NAMES[role],
-                _QOS,
+                _qos(WINDOW[role]),
             )
             for role in reader.topics
         }
@@ -236,7 +231,7 @@ class _Player:
                     self._tell_time(log_ns)
                 self._publishers[role].publish(data)
                 self._n_sent[role] += 1
-                if self._n_sent[role] % WINDOW == 0:
+                if self._n_sent[role] % WINDOW[role] == 0:
                     self._await_acknowledgement(role)
                     if role == 'accel' and self._throttle is not None:
                         self._throttle(self._n_sent[role])
@@ -287,6 +282,14 @@ class _Player:
                     f'{publisher.topic_name}: a subscriber took nothing for {PATIENCE:g} s'
                 )
             time.sleep(ACKNOWLEDGEMENT_NAP)
+
+
+def _qos(depth: int) -> QoSProfile:
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
 
 
 def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, Role, bytes]]:
