@@ -29,6 +29,7 @@ from geometry_msgs.msg import Vector3Stamped
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
@@ -83,7 +84,7 @@ def play(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     ros_args: Sequence[str] = (),
-    is_found: Callable[[Collection[Role]], bool] | None = None,
+    is_found: Callable[[Node, Collection[Role]], bool] | None = None,
     throttle: Callable[[int], None] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> PlayReport:
@@ -109,7 +110,7 @@ def play(
     ros_args : sequence of str, optional
         ROS arguments, such as ``['-r', '__ns:=/imu0']``.
     is_found : callable, optional
-        Tells whether the subscribers have found the player's topics of these roles; what is sent
+        Tells whether the subscribers have found the node's topics of these roles; what is sent
         before that can come late. A little time is given to them if not given.
     throttle : callable, optional
         Called with the number of samples sent after each window; may block for a while.
@@ -186,7 +187,7 @@ class _Player:
         self._next_clock = 0.0
 
     def wait_for_subscribers(
-        self, wait_s: float, is_found: Callable[[Collection[Role]], bool] | None
+        self, wait_s: float, is_found: Callable[[Node, Collection[Role]], bool] | None
     ) -> None:
         """
         Wait until every topic has a subscriber which knows of it, or for so long.
@@ -205,7 +206,7 @@ class _Player:
             )
         ]
         if is_found is not None:
-            while not is_found(self._publishers) and time.monotonic() < deadline:
+            while not is_found(self._node, self._publishers) and time.monotonic() < deadline:
                 time.sleep(min(NAP, 0.02))
         elif wait_s > 0.0:
             time.sleep(SETTLING)

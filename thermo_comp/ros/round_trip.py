@@ -22,15 +22,22 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import GetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 
 from ..errors import ThermoCompError
 from ..recording import Input, Role, Topics
+from .node import NODE_NAME
 from .player import PlayReport, play
 from .recorder import OUTPUTS, Recorder
 
 #: How long node and recorder may take to find each other [s].
 DISCOVERY_S = 30.0
+#: How long the node may take to answer [s]; then it is asked again.
+ANSWER_S = 1.0
 #: How long the node may take to end [s].
 STOPPING_S = 10.0
 #: A message that Fast DDS has to repeat is 3 s late, on a busy machine several times [s].
@@ -251,7 +258,7 @@ def round_trip(
             input=input,
             wait_s=DISCOVERY_S,
             ros_args=ros_args,
-            is_found=lambda roles: _is_found(recorder, roles),
+            is_found=lambda player, roles: _is_found(recorder, player, roles),
             throttle=_Throttle(recorder),
             progress=progress,
         )
@@ -268,13 +275,27 @@ def _account(recorder: Recorder) -> dict[str, str]:
     return {one.key: one.value for one in diagnostics.status[0].values}
 
 
-def _is_found(recorder: Recorder, roles: Collection[Role]) -> bool:
+def _is_found(recorder: Recorder, player: Node, roles: Collection[Role]) -> bool:
     """
-    Tell whether the node has found the player, by what it says itself.
+    Tell whether the node has found the player, by what it says itself, and hears it.
 
     """
     account = _account(recorder)
-    return all(account.get(_PUBLISHERS[role], '0') != '0' for role in roles)
+    if any(account.get(_PUBLISHERS[role], '0') == '0' for role in roles):
+        return False
+    # The first thing that one process ever sends to another can get lost on a busy machine, and
+    # would come again behind the samples: so it is a question that is answered.
+    client = player.create_client(GetParameters, f'{NODE_NAME}/get_parameters')
+    executor = SingleThreadedExecutor(context=player.context)
+    try:
+        if not client.wait_for_service(ANSWER_S):
+            return False
+        answer = client.call_async(GetParameters.Request(names=['calibration_file']))
+        rclpy.spin_until_future_complete(player, answer, executor, ANSWER_S)
+        return bool(answer.done())
+    finally:
+        executor.shutdown()
+        player.destroy_client(client)
 
 
 def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
