@@ -90,7 +90,7 @@ TOLD = [
     ),
     Told(
         'the output folder is read-only',
-        '`report` and `replay`',
+        '`fit`, `report` and `replay`',
         'exit code 1',
         'one line: the output and the reason',
         f'{_FILES}::test_a_folder_that_is_read_only',
