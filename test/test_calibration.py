@@ -108,6 +108,8 @@ TEXT = dump_calibration(rich_calibration())
         ('full_scale: 32767.0', "full_scale: '9'", 'unit.full_scale', "valid number, got '9'"),
         ('full_scale: 32767.0', 'full_scale: -1.0', 'unit.full_scale', 'greater than 0, got -1'),
         ('full_scale: 32767.0', 'fullscale: 1.0', 'unit.fullscale', 'unknown key'),
+        ('full_scale: 32767.0', '"full\\nscale": 1.0', r"unit.'full\nscale'", 'unknown key'),
+        ('full_scale: 32767.0', f'{"x" * 999}: 1.0', "unit.'" + 'x' * 59, 'unknown key'),
         ('full_scale: 32767.0, ', '', 'unit.full_scale', 'missing'),
         ('input: counts', 'input: volts', 'unit.input', "got 'volts'"),
         ('serial: T-1', "serial: ''", 'unit.serial', 'at least 1 character'),

@@ -29,6 +29,8 @@ SIZE_LIMIT = 1 << 20
 DEPTH_LIMIT = 12
 #: Digits of the longest integer accepted; a float64 needs no more.
 _INTEGER_DIGITS = 20
+#: Longer than any key that there is.
+_LONGEST_NAME = 60
 _NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)')
 
 _ADAPTER: TypeAdapter[Calibration] = TypeAdapter(Calibration)
@@ -317,7 +319,12 @@ def _first_problem(error: ValidationError) -> tuple[str, str | None]:
     location = [part for part in problem['loc'] if part not in kinds]
     key = ''
     for part in location:
-        key += f'[{part}]' if isinstance(part, int) else f'.{part}' if key else str(part)
+        if isinstance(part, int):
+            key += f'[{part}]'
+        else:
+            # What is no name can be anything: lines, or pages of text.
+            name = part if part.isprintable() and len(part) < _LONGEST_NAME else repr(part)
+            key += ('.' if key else '') + f'{name:.{_LONGEST_NAME}}'
     message = problem['msg'].removeprefix('Value error, ')
     # What two keys have to do with each other is checked where both are known, and named there.
     named = _NAMED_FIRST.fullmatch(message)
