@@ -40,9 +40,8 @@ def draw(measured: list[dict[str, Any]], path: Path) -> None:
             label = f'{NAMES[relay]}, {reliability.replace("_", " ")}'
             cpu.plot(rates, [case[relay]['cpu_us'] for case in cases], label=label, **look)
             latency.plot(rates, [case[relay]['p99_ms'] for case in cases], **look)
-    latency.axhline(1.0, color='0.6', linewidth=0.8)
-    fastest = max(case['rate'] for case in measured)
-    latency.text(fastest, 1.1, 'goal: 1 ms', color='0.4', fontsize=8, ha='right')
+    goal = latency.axhline(1.0, color='0.6', linewidth=0.8, label='goal: 1 ms')
+    latency.legend(handles=[goal], loc='upper left', fontsize=8, frameon=False)
     cpu.set(ylabel='CPU time per sample [µs]', ylim=(10.0, None))
     latency.set(ylabel='99th percentile of the latency [ms]')
     for axes in (cpu, latency):
@@ -51,7 +50,9 @@ def draw(measured: list[dict[str, Any]], path: Path) -> None:
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
         axes.minorticks_off()
         axes.grid(visible=True, which='major', color='0.9')
-    figure.legend(loc='outside upper center', ncols=4, fontsize=8, frameon=False, handlelength=3.5)
+    handles, _ = cpu.get_legend_handles_labels()
+    look = {'fontsize': 8, 'frameon': False, 'handlelength': 3.5}
+    figure.legend(handles=handles, loc='outside upper center', ncols=4, **look)
     figure.savefig(path, dpi=130)
 
 
