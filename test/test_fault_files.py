@@ -147,7 +147,7 @@ def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: st
 
 
 def rewritten(torn: Path, whole: Path) -> None:
-    """Write what can be read of a torn bag as a whole one, message by message in their order."""
+    """Write what can be read of a torn bag as a whole one."""
     found = read_recording(torn).columns
     with BagWriter(whole) as bag:
         bag.write_temperature('temperature/board', found.board_stamp_ns, found.board)

@@ -271,6 +271,23 @@ def test_quality_of_service_is_open_to_overrides(node: Node) -> None:
     loop.close()
 
 
+def test_a_subscription_that_was_ready_stays_in_the_wait_set(node: Node, peer: Peer) -> None:
+    # The loop does not put it in anew: should rcl ever take it out, the second wait would not end.
+    subscription = node.create_subscription(Vector3Stamped, 'samples', print, 10, raw=True)
+    publisher = peer.publisher(Vector3Stamped, 'samples')
+    with subscription.handle, node.context.handle:
+        wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
+        assert not wait_set.is_ready('subscription', 0)
+        wait_set.add_subscription(subscription.handle)
+        for _ in range(3):
+            publisher.publish(Vector3Stamped())
+            wait_set.wait(int(TIMEOUT * 1e9))
+            assert wait_set.is_ready('subscription', 0)
+            assert subscription.handle.take_message(Vector3Stamped, True) is not None
+        wait_set.wait(0)
+        assert not wait_set.is_ready('subscription', 0)
+
+
 def test_a_paced_drain_leaves_nothing_behind_for_long(node: Node, peer: Peer) -> None:
     """What comes in bursts, against any expectation of the next message, is all taken in order."""
     running = Running(node)
@@ -283,7 +300,6 @@ def test_a_paced_drain_leaves_nothing_behind_for_long(node: Node, peer: Peer) ->
             running.received_ns += received_ns
             running.news.notify_all()
 
-    running.take = take  # type: ignore[method-assign]
     running.thread = threading.Thread(target=running.loop.run, args=(take,), daemon=True)
     with running:
         publisher = peer.publisher(Vector3Stamped, 'samples')

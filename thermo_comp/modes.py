@@ -165,6 +165,8 @@ def merge(one: State, other: State, share: float) -> tuple[float, float, float, 
     """
     Mix two states as `blend` does, without what concerns the acceleration.
 
+    That is asked for rarely, and this is done for each reading.
+
     Parameters
     ----------
     one, other : tuple of float

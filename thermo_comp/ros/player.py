@@ -110,7 +110,7 @@ def play(
     ros_args : sequence of str, optional
         ROS arguments, such as ``['-r', '__ns:=/imu0']``.
     is_found : callable, optional
-        Tells whether the subscribers have found the node's topics of these roles; what is sent
+        Tells whether the subscribers have found the player's topics of these roles; what is sent
         before that can come late. A little time is given to them if not given.
     throttle : callable, optional
         Called with the number of samples sent after each window; may block for a while.
