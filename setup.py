@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
+import os
 import re
+import sys
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -31,11 +33,63 @@ EXTRAS = {
     'px4': ['pyulog>=1.0'],
     'ardupilot': ['pymavlink>=2.4.40'],
     'fleet': ['dask>=2024.1', 'distributed>=2024.1', 'fsspec>=2023.6', 'pyarrow>=14'],
-    'test': ['pytest>=7.4', 'pytest-xdist>=3.4', 'hypothesis>=6.98'],
+    'test': ['pytest>=7.4', 'pytest-xdist>=3.4', 'hypothesis>=6.98', 'mypy>=1.18'],
     'dev': ['ruff>=0.15', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs', 'pre-commit>=3.5'],
     'fuzz': ['atheris>=3.0'],
     'docs': ['mkdocs-material>=9.5'],
 }
+
+# THERMO_COMP_COMPILE=1 makes C extensions of these, from the same source: what runs for each
+# reading and each sample. Their .py files are installed beside them.
+CORE = [
+    'batch',
+    'compensator',
+    'health',
+    'modes',
+    'onset',
+    'plausibility',
+    'reading_queue',
+    'regime',
+    'sample_guard',
+    'thermal',
+    'thermometer',
+]
+COMPILER = 'mypy>=1.18'
+IS_COMPILED = os.environ.get('THERMO_COMP_COMPILE', '0') not in ('', '0')
+COMMANDS = set(sys.argv[1:])
+
+
+def compiled():
+    """
+    Make the C extensions of the core, where they are asked for.
+
+    """
+    if IS_COMPILED and COMMANDS & {'develop', 'editable_wheel'}:
+        sys.exit(
+            f'{NAME}: THERMO_COMP_COMPILE does not go with an editable install, whose edited '
+            'sources would not run: unset it, or install without -e (colcon: --symlink-install)'
+        )
+    if not IS_COMPILED or not COMMANDS & {'build', 'build_ext', 'bdist_wheel', 'install'}:
+        return []
+    try:
+        from mypyc.build import mypycify
+    except ImportError:
+        sys.exit(f"{NAME}: THERMO_COMP_COMPILE needs mypyc: pip install '{COMPILER}'")
+    # Types of other libraries make no code here, so those need not be there.
+    options = ['--config-file=', '--no-site-packages', '--ignore-missing-imports']
+    files = [f'{NAME}/{module}.py' for module in CORE]
+    extensions = mypycify(
+        [*options, '--follow-imports=silent', *files],
+        group_name=f'{NAME}._core',
+        opt_level='1',
+        debug_level='0',
+    )
+    for extension in extensions:
+        # The same bits on every architecture: nothing is fused, nothing computed in advance.
+        # And what another compiler warns of is no error.
+        exact = ['-ffp-contract=off', *(f'-fno-builtin-{f}' for f in ('exp', 'log', 'pow'))]
+        extension.extra_compile_args += [*exact, '-Wno-error']
+    return extensions
 
 
 def shared(folder, *patterns):
@@ -73,6 +127,9 @@ setup(
         shared('config/columns', '*.yaml'),
         shared('launch', '*.xml', '*.py'),
     ],
+    ext_modules=compiled(),
+    # Under its own isolation pip asks with this command what a build needs.
+    setup_requires=[COMPILER] if IS_COMPILED and sys.argv[1:] == ['egg_info'] else [],
     install_requires=INSTALL,
     extras_require=EXTRAS,
     entry_points={

@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from regime_rules import BOARD_LAG_S, RIPPLE_C, RIVALS, Array, Scene, read, temperatures
 
-from thermo_comp.regime import DetectorSettings, Regime, RegimeDetector
-from thermo_comp.thermometer import Thermometer, ThermometerSettings
+from thermo_comp.regime import Regime, RegimeDetector
+from thermo_comp.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.thermometer import Thermometer
 
 SEGMENT_H = 2.5
 OURS = 'ours'

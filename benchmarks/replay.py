@@ -29,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thermo_comp import is_compiled
 from thermo_comp.calibration import Calibration
 from thermo_comp.calibration_file import load_calibration
 from thermo_comp.compensator import Compensator
@@ -279,9 +280,10 @@ def main() -> None:
     parser.add_argument('--gigabytes', type=float, default=0.0, help='of the large bag')
     parser.add_argument('--repeats', type=int, default=2)
     options = parser.parse_args()
+    core = 'compiled' if is_compiled() else 'interpreted'
     print(
         f'{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, '
-        f'numpy {np.__version__}'
+        f'numpy {np.__version__}, {core} core'
     )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

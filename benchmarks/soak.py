@@ -297,8 +297,7 @@ def calibrations(rate: int, folder: Path) -> list[str]:
 
     """
     from thermo_comp.calibration_file import load_calibration, save_calibration
-    from thermo_comp.regime import DetectorSettings
-    from thermo_comp.thermometer import ThermometerSettings
+    from thermo_comp.settings import DetectorSettings, ThermometerSettings
 
     example = load_calibration(CALIBRATION)
     case, board = (

@@ -21,9 +21,8 @@ import numpy as np
 from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set
 
 from thermo_comp.calibration import Axes, AxisReference, Calibration, LinearTerm, MemoryTerm, Unit
-from thermo_comp.regime import DetectorSettings
+from thermo_comp.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.status import CompensatorConfig
-from thermo_comp.thermometer import ThermometerSettings
 
 START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5

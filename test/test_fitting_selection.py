@@ -38,7 +38,7 @@ from thermo_comp.fitting.table import WindowTable
 from thermo_comp.fitting.uncertainty import full_covariance, predicted_sd
 from thermo_comp.fitting.warm_up import find_warm_up
 from thermo_comp.functions import CubicSpline, Exponential
-from thermo_comp.regime import DetectorSettings
+from thermo_comp.settings import DetectorSettings
 
 
 def selector_of(table: WindowTable) -> Selector:

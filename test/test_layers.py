@@ -26,6 +26,7 @@ LAYERS = {
     'plain_yaml': 1,
     'functions': 1,
     'modes': 1,
+    'settings': 1,
     'thermometer': 1,
     'onset': 1,
     'regime': 1,

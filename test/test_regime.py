@@ -25,8 +25,9 @@ from thermal_signals import (
 )
 
 from thermo_comp.onset import OnsetTest
-from thermo_comp.regime import DetectorSettings, Regime, RegimeDetector
-from thermo_comp.thermometer import Thermometer, ThermometerSettings
+from thermo_comp.regime import Regime, RegimeDetector
+from thermo_comp.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.thermometer import Thermometer
 
 UNKNOWN, STATIC, DYNAMIC = Regime.UNKNOWN, Regime.STATIC, Regime.DYNAMIC
 SENSORS = {

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from thermal_signals import LAG_S, SECOND_NS, lagged, read
 
 from thermo_comp.modes import blend, correct, predict
-from thermo_comp.thermometer import Thermometer, ThermometerSettings
+from thermo_comp.settings import ThermometerSettings
+from thermo_comp.thermometer import Thermometer
 
 SOAK_S, RAMP_S = 1800.0, 2400.0
 SENSORS = {

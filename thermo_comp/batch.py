@@ -272,7 +272,7 @@ def _apply(
     if source is not None:
         index, stamps, samples = index[source], stamps[source], samples[source]
     lines = Lines(np.array(segments.start_ns, dtype=np.int64), columns, counts)
-    force, covariance = correct(lines, compensator.misalignment, stamps, samples)
+    force, covariance = correct(lines, correction.misalignment, stamps, samples)
     keep = _good(compensator.calibration.unit.full_scale, samples)
     _judge(compensator, segments, counts, stamps, samples, force, covariance, keep)
     if not keep.all():
@@ -363,7 +363,7 @@ def _refuted(
     Let the first sample of each segment tell of gravity; say which segments are held back for it.
 
     """
-    gravity, trace = compensator.gravity, compensator.noise_trace
+    gravity, trace = compensator.gravity, compensator.correction.noise_trace
     is_refuted: list[bool] = []
     firsts = zip(
         stamps[begins].tolist(),

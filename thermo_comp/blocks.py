@@ -8,13 +8,13 @@ Owns the shape of a batch: columns in file order in, columns of published sample
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Stamps = npt.NDArray[np.int64]
+Floats: TypeAlias = npt.NDArray[np.float64]
+Stamps: TypeAlias = npt.NDArray[np.int64]
 
 
 class AccelBlock(Protocol):

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from .functions import CubicSpline, Exponential, Polynomial
-from .regime import DetectorSettings
+from .settings import DetectorSettings
 
 #: The version of the file's layout that this code writes and reads.
 FORMAT_VERSION = 1

@@ -30,9 +30,10 @@ from .health import GravityMonitor
 from .reading_queue import ReadingQueue
 from .regime import Regime
 from .sample_guard import RateWatch, StuckWatch
+from .settings import ThermalConfig
 from .snapshot import snapshot
 from .status import CompensatorConfig, CompensatorStatus, Counters
-from .thermal import ThermalConfig, ThermalTracker
+from .thermal import ThermalTracker
 
 #: Samples this much faster than calibrated, relative, still have the calibrated noise.
 RATE_TOLERANCE = 0.1
@@ -40,8 +41,12 @@ RATE_TOLERANCE = 0.1
 #: Earlier than any stamp.
 _EVER_NS = -(1 << 62)
 
+_Nine = tuple[float, float, float, float, float, float, float, float, float]
+_Twelve = tuple[
+    float, float, float, float, float, float, float, float, float, float, float, float
+]  # fmt: skip
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
-Corrected = tuple[float, float, float, float, float, float, float, float, float]
+Corrected = _Nine
 
 
 class Compensator:
@@ -80,16 +85,6 @@ class Compensator:
         self._counts_cycles = calibration.unit.input == 'counts'
         self.rate = RateWatch(calibration.unit.cycle_time_s)
         self.gravity = self._gravity_monitor()
-        # To the noise of one sample comes that of rounding to whole counts, twice 1/12 count^2
-        # where the converter carries the remainder on.
-        quantum = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
-        axes = calibration.axes
-        self.noise_trace = sum(self.correction.noise) + sum(
-            quantum / axis.scale_factor**2 for axis in (axes.x, axes.y, axes.z)
-        )
-        M = calibration.misalignment
-        sd = calibration.misalignment_sd
-        self.misalignment = (M[1][0], M[2][0], M[2][1], *(value * value for value in sd))
 
     def _thermal_config(self) -> ThermalConfig:
         return ThermalConfig(
@@ -162,7 +157,8 @@ class Compensator:
             self.counters.n_stuck += 1
             return None
         (
-            (start_ns, bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1),
+            start_ns,
+            (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1),
             (ax, lx, qx, ay, ly, qy, az, lz, qz),
             (yx, zx, zy, var_yx, var_zx, var_zy),
         ) = self._segment
@@ -222,7 +218,7 @@ class Compensator:
                 self.counters.n_out -= 1
                 self.counters.n_refuted += 1
         if row is not None and self.gravity.wants(stamp_ns):
-            self.gravity.add(stamp_ns, row[:3], row[3:], self.noise_trace)
+            self.gravity.add(stamp_ns, row[:3], row[3:], self.correction.noise_trace)
         return None if self.is_refusing else row
 
     @property
@@ -310,7 +306,8 @@ class Compensator:
         start_ns = updated_ns + (stamp_ns - updated_ns) // SEGMENT_NS * SEGMENT_NS
         counters = self.counters
         self.open_segment(start_ns, counters.n_in - counters.n_out_of_order, stamp_ns)
-        self._segment = (*self._evaluate(start_ns), self.misalignment)
+        line, variance = self._evaluate(start_ns)
+        self._segment = (start_ns, line, variance, self.correction.misalignment)
         deadline_ns = board_ns + self.timeout_ns + 1
         self._event_ns = min(next_ns, start_ns + SEGMENT_NS, deadline_ns)
         return True
@@ -350,17 +347,22 @@ class Compensator:
         excess = self.rate.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
-    def _evaluate(self, start_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        at_start = self.correction.bias_scale(self.tracker.sample(start_ns))
-        at_end, variance = self.correction.evaluate(self.tracker.sample(start_ns + SEGMENT_NS))
-        linear: list[float] = [start_ns]
-        for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
-            linear += (bias, bias_end - bias, scale, scale_end - scale)
+    def _evaluate(self, start_ns: int) -> tuple[_Twelve, _Nine]:
+        """
+        Lay a line from a segment's beginning to its end: bias and scale, their change; a, b, c.
+
+        """
+        correction = self.correction
+        (bx, sx), (by, sy), (bz, sz) = correction.bias_scale(self.tracker.sample(start_ns))
+        at_end, variance = correction.evaluate(self.tracker.sample(start_ns + SEGMENT_NS))
+        (bx1, sx1), (by1, sy1), (bz1, sz1) = at_end
+        (ax, lx, qx), (ay, ly, qy), (az, lz, qz) = variance
+        nx, ny, nz = correction.noise
         excess = self.noise_excess
-        flat: list[float] = []
-        for (a, b, c), noise in zip(variance, self.correction.noise, strict=True):
-            flat += (a + excess * noise, b, c)
-        return tuple(linear), tuple(flat)
+        return (
+            (bx, bx1 - bx, sx, sx1 - sx, by, by1 - by, sy, sy1 - sy, bz, bz1 - bz, sz, sz1 - sz),
+            (ax + excess * nx, lx, qx, ay + excess * ny, ly, qy, az + excess * nz, lz, qz),
+        )
 
     def take_flags(self) -> list[tuple[int, bool]]:
         """

@@ -161,6 +161,17 @@ class Correction:
             density * density / calibration.unit.cycle_time_s
             for density in calibration.noise_density_m_s2_sqrt_hz
         )
+        # To the noise of one sample comes that of rounding to whole counts, twice 1/12 count^2
+        # where the converter carries the remainder on.
+        quantum = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
+        #: The sum over the axes, rounding included [m^2/s^4].
+        self.noise_trace = sum(self.noise, 0.0) + sum((quantum / K**2 for K in self._K), 0.0)
+        M, sd = calibration.misalignment, calibration.misalignment_sd
+        #: yx, zx, zy of the misalignment and their variances.
+        self.misalignment = (
+            *(M[1][0], M[2][0], M[2][1]),
+            *(sd[0] * sd[0], sd[1] * sd[1], sd[2] * sd[2]),
+        )
 
     def bias_scale(self, state: tuple[Number, ...]) -> list[BiasScale[Number]]:
         """

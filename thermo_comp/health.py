@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from .status import GravityResidual
 
 #: Shortest window; it is longer where samples are few, up to the second figure.
 WINDOW_NS = 1_000_000_000
@@ -34,31 +35,6 @@ REFUTING_WINDOWS = 3
 RESTORING_WINDOWS = 2
 #: Beyond the tolerance, and beyond so many of its own standard deviations.
 REFUTING_SIGMAS = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class GravityResidual:
-    """
-    What the still windows say.
-
-    """
-
-    #: |f| - g [m/s^2], averaged over the recent still windows.
-    residual: float
-    #: Its standard deviation [m/s^2]: what calibration and noise leave uncertain.
-    residual_sd: float
-    #: Still windows that went into it.
-    n_windows: int
-    #: Whether the last window was still.
-    is_still: bool
-
-    @property
-    def sigmas(self) -> float:
-        """
-        Size of the residual in its own standard deviations.
-
-        """
-        return abs(self.residual) / self.residual_sd
 
 
 class GravityMonitor:
@@ -167,7 +143,7 @@ class GravityMonitor:
         n = self._n
         shift = [value / n for value in self._sum]
         mean = tuple(o + s for o, s in zip(self._origin, shift, strict=True))
-        scatter = (self._squares - n * sum(s * s for s in shift)) / (n - 1)
+        scatter = (self._squares - n * sum([s * s for s in shift], 0.0)) / (n - 1)
         last, self._last_mean = self._last_mean, (mean[0], mean[1], mean[2])
         # Two means of n samples differ by noise, too: at most four standard deviations of it.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
@@ -178,8 +154,8 @@ class GravityMonitor:
         )
         if not self._is_still:
             return
-        size = math.sqrt(sum(value * value for value in mean))
-        ux, uy, uz = (value / size for value in mean)
+        size = math.sqrt(sum([value * value for value in mean], 0.0))
+        ux, uy, uz = mean[0] / size, mean[1] / size, mean[2] / size
         xx, xy, xz, yy, yz, zz = covariance
         along = (
             ux * ux * xx

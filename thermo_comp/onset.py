@@ -21,9 +21,11 @@ References
 
 from __future__ import annotations
 
+import math
 from math import acos, inf, isnan, log, nan, pi, sqrt
 
-from .thermometer import Thermometer, ThermometerSettings
+from .settings import ThermometerSettings
+from .thermometer import Thermometer
 
 BEND_SHARES = (1.0, 10.0)  # accelerations the two filters are tuned to / the smallest onset
 TUNING = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
@@ -77,7 +79,9 @@ class OnsetTest:
         # it the power of the acceleration that the filter expects, whatever the readings' rate.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
-        memories = [TUNING * (sqrt(self._noise) / (share * onset)) ** 0.4 for share in BEND_SHARES]
+        memories = [
+            TUNING * math.pow(sqrt(self._noise) / (share * onset), 0.4) for share in BEND_SHARES
+        ]
         self._powers = [self._noise / memory**4 for memory in memories]
         # crossings per second of h: acos(rho) / (2 pi dt) exp(-h^2 / 2); two filters, two signs
         self._log_crossings = -log(2.0 * pi * false_alarms / (2.0 * len(self._powers)))
@@ -231,15 +235,15 @@ class OnsetTest:
         self._dt = dt
         self._thresholds = []
         squared = 1.0
-        for power in reversed(self._powers):
-            pace = dt * (power / (self._noise * dt)) ** 0.25
+        for power in self._powers[::-1]:
+            pace = dt * math.pow(power / (self._noise * dt), 0.25)
             correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
             squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
             share = CELL_NOISE_SHARE if self._has_cells else 0.25 + 0.08 * min(pace, 1.0)
             self._thresholds.insert(0, squared * share)
             self._noise_share = share
         self._edge_margin = sqrt(squared) * self._edge_noise
-        self._settled_s = SETTLING * (self._noise * dt / self._powers[0]) ** 0.25
+        self._settled_s = SETTLING * math.pow(self._noise * dt / self._powers[0], 0.25)
 
     def _watch_filters(
         self, dt: float, measured: float, variance: float, low: float, high: float

@@ -15,7 +15,8 @@ from __future__ import annotations
 from enum import Enum
 from math import erf, exp, isfinite, log, nan, sqrt
 
-from .thermometer import Thermometer, ThermometerSettings
+from .settings import ThermometerSettings
+from .thermometer import Thermometer
 
 #: No part changes by more than this at once [K] or in the long run [K/s]; quanta come on top.
 LARGEST_STEP = 3.0

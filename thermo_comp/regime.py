@@ -17,18 +17,17 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from enum import IntEnum
-from math import inf, sqrt
+from math import sqrt
 
 from .onset import OnsetTest
-from .thermometer import Thermometer, ThermometerSettings
+from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
+from .thermometer import Thermometer
 
 HOLD_LAGS = 0.75  # the shortest dynamic state, in lags of the leading sensor
 # "The rate is below": the variance in a calm is mostly that of what may begin, so half a sd.
 SURE_SIGMAS = 0.5
 OBVIOUS_SIGMAS = 5.0  # confidence of "the rate is above"
-OBVIOUS_SHARE = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
 FIRST_READINGS = 20  # until a noise declared too small is known
 
 
@@ -41,62 +40,6 @@ class Regime(IntEnum):
     UNKNOWN = -1
     STATIC = 0
     DYNAMIC = 1
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorSettings:
-    """
-    What must be seen and what must not; its keys are the calibration file's `detector` section.
-
-    Parameters
-    ----------
-    smallest_ramp_k_min : float
-        The slowest ramp that must never be missed, K/min.
-    false_alarms_per_hour : float
-        How often the sensor's noise alone may open the dynamic state, per hour of soak.
-    ripple_c : float
-        Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K.
-        Through the lag it makes a rate of at most ``ripple_c / lag_s``, which is no onset.
-    relaxed_rate_k_min : float
-        The lag has died when every sensor's rate is surely below this, K/min.
-    dwell_s : float
-        How long it must have been below, and the shortest dynamic state, s.
-    case, board : ThermometerSettings
-        The two sensors.
-
-    Raises
-    ------
-    ValueError
-        If a value is not finite, outside its range, or contradicts another one.
-
-    """
-
-    smallest_ramp_k_min: float = 0.2
-    false_alarms_per_hour: float = 0.02
-    ripple_c: float = 0.1
-    relaxed_rate_k_min: float = 0.05
-    dwell_s: float = 60.0
-    case: ThermometerSettings = field(default_factory=ThermometerSettings)
-    board: ThermometerSettings = field(default_factory=ThermometerSettings)
-
-    def __post_init__(self) -> None:
-        """
-        Refuse values that contradict each other.
-
-        """
-        for name in ('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'):
-            value = getattr(self, name)
-            if not 0.0 < value < inf:
-                raise ValueError(f'`{name}` must be positive and finite, got {value}')
-        for name in ('ripple_c', 'dwell_s'):
-            value = getattr(self, name)
-            if not 0.0 <= value < inf:
-                raise ValueError(f'`{name}` must be zero or positive and finite, got {value}')
-        if self.relaxed_rate_k_min * OBVIOUS_SHARE >= self.smallest_ramp_k_min:
-            raise ValueError(
-                f'`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / {OBVIOUS_SHARE}, '
-                f'got {self.relaxed_rate_k_min} and {self.smallest_ramp_k_min}'
-            )
 
 
 class RegimeDetector:

@@ -13,11 +13,12 @@ come at another rate are of another scale, whatever else they are.
 from __future__ import annotations
 
 from math import nan
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-Mask = npt.NDArray[np.bool_]
+Mask: TypeAlias = npt.NDArray[np.bool_]
 
 #: Fewer equal samples in a row than this are chance, however far they lie apart.
 STUCK_SAMPLES = 50

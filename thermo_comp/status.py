@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from .health import GravityResidual
 from .plausibility import Fault
-from .thermal import ThermalConfig, ThermalState
+from .regime import Regime
+from .settings import ThermalConfig
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,8 @@ class CompensatorConfig:
         ThermalConfig(self.transition_time_s, self.case_timeout_s)
 
 
+#: A memory is called settled when its start-up uncertainty is below this [K].
+MEMORY_SETTLED_SD = 0.05
 #: The counters of samples that came in and did not go out.
 DROPPED = (
     'n_not_finite',
@@ -122,6 +124,63 @@ class Counters:
 
         """
         return self.n_out + self.n_dropped
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalState:
+    """
+    The thermal state at one stamp.
+
+    """
+
+    #: Board temperature [degC], its variance [K^2] and its rate [K/s].
+    board: float
+    var_board: float
+    rate: float
+    #: T_case - T_board [K] and the part of its variance that does not come from the board.
+    gradient: float
+    var_gradient: float
+    #: Weight of the dynamic set, 0..1.
+    weight: float
+    regime: Regime
+    #: -1 cooling, +1 heating, 0 neither.
+    direction: int
+    #: T_board minus its lags [K], and the variance that start-up left in them [K^2].
+    memory: tuple[float, ...]
+    var_memory: tuple[float, ...]
+
+    @property
+    def is_settled(self) -> bool:
+        """
+        Whether the memory has forgotten that its start was not seen.
+
+        """
+        return all(variance < MEMORY_SETTLED_SD**2 for variance in self.var_memory)
+
+
+@dataclass(frozen=True, slots=True)
+class GravityResidual:
+    """
+    What the still windows say.
+
+    """
+
+    #: |f| - g [m/s^2], averaged over the recent still windows.
+    residual: float
+    #: Its standard deviation [m/s^2]: what calibration and noise leave uncertain.
+    residual_sd: float
+    #: Still windows that went into it.
+    n_windows: int
+    #: Whether the last window was still.
+    is_still: bool
+
+    @property
+    def sigmas(self) -> float:
+        """
+        Size of the residual in its own standard deviations.
+
+        """
+        return abs(self.residual) / self.residual_sd
 
 
 @dataclass(frozen=True, slots=True)

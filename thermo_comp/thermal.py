@@ -16,16 +16,15 @@ dt is ``m' = m e + (T' - T) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from .plausibility import Fault, LeadWatch, SensorGuard
-from .regime import DetectorSettings, Regime, RegimeDetector
+from .regime import Regime, RegimeDetector
+from .settings import DetectorSettings, ThermalConfig
+from .status import ThermalState
 from .thermometer import Thermometer
 
 #: A unit that starts in the middle of a ramp has a memory that nobody saw: its sd then [K].
 MEMORY_START_SD = 3.0
-#: A memory is called settled when its start-up uncertainty is below this [K].
-MEMORY_SETTLED_SD = 0.05
 #: While the case sensor is lost the gradient is guessed from the board's rate, this well.
 LOST_GRADIENT_RELATIVE_SD = 0.5
 #: A regime that no sensor has watched for this part of a thermal lag is not known any more.
@@ -42,77 +41,6 @@ UNWATCHED_SHARE = 0.25
     UNKNOWN,
     MEMORY,
 ) = range(8)
-
-
-@dataclass(frozen=True)
-class ThermalConfig:
-    """
-    How the tracker behaves where the unit's calibration has no say.
-
-    Parameters
-    ----------
-    transition_time_s : float
-        Time over which the sets cross over after a switch [s]; 0 = the paper's hard switch.
-    case_timeout_s : float
-        Age at which the case temperature counts as lost [s].
-    board_lag_s : float
-        Time constant of the board behind the case, for the gradient while the case is lost [s].
-    temperature_timeout_s : float
-        Age of the board temperature at which the unit counts as unmeasured: only after that does
-        a sensor that has taken an impossible step start anew [s].
-
-    Raises
-    ------
-    ValueError
-        If a value is out of its range.
-
-    """
-
-    transition_time_s: float = 30.0
-    case_timeout_s: float = 30.0
-    board_lag_s: float = 900.0
-    temperature_timeout_s: float = 60.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.transition_time_s < math.inf:
-            raise ValueError(
-                f'`transition_time_s` must be zero or more, got {self.transition_time_s}'
-            )
-        for name in ('case_timeout_s', 'board_lag_s', 'temperature_timeout_s'):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
-
-
-@dataclass(frozen=True, slots=True)
-class ThermalState:
-    """
-    The thermal state at one stamp.
-
-    """
-
-    #: Board temperature [degC], its variance [K^2] and its rate [K/s].
-    board: float
-    var_board: float
-    rate: float
-    #: T_case - T_board [K] and the part of its variance that does not come from the board.
-    gradient: float
-    var_gradient: float
-    #: Weight of the dynamic set, 0..1.
-    weight: float
-    regime: Regime
-    #: -1 cooling, +1 heating, 0 neither.
-    direction: int
-    #: T_board minus its lags [K], and the variance that start-up left in them [K^2].
-    memory: tuple[float, ...]
-    var_memory: tuple[float, ...]
-
-    @property
-    def is_settled(self) -> bool:
-        """
-        Whether the memory has forgotten that its start was not seen.
-
-        """
-        return all(variance < MEMORY_SETTLED_SD**2 for variance in self.var_memory)
 
 
 class ThermalTracker:

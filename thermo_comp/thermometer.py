@@ -22,10 +22,10 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import erf, exp, inf, nan, sqrt
 
 from .modes import NOWHERE, State, blend, correct, merge, mix, predict
+from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS = 6.0  # innovations beyond this limit count less ...
 OUTLIER_LIMITS = 5.0  # ... and beyond this many limits not at all ...
@@ -33,70 +33,10 @@ RESTART_READINGS = 4  # ... unless that many in a row lie on one side
 SOAK_S = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
 QUIET_SHARE = 5e-3  # quiet acceleration wander / bending one, of a sensor without cells
 CELL_SHARE = 0.2  # the same where wide cells hide slow changes
-CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells ...
-WIDE_CELL_SIGMAS = 8.5  # ... that noise never crosses: six sds of a difference
 #: What is outside is no temperature of an instrument [degC]; nor is NaN.
 COLDEST, HOTTEST = -273.15, 1000.0
 HORIZON_INTERVALS = 5.0  # extrapolation is linear up to here, then held
 NOISE_MEMORY = 200.0  # surprises over which the declared noise is judged
-
-
-@dataclass(frozen=True, slots=True)
-class ThermometerSettings:
-    """
-    What is known of one temperature sensor, in physical terms; its keys are the file's keys.
-
-    Parameters
-    ----------
-    noise_sd_c : float
-        Standard deviation of the white noise of one reading, before quantization, K.
-    quantum_c : float
-        Step of the readings, K; 0 for a continuous sensor.
-    fastest_ramp_k_min : float
-        Rate of the fastest ramps it will see, K/min.
-    lag_s : float
-        Thermal lag between the surroundings and the sensor, s. Together with the ramp it says how
-        sharply the temperature bends: an onset is an acceleration of ``ramp / lag``.
-
-    Raises
-    ------
-    ValueError
-        If a value is not finite or outside its range.
-
-    """
-
-    noise_sd_c: float = 0.005
-    quantum_c: float = 0.0
-    fastest_ramp_k_min: float = 3.0
-    lag_s: float = 600.0
-
-    def __post_init__(self) -> None:
-        """
-        Refuse values that no sensor has.
-
-        """
-        for name in ('noise_sd_c', 'fastest_ramp_k_min', 'lag_s'):
-            value = getattr(self, name)
-            if not 0.0 < value < inf:
-                raise ValueError(f'`{name}` must be positive and finite, got {value}')
-        if not 0.0 <= self.quantum_c < inf:
-            raise ValueError(f'`quantum_c` must be zero or positive, got {self.quantum_c}')
-
-    @property
-    def has_cells(self) -> bool:
-        """
-        Whether the quantum exceeds the noise so far that a reading is a cell, not a value.
-
-        """
-        return self.quantum_c > CELL_SIGMAS * self.noise_sd_c
-
-    @property
-    def has_wide_cells(self) -> bool:
-        """
-        Whether a cell is so wide that noise alone never carries a reading across it.
-
-        """
-        return self.quantum_c > WIDE_CELL_SIGMAS * self.noise_sd_c
 
 
 class Thermometer:

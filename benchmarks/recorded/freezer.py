@@ -31,7 +31,8 @@ from thermo_comp.fitting.one_pose import (
 )
 from thermo_comp.fitting.sources import FitSource
 from thermo_comp.partial import recording_source
-from thermo_comp.regime import DetectorSettings, Regime
+from thermo_comp.regime import Regime
+from thermo_comp.settings import DetectorSettings
 from thermo_comp.thermal import ThermalTracker
 
 from .data import GRAVITY, freezer_column

@@ -25,7 +25,7 @@ from ..calibration import (
     Source,
     Unit,
 )
-from ..regime import DetectorSettings
+from ..settings import DetectorSettings
 from .evidence import ResidualRow, inflation
 from .model import RegimeName
 from .reduction import ReducedBag

@@ -21,8 +21,9 @@ from ..calibration import Calibration
 from ..correction import Correction
 from ..errors import FitError
 from ..metrics import MICRO_G, ResidualStatistics, norm_residual, statistics_by_regime
+from ..settings import ThermalConfig
 from ..status import CompensatorConfig
-from ..thermal import WEIGHT, ThermalConfig, ThermalTracker
+from ..thermal import WEIGHT, ThermalTracker
 from .assembly import parameter_covariance
 from .evidence import inflation
 from .history import thermal_states

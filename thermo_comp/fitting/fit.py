@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from ..calibration import Calibration, Unit
 from ..errors import FitError
-from ..regime import DetectorSettings
-from ..thermal import ThermalConfig
+from ..settings import DetectorSettings, ThermalConfig
 from .assembly import UNKNOWN_SKEW, UnitFacts, build_calibration
 from .evidence import (
     PositionReport,

@@ -15,17 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ..regime import DetectorSettings
-from ..thermal import (
-    BOARD,
-    GRADIENT,
-    RATE,
-    UNKNOWN,
-    VAR_BOARD,
-    WEIGHT,
-    ThermalConfig,
-    ThermalTracker,
-)
+from ..settings import DetectorSettings, ThermalConfig
+from ..thermal import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, WEIGHT, ThermalTracker
 from .reduction import ReducedBag
 
 Array = npt.NDArray[np.float64]

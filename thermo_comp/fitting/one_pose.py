@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import FitError
-from ..regime import DetectorSettings
+from ..settings import DetectorSettings
 from .branches import Branch, Event, find_branches
 from .history import ThermalHistory
 from .pose_series import PoseSeries, pose_series

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ..regime import DetectorSettings
-from ..thermal import ThermalConfig
+from ..settings import DetectorSettings, ThermalConfig
 from .branches import Branch
 from .history import ThermalHistory, thermal_history
 from .reduction import ReducedBag

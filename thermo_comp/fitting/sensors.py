@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ..regime import OBVIOUS_SHARE, DetectorSettings
-from ..thermometer import ThermometerSettings
+from ..settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .reduction import Readings, ReducedBag
 
 Array = npt.NDArray[np.float64]

@@ -29,8 +29,8 @@ from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sensors import learn_detector
 from ..recording import Block, Input, RecordingInfo, Topics, open_recording
-from ..regime import DetectorSettings
 from ..replay import check_unit
+from ..settings import DetectorSettings
 from ..simulation import CYCLOGRAM_NAMES, Cyclogram, cyclogram_preset, parse_cyclogram
 from .evidence import CHOSEN, RAW, STATIC_ALONE, BagFacts, Evidence, ShownBag, Windows
 from .trace import ThermalTrace, thermal_trace

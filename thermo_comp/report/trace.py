@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..fitting.reduction import Readings
-from ..regime import DetectorSettings, Regime
-from ..thermal import ThermalConfig, ThermalTracker
+from ..regime import Regime
+from ..settings import DetectorSettings, ThermalConfig
+from ..thermal import ThermalTracker
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the settings of thermometers, detector and tracker: what is known of a unit beforehand.
+
+They travel in calibrations and to a fleet's workers, so they stand apart from what is compiled.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf
+
+CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells ...
+WIDE_CELL_SIGMAS = 8.5  # ... that noise never crosses: six sds of a difference
+OBVIOUS_SHARE = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
+
+
+@dataclass(frozen=True, slots=True)
+class ThermometerSettings:
+    """
+    What is known of one temperature sensor, in physical terms; its keys are the file's keys.
+
+    Parameters
+    ----------
+    noise_sd_c : float
+        Standard deviation of the white noise of one reading, before quantization, K.
+    quantum_c : float
+        Step of the readings, K; 0 for a continuous sensor.
+    fastest_ramp_k_min : float
+        Rate of the fastest ramps it will see, K/min.
+    lag_s : float
+        Thermal lag between the surroundings and the sensor, s. Together with the ramp it says how
+        sharply the temperature bends: an onset is an acceleration of ``ramp / lag``.
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite or outside its range.
+
+    """
+
+    noise_sd_c: float = 0.005
+    quantum_c: float = 0.0
+    fastest_ramp_k_min: float = 3.0
+    lag_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        """
+        Refuse values that no sensor has.
+
+        """
+        for name in ('noise_sd_c', 'fastest_ramp_k_min', 'lag_s'):
+            value = getattr(self, name)
+            if not 0.0 < value < inf:
+                raise ValueError(f'`{name}` must be positive and finite, got {value}')
+        if not 0.0 <= self.quantum_c < inf:
+            raise ValueError(f'`quantum_c` must be zero or positive, got {self.quantum_c}')
+
+    @property
+    def has_cells(self) -> bool:
+        """
+        Whether the quantum exceeds the noise so far that a reading is a cell, not a value.
+
+        """
+        return self.quantum_c > CELL_SIGMAS * self.noise_sd_c
+
+    @property
+    def has_wide_cells(self) -> bool:
+        """
+        Whether a cell is so wide that noise alone never carries a reading across it.
+
+        """
+        return self.quantum_c > WIDE_CELL_SIGMAS * self.noise_sd_c
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorSettings:
+    """
+    What must be seen and what must not; its keys are the calibration file's `detector` section.
+
+    Parameters
+    ----------
+    smallest_ramp_k_min : float
+        The slowest ramp that must never be missed, K/min.
+    false_alarms_per_hour : float
+        How often the sensor's noise alone may open the dynamic state, per hour of soak.
+    ripple_c : float
+        Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K.
+        Through the lag it makes a rate of at most ``ripple_c / lag_s``, which is no onset.
+    relaxed_rate_k_min : float
+        The lag has died when every sensor's rate is surely below this, K/min.
+    dwell_s : float
+        How long it must have been below, and the shortest dynamic state, s.
+    case, board : ThermometerSettings
+        The two sensors.
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite, outside its range, or contradicts another one.
+
+    """
+
+    smallest_ramp_k_min: float = 0.2
+    false_alarms_per_hour: float = 0.02
+    ripple_c: float = 0.1
+    relaxed_rate_k_min: float = 0.05
+    dwell_s: float = 60.0
+    case: ThermometerSettings = field(default_factory=ThermometerSettings)
+    board: ThermometerSettings = field(default_factory=ThermometerSettings)
+
+    def __post_init__(self) -> None:
+        """
+        Refuse values that contradict each other.
+
+        """
+        for name in ('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'):
+            value = getattr(self, name)
+            if not 0.0 < value < inf:
+                raise ValueError(f'`{name}` must be positive and finite, got {value}')
+        for name in ('ripple_c', 'dwell_s'):
+            value = getattr(self, name)
+            if not 0.0 <= value < inf:
+                raise ValueError(f'`{name}` must be zero or positive and finite, got {value}')
+        if self.relaxed_rate_k_min * OBVIOUS_SHARE >= self.smallest_ramp_k_min:
+            raise ValueError(
+                f'`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / {OBVIOUS_SHARE}, '
+                f'got {self.relaxed_rate_k_min} and {self.smallest_ramp_k_min}'
+            )
+
+
+@dataclass(frozen=True)
+class ThermalConfig:
+    """
+    How the tracker behaves where the unit's calibration has no say.
+
+    Parameters
+    ----------
+    transition_time_s : float
+        Time over which the sets cross over after a switch [s]; 0 = the paper's hard switch.
+    case_timeout_s : float
+        Age at which the case temperature counts as lost [s].
+    board_lag_s : float
+        Time constant of the board behind the case, for the gradient while the case is lost [s].
+    temperature_timeout_s : float
+        Age of the board temperature at which the unit counts as unmeasured: only after that does
+        a sensor that has taken an impossible step start anew [s].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range.
+
+    """
+
+    transition_time_s: float = 30.0
+    case_timeout_s: float = 30.0
+    board_lag_s: float = 900.0
+    temperature_timeout_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.transition_time_s < inf:
+            raise ValueError(
+                f'`transition_time_s` must be zero or more, got {self.transition_time_s}'
+            )
+        for name in ('case_timeout_s', 'board_lag_s', 'temperature_timeout_s'):
+            if not 0.0 < getattr(self, name) < inf:
+                raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
