@@ -272,9 +272,16 @@ def _apply(
     if source is not None:
         index, stamps, samples = index[source], stamps[source], samples[source]
     lines = Lines(np.array(segments.start_ns, dtype=np.int64), columns, counts)
-    force, covariance = correct(lines, correction.misalignment, stamps, samples)
-    keep = _good(compensator.calibration.unit.full_scale, samples)
-    _judge(compensator, segments, counts, stamps, samples, force, covariance, keep)
+    force, covariance, lowest, highest = correct(lines, correction.misalignment, stamps, samples)
+    full_scale = compensator.calibration.unit.full_scale
+    # The extremes settle the usual case; a NaN fails both comparisons.
+    if (lowest > -full_scale).all() and (highest < full_scale).all():
+        keep = np.ones(len(samples), dtype=bool)
+    else:
+        keep = ((-full_scale < samples) & (samples < full_scale)).all(axis=1)
+    may_be_zero = not ((lowest > 0.0) | (highest < 0.0)).any()
+    is_stuck = _stuck(compensator, stamps, samples, may_be_zero)
+    _judge(compensator, segments, counts, stamps, samples, force, covariance, keep, is_stuck)
     if not keep.all():
         index, stamps = index[keep], stamps[keep]
         force, covariance = force[keep], covariance[keep]
@@ -294,13 +301,6 @@ def _covered(
     return np.concatenate([np.arange(f, f + c) for f, c in zip(first, counts, strict=True)])
 
 
-def _good(full_scale: float, samples: Floats) -> Mask:
-    # One look at the extremes settles the usual case; a NaN fails both comparisons.
-    if -full_scale < np.min(samples) and np.max(samples) < full_scale:
-        return np.ones(len(samples), dtype=bool)
-    return np.asarray(((-full_scale < samples) & (samples < full_scale)).all(axis=1))
-
-
 def _judge(
     compensator: Compensator,
     segments: _Segments,
@@ -310,6 +310,7 @@ def _judge(
     force: Floats,
     covariance: Floats,
     keep: Mask,
+    is_stuck: Mask | None,
 ) -> None:
     """
     Leave out what the stream would not publish, and count why.
@@ -317,7 +318,6 @@ def _judge(
     """
     counters = compensator.counters
     is_good = keep
-    is_stuck = _stuck(compensator, stamps, samples)
     if is_stuck is not None:
         is_good = keep.copy()
         keep &= ~is_stuck
@@ -384,7 +384,9 @@ def _refuted(
     return is_refuted
 
 
-def _stuck(compensator: Compensator, stamps: Stamps, samples: Floats) -> Mask | None:
+def _stuck(
+    compensator: Compensator, stamps: Stamps, samples: Floats, may_be_zero: bool
+) -> Mask | None:
     """
     Find the samples that are not believed: too long the same, or three exact zeros.
 
@@ -392,6 +394,8 @@ def _stuck(compensator: Compensator, stamps: Stamps, samples: Floats) -> Mask | 
     if not compensator.stuck.is_on:
         return None
     found = compensator.stuck.find(stamps, samples)
+    if not may_be_zero:
+        return found
     zeros = np.flatnonzero(samples[:, 0] == 0.0)
     if len(zeros):
         zeros = zeros[(samples[zeros, 1] == 0.0) & (samples[zeros, 2] == 0.0)]

@@ -109,9 +109,9 @@ def correct(
     misalignment: tuple[float, ...],
     stamps: Stamps,
     samples: Floats,
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Correct the samples that stand in segments.
+    Correct the samples that stand in segments, and find the extremes of each axis on the way.
 
     Parameters
     ----------
@@ -130,9 +130,13 @@ def correct(
         [m/s^2].
     covariance : ndarray, shape (n, 9)
         [m^2/s^4].
+    lowest, highest : ndarray, shape (3,)
+        The extremes of the samples, in their unit; NaN where a sample is.
 
     """
     n = len(stamps)
+    lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
+    raw = np.empty((3, min(n, PIECE)))
     # The columns stand one after the other in memory: each is written in one run.
     force, covariance = np.empty((3, n)), np.empty((9, n))
     # What is not finite is corrected like the rest; whoever asked leaves it out.
@@ -140,29 +144,33 @@ def correct(
         for begin in range(0, n, PIECE):
             piece = slice(begin, min(begin + PIECE, n))
             lines.select(piece.start, piece.stop)
+            columns = raw[:, : piece.stop - begin]
+            np.copyto(columns, samples[piece].T)
+            np.minimum(lowest, columns.min(axis=1), out=lowest)
+            np.maximum(highest, columns.max(axis=1), out=highest)
             _correct(
                 lines,
                 misalignment,
                 stamps[piece],
-                samples[piece],
+                columns,
                 force[:, piece],
                 covariance[:, piece],
             )
-    return force.T, covariance.T
+    return force.T, covariance.T, lowest, highest
 
 
 def _correct(
     lines: Lines,
     misalignment: tuple[float, ...],
     stamps: Stamps,
-    samples: Floats,
+    raw: Floats,
     force: Floats,
     covariance: Floats,
 ) -> None:
     yx, zx, zy, var_yx, var_zx, var_zy = misalignment
     dt = lines.age(stamps)
-    x = lines.corrected(0, samples[:, 0], dt, out=force[0])
-    y, z = (lines.corrected(axis, samples[:, axis], dt) for axis in (1, 2))
+    x = lines.corrected(0, raw[0], dt, out=force[0])
+    y, z = (lines.corrected(axis, raw[axis], dt) for axis in (1, 2))
     vx = lines.variance(0, x, out=covariance[0])
     vy, vz = lines.variance(1, y), lines.variance(2, z)
     np.add(np.multiply(x, yx, out=dt), y, out=force[1])
