@@ -208,3 +208,29 @@ def test_temperature() -> None:
     assert read_temperature(cdr('>', (2, 5), '', [21.5, 0.0])) == (2 * 10**9 + 5, 21.5)
     assert read_temperature(serialize_message(Temperature())[:-9]) is None
     assert read_temperature(b'') is None
+
+
+@given(
+    st.binary(max_size=80)
+    | st.builds(
+        lambda order, stamp, frame, value, cut, tail: (
+            cdr(order, stamp, frame, [value, 0.0])[: 64 - cut] + tail
+        ),
+        st.sampled_from('<>'),
+        st.tuples(st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1)),
+        st.text(max_size=12),
+        st.floats(),
+        st.integers(0, 40),
+        st.sampled_from([b'', b'\0\0\0\0', bytes(8)]),
+    ),
+)
+def test_a_temperature_is_read_as_rclpy_reads_it(data: bytes) -> None:
+    try:
+        message = deserialize_message(data, Temperature)
+    except (RuntimeError, ValueError):
+        expected = None
+    else:
+        stamp = message.header.stamp
+        expected = (stamp.sec * 10**9 + stamp.nanosec, message.temperature)
+    # NaN included: as text.
+    assert repr(read_temperature(data)) == repr(expected)

@@ -8,6 +8,7 @@ The one file that leaves rclpy's documented API: these tests fail loudly when rc
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -197,6 +198,43 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Pee
             stop.set()
             flooding.join(TIMEOUT)
     assert OTHERS_PERIOD_NS <= 50_000_000
+
+
+def test_a_regular_call_goes_on_with_and_without_samples(node: Node, peer: Peer) -> None:
+    called: list[int] = []
+    running = Running(node)
+
+    def call() -> None:
+        with running.news:
+            called.append(len(running.messages))
+            running.news.notify_all()
+        if len(called) == 2:
+            raise RCLError('nobody listens')
+
+    running.loop.call_every(0.01, call)
+    with running:
+        running.wait_for(lambda: len(called) >= 4)
+        publisher = peer.publisher(Vector3Stamped, 'samples')
+        n_before = len(called)
+        for n_sent in range(1, 51):
+            publisher.publish(Vector3Stamped())
+            running.wait_for(lambda n=n_sent: len(running.messages) == n)
+        running.wait_for(lambda: len(called) > n_before and called[-1] == 50)
+        # Another one takes its place, and comes when it is due, not before.
+        again: list[float] = []
+        start = time.monotonic()
+
+        def note() -> None:
+            with running.news:
+                again.append(time.monotonic() - start)
+                running.news.notify_all()
+
+        running.loop.call_every(0.03, note)
+        n_called = len(called)
+        running.wait_for(lambda: len(again) >= 3)
+    assert again[0] >= 0.03
+    assert again[2] >= 0.09
+    assert len(called) <= n_called + 1
 
 
 def test_a_callback_that_fails_in_the_middleware_stops_no_samples(node: Node, peer: Peer) -> None:

@@ -39,6 +39,9 @@ _UNREADABLE = (RuntimeError, ValueError)
 
 _ENCAPSULATION = b'\0\1\0\0'
 _NO_GYRO = Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
+_HEADER = Struct('<iII')
+_VALUE = Struct('<d')
+_SHORTEST_READING = 36  # no frame_id: its NUL, padding, temperature and variance
 _FOREIGN = Struct('>25Q')
 _NATIVE = Struct('<25Q')
 
@@ -268,6 +271,14 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
         Stamp [ns] and temperature; None if the bytes are no such message.
 
     """
+    # A node that sleeps between samples pays for each line of code it has not touched for long:
+    # rclpy's deserialization costs it as much as several samples.
+    if data[:4] == _ENCAPSULATION and len(data) >= _SHORTEST_READING:
+        sec, nanosec, length = _HEADER.unpack_from(data, 4)
+        values = 16 + length + -(12 + length) % 8
+        name = data[16 : 16 + length]
+        if len(data) == values + 16 and name[-1:] == b'\0' and name.isascii():
+            return sec * 1_000_000_000 + nanosec, _VALUE.unpack_from(data, values)[0]
     try:
         message = deserialize_message(data, Temperature)
     except _UNREADABLE:

@@ -23,12 +23,12 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, Temperature
@@ -76,6 +76,9 @@ example: thermo_comp_node --ros-args -p calibration_file:=unit42.yaml -r accel/c
 
 parameters:
 """
+
+#: The two messages of the flag, serialized.
+_FLAGS = tuple(serialize_message(Bool(data=is_dynamic)) for is_dynamic in (False, True))
 
 _INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
 
@@ -136,11 +139,7 @@ class CompensationNode:
         self.node.add_pre_set_parameters_callback(parameters.coerce)
         self.node.add_on_set_parameters_callback(self._on_set)
         self.node.add_post_set_parameters_callback(self._post_set)
-        self._timer = self.node.create_timer(
-            self._config.diagnostics_period,
-            self._report,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
+        self._loop.call_every(self._config.diagnostics_period, self._report)
         self._log = self.node.get_logger()
         inputs = tuple(
             f'qos_overrides.{self.node.resolve_topic_name(topic)}.'
@@ -201,6 +200,7 @@ class CompensationNode:
         except (RuntimeError, InvalidQosOverridesError) as error:
             raise ParameterError(f'a topic cannot be opened: {error}') from error
         self._publish = RawPublisher(self._imu).publish
+        self._publish_flag = RawPublisher(self._flag).publish
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
         return self._loop.subscribe(*_INPUTS[config.input], SAMPLE_QOS)
@@ -271,7 +271,7 @@ class CompensationNode:
     def _publish_flags(self) -> None:
         for _, is_dynamic in self._compensator.take_flags():
             try:
-                self._flag.publish(Bool(data=is_dynamic))
+                self._publish_flag(_FLAGS[is_dynamic])
             except RCLError:
                 self._count_unpublished()
             self._n_flags += 1
@@ -395,8 +395,7 @@ class CompensationNode:
             self._loop.unsubscribe(self._samples)
             self._samples = self._open_samples(config)
         if config.diagnostics_period != before.diagnostics_period:
-            self._timer.timer_period_ns = int(config.diagnostics_period * 1e9)
-            self._timer.reset()
+            self._loop.call_every(config.diagnostics_period, self._report)
 
     def _say_calibration(self) -> None:
         loaded = self._loaded

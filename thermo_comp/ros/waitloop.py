@@ -25,6 +25,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -45,6 +46,9 @@ DRAIN_LIMIT = 4096
 #: While samples flow, services and timers are looked after this often [ns]: a wake-up that holds
 #: them costs twice one that does not.
 OTHERS_PERIOD_NS = 50_000_000
+
+#: Longer than any machine runs, and what the middleware can still count [ns].
+_NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 
 RCLError = rclpy_implementation.RCLError
 
@@ -219,6 +223,9 @@ class WaitLoop:
         self._hot: list[RawSubscription] = []
         self._is_stopping = False
         self._is_stale = True
+        self._period_ns = _NEVER_NS
+        self._call_ns = _NEVER_NS
+        self._callback: Callable[[], None] = _nothing
         node.context.on_shutdown(self.stop)
 
     def subscribe(
@@ -276,6 +283,23 @@ class WaitLoop:
             self._hot.remove(raw)
         self._is_stale = True
         self._node.destroy_subscription(raw.subscription)
+
+    def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """
+        Call back at regular times, in place of the last such callback; for a timer of rclpy the
+        executor does ten times the work.
+
+        Parameters
+        ----------
+        period_s : float
+            From one call to the next, and from now to the first [s].
+        callback : callable
+            What to call, between two wake-ups.
+
+        """
+        self._period_ns = int(period_s * 1e9)
+        self._call_ns = time.monotonic_ns() + self._period_ns
+        self._callback = callback
 
     def stop(self) -> None:
         """
@@ -354,8 +378,16 @@ class WaitLoop:
         now_ns, others_due_ns = time.monotonic_ns, 0
         is_full = True
         while not (self._is_stopping or self._is_stale):
-            left_ns = others_due_ns - now_ns()
-            if left_ns > 0 and self._hot:
+            now = now_ns()
+            if now >= self._call_ns:
+                self._call_ns += self._period_ns
+                if self._call_ns <= now:
+                    # One that was missed is not made up for.
+                    self._call_ns = now + self._period_ns
+                self._guarded(self._callback)
+                continue
+            left_ns = min(others_due_ns, self._call_ns) - now
+            if now < others_due_ns and self._hot:
                 if is_full:
                     entities.wait_set.clear_entities()
                     is_full = False
@@ -368,26 +400,34 @@ class WaitLoop:
                 continue
             entities.fill_all()
             is_full = True
-            wait(-1)
+            wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
             on_data()
             others_due_ns = now_ns() + OTHERS_PERIOD_NS
             if entities.wait_set.get_ready_entities('guard_condition'):
                 self._is_stopping = True
             elif entities.is_other_ready():
-                self._serve_others()
+                # Runs one callback of the node.
+                self._guarded(partial(self._executor.spin_once, timeout_sec=0.0))
                 self._is_stale = True
 
-    def _serve_others(self) -> None:
+    def _guarded(self, callback: Callable[[], None]) -> None:
         """
-        Let the executor run one callback; samples go on where one fails in the middleware.
+        Call back; samples go on where that fails in the middleware.
 
         """
         try:
-            self._executor.spin_once(timeout_sec=0.0)
+            callback()
         except RCLError as error:
             if not self._node.context.ok():
                 raise
             self._node.get_logger().error(f'a callback failed: {error}')
+
+
+def _nothing() -> None:
+    """
+    Stand in for a callback that nobody has asked for.
+
+    """
 
 
 def _never_called(message: bytes) -> None:
