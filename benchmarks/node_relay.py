@@ -9,11 +9,12 @@ For each rate and reliability a source process publishes stamped samples at that
 temperatures at 10 Hz, a sink process receives the Imu messages, and between them runs either the
 node, with everything on, or the naive relay: an rclpy node that copies Vector3Stamped to Imu in a
 callback. The CPU time is that of the whole relay process, all its threads, from the first sample
-to the last; the latency runs from the source's publish call to the sink's take. The figures of
-interest are the ratios; absolute ones depend on the machine and on what else it does. At the last
-rate the node is measured once more while its `calibration_file` is set twice a second. `--floor`
-measures a third relay, too: one wait set, one subscription, bytes copied, nothing computed, which
-is what is left to a node in Python that computes in no time.
+to the last; the latency runs from the source's publish call to the arrival in the sink's
+middleware, before any Python of the sink. The figures of interest are the ratios; absolute ones
+depend on the machine and on what else it does. At the last rate the node is measured once more
+while its `calibration_file` is set twice a second. `--floor` measures a third relay, too: one wait
+set, one subscription, bytes copied, nothing computed, which is what is left to a node in Python
+that computes in no time.
 
 """
 
