@@ -11,7 +11,7 @@ the operations of `Compensator.process` in their order.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from .compensator import Compensator
 
 #: Longest time over which bias and scale are taken as linear in time.
-SEGMENT_NS = 1_000_000_000
+SEGMENT_NS: Final = 1_000_000_000
 #: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
-TIME_JUMP_NS = 1_000_000_000
+TIME_JUMP_NS: Final = 1_000_000_000
 #: Where xx, xy, xz, yy, yz, zz stand in a row of the covariance.
 _UNIQUE = [0, 1, 2, 4, 5, 8]
 

@@ -21,6 +21,7 @@ per sample, and a batch comes to the same verdicts.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from .batch import SEGMENT_NS, TIME_JUMP_NS, process_block
 from .blocks import AccelBlock, CompensatedBlock
@@ -36,10 +37,9 @@ from .status import CompensatorConfig, CompensatorStatus, Counters
 from .thermal import ThermalTracker
 
 #: Samples this much faster than calibrated, relative, still have the calibrated noise.
-RATE_TOLERANCE = 0.1
-
+RATE_TOLERANCE: Final = 0.1
 #: Earlier than any stamp.
-_EVER_NS = -(1 << 62)
+_EVER_NS: Final = -(1 << 62)
 
 _Nine = tuple[float, float, float, float, float, float, float, float, float]
 _Twelve = tuple[

@@ -14,27 +14,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 from .status import GravityResidual
 
 #: Shortest window; it is longer where samples are few, up to the second figure.
-WINDOW_NS = 1_000_000_000
-LONGEST_WINDOW_NS = 30_000_000_000
+WINDOW_NS: Final = 1_000_000_000
+LONGEST_WINDOW_NS: Final = 30_000_000_000
 #: Samples closer than this to the last one need not be added.
-PROBE_NS = 90_000_000
+PROBE_NS: Final = 90_000_000
 #: Fewer samples than this make no window.
-SMALLEST_WINDOW = 5
+SMALLEST_WINDOW: Final = 5
 #: A still window scatters by at most this many times the noise of its samples...
-SCATTER_FACTOR = 3.0
+SCATTER_FACTOR: Final = 3.0
 #: ... and its mean differs from the last one's by noise and this [m/s^2]: half a milli-g.
-LARGEST_CHANGE = 5e-3
+LARGEST_CHANGE: Final = 5e-3
 #: Still windows averaged into one residual, the older with falling weight.
-MEMORY_WINDOWS = 30.0
+MEMORY_WINDOWS: Final = 30.0
 #: So many still windows running refute a calibration; so many restore the trust in it.
-REFUTING_WINDOWS = 3
-RESTORING_WINDOWS = 2
+REFUTING_WINDOWS: Final = 3
+RESTORING_WINDOWS: Final = 2
 #: Beyond the tolerance, and beyond so many of its own standard deviations.
-REFUTING_SIGMAS = 5.0
+REFUTING_SIGMAS: Final = 5.0
 
 
 class GravityMonitor:
@@ -79,7 +80,7 @@ class GravityMonitor:
 
     def _clear_window(self) -> None:
         self._n = 0
-        self._sum = [0.0, 0.0, 0.0]
+        self._sum_x = self._sum_y = self._sum_z = 0.0
         self._squares = 0.0
         self._origin = (0.0, 0.0, 0.0)
 
@@ -123,12 +124,11 @@ class GravityMonitor:
             self._clear_window()
             self._origin = (x, y, z)
         self._last_ns = stamp_ns
-        total = self._sum
         from_x, from_y, from_z = self._origin
         dx, dy, dz = x - from_x, y - from_y, z - from_z
-        total[0] += dx
-        total[1] += dy
-        total[2] += dz
+        self._sum_x += dx
+        self._sum_y += dy
+        self._sum_z += dz
         self._squares += dx * dx + dy * dy + dz * dz
         self._n += 1
         if self._n >= SMALLEST_WINDOW and stamp_ns - start >= 0.98 * WINDOW_NS:
@@ -141,7 +141,7 @@ class GravityMonitor:
         noise_variance: float,
     ) -> None:
         n = self._n
-        shift = [value / n for value in self._sum]
+        shift = [self._sum_x / n, self._sum_y / n, self._sum_z / n]
         mean = tuple(o + s for o, s in zip(self._origin, shift, strict=True))
         scatter = (self._squares - n * sum([s * s for s in shift], 0.0)) / (n - 1)
         last, self._last_mean = self._last_mean, (mean[0], mean[1], mean[2])

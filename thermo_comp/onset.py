@@ -23,19 +23,20 @@ from __future__ import annotations
 
 import math
 from math import acos, inf, isnan, log, nan, pi, sqrt
+from typing import Final
 
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
 BEND_SHARES = (1.0, 10.0)  # accelerations the two filters are tuned to / the smallest onset
-TUNING = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
-CELL_NOISE_SHARE = 0.4  # noise in a filter's own variance when cells make it come in bunches
-SETTLING = 5.0  # memories until a filter's noise is the formula's
-LONGEST_HALF_SWING_S = 600.0  # a ripple turns faster
-LARGEST_BASELINE = 0.25  # of the smallest ramp: as far as a baseline follows a rate
-SWING_MARGIN = 1.25  # on a swing of the rate about its trend ...
-SWING_SIGMAS = 3.0  # ... beyond what the noise makes of it
-SWING_MEMORY_LAGS = 10.0  # and how slowly it is forgotten
+TUNING: Final = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
+CELL_NOISE_SHARE: Final = 0.4  # noise in a filter's variance when cells make it come in bunches
+SETTLING: Final = 5.0  # memories until a filter's noise is the formula's
+LONGEST_HALF_SWING_S: Final = 600.0  # a ripple turns faster
+LARGEST_BASELINE: Final = 0.25  # of the smallest ramp: as far as a baseline follows a rate
+SWING_MARGIN: Final = 1.25  # on a swing of the rate about its trend ...
+SWING_SIGMAS: Final = 3.0  # ... beyond what the noise makes of it
+SWING_MEMORY_LAGS: Final = 10.0  # and how slowly it is forgotten
 
 
 class OnsetTest:

@@ -14,40 +14,41 @@ from __future__ import annotations
 
 from enum import Enum
 from math import erf, exp, isfinite, log, nan, sqrt
+from typing import Final
 
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
 #: No part changes by more than this at once [K] or in the long run [K/s]; quanta come on top.
-LARGEST_STEP = 3.0
-LARGEST_RATE = 0.2
+LARGEST_STEP: Final = 3.0
+LARGEST_RATE: Final = 0.2
 #: The rule of steps holds from so many readings on: what a sensor says first may be wrong.
-SETTLED_READINGS = 5
+SETTLED_READINGS: Final = 5
 
 #: Readings stand still when so many of them, over so long [s], are the same to the bit, or as
 #: many as the declared noise makes this unlikely; a few of them are enough to doubt.
-STILL_READINGS = 20
-STILL_S = 5.0
-STILL_PROBABILITY = 1e-9
-DOUBTFUL_READINGS = 4
+STILL_READINGS: Final = 20
+STILL_S: Final = 5.0
+STILL_PROBABILITY: Final = 1e-9
+DOUBTFUL_READINGS: Final = 4
 #: How far [K] the other sensor must have moved meanwhile to call a sensor frozen that has noise
 #: of its own, and one whose quantum hides it.
-OTHER_MOVED = 0.3
-OTHER_MOVED_BEYOND_CELL = 0.7
+OTHER_MOVED: Final = 0.3
+OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: A frozen sensor may be off by any temperature it was made for, at most by this [K].
-LARGEST_DOUBT = 60.0
+LARGEST_DOUBT: Final = 60.0
 #: Doubt below this is none [K^2].
-_SMALLEST_DOUBT = 1e-6
+_SMALLEST_DOUBT: Final = 1e-6
 
 #: A lead must be this large [K] and this part of the movement to be one ...
-LEAD_K = 0.5
-LEAD_SHARE = 0.15
+LEAD_K: Final = 0.5
+LEAD_SHARE: Final = 0.15
 #: ... in so many readings running, while the slower of both moves at least at this part of the
 #: rate of the faster; for a doubt a smaller part is enough.
-LEAD_READINGS = 5
-LEAD_RATE_SHARE = 0.3
-DOUBTFUL_RATE_SHARE = 0.03
-_SIGMAS = 6.0
+LEAD_READINGS: Final = 5
+LEAD_RATE_SHARE: Final = 0.3
+DOUBTFUL_RATE_SHARE: Final = 0.03
+_SIGMAS: Final = 6.0
 
 
 class Fault(Enum):

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
+from typing import Final
 
 #: (stamp [ns], kind: 0 board, 1 case, order of arrival, degC).
 Entry = tuple[int, int, int, float]
 
 #: More readings than this that wait mean that their clock is not the samples'.
-PENDING_LIMIT = 4096
+PENDING_LIMIT: Final = 4096
 #: Later than any stamp.
-NEVER_NS = 1 << 62
+NEVER_NS: Final = 1 << 62
 
 
 class ReadingQueue:

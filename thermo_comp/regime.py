@@ -19,16 +19,17 @@ from __future__ import annotations
 
 from enum import IntEnum
 from math import sqrt
+from typing import Final
 
 from .onset import OnsetTest
 from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
-HOLD_LAGS = 0.75  # the shortest dynamic state, in lags of the leading sensor
+HOLD_LAGS: Final = 0.75  # the shortest dynamic state, in lags of the leading sensor
 # "The rate is below": the variance in a calm is mostly that of what may begin, so half a sd.
-SURE_SIGMAS = 0.5
-OBVIOUS_SIGMAS = 5.0  # confidence of "the rate is above"
-FIRST_READINGS = 20  # until a noise declared too small is known
+SURE_SIGMAS: Final = 0.5
+OBVIOUS_SIGMAS: Final = 5.0  # confidence of "the rate is above"
+FIRST_READINGS: Final = 20  # until a noise declared too small is known
 
 
 class Regime(IntEnum):

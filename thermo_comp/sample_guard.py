@@ -13,7 +13,7 @@ come at another rate are of another scale, whatever else they are.
 from __future__ import annotations
 
 from math import nan
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -21,15 +21,15 @@ import numpy.typing as npt
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
 #: Fewer equal samples in a row than this are chance, however far they lie apart.
-STUCK_SAMPLES = 50
+STUCK_SAMPLES: Final = 50
 #: Samples may come this many times as fast as the calibrated cycle in the long run ...
-LARGEST_RATE = 1.5
+LARGEST_RATE: Final = 1.5
 #: ... with so many of them, or so many seconds' worth, at once (a driver that empties a buffer).
-BURST_SAMPLES = 50
-BURST_S = 0.25
+BURST_SAMPLES: Final = 50
+BURST_S: Final = 0.25
 #: A rate is measured over so many seconds.
-_WINDOW_S = 1.0
-_NEVER_NS = 1 << 62
+_WINDOW_S: Final = 1.0
+_NEVER_NS: Final = 1 << 62
 
 
 class StuckWatch:

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import inf
+from typing import Final
 
-CELL_SIGMAS = 2.5  # a quantum above this many noise sds has cells ...
-WIDE_CELL_SIGMAS = 8.5  # ... that noise never crosses: six sds of a difference
-OBVIOUS_SHARE = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
+CELL_SIGMAS: Final = 2.5  # a quantum above this many noise sds has cells ...
+WIDE_CELL_SIGMAS: Final = 8.5  # ... that noise never crosses: six sds of a difference
+OBVIOUS_SHARE: Final = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
 
 
 @dataclass(frozen=True, slots=True)

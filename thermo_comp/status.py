@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from .plausibility import Fault
 from .regime import Regime
@@ -64,7 +65,7 @@ class CompensatorConfig:
 
 
 #: A memory is called settled when its start-up uncertainty is below this [K].
-MEMORY_SETTLED_SD = 0.05
+MEMORY_SETTLED_SD: Final = 0.05
 #: The counters of samples that came in and did not go out.
 DROPPED = (
     'n_not_finite',

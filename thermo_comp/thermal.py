@@ -16,6 +16,7 @@ dt is ``m' = m e + (T' - T) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from .plausibility import Fault, LeadWatch, SensorGuard
 from .regime import Regime, RegimeDetector
@@ -24,11 +25,11 @@ from .status import ThermalState
 from .thermometer import Thermometer
 
 #: A unit that starts in the middle of a ramp has a memory that nobody saw: its sd then [K].
-MEMORY_START_SD = 3.0
+MEMORY_START_SD: Final = 3.0
 #: While the case sensor is lost the gradient is guessed from the board's rate, this well.
-LOST_GRADIENT_RELATIVE_SD = 0.5
+LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: A regime that no sensor has watched for this part of a thermal lag is not known any more.
-UNWATCHED_SHARE = 0.25
+UNWATCHED_SHARE: Final = 0.25
 
 #: Layout of `ThermalTracker.sample`; the memory values follow as pairs (value, variance).
 (

@@ -23,20 +23,22 @@ References
 from __future__ import annotations
 
 from math import erf, exp, inf, nan, sqrt
+from typing import Final
 
 from .modes import NOWHERE, State, blend, correct, merge, mix, predict
 from .settings import ThermometerSettings
 
-OUTLIER_SIGMAS = 6.0  # innovations beyond this limit count less ...
-OUTLIER_LIMITS = 5.0  # ... and beyond this many limits not at all ...
-RESTART_READINGS = 4  # ... unless that many in a row lie on one side
-SOAK_S = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
-QUIET_SHARE = 5e-3  # quiet acceleration wander / bending one, of a sensor without cells
-CELL_SHARE = 0.2  # the same where wide cells hide slow changes
+OUTLIER_SIGMAS: Final = 6.0  # innovations beyond this limit count less ...
+OUTLIER_LIMITS: Final = 5.0  # ... and beyond this many limits not at all ...
+RESTART_READINGS: Final = 4  # ... unless that many in a row lie on one side
+SOAK_S: Final = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
+QUIET_SHARE: Final = 5e-3  # quiet acceleration wander / bending one, of a sensor without cells
+CELL_SHARE: Final = 0.2  # the same where wide cells hide slow changes
 #: What is outside is no temperature of an instrument [degC]; nor is NaN.
-COLDEST, HOTTEST = -273.15, 1000.0
-HORIZON_INTERVALS = 5.0  # extrapolation is linear up to here, then held
-NOISE_MEMORY = 200.0  # surprises over which the declared noise is judged
+COLDEST: Final = -273.15
+HOTTEST: Final = 1000.0
+HORIZON_INTERVALS: Final = 5.0  # extrapolation is linear up to here, then held
+NOISE_MEMORY: Final = 200.0  # surprises over which the declared noise is judged
 
 
 class Thermometer:
