@@ -5,7 +5,7 @@ import re
 import sys
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
 
 NAME = 'thermo_comp'
 ROOT = Path(__file__).resolve().parent
@@ -40,7 +40,8 @@ EXTRAS = {
 }
 
 # THERMO_COMP_COMPILE=1 makes C extensions of these, from the same source: what runs for each
-# reading and each sample. Their .py files are installed beside them.
+# reading and each sample. Their .py files are installed beside them. The arithmetic of many
+# samples, which is numpy's otherwise, is written in C.
 CORE = [
     'batch',
     'compensator',
@@ -84,12 +85,13 @@ def compiled():
         opt_level='1',
         debug_level='0',
     )
-    for extension in extensions:
+    kernel = Extension(f'{NAME}._kernel', [f'{NAME}/_kernel.c'], extra_compile_args=['-O3'])
+    for extension in (*extensions, kernel):
         # The same bits on every architecture: nothing is fused, nothing computed in advance.
         # And what another compiler warns of is no error.
         exact = ['-ffp-contract=off', *(f'-fno-builtin-{f}' for f in ('exp', 'log', 'pow'))]
         extension.extra_compile_args += [*exact, '-Wno-error']
-    return extensions
+    return [*extensions, kernel]
 
 
 def shared(folder, *patterns):
@@ -119,7 +121,7 @@ setup(
     keywords=['ROS', 'accelerometer', 'calibration', 'inertial navigation', 'temperature'],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', '**/*.html', '**/*.css', '**/*.yaml', '**/*.json']},
+    package_data={NAME: ['py.typed', '*.pyi', '**/*.html', '**/*.css', '**/*.yaml', '**/*.json']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

@@ -112,7 +112,9 @@ def in_blocks(calibration, events):
 
 def main() -> None:
     """Run all and save it."""
-    result = {'is_compiled': np.array([is_compiled(), not thermal.__file__.endswith('.py')])}
+    is_in_c = 'thermo_comp._kernel' in sys.modules
+    is_made = not thermal.__file__.endswith('.py')
+    result = {'is_compiled': np.array([is_compiled(), is_made, is_in_c])}
     for name, quantum in QUANTA.items():
         sensor = ThermometerSettings(quantum_c=quantum)
         detector = DetectorSettings(case=sensor, board=replace(sensor, lag_s=700.0))

@@ -107,12 +107,13 @@ def tracked(*patterns: str) -> list[Path]:
 
 
 def test_every_source_carries_its_licence() -> None:
-    first = '# SPDX-FileCopyrightText: 2026 thermo_comp contributors'
-    second = '# SPDX-License-Identifier: Apache-2.0'
-    for path in tracked('*.py', 'Makefile', '.ci/run'):
+    first = 'SPDX-FileCopyrightText: 2026 thermo_comp contributors'
+    second = 'SPDX-License-Identifier: Apache-2.0'
+    for path in tracked('*.py', '*.pyi', '*.c', 'Makefile', '.ci/run'):
         lines = path.read_text().splitlines()
         lines = lines[1:] if lines and lines[0].startswith('#!') else lines
-        assert lines[:2] == [first, second], path
+        begin = ('/* ', ' * ') if path.suffix == '.c' else ('# ', '# ')
+        assert lines[:2] == [begin[0] + first, begin[1] + second], path
 
 
 def test_no_source_is_too_long_to_read() -> None:
