@@ -207,7 +207,7 @@ class WaitLoop:
     node : rclpy.node.Node
         The node to serve. It must not be added to another executor.
     rest_s : float, optional
-        Messages that come more often than this gather for so long after each wake-up [s].
+        Messages that come more often than this gather until so long after each wake-up [s].
 
     """
 
@@ -374,7 +374,7 @@ class WaitLoop:
 
         """
         wait = entities.wait_set.wait
-        rest_s, rest_ns = self._rest_s, int(self._rest_s * 1e9)
+        rest_ns = int(self._rest_s * 1e9)
         now_ns, others_due_ns = time.monotonic_ns, 0
         is_full = True
         while not (self._is_stopping or self._is_stale):
@@ -393,10 +393,13 @@ class WaitLoop:
                     is_full = False
                 entities.fill_hot()
                 wait(left_ns)
+                woken_ns = now_ns()
                 on_data()
                 # No interval at all: the middleware does not tell the time.
                 if 0 < self._hot[0].interval_ns < rest_ns:
-                    time.sleep(rest_s)
+                    left_ns = woken_ns + rest_ns - now_ns()
+                    if left_ns > 0:
+                        time.sleep(left_ns * 1e-9)
                 continue
             entities.fill_all()
             is_full = True
