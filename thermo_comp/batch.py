@@ -275,10 +275,11 @@ def _apply(
     force, covariance, lowest, highest = correct(lines, correction.misalignment, stamps, samples)
     full_scale = compensator.calibration.unit.full_scale
     # The extremes settle the usual case; a NaN fails both comparisons.
+    keep: Mask
     if (lowest > -full_scale).all() and (highest < full_scale).all():
         keep = np.ones(len(samples), dtype=bool)
     else:
-        keep = ((-full_scale < samples) & (samples < full_scale)).all(axis=1)
+        keep = np.asarray(((-full_scale < samples) & (samples < full_scale)).all(axis=1))
     may_be_zero = not ((lowest > 0.0) | (highest < 0.0)).any()
     is_stuck = _stuck(compensator, stamps, samples, may_be_zero)
     _judge(compensator, segments, counts, stamps, samples, force, covariance, keep, is_stuck)
