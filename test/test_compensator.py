@@ -394,7 +394,7 @@ def test_covariance_is_the_scatter_of_calibrations_drawn_from_it(rng):
     ('values', 'message'),
     [
         ({'temperature_timeout_s': 0.0}, '`temperature_timeout_s` must be positive'),
-        ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or more'),
+        ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or positive and finite'),
         ({'case_timeout_s': math.inf}, '`case_timeout_s` must be positive'),
         ({'stuck_timeout_s': -1.0}, '`stuck_timeout_s` must be zero or positive'),
         ({'local_gravity_m_s2': math.nan}, '`local_gravity_m_s2` must be zero or positive'),

@@ -141,7 +141,7 @@ def test_state_before_any_board_temperature_is_refused():
 @pytest.mark.parametrize(
     ('values', 'message'),
     [
-        ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or more'),
+        ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or positive and finite'),
         ({'transition_time_s': math.nan}, '`transition_time_s`'),
         ({'case_timeout_s': 0.0}, '`case_timeout_s` must be positive'),
         ({'board_lag_s': -5.0}, '`board_lag_s` must be positive'),

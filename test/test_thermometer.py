@@ -424,7 +424,7 @@ def test_any_readings_leave_a_valid_estimate(quantum, rows):
         ({'noise_sd_c': math.nan}, '`noise_sd_c` must be positive and finite, got nan'),
         ({'fastest_ramp_k_min': -1.0}, '`fastest_ramp_k_min` must be positive and finite, got -1'),
         ({'lag_s': math.inf}, '`lag_s` must be positive and finite, got inf'),
-        ({'quantum_c': -0.1}, '`quantum_c` must be zero or positive, got -0.1'),
+        ({'quantum_c': -0.1}, '`quantum_c` must be zero or positive and finite, got -0.1'),
     ],
 )
 def test_settings_refuse_what_no_sensor_has(changes, text):

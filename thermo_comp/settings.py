@@ -18,6 +18,32 @@ WIDE_CELL_SIGMAS: Final = 8.5  # ... that noise never crosses: six sds of a diff
 OBVIOUS_SHARE: Final = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
 
 
+def refuse_outside(
+    settings: object, *, positive: tuple[str, ...], not_negative: tuple[str, ...]
+) -> None:
+    """
+    Refuse settings that are outside their range.
+
+    Parameters
+    ----------
+    settings : object
+        Whatever has them as attributes.
+    positive, not_negative : tuple of str
+        The names of those that must be above zero, and of those that may be zero.
+
+    Raises
+    ------
+    ValueError
+        If one is outside its range or not finite.
+
+    """
+    for name in (*positive, *not_negative):
+        value = getattr(settings, name)
+        if not 0.0 <= value < inf or (value == 0.0 and name in positive):
+            least = 'positive' if name in positive else 'zero or positive'
+            raise ValueError(f'`{name}` must be {least} and finite, got {value}')
+
+
 @dataclass(frozen=True, slots=True)
 class ThermometerSettings:
     """
@@ -52,12 +78,11 @@ class ThermometerSettings:
         Refuse values that no sensor has.
 
         """
-        for name in ('noise_sd_c', 'fastest_ramp_k_min', 'lag_s'):
-            value = getattr(self, name)
-            if not 0.0 < value < inf:
-                raise ValueError(f'`{name}` must be positive and finite, got {value}')
-        if not 0.0 <= self.quantum_c < inf:
-            raise ValueError(f'`quantum_c` must be zero or positive, got {self.quantum_c}')
+        refuse_outside(
+            self,
+            positive=('noise_sd_c', 'fastest_ramp_k_min', 'lag_s'),
+            not_negative=('quantum_c',),
+        )
 
     @property
     def has_cells(self) -> bool:
@@ -117,14 +142,11 @@ class DetectorSettings:
         Refuse values that contradict each other.
 
         """
-        for name in ('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'):
-            value = getattr(self, name)
-            if not 0.0 < value < inf:
-                raise ValueError(f'`{name}` must be positive and finite, got {value}')
-        for name in ('ripple_c', 'dwell_s'):
-            value = getattr(self, name)
-            if not 0.0 <= value < inf:
-                raise ValueError(f'`{name}` must be zero or positive and finite, got {value}')
+        refuse_outside(
+            self,
+            positive=('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'),
+            not_negative=('ripple_c', 'dwell_s'),
+        )
         if self.relaxed_rate_k_min * OBVIOUS_SHARE >= self.smallest_ramp_k_min:
             raise ValueError(
                 f'`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / {OBVIOUS_SHARE}, '
@@ -162,10 +184,12 @@ class ThermalConfig:
     temperature_timeout_s: float = 60.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.transition_time_s < inf:
-            raise ValueError(
-                f'`transition_time_s` must be zero or more, got {self.transition_time_s}'
-            )
-        for name in ('case_timeout_s', 'board_lag_s', 'temperature_timeout_s'):
-            if not 0.0 < getattr(self, name) < inf:
-                raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
+        """
+        Refuse values that mean nothing.
+
+        """
+        refuse_outside(
+            self,
+            positive=('case_timeout_s', 'board_lag_s', 'temperature_timeout_s'),
+            not_negative=('transition_time_s',),
+        )

@@ -7,13 +7,12 @@ Owns what surrounds the compensator's arithmetic: its settings, its counters, it
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
 from .plausibility import Fault
 from .regime import Regime
-from .settings import ThermalConfig
+from .settings import ThermalConfig, refuse_outside
 
 
 @dataclass(frozen=True)
@@ -54,13 +53,15 @@ class CompensatorConfig:
     gravity_tolerance_m_s2: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.temperature_timeout_s < math.inf:
-            raise ValueError(
-                f'`temperature_timeout_s` must be positive, got {self.temperature_timeout_s}'
-            )
-        for name in ('stuck_timeout_s', 'local_gravity_m_s2', 'gravity_tolerance_m_s2'):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f'`{name}` must be zero or positive, got {getattr(self, name)}')
+        """
+        Refuse values that mean nothing.
+
+        """
+        refuse_outside(
+            self,
+            positive=('temperature_timeout_s',),
+            not_negative=('stuck_timeout_s', 'local_gravity_m_s2', 'gravity_tolerance_m_s2'),
+        )
         ThermalConfig(self.transition_time_s, self.case_timeout_s)
 
 
