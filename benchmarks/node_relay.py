@@ -36,6 +36,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from thermo_comp import is_compiled
+
 ROOT = Path(__file__).resolve().parent.parent
 RATES = (100, 400, 1000, 2000, 5000, 10000)
 RELIABILITIES = ('best_effort', 'reliable')
@@ -272,7 +274,9 @@ def _machine() -> str:
     if info.is_file():
         lines = info.read_text(encoding='utf-8').splitlines()
         model = next((line.split(':')[1].strip() for line in lines if 'model name' in line), model)
-    return f'{model}, {os.cpu_count()} cores, Python {platform.python_version()}'
+    core = 'compiled' if is_compiled() else 'interpreted'
+    python = platform.python_version()
+    return f'{model}, {os.cpu_count()} cores, Python {python}, {core} core'
 
 
 # --- the processes -------------------------------------------------------------------------------
