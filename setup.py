@@ -121,7 +121,9 @@ setup(
     keywords=['ROS', 'accelerometer', 'calibration', 'inertial navigation', 'temperature'],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', '*.pyi', '**/*.html', '**/*.css', '**/*.yaml', '**/*.json']},
+    package_data={
+        NAME: ['py.typed', '*.pyi', '**/*.html', '**/*.css', '**/*.yaml', '**/*.json', '**/*.xml']
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

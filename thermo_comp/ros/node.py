@@ -40,6 +40,7 @@ from . import parameters
 from .conversions import SampleConverter, read_temperature
 from .diagnostics import Snapshot, Traffic, build
 from .loading import check, load
+from .middleware import use_profile
 from .parameters import NodeConfig, ParameterError
 from .signals import SignalWatch
 from .waitloop import RawPublisher, RawSubscription, RCLError, WaitLoop, undeclared_overrides
@@ -434,6 +435,7 @@ def main(args: list[str] | None = None) -> int:
         return 0 if is_help else 2
     with SignalWatch() as signals:
         try:
+            use_profile()
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
             _serve(signals)
         except ExternalShutdownException:
