@@ -10,12 +10,10 @@ temperatures at 10 Hz, a sink process receives the Imu messages, and between the
 node, with everything on, or the naive relay: an rclpy node that copies Vector3Stamped to Imu in a
 callback. The CPU time is that of the whole relay process, all its threads, from the first sample
 to the last; the latency runs from the source's publish call to the arrival in the sink's
-middleware, before any Python of the sink. The figures of interest are the ratios; absolute ones
-depend on the machine and on what else it does. The node brings its own profile for Fast DDS;
-source, sink and naive relay run as any node does that brings none. At the last rate the node is
-measured once more while its `calibration_file` is set twice a second. `--floor` measures a third
-relay, too: one wait set, one subscription, bytes copied, nothing computed, the node's profile,
-which is what is left to a node in Python that computes in no time.
+middleware, before any Python of the sink. Only ratios travel. The node brings its own profile for
+Fast DDS; source, sink and naive relay run without one. At the last rate the node is measured once
+more while its `calibration_file` is set twice a second. `--floor` measures a third relay, too: one
+wait set, one subscription, bytes copied, nothing computed, the node's profile.
 
 """
 
