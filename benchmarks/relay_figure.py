@@ -66,7 +66,8 @@ def main() -> None:
     parser.add_argument('picture', type=Path, help='PNG file to write')
     options = parser.parse_args()
     documents = [json.loads(path.read_text(encoding='utf-8')) for path in options.figures]
-    draw([case for document in documents for case in document['cases']], options.picture)
+    cases = [case for document in documents for case in document['cases']]
+    draw(sorted(cases, key=lambda case: case['rate']), options.picture)
 
 
 if __name__ == '__main__':

@@ -25,7 +25,11 @@ from thermo_comp.ros.round_trip import NodeProcess, lossless
 
 CYCLE_NS = 10_000_000
 N_SAMPLES = 500
-OTHER = '<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles/></dds>'
+OTHER = """\
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
+  <data_reader profile_name="other"/>
+</profiles></dds>
+"""
 
 
 def event_wakes(pid: int) -> int:
