@@ -53,6 +53,12 @@ stamps are carried through; the node never stamps with its own clock and needs n
 Each QoS policy can be overridden at start with the usual `qos_overrides./topic.subscription.reliability`
 parameters.
 
+With Fast DDS the node brings one setting that ROS has no word for, a profile with `nackSupressionDuration`
+20 ms for its publishers: under the default of 0 s each sample for a reliable subscriber wakes a thread of
+the middleware some four times, a quarter of the node's CPU time. A sample lost on the way is repeated up to
+20 ms later than by default. A profile of yours (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
+`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) takes its place; repeat the setting there.
+
 `linear_acceleration_covariance` is a full 3x3: noise of the sample plus what is uncertain about the
 calibration at this thermal state. Without angular rate or orientation in the input, the first element
 of their covariance is -1 (REP 145).
