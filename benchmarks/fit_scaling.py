@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of a fit: CPU time and peak memory over the number of bags, against reading alone.
+Owns the cost of a fit: CPU time and peak memory over the number of bags, against reading alone,
+and the power of the number of samples with which the time grows.
 
 Bags of four hours are simulated once, written to disk, and then read, and fitted, by processes of
 their own, so that each peak is that process' alone.
@@ -62,10 +63,12 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
     """
     done = subprocess.run(
         [sys.executable, __file__, '--task', task, *map(str, paths)],
-        check=True,
+        check=False,
         capture_output=True,
         text=True,
     )
+    if done.returncode:
+        sys.exit(f'{task} of {len(paths)} bags failed: {done.stderr.splitlines()[-1]}')
     return dict(json.loads(done.stdout))
 
 
@@ -114,6 +117,7 @@ def main() -> int:
     print('|---|---|---|---|---|---|---|')
     with tempfile.TemporaryDirectory() as folder:
         paths = write_bags(Path(folder), max(options.bags), options.rate_hz)
+        measured = []
         for n in options.bags:
             read, fitted = measure('read', paths[:n]), measure('fit', paths[:n])
             print(
@@ -122,6 +126,10 @@ def main() -> int:
                 f'| {read["peak_mb"]:.0f} | {fitted["peak_mb"]:.0f} |',
                 flush=True,
             )
+            measured.append((fitted['n_samples'], fitted['seconds']))
+    if len(measured) > 1:
+        slope = np.polyfit(*np.log(measured).T, 1)[0]
+        print(f'CPU time of the fit grows as samples^{slope:.2f}')
     return 0
 
 
