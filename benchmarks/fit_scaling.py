@@ -128,7 +128,8 @@ def main() -> int:
             )
             measured.append((fitted['n_samples'], fitted['seconds']))
     if len(measured) > 1:
-        slope = np.polyfit(*np.log(measured).T, 1)[0]
+        samples, seconds = np.log(measured).T
+        slope = np.polyfit(samples, seconds, 1)[0]
         print(f'CPU time of the fit grows as samples^{slope:.2f}')
     return 0
 
