@@ -40,8 +40,9 @@ EXTRAS = {
 }
 
 # THERMO_COMP_COMPILE=1 makes C extensions of these, from the same source: what runs for each
-# reading and each sample. Their .py files are installed beside them. The arithmetic of many
-# samples, which is numpy's otherwise, is written in C.
+# reading and each sample, in the node, too. Their .py files are installed beside them. The
+# arithmetic of many samples, which is numpy's otherwise, is written in C. Nothing here may log
+# through rclpy at more than one severity: it tells the callers apart by their Python frames.
 CORE = [
     'batch',
     'compensator',
@@ -51,6 +52,9 @@ CORE = [
     'plausibility',
     'reading_queue',
     'regime',
+    'ros/conversions',
+    'ros/relay',
+    'ros/waitloop',
     'sample_guard',
     'thermal',
     'thermometer',

@@ -32,6 +32,8 @@ from thermo_comp.ros.round_trip import NodeProcess, lossless
 
 CYCLE_NS = 10_000_000
 N_SAMPLES = 500
+#: After so many nobody hears any.
+N_TRIED = 5000
 OTHER = """\
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
   <data_reader profile_name="other"/>
@@ -116,15 +118,16 @@ def wakes_per_sample(peer: Peer, node_arguments: list[str]) -> float:
         heard = peer.listen(Imu, 'imu/data_raw')
         driver = Driver(peer)
 
-        def send_and_hear(first: int, last: int) -> None:
-            send(driver, first, last, 0.001)
-            newest_ns = (last - 1) * CYCLE_NS
-            peer.wait_for(lambda: heard and stamp_of(heard[-1]) == newest_ns, 'the last sample')
-
-        # The first ones may come before the node and the peer know each other.
-        send_and_hear(0, 200)
-        before = event_wakes(node.process.pid)
-        send_and_hear(200, 200 + N_SAMPLES)
+        first = 0
+        # Until the node and the peer know each other.
+        while not heard:
+            assert first < N_TRIED, node.said
+            send(driver, first, first + 100, 0.001)
+            first += 100
+        before, last = event_wakes(node.process.pid), first + N_SAMPLES
+        send(driver, first, last, 0.001)
+        newest_ns = (last - 1) * CYCLE_NS
+        peer.wait_for(lambda: stamp_of(heard[-1]) == newest_ns, 'the last sample')
         return (event_wakes(node.process.pid) - before) / N_SAMPLES
 
 
@@ -150,7 +153,7 @@ def test_what_is_lost_on_the_way_is_repeated(
     monkeypatch.delenv(VARIABLE, raising=False)
     command = [sys.executable, '-c', RECEIVER]
     with (
-        NodeProcess(*node_arguments),
+        NodeProcess(*node_arguments) as node,
         subprocess.Popen(command, stdin=PIPE, stdout=PIPE, text=True) as receiver,
     ):
         assert receiver.stdin
@@ -158,6 +161,7 @@ def test_what_is_lost_on_the_way_is_repeated(
         driver = Driver(peer)
         first = 0
         while not select.select([receiver.stdout], [], [], 0.0)[0]:
+            assert first < N_TRIED, node.said
             send(driver, first, first + 1, 0.01)
             first += 1
         receiver.send_signal(signal.SIGSTOP)

@@ -51,6 +51,8 @@ class _Layout:
     """
     Where a sample of one kind holds its values, and the Imu that it becomes.
 
+    What is passed on, of an Imu, begins at `passed`; 0 for counts.
+
     """
 
     unpack: Callable[[bytes], tuple[Any, ...]]
@@ -58,13 +60,13 @@ class _Layout:
     name: bytes
     pack: Callable[..., bytes]
     frame: bytes
-    passed: slice | None
+    passed: int
     is_foreign: bool
 
     def write(self, data: bytes, sec: int, nanosec: int, result: tuple[float, ...]) -> bytes:
         block = _NO_GYRO
-        if self.passed is not None:
-            block = data[self.passed]
+        if self.passed:
+            block = data[self.passed : self.passed + 8 * _PASSED]
             if self.is_foreign:
                 block = _NATIVE.pack(*_FOREIGN.unpack(block))
         fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
@@ -97,7 +99,7 @@ def _pack_nothing(*_values: Any) -> bytes:
     raise StructError
 
 
-_UNKNOWN = _Layout(_unpack_nothing, b'', b'', _pack_nothing, b'', None, False)
+_UNKNOWN = _Layout(_unpack_nothing, b'', b'', _pack_nothing, b'', 0, False)
 
 
 class SampleConverter:
@@ -200,7 +202,7 @@ class SampleConverter:
             name,
             imu.pack,
             head,
-            slice(start, start + skip) if is_imu else None,
+            start if is_imu else 0,
             order == '>',
         )
         try:

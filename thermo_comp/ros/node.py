@@ -3,10 +3,8 @@
 """
 Owns the node `thermo_comp`: samples and temperatures in, specific force, flag and diagnostics out.
 
-A wake-up takes what has arrived of all three inputs, samples first, and works through it in the
-order of arrival. So it does not matter how the wake-ups fell: the node publishes what the offline
-replay of a bag of the same messages writes, bit for bit. Parameters are checked when they are set
-and change what runs between two wake-ups.
+It publishes what the offline replay of a bag of the same messages writes, bit for bit. Parameters
+are checked when they are set and change what runs between two wake-ups.
 
 """
 
@@ -15,8 +13,6 @@ from __future__ import annotations
 import gc
 import sys
 import time
-from bisect import bisect_left
-from collections.abc import Callable, Iterable
 from copy import copy
 
 import rclpy
@@ -28,7 +24,6 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
-from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, Temperature
@@ -37,13 +32,14 @@ from std_msgs.msg import Bool
 from ..compensator import Compensator
 from ..errors import ThermoCompError
 from . import parameters
-from .conversions import SampleConverter, read_temperature
+from .conversions import SampleConverter
 from .diagnostics import Snapshot, Traffic, build
 from .loading import check, load
 from .middleware import use_profile
 from .parameters import NodeConfig, ParameterError
+from .relay import Relay
 from .signals import SignalWatch
-from .waitloop import RawPublisher, RawSubscription, RCLError, WaitLoop, undeclared_overrides
+from .waitloop import RawSubscription, WaitLoop, undeclared_overrides
 
 NODE_NAME = 'thermo_comp'
 
@@ -63,10 +59,8 @@ DIAGNOSTICS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 #: an INS at 2 kHz for its next one.
 REST_S = 0.3e-3
 
-#: After so long without samples [s] readings take effect without them, but for those not older
-#: than the newest by this: a sample that Fast DDS has to repeat can be 3 s late.
+#: After so long without samples [s] readings take effect without them.
 IDLE_S = 5.0
-IDLE_NS = 1_000_000_000
 
 USAGE = """\
 usage: thermo_comp_node --ros-args -p calibration_file:=PATH [-p NAME:=VALUE ...]
@@ -79,13 +73,7 @@ example: thermo_comp_node --ros-args -p calibration_file:=unit42.yaml -r accel/c
 parameters:
 """
 
-#: The two messages of the flag, serialized.
-_FLAGS = tuple(serialize_message(Bool(data=is_dynamic)) for is_dynamic in (False, True))
-
 _INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
-
-# A temperature that has arrived: received [ns], stamp [ns], degC, and where it goes.
-_Reading = tuple[int, int, float, Callable[[int, float], None]]
 
 
 class CompensationNode:
@@ -123,19 +111,14 @@ class CompensationNode:
         self._compensator = Compensator(
             self._loaded.calibration, self._config.compensator_config()
         )
-        self._readings: list[_Reading] = []
-        self._newest_reading_ns: int | None = None
         self._n_publishers = 0
         self._n_lost = 0
         self._n_malformed = 0
         self._n_fallback = 0
-        self._n_unpublished = 0
-        self._n_flags = 0
-        self._converter = SampleConverter(_INPUTS[self._config.input][0], self._config.frame_id)
         self._level = b''
         self._last_samples = time.monotonic()
         self._loop = WaitLoop(self.node, REST_S)
-        self._open_topics()
+        self._relay = self._open_topics()
         self._reported = self._snapshot()
         self._prepared = (self._config, self._loaded)
         self.node.add_pre_set_parameters_callback(parameters.coerce)
@@ -157,7 +140,7 @@ class CompensationNode:
         Serve until shutdown or a signal.
 
         """
-        self._loop.run(self._on_data)
+        self._loop.run(self._relay.on_data)
 
     def stop(self) -> None:
         """
@@ -174,22 +157,23 @@ class CompensationNode:
         self._loop.close()
         self.node.destroy_node()
 
-    def _open_topics(self) -> None:
+    def _open_topics(self) -> Relay:
         """
-        Create the subscriptions and publishers.
+        Create the subscriptions and publishers, and what connects them.
 
         """
         subscribe, overridable = self._loop.subscribe, QoSOverridingOptions.with_default_policies()
+        compensator = self._compensator
         try:
-            self._samples = self._open_samples(self._config)
-            self._temperatures: list[tuple[RawSubscription, Callable[[int, float], None]]] = [
+            samples = self._open_samples(self._config)
+            temperatures = [
                 (subscribe(Temperature, topic, TEMPERATURE_QOS, is_hot=False), push)
                 for topic, push in (
-                    ('temperature/board', self._push_board),
-                    ('temperature/case', self._push_case),
+                    ('temperature/board', compensator.push_board),
+                    ('temperature/case', compensator.push_case),
                 )
             ]
-            self._imu, self._flag, self._diagnostics = (
+            imu, flag, self._diagnostics = (
                 self.node.create_publisher(
                     message_type, topic, copy(qos), qos_overriding_options=overridable
                 )
@@ -201,101 +185,25 @@ class CompensationNode:
             )
         except (RuntimeError, InvalidQosOverridesError) as error:
             raise ParameterError(f'a topic cannot be opened: {error}') from error
-        self._publish = RawPublisher(self._imu).publish
-        self._publish_flag = RawPublisher(self._flag).publish
+        self._inputs = [samples, *(subscription for subscription, _ in temperatures)]
+        converter = self._new_converter(self._config)
+        return Relay(self.node, compensator, converter, samples, temperatures, imu, flag)
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
         return self._loop.subscribe(*_INPUTS[config.input], SAMPLE_QOS)
 
-    def _push_board(self, stamp_ns: int, celsius: float) -> None:
-        self._compensator.push_board(stamp_ns, celsius)
-
-    def _push_case(self, stamp_ns: int, celsius: float) -> None:
-        self._compensator.push_case(stamp_ns, celsius)
-
-    def _on_data(self) -> None:
-        """
-        Work through everything that has arrived.
-
-        """
-        messages, received_ns = self._samples.drain(is_paced=True)
-        for subscription, push in self._temperatures:
-            readings = subscription.drain()
-            if readings[0]:
-                self._take_readings(*readings, push)
-        if not messages:
-            return
-        if self._readings:
-            messages = self._relay_with_readings(messages, received_ns)
-        self._relay(messages)
-
-    def _take_readings(
-        self, messages: list[bytes], received_ns: list[int], push: Callable[[int, float], None]
-    ) -> None:
-        for data, received in zip(messages, received_ns, strict=True):
-            reading = read_temperature(data)
-            if reading is None:
-                self._n_malformed += 1
-            else:
-                self._newest_reading_ns = reading[0]
-                self._readings.append((received, *reading, push))
-
-    def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """
-        Relay up to the last reading that came before the last sample; return the rest.
-
-        """
-        start = 0
-        later = []
-        for reading in sorted(self._readings, key=lambda one: one[0]):
-            received, stamp_ns, celsius, push = reading
-            if received > received_ns[-1]:
-                later.append(reading)
-                continue
-            end = bisect_left(received_ns, received, start)
-            self._relay(messages[start:end])
-            push(stamp_ns, celsius)
-            start = end
-        self._readings = later
-        return messages[start:]
-
-    def _relay(self, messages: Iterable[bytes]) -> None:
-        convert, process = self._converter.convert, self._compensator.process
-        for data in messages:
-            frame = convert(data, process)
-            if frame is not None:
-                try:
-                    self._publish(frame)
-                except RCLError:
-                    self._count_unpublished()
-        self._publish_flags()
-
-    def _publish_flags(self) -> None:
-        for _, is_dynamic in self._compensator.take_flags():
-            try:
-                self._publish_flag(_FLAGS[is_dynamic])
-            except RCLError:
-                self._count_unpublished()
-            self._n_flags += 1
-
-    def _count_unpublished(self) -> None:
-        """
-        Go on after a message that the middleware did not take, but not after the shutdown.
-
-        """
-        if not self.node.context.ok():
-            raise ExternalShutdownException
-        self._n_unpublished += 1
+    def _new_converter(self, config: NodeConfig) -> SampleConverter:
+        return SampleConverter(_INPUTS[config.input][0], config.frame_id)
 
     def _snapshot(self) -> Snapshot:
-        last, converter = self._converter.last_result, self._converter
-        inputs = (self._samples, *(subscription for subscription, _ in self._temperatures))
-        found = [one.subscription.get_publisher_count() for one in inputs]
+        relay, converter = self._relay, self._relay.converter
+        last = converter.last_result
+        found = [one.subscription.get_publisher_count() for one in self._inputs]
         traffic = Traffic(
             n_lost=self._n_lost,
-            n_unpublished=self._n_unpublished,
-            n_malformed=self._n_malformed + converter.n_malformed,
-            n_flags=self._n_flags,
+            n_unpublished=relay.n_unpublished,
+            n_malformed=self._n_malformed + relay.n_malformed + converter.n_malformed,
+            n_flags=relay.n_flags,
             n_fallback=self._n_fallback + converter.n_fallback,
             n_sample_publishers=found[0],
             n_board_publishers=found[1],
@@ -314,7 +222,7 @@ class CompensationNode:
         if now.status.counters.n_in != self._reported.status.counters.n_in:
             self._last_samples = time.monotonic()
         elif time.monotonic() - self._last_samples > IDLE_S:
-            self._advance_without_samples()
+            self._relay.advance_without_samples()
             now = self._snapshot()
         array = build(self.node.get_name(), self._loaded, now, self._reported)
         self._reported = now
@@ -335,26 +243,11 @@ class CompensationNode:
         Count gaps in the driver's numbering, which mean something only while there is one driver.
 
         """
-        samples = self._samples
+        samples = self._relay.samples
         n_lost, samples.n_lost = samples.n_lost, 0
         before, self._n_publishers = self._n_publishers, samples.subscription.get_publisher_count()
         if before == self._n_publishers == 1:
             self._n_lost += n_lost
-
-    def _advance_without_samples(self) -> None:
-        """
-        Let readings take effect that no sample will come to, so that the flag stays alive.
-
-        """
-        if self._newest_reading_ns is None:
-            return
-        horizon_ns = self._newest_reading_ns - IDLE_NS
-        for _, stamp_ns, celsius, push in self._readings:
-            if stamp_ns <= horizon_ns:
-                push(stamp_ns, celsius)
-        self._readings = [one for one in self._readings if one[1] > horizon_ns]
-        self._compensator.flush(horizon_ns)
-        self._publish_flags()
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         """
@@ -378,7 +271,7 @@ class CompensationNode:
         Apply what `_on_set` checked.
 
         """
-        before = self._config
+        before, relay = self._config, self._relay
         config, loaded = self._prepared
         if loaded is not self._loaded:
             self._loaded = loaded
@@ -389,13 +282,12 @@ class CompensationNode:
         if config.compensator_config() != before.compensator_config():
             self._compensator.reconfigure(config.compensator_config())
         if (config.input, config.frame_id) != (before.input, before.frame_id):
-            self._n_malformed += self._converter.n_malformed
-            self._n_fallback += self._converter.n_fallback
-            message_type, _ = _INPUTS[config.input]
-            self._converter = SampleConverter(message_type, config.frame_id)
+            self._n_malformed += relay.converter.n_malformed
+            self._n_fallback += relay.converter.n_fallback
+            relay.converter = self._new_converter(config)
         if config.input != before.input:
-            self._loop.unsubscribe(self._samples)
-            self._samples = self._open_samples(config)
+            self._loop.unsubscribe(relay.samples)
+            relay.samples = self._inputs[0] = self._open_samples(config)
         if config.diagnostics_period != before.diagnostics_period:
             self._loop.call_every(config.diagnostics_period, self._report)
 

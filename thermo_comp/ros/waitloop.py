@@ -53,16 +53,6 @@ _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 RCLError = rclpy_implementation.RCLError
 
 
-class _Reserved(ReentrantCallbackGroup):  # type: ignore[misc]  # rclpy counts as untyped
-    """
-    Keeps subscriptions from the executor; their middleware events it still serves.
-
-    """
-
-    def can_execute(self, entity: Any) -> bool:
-        return not isinstance(entity, Subscription)
-
-
 class RawSubscription:
     """
     A subscription read in serialized form by whoever runs the loop, not by an executor.
@@ -218,7 +208,9 @@ class WaitLoop:
         self._executor.add_node(node)
         self._stop_guard = GuardCondition(None, None, context=node.context)
         self._signal_guard = SignalHandlerGuardCondition(context=node.context)
-        self._reserved = _Reserved()
+        # Keeps the hot subscriptions from the executor.
+        self._reserved = ReentrantCallbackGroup()
+        self._reserved.can_execute = _is_no_subscription
         self._raw: list[RawSubscription] = []
         self._hot: list[RawSubscription] = []
         self._is_stopping = False
@@ -431,6 +423,14 @@ def _nothing() -> None:
     Stand in for a callback that nobody has asked for.
 
     """
+
+
+def _is_no_subscription(entity: Any) -> bool:
+    """
+    Leave middleware events to the executor, but not the messages.
+
+    """
+    return not isinstance(entity, Subscription)
 
 
 def _never_called(message: bytes) -> None:

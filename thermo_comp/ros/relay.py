@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the way of the samples through the node: in the order of arrival, compensated, published.
+
+A wake-up takes what has arrived of all three inputs, samples first, and works through it in the
+order of arrival. So it does not matter how the wake-ups fell.
+
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.serialization import serialize_message
+from std_msgs.msg import Bool
+
+from ..compensator import Compensator
+from .conversions import SampleConverter, read_temperature
+from .waitloop import RawPublisher, RawSubscription, RCLError
+
+#: Without samples, readings take effect but for those not older than the newest by this [ns]: a
+#: sample that Fast DDS has to repeat can be 3 s late.
+IDLE_NS = 1_000_000_000
+
+#: The two messages of the flag, serialized.
+_FLAGS: list[bytes] = [serialize_message(Bool(data=is_dynamic)) for is_dynamic in (False, True)]
+
+#: Takes a temperature: stamp [ns] and degC.
+Push = Callable[[int, float], None]
+
+# A temperature that has arrived: received [ns], stamp [ns], degC, and where it goes.
+_Reading = tuple[int, int, float, Push]
+
+
+class Relay:
+    """
+    What stands between the node's inputs and its outputs.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Whose context tells whether a message that could not go out is an end.
+    compensator : Compensator
+        Gets readings and samples.
+    converter : SampleConverter
+        From and to the bytes of messages.
+    samples : RawSubscription
+        The raw samples.
+    temperatures : sequence of (RawSubscription, callable)
+        The readings, and who takes them.
+    imu, flag : rclpy.publisher.Publisher
+        The outputs.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        compensator: Compensator,
+        converter: SampleConverter,
+        samples: RawSubscription,
+        temperatures: Sequence[tuple[RawSubscription, Push]],
+        imu: Publisher,
+        flag: Publisher,
+    ) -> None:
+        self._node = node
+        self._compensator = compensator
+        #: May be exchanged between two wake-ups, and so may `samples`.
+        self.converter = converter
+        self.samples = samples
+        self._temperatures: list[tuple[RawSubscription, Push]] = list(temperatures)
+        self._publish = RawPublisher(imu).publish
+        self._publish_flag = RawPublisher(flag).publish
+        self._readings: list[_Reading] = []
+        self._newest_reading_ns: int | None = None
+        #: Readings that were none.
+        self.n_malformed = 0
+        #: Messages that the middleware did not take.
+        self.n_unpublished = 0
+        #: Changes of the flag.
+        self.n_flags = 0
+
+    def on_data(self) -> None:
+        """
+        Work through everything that has arrived.
+
+        """
+        messages, received_ns = self.samples.drain(is_paced=True)
+        for subscription, push in self._temperatures:
+            readings, read_ns = subscription.drain()
+            if readings:
+                self._take_readings(readings, read_ns, push)
+        if not messages:
+            return
+        if self._readings:
+            messages = self._relay_with_readings(messages, received_ns)
+        self._relay(messages)
+
+    def advance_without_samples(self) -> None:
+        """
+        Let readings take effect that no sample will come to, so that the flag stays alive.
+
+        """
+        if self._newest_reading_ns is None:
+            return
+        horizon_ns = self._newest_reading_ns - IDLE_NS
+        for _, stamp_ns, celsius, push in self._readings:
+            if stamp_ns <= horizon_ns:
+                push(stamp_ns, celsius)
+        self._readings = [one for one in self._readings if one[1] > horizon_ns]
+        self._compensator.flush(horizon_ns)
+        self._publish_flags()
+
+    def _take_readings(self, messages: list[bytes], received_ns: list[int], push: Push) -> None:
+        for data, received in zip(messages, received_ns, strict=True):
+            reading = read_temperature(data)
+            if reading is None:
+                self.n_malformed += 1
+            else:
+                stamp_ns, celsius = reading
+                self._newest_reading_ns = stamp_ns
+                self._readings.append((received, stamp_ns, celsius, push))
+
+    def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
+        """
+        Relay up to the last reading that came before the last sample; return the rest.
+
+        """
+        start = 0
+        later: list[_Reading] = []
+        for reading in sorted(self._readings, key=lambda one: one[0]):
+            received, stamp_ns, celsius, push = reading
+            if received > received_ns[-1]:
+                later.append(reading)
+                continue
+            end = bisect_left(received_ns, received, start)
+            self._relay(messages[start:end])
+            push(stamp_ns, celsius)
+            start = end
+        self._readings = later
+        return messages[start:]
+
+    def _relay(self, messages: list[bytes]) -> None:
+        convert, process = self.converter.convert, self._compensator.process
+        for data in messages:
+            frame = convert(data, process)
+            if frame is not None:
+                try:
+                    self._publish(frame)
+                except RCLError:
+                    self._count_unpublished()
+        self._publish_flags()
+
+    def _publish_flags(self) -> None:
+        for _, is_dynamic in self._compensator.take_flags():
+            try:
+                self._publish_flag(_FLAGS[is_dynamic])
+            except RCLError:
+                self._count_unpublished()
+            self.n_flags += 1
+
+    def _count_unpublished(self) -> None:
+        """
+        Go on after a message that the middleware did not take, but not after the shutdown.
+
+        """
+        if not self._node.context.ok():
+            raise ExternalShutdownException
+        self.n_unpublished += 1
