@@ -59,6 +59,11 @@ the middleware some four times, a quarter of the node's CPU time. A sample lost 
 20 ms later than by default. A profile of yours (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
 `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) takes its place; repeat the setting there.
 
+A message wakes a thread of the middleware, and that one the node's; the system spreads them over idle cores,
+with cold caches. With `cpu_affinity` all threads keep to one core: a third less CPU time up to 2 kHz, and less
+latency ([measured](benchmarks.md#the-node)). Name a core that nothing of a higher priority holds for long. A core
+that the process was not started with (`taskset`, cpusets, `isolcpus`) is refused.
+
 `linear_acceleration_covariance` is a full 3x3: noise of the sample plus what is uncertain about the
 calibration at this thermal state. Without angular rate or orientation in the input, the first element
 of their covariance is -1 (REP 145).

@@ -15,16 +15,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from ..errors import ThermoCompError
 from ..status import CompensatorConfig
+from .affinity import ANY
 
 _DEFAULTS = CompensatorConfig()
 
-_TYPES = {str: Parameter.Type.STRING, float: Parameter.Type.DOUBLE}
+_TYPES = {
+    str: Parameter.Type.STRING,
+    float: Parameter.Type.DOUBLE,
+    int: Parameter.Type.INTEGER,
+}
 
 
 def _parameter(
@@ -49,6 +54,7 @@ class NodeConfig:
         Seconds.
     local_gravity, gravity_tolerance : float
         Metres per second squared.
+    cpu_affinity : int
 
     """
 
@@ -100,6 +106,12 @@ class NodeConfig:
         (0.0, 100.0),
     )
     diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
+    cpu_affinity: int = _parameter(
+        ANY,
+        'Core that all threads of the process keep to, for less CPU time and latency; -1 leaves '
+        'it to the system.',
+        (ANY, 4095),
+    )
 
     def compensator_config(self) -> CompensatorConfig:
         """
@@ -180,7 +192,10 @@ def descriptor(name: str) -> ParameterDescriptor:
     )
     if entry.metadata['bounds']:
         lower, upper = entry.metadata['bounds']
-        described.floating_point_range = [FloatingPointRange(from_value=lower, to_value=upper)]
+        if isinstance(entry.default, int):
+            described.integer_range = [IntegerRange(from_value=lower, to_value=upper, step=1)]
+        else:
+            described.floating_point_range = [FloatingPointRange(from_value=lower, to_value=upper)]
     if entry.metadata['choices']:
         described.additional_constraints = f'one of: {", ".join(entry.metadata["choices"])}'
     return described
@@ -249,7 +264,7 @@ def parameters_table() -> str:
     """
     rows = ['| parameter | type | default | range | what it does |', '|---|---|---|---|---|']
     for name, entry in _TABLE.items():
-        kind = 'string' if isinstance(entry.default, str) else 'double'
+        kind = _TYPES[type(entry.default)].name.lower()
         default = f"'{entry.default}'" if isinstance(entry.default, str) else f'{entry.default:g}'
         limits = ''
         if entry.metadata['bounds']:
@@ -295,11 +310,13 @@ def _checked(name: str, value: Any) -> Any:
                 f'parameter `{name}` must be one of {", ".join(choices)}, got {value!r}'
             )
         return value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ParameterError(f'parameter `{name}` must be a number, got {value!r}')
+    is_whole = isinstance(entry.default, int)
+    if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float):
+        kind = 'whole number' if is_whole else 'number'
+        raise ParameterError(f'parameter `{name}` must be a {kind}, got {value!r}')
     lower, upper = entry.metadata['bounds']
     if not (math.isfinite(value) and lower <= value <= upper):
         raise ParameterError(
             f'parameter `{name}` must be between {lower:g} and {upper:g}, got {value:g}'
         )
-    return float(value)
+    return value if is_whole else float(value)
