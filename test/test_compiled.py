@@ -240,6 +240,23 @@ def test_c_refuses_what_does_not_fit(
         correct_in_c(*wrong.values())
 
 
+def test_the_compiled_node_does_what_the_interpreted_does(tree: Path) -> None:
+    """
+    WHY: the compiler's Python is not quite Python; it could not take a slice from a variable.
+
+    WHAT: the node's own tests over DDS, of its layouts and of its loop, on the compiled way.
+
+    """
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    for name in ('conversions', 'relay', 'waitloop'):
+        assert list((tree / 'thermo_comp' / 'ros').glob(f'{name}.*.so')), name
+    for folder in ('test', 'config'):
+        shutil.copytree(ROOT / folder, tree / folder)
+    tests = [f'test/test_{name}.py' for name in ('cdr', 'waitloop', 'node', 'node_parity')]
+    finished = run('-m', 'pytest', '-q', *tests, cwd=str(tree), PYTHONPATH=str(tree))
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+
+
 def test_a_compiled_core_says_so(tree: Path) -> None:
     finished = run('-m', 'thermo_comp', '--version', cwd=str(tree))
     assert re.fullmatch(r'thermo_comp \S+ \(compiled core\)\n', finished.stdout)
