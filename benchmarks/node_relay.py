@@ -3,7 +3,7 @@
 """
 Measures the node against a naive relay: CPU time per sample, loss and latency, in one run.
 
-    python benchmarks/node_relay.py [--quick] [--floor] [--rates 400 2000] [--json FILE]
+    python benchmarks/node_relay.py [--quick] [--floor] [--core 1] [--rates 400 2000] [--json FILE]
 
 For each rate and reliability a source process publishes stamped samples at that rate and both
 temperatures at 10 Hz, a sink process receives the Imu messages, and between them runs either the
@@ -12,8 +12,9 @@ callback. The CPU time is that of the whole relay process, all its threads, from
 to the last; the latency runs from the source's publish call to the arrival in the sink's
 middleware, before any Python of the sink. Only ratios travel. The node brings its own profile for
 Fast DDS; source, sink and naive relay run without one. At the last rate the node is measured once
-more while its `calibration_file` is set twice a second. `--floor` measures a third relay, too: one
-wait set, one subscription, bytes copied, nothing computed, the node's profile.
+more while its `calibration_file` is set twice a second. `--core` keeps each relay to that core,
+the node by its `cpu_affinity`. `--floor` measures a third relay, too: one wait set, one
+subscription, bytes copied, nothing computed, the node's profile.
 
 """
 
@@ -62,6 +63,8 @@ def main() -> None:
     """
     arguments = _arguments()
     if arguments.role:
+        if arguments.role in ('naive', 'floor') and arguments.core >= 0:
+            os.sched_setaffinity(0, {arguments.core})
         _ROLES[arguments.role](arguments)
         return
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100)
@@ -72,8 +75,9 @@ def main() -> None:
         for rate in arguments.rates:
             calibration = _calibration_for(rate, Path(folder))
             for reliability in RELIABILITIES:
-                options = ['--rate', str(rate), '--reliability', reliability]
-                options += ['--seconds', str(arguments.seconds), '--calibration', calibration]
+                options = [f'--rate={rate}', f'--reliability={reliability}']
+                options += [f'--seconds={arguments.seconds}', f'--core={arguments.core}']
+                options += [f'--calibration={calibration}']
                 relays = ('naive', 'node', 'floor') if arguments.floor else ('naive', 'node')
                 runs: dict[str, list[dict[str, Any]]] = {relay: [] for relay in relays}
                 for _ in range(arguments.repeats):
@@ -81,17 +85,15 @@ def main() -> None:
                         done.append(_measure(relay, rate, arguments.seconds, options))
                 case: dict[str, Any] = {'rate': rate, 'reliability': reliability}
                 case |= {relay: _summary(done) for relay, done in runs.items()}
-                for relay in ('node', 'floor'):
-                    if relay in runs:
-                        case[relay]['cpu_ratio'] = _ratio(runs[relay], runs['naive'])
+                for relay in relays[1:]:
+                    case[relay]['cpu_ratio'] = _ratio(runs[relay], runs['naive'])
                 _print_row(case)
                 cases.append(case)
         reload = _measure('node', rate, arguments.seconds, options, reloads=True)
         _print_reload(rate, reload)
     document = {
         'machine': _machine(),
-        'seconds': arguments.seconds,
-        'repeats': arguments.repeats,
+        **{name: getattr(arguments, name) for name in ('seconds', 'repeats', 'core')},
         'cases': cases,
         'reload': {'rate': rate, **reload},
     }
@@ -105,9 +107,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument('--seconds', type=float, help='length of a run (default 10)')
     parser.add_argument('--repeats', type=int, help='runs of each case (default 3)')
     parser.add_argument('--rates', type=int, nargs='+', help=f'default {RATES}')
-    parser.add_argument(
-        '--floor', action='store_true', help='measure a loop that only copies, too'
-    )
+    parser.add_argument('--floor', action='store_true', help='a loop that only copies, too')
+    parser.add_argument('--core', type=int, default=-1, help='core for the relays (default any)')
     parser.add_argument('--json', help='write the figures to this file')
     parser.add_argument('--role', choices=tuple(_ROLES), help=argparse.SUPPRESS)
     parser.add_argument('--rate', type=int, help=argparse.SUPPRESS)
@@ -198,8 +199,7 @@ def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
 
 def _say(process: subprocess.Popen[str], word: str) -> None:
     assert process.stdin
-    process.stdin.write(word + '\n')
-    process.stdin.flush()
+    print(word, file=process.stdin, flush=True)
 
 
 def _line(process: subprocess.Popen[str]) -> str:
@@ -211,8 +211,7 @@ def _line(process: subprocess.Popen[str]) -> str:
 
 
 def _expect(process: subprocess.Popen[str], word: str) -> None:
-    line = _line(process).strip()
-    assert line == word, line
+    assert _line(process) == word + '\n'
 
 
 @contextmanager
@@ -455,6 +454,7 @@ def _node(arguments: argparse.Namespace) -> None:
 
     overrides = [
         f'calibration_file:={arguments.calibration}',
+        f'cpu_affinity:={arguments.core}',
         f'qos_overrides./accel/counts.subscription.reliability:={arguments.reliability}',
     ]
     command = [argument for override in overrides for argument in ('-p', override)]
