@@ -357,9 +357,8 @@ def _sink(arguments: argparse.Namespace) -> None:
     from thermo_comp.ros.waitloop import WaitLoop
 
     rclpy.init()
-    imu = WaitLoop(rclpy.create_node('sink')).subscribe(
-        Imu, 'imu/data_raw', _qos(arguments.reliability)
-    )
+    loop = WaitLoop(rclpy.create_node('sink'))
+    imu = loop.subscribe(Imu, 'imu/data_raw', _qos(arguments.reliability))
     stamp = struct.Struct('<iI')
     latencies: list[int] = []
     n_expected = round(arguments.rate * arguments.seconds)
@@ -377,6 +376,7 @@ def _sink(arguments: argparse.Namespace) -> None:
                 latencies.append(received - sec * 1_000_000_000 - nanosec)
         if messages and latencies:
             last = time.monotonic()
+    loop.close()
     if not latencies:
         sys.exit('nothing came out of the relay')
     percentiles = np.percentile(latencies, (50, 99, 99.9)) * 1e-6
