@@ -68,7 +68,9 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
         text=True,
     )
     if done.returncode:
-        sys.exit(f'{task} of {len(paths)} bags failed: {done.stderr.splitlines()[-1]}')
+        # One that the system ended says nothing.
+        said = done.stderr.splitlines() or [f'exit code {done.returncode}']
+        sys.exit(f'{task} of {len(paths)} bags failed: {said[-1]}')
     return dict(json.loads(done.stdout))
 
 

@@ -211,7 +211,7 @@ def _line(process: subprocess.Popen[str]) -> str:
 
 
 def _expect(process: subprocess.Popen[str], word: str) -> None:
-    assert _line(process) == word + '\n'
+    assert (line := _line(process).strip()) == word, line
 
 
 @contextmanager

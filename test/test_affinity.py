@@ -86,4 +86,4 @@ def test_a_system_without_affinities_has_no_core_to_keep_to(
     affinity = Affinity()
     affinity.keep_to(ANY)
     with pytest.raises(AffinityError, match=r'core 0 is not among those that .*none that'):
-        affinity.keep_to(0)
+        affinity.check(0)

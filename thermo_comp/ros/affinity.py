@@ -65,20 +65,14 @@ class Affinity:
 
     def keep_to(self, core: int) -> None:
         """
-        Move all threads to a core, or back to all that they had.
-
-        Parameters
-        ----------
-        core : int
-            Its number, or `ANY`.
+        Move all threads to a core that `check` lets pass, or back to all that they had.
 
         Raises
         ------
         AffinityError
-            If the core is not there or the system refuses.
+            If the system refuses.
 
         """
-        self.check(core)
         if core == self._core:
             return
         cores = self._before if core == ANY else {core}

@@ -189,7 +189,6 @@ class CompensationNode:
             )
         except (RuntimeError, InvalidQosOverridesError) as error:
             raise ParameterError(f'a topic cannot be opened: {error}') from error
-        self._inputs = [samples, *(subscription for subscription, _ in temperatures)]
         converter = self._new_converter(self._config)
         return Relay(self.node, compensator, converter, samples, temperatures, imu, flag)
 
@@ -202,7 +201,7 @@ class CompensationNode:
     def _snapshot(self) -> Snapshot:
         relay, converter = self._relay, self._relay.converter
         last = converter.last_result
-        found = [one.subscription.get_publisher_count() for one in self._inputs]
+        found = [one.subscription.get_publisher_count() for one in relay.inputs]
         traffic = Traffic(
             n_lost=self._n_lost,
             n_unpublished=relay.n_unpublished,
@@ -292,7 +291,7 @@ class CompensationNode:
             relay.converter = self._new_converter(config)
         if config.input != before.input:
             self._loop.unsubscribe(relay.samples)
-            relay.samples = self._inputs[0] = self._open_samples(config)
+            relay.samples = self._open_samples(config)
         if config.diagnostics_period != before.diagnostics_period:
             self._loop.call_every(config.diagnostics_period, self._report)
         self._keep_to_core()

@@ -85,6 +85,14 @@ class Relay:
         #: Changes of the flag.
         self.n_flags = 0
 
+    @property
+    def inputs(self) -> list[RawSubscription]:
+        """
+        The samples and the readings, in the order in which they were given.
+
+        """
+        return [self.samples, *[subscription for subscription, _ in self._temperatures]]
+
     def on_data(self) -> None:
         """
         Work through everything that has arrived.
