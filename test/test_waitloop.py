@@ -351,10 +351,23 @@ def test_a_paced_drain_leaves_nothing_behind_for_long(node: Node, peer: Peer) ->
     assert paced.interval_ns > 0
 
 
-@pytest.mark.parametrize(('rest_s', 'is_resting'), [(1000.0, True), (1e-9, False)])
+@pytest.mark.parametrize(
+    ('interval_s', 'is_resting'),
+    [
+        pytest.param(None, True, id='as measured'),
+        pytest.param(749.0, True, id='four in three rests'),
+        pytest.param(751.0, False, id='hardly more than one in a rest'),
+        pytest.param(0.0, False, id='a middleware that does not tell the time'),
+    ],
+)
 def test_only_messages_that_crowd_gather(
-    node: Node, peer: Peer, monkeypatch: pytest.MonkeyPatch, rest_s: float, is_resting: bool
+    node: Node,
+    peer: Peer,
+    monkeypatch: pytest.MonkeyPatch,
+    interval_s: float | None,
+    is_resting: bool,
 ) -> None:
+    rest_s = 1000.0
     rests: list[float] = []
     monkeypatch.setattr('thermo_comp.ros.waitloop.time.sleep', rests.append)
     loop = WaitLoop(node, rest_s)
@@ -366,6 +379,8 @@ def test_only_messages_that_crowd_gather(
         nonlocal n_taken
         with news:
             n_taken += len(raw.drain(is_paced=True)[0])
+            if interval_s is not None:
+                raw.interval_ns = int(interval_s * 1e9)
             news.notify_all()
 
     thread = threading.Thread(target=loop.run, args=(take,), daemon=True)

@@ -197,7 +197,8 @@ class WaitLoop:
     node : rclpy.node.Node
         The node to serve. It must not be added to another executor.
     rest_s : float, optional
-        Messages that come more often than this gather until so long after each wake-up [s].
+        Messages gather until so long after each wake-up [s], where they come often enough for it:
+        four within three such times, so that a rest is not for one alone.
 
     """
 
@@ -367,6 +368,7 @@ class WaitLoop:
         """
         wait = entities.wait_set.wait
         rest_ns = int(self._rest_s * 1e9)
+        crowd_ns = rest_ns * 3 // 4
         now_ns, others_due_ns = time.monotonic_ns, 0
         is_full = True
         while not (self._is_stopping or self._is_stale):
@@ -388,7 +390,7 @@ class WaitLoop:
                 woken_ns = now_ns()
                 on_data()
                 # No interval at all: the middleware does not tell the time.
-                if 0 < self._hot[0].interval_ns < rest_ns:
+                if 0 < self._hot[0].interval_ns < crowd_ns:
                     left_ns = woken_ns + rest_ns - now_ns()
                     if left_ns > 0:
                         time.sleep(left_ns * 1e-9)
