@@ -54,6 +54,7 @@ CORE = [
     'regime',
     'ros/conversions',
     'ros/relay',
+    'ros/scheduling',
     'ros/waitloop',
     'sample_guard',
     'thermal',

@@ -7,6 +7,7 @@ The one file that leaves rclpy's documented API: these tests fail loudly when rc
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 import rclpy
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -27,6 +29,7 @@ from ros_helpers import DEEP, TIMEOUT, Peer
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from thermo_comp.ros.scheduling import LATE_NS, LIMIT
 from thermo_comp.ros.waitloop import (
     OTHERS_PERIOD_NS,
     RawPublisher,
@@ -34,6 +37,9 @@ from thermo_comp.ros.waitloop import (
     WaitLoop,
     undeclared_overrides,
 )
+
+RELIABLE = QoSProfile(depth=2000)
+BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 @pytest.fixture
@@ -352,18 +358,20 @@ def test_a_paced_drain_leaves_nothing_behind_for_long(node: Node, peer: Peer) ->
 
 
 @pytest.mark.parametrize(
-    ('interval_s', 'is_resting'),
+    ('qos', 'interval_s', 'is_resting'),
     [
-        pytest.param(None, True, id='as measured'),
-        pytest.param(749.0, True, id='four in three rests'),
-        pytest.param(751.0, False, id='hardly more than one in a rest'),
-        pytest.param(0.0, False, id='a middleware that does not tell the time'),
+        pytest.param(BEST_EFFORT, None, True, id='as measured'),
+        pytest.param(BEST_EFFORT, 749.0, True, id='four in three rests'),
+        pytest.param(BEST_EFFORT, 751.0, False, id='hardly more than one in a rest'),
+        pytest.param(BEST_EFFORT, 0.0, False, id='a middleware that does not tell the time'),
+        pytest.param(RELIABLE, None, False, id='reliable'),
     ],
 )
-def test_only_messages_that_crowd_gather(
+def test_only_best_effort_messages_that_crowd_gather(
     node: Node,
     peer: Peer,
     monkeypatch: pytest.MonkeyPatch,
+    qos: QoSProfile,
     interval_s: float | None,
     is_resting: bool,
 ) -> None:
@@ -371,7 +379,7 @@ def test_only_messages_that_crowd_gather(
     rests: list[float] = []
     monkeypatch.setattr('thermo_comp.ros.waitloop.time.sleep', rests.append)
     loop = WaitLoop(node, rest_s)
-    raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=2000))
+    raw = loop.subscribe(Vector3Stamped, 'samples', qos)
     n_taken = 0
     news = threading.Condition()
 
@@ -386,6 +394,7 @@ def test_only_messages_that_crowd_gather(
     thread = threading.Thread(target=loop.run, args=(take,), daemon=True)
     thread.start()
     publisher = peer.publisher(Vector3Stamped, 'samples')
+    peer.poll(raw.subscription.get_publisher_count, 'the publisher')
     for n_sent in range(1, 6):
         publisher.publish(Vector3Stamped())
         with news:
@@ -396,3 +405,68 @@ def test_only_messages_that_crowd_gather(
     loop.close()
     assert bool(rests) == is_resting
     assert all(0.0 < rest <= rest_s for rest in rests)
+
+
+@pytest.mark.skipif(not hasattr(os, 'sched_setscheduler'), reason='no policies on this system')
+@pytest.mark.parametrize(
+    ('qos', 'delay_ns', 'is_courteous'),
+    [
+        pytest.param(BEST_EFFORT, 0, True, id='best effort'),
+        pytest.param(BEST_EFFORT, 10 * LATE_NS, False, id='best effort, but late'),
+        pytest.param(RELIABLE, 0, False, id='reliable'),
+    ],
+)
+def test_only_a_best_effort_loop_that_is_in_time_takes_the_core_from_nobody(
+    node: Node, peer: Peer, qos: QoSProfile, delay_ns: int, is_courteous: bool
+) -> None:
+    loop = WaitLoop(node)
+    raw = loop.subscribe(Vector3Stamped, 'samples', qos)
+    policies: list[int] = []
+    news = threading.Condition()
+
+    def take() -> None:
+        messages, _ = raw.drain(is_paced=True)
+        if messages:
+            raw.delay_ns = delay_ns
+            with news:
+                policies.append(os.sched_getscheduler(0))
+                news.notify_all()
+
+    after: list[int] = []
+
+    def run() -> None:
+        loop.run(take)
+        after.append(os.sched_getscheduler(0))
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    publisher = peer.publisher(Vector3Stamped, 'samples')
+    peer.poll(raw.subscription.get_publisher_count, 'the publisher')
+    for n_sent in range(1, 3 * LIMIT):
+        publisher.publish(Vector3Stamped())
+        with news:
+            assert news.wait_for(lambda n=n_sent: len(policies) >= n, TIMEOUT)
+    loop.stop()
+    thread.join(TIMEOUT)
+    assert not thread.is_alive()
+    loop.close()
+    assert policies[-1] == (os.SCHED_BATCH if is_courteous else os.SCHED_OTHER)
+    assert after == [os.SCHED_OTHER]
+
+
+def test_a_drain_tells_how_long_its_first_message_waited(node: Node, peer: Peer) -> None:
+    loop = WaitLoop(node)
+    raw = loop.subscribe(Vector3Stamped, 'samples', RELIABLE)
+    publisher = peer.publisher(Vector3Stamped, 'samples')
+    publisher.publish(Vector3Stamped())
+    assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
+    time.sleep(0.05)
+    publisher.publish(Vector3Stamped())
+    assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
+    before_ns = time.time_ns()
+    _, received_ns = raw.drain()
+    assert len(received_ns) == 2
+    assert 0.05e9 <= before_ns - received_ns[0] <= raw.delay_ns <= time.time_ns() - received_ns[0]
+    raw.drain()
+    assert raw.delay_ns == 0
+    loop.close()

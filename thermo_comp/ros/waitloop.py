@@ -8,8 +8,8 @@ times the compensation itself. Here the subscriptions of the hot path are kept f
 one wait set is reused, and a wake-up empties their queues. Everything else of the node (services,
 timers, other subscriptions, middleware events) is served by an ordinary executor, which is asked
 only when the wait set says that one of these is ready; while samples flow, the wait set holds them
-now and then only. Messages that come faster than anybody waits for them may gather a little, so
-that one wake-up serves several.
+now and then only. With best effort, where wake-ups cost the most, messages that come faster than
+anybody waits for them may gather a little, so that one wake-up serves several.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message` and `publish_raw` of the handles, `SignalHandlerGuardCondition`, and the node's
@@ -35,10 +35,12 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerGuardCondition
 from rclpy.subscription import Subscription
+
+from .scheduling import Courtesy
 
 #: The most messages taken in one go, so that a flood cannot keep the rest of the node waiting.
 DRAIN_LIMIT = 4096
@@ -66,6 +68,8 @@ class RawSubscription:
 
     def __init__(self, subscription: Subscription) -> None:
         self.subscription = subscription
+        #: Whether messages that did not arrive are not sent again.
+        self.is_best_effort = subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT
         self._message_type = subscription.msg_type
         self._take: Callable[[Any, bool], Any] = subscription.handle.take_message
         self._sequence: int | None = None
@@ -74,6 +78,8 @@ class RawSubscription:
         self.n_lost = 0
         #: What lay between the last two messages, on average over one drain [ns].
         self.interval_ns = 0
+        #: How long the first message of the last drain had waited for it [ns].
+        self.delay_ns = 0
 
     def drain(self, *, is_paced: bool = False) -> tuple[list[bytes], list[int]]:
         """
@@ -98,7 +104,9 @@ class RawSubscription:
         take, message_type = self._take, self._message_type
         taken = take(message_type, True)
         if taken is None:
+            self.delay_ns = 0
             return messages, received_ns
+        taken_ns = time.time_ns()
         before_ns = newest_ns = self._newest_ns
         while taken is not None:
             message, info = taken
@@ -112,6 +120,7 @@ class RawSubscription:
             taken = take(message_type, True)
         self._newest_ns = newest_ns
         self.interval_ns = (newest_ns - before_ns) // len(messages)
+        self.delay_ns = taken_ns - received_ns[0] if received_ns[0] else 0
         self._count_lost(info['publication_sequence_number'], len(messages))
         return messages, received_ns
 
@@ -197,8 +206,9 @@ class WaitLoop:
     node : rclpy.node.Node
         The node to serve. It must not be added to another executor.
     rest_s : float, optional
-        Messages gather until so long after each wake-up [s], where they come often enough for it:
-        four within three such times, so that a rest is not for one alone.
+        Messages of a best-effort subscription gather until so long after each wake-up [s], where
+        they come often enough for it: four within three such times, so that a rest is not for one
+        alone.
 
     """
 
@@ -214,6 +224,7 @@ class WaitLoop:
         self._reserved.can_execute = _is_no_subscription
         self._raw: list[RawSubscription] = []
         self._hot: list[RawSubscription] = []
+        self._courtesy = Courtesy()
         self._is_stopping = False
         self._is_stale = True
         self._period_ns = _NEVER_NS
@@ -316,7 +327,13 @@ class WaitLoop:
         try:
             while not self._is_stopping:
                 with ExitStack() as in_use:
-                    self._serve(on_data, self._collect(in_use))
+                    entities = self._collect(in_use)
+                    rest_ns = 0
+                    # Only there a wake-up costs more than to sleep a little.
+                    if all(one.is_best_effort for one in self._hot):
+                        in_use.enter_context(self._courtesy)
+                        rest_ns = int(self._rest_s * 1e9)
+                    self._serve(on_data, entities, rest_ns)
         except (RCLError, ExternalShutdownException):
             if self._node.context.ok():
                 raise
@@ -361,13 +378,12 @@ class WaitLoop:
         self._is_stale = False
         return _Entities(wait_set, hot, fill, range(len(raw), len(raw) + len(others)))
 
-    def _serve(self, on_data: Callable[[], None], entities: _Entities) -> None:
+    def _serve(self, on_data: Callable[[], None], entities: _Entities, rest_ns: int) -> None:
         """
         Wait and serve until the entities change or the loop is to stop.
 
         """
         wait = entities.wait_set.wait
-        rest_ns = int(self._rest_s * 1e9)
         crowd_ns = rest_ns * 3 // 4
         now_ns, others_due_ns = time.monotonic_ns, 0
         is_full = True
@@ -389,6 +405,7 @@ class WaitLoop:
                 wait(left_ns)
                 woken_ns = now_ns()
                 on_data()
+                self._courtesy.note(self._hot[0].delay_ns, woken_ns)
                 # No interval at all: the middleware does not tell the time.
                 if 0 < self._hot[0].interval_ns < crowd_ns:
                     left_ns = woken_ns + rest_ns - now_ns()
