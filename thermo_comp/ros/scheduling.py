@@ -21,7 +21,7 @@ from types import TracebackType
 #: A thread that gets a sample so long after the middleware had it is late [ns].
 LATE_NS = 500_000
 
-#: As often late as this, out of four times as many wake-ups, and it does not wait for others.
+#: So many late wake-ups in a row are too many, and so is any more than a quarter in the long run.
 LIMIT = 8
 
 #: For so long; then it tries again [ns].
@@ -38,7 +38,7 @@ class Courtesy:
     """
 
     def __init__(self) -> None:
-        self._is_possible = hasattr(os, 'sched_setscheduler')
+        self._is_possible = hasattr(os, 'SCHED_BATCH')  # Linux
         self._is_entered = self._is_on = False
         self._lateness = 0
         self._retry_ns = 0
