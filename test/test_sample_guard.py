@@ -93,11 +93,13 @@ def test_few_equal_samples_are_chance_however_long_they_take(rng):
     st.lists(st.sampled_from([1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]), max_size=40),
     st.lists(st.integers(1, 300), min_size=1, max_size=10),
     st.sampled_from([0, 1, 49, 60]),
+    st.sampled_from([2, 3, 1000]),
 )
-@settings(max_examples=200, deadline=None)
-def test_standstills_are_found_however_long_the_batch(lengths, cuts, period):
-    # Runs of equal samples, each of one value that differs from its neighbours' in one axis.
-    values = np.repeat(np.arange(len(lengths)), lengths)
+@settings(max_examples=300, deadline=None)
+def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_values):
+    # Runs of equal samples, each of one value that differs from its neighbours' in one axis; with
+    # few values samples far from each other are equal by chance.
+    values = np.repeat(np.arange(len(lengths)) % n_values, lengths)
     samples = np.stack([values * (k == values % 3) for k in range(3)], axis=1) + 1.0
     stamps = np.arange(len(values), dtype=np.int64) * 20_000_000
     one, many = (StuckWatch(period / 50.0) for _ in range(2))

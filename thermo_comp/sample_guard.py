@@ -22,6 +22,10 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 
 #: Fewer equal samples in a row than this are chance, however far they lie apart.
 STUCK_SAMPLES: Final = 50
+#: Of so many equal samples in a row two neighbouring probes are part, and all between them.
+_PROBE_STEP: Final = STUCK_SAMPLES // 2
+#: With more probes that equal their neighbour each sample is compared with the one before.
+_MAX_LOOKS: Final = 16
 #: Samples may come this many times as fast as the calibrated cycle in the long run ...
 LARGEST_RATE: Final = 1.5
 #: ... with so many of them, or so many seconds' worth, at once (a driver that empties a buffer).
@@ -140,10 +144,17 @@ def _may_stand_still(samples: npt.NDArray[np.float64]) -> bool:
     Look at a few samples whether `STUCK_SAMPLES` in a row may be equal anywhere.
 
     """
-    probes = samples[:: STUCK_SAMPLES // 2]
+    probes = samples[::_PROBE_STEP]
     # Most differ in any one component already.
     same = np.flatnonzero(probes[1:, 0] == probes[:-1, 0])
-    return bool((probes[same + 1, 1:] == probes[same, 1:]).all(axis=1).any())
+    same = same[(probes[same + 1, 1:] == probes[same, 1:]).all(axis=1)]
+    if len(same) > _MAX_LOOKS:
+        return True
+    # Two probes may be equal by chance; all that lie between them hardly are.
+    for first in (same * _PROBE_STEP).tolist():
+        if bool((samples[first + 1 : first + _PROBE_STEP] == samples[first]).all()):
+            return True
+    return False
 
 
 class RateWatch:
