@@ -14,7 +14,11 @@ middleware, before any Python of the sink. Only ratios travel. The node brings i
 Fast DDS; source, sink and naive relay run without one. At the last rate the node is measured once
 more while its `calibration_file` is set twice a second. `--core` keeps each relay to that core,
 the node by its `cpu_affinity`. `--floor` measures a third relay, too: one wait set, one
-subscription, bytes copied, nothing computed, the node's profile.
+subscription, bytes copied, nothing computed, the node's profile. What is measured is the package
+that Python finds: the installed one, compiled or not, or the source of an editable install.
+
+A virtual machine may be stopped by its host; while it is, no process gets on. How much of the time
+that was stands behind each row ("stolen"): latencies say something where it is small.
 
 """
 
@@ -24,49 +28,32 @@ import argparse
 import json
 import os
 import platform
-import select
 import statistics
-import struct
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from thermo_comp import is_compiled
+from relay_roles import RELIABILITIES
+
+import thermo_comp
 
 ROOT = Path(__file__).resolve().parent.parent
 RATES = (100, 400, 1000, 2000, 5000, 10000)
-RELIABILITIES = ('best_effort', 'reliable')
-DEPTH = 2000
-#: The sink calls it a day when nothing came for this long.
-SILENCE_S = 2.0
-#: The first sample may take this long.
-PATIENCE_S = 30.0
-#: It looks this often for what has arrived.
-SINK_REST_S = 2e-3
-
+ROLES = ROOT / 'benchmarks' / 'relay_roles.py'
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
-COUNTS = struct.Struct('<4siII7s5x3d')
-ENCAPSULATION = b'\0\1\0\0'
-#: The frame_id goes through any relay: it tells the samples that count from those before them.
-WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 
 def main() -> None:
     """
-    Run all cases, or, in a subprocess, one role of one case.
+    Run all cases.
 
     """
     arguments = _arguments()
-    if arguments.role:
-        if arguments.role in ('naive', 'floor') and arguments.core >= 0:
-            os.sched_setaffinity(0, {arguments.core})
-        _ROLES[arguments.role](arguments)
-        return
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     print(_machine(), flush=True)
@@ -110,18 +97,11 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument('--floor', action='store_true', help='a loop that only copies, too')
     parser.add_argument('--core', type=int, default=-1, help='core for the relays (default any)')
     parser.add_argument('--json', help='write the figures to this file')
-    parser.add_argument('--role', choices=tuple(_ROLES), help=argparse.SUPPRESS)
-    parser.add_argument('--rate', type=int, help=argparse.SUPPRESS)
-    parser.add_argument('--reliability', choices=RELIABILITIES, help=argparse.SUPPRESS)
-    parser.add_argument('--calibration', help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     arguments.seconds = arguments.seconds or (3.0 if arguments.quick else 10.0)
     arguments.repeats = arguments.repeats or (1 if arguments.quick else 3)
     arguments.rates = arguments.rates or ((400, 2000, 10000) if arguments.quick else RATES)
     return arguments
-
-
-# --- the parent ----------------------------------------------------------------------------------
 
 
 def _calibration_for(rate: int, folder: Path) -> str:
@@ -157,8 +137,9 @@ def _measure(
             _expect(reloader, 'ready')
         _say(source, 'go')
         _expect(source, 'start')
-        before = _cpu_time(middle.pid)
+        before, times = _cpu_time(middle.pid), _machine_time()
         _expect(source, 'end')
+        stolen, spent = (new - old for new, old in zip(_machine_time(), times, strict=True))
         received = json.loads(_line(sink))
         cpu = _cpu_time(middle.pid) - before
         if reloader:
@@ -170,6 +151,7 @@ def _measure(
         'n_sent': n_sent,
         'n_lost': n_sent - n_received,
         'cpu_us': cpu / n_received * 1e6,
+        'stolen': stolen / spent if spent else 0.0,
         **received,
     }
 
@@ -180,7 +162,7 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
     """
     summary = {name: sum(run[name] for run in runs) for name in ('n_sent', 'n_lost')}
-    for name in ('cpu_us', 'p50_ms', 'p99_ms', 'p999_ms'):
+    for name in ('cpu_us', 'stolen', 'p50_ms', 'p99_ms', 'p999_ms'):
         summary[name] = statistics.median(run[name] for run in runs)
     return summary
 
@@ -216,8 +198,9 @@ def _expect(process: subprocess.Popen[str], word: str) -> None:
 
 @contextmanager
 def _process(role: str, options: list[str]) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, str(Path(__file__).resolve()), '--role', role, *options]
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    command = [sys.executable, str(ROLES), role, *options]
+    # The very package that is found here, installed or not.
+    environment = {**os.environ, 'PYTHONPATH': str(Path(thermo_comp.__file__).parents[1])}
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     )
@@ -242,6 +225,19 @@ def _cpu_time(pid: int) -> float:
     return time.clock_gettime((~pid << 3) | 2)
 
 
+def _machine_time() -> tuple[int, int]:
+    """
+    Give the time that the host took from this machine, and all that has passed; of all cores.
+
+    """
+    file = Path('/proc/stat')
+    if not file.is_file():
+        return 0, 0
+    # user nice system idle iowait irq softirq steal
+    ticks = [int(field) for field in file.read_text(encoding='utf-8').split()[1:9]]
+    return ticks[7], sum(ticks)
+
+
 def _print_row(case: dict[str, Any]) -> None:
     naive, node = case['naive'], case['node']
     latencies = [
@@ -252,7 +248,8 @@ def _print_row(case: dict[str, Any]) -> None:
         f'{case["rate"]:6d} Hz {case["reliability"]:11s} CPU/sample {node["cpu_us"]:6.1f} us = '
         f'{node["cpu_ratio"]:.3f} x naive ({naive["cpu_us"]:6.1f})   '
         f'lost {node["n_lost"]} ({naive["n_lost"]})   '
-        f'p50/p99/p99.9 {latencies[0]} ms ({latencies[1]})'
+        f'p50/p99/p99.9 {latencies[0]} ms ({latencies[1]})   '
+        f'stolen {node["stolen"]:.1%} ({naive["stolen"]:.1%})'
         + (f'   floor {case["floor"]["cpu_ratio"]:.3f}' if 'floor' in case else ''),
         flush=True,
     )
@@ -262,7 +259,8 @@ def _print_reload(rate: int, run: dict[str, Any]) -> None:
     times = run['reload_ms']
     print(
         f'{rate:6d} Hz with {len(times)} reloads: answered in {statistics.median(times):.1f} ms '
-        f'(median), {max(times):.1f} ms (worst); lost {run["n_lost"]}; p99 {run["p99_ms"]:.2f} ms'
+        f'(median), {max(times):.1f} ms (worst); lost {run["n_lost"]}; '
+        f'p99 {run["p99_ms"]:.2f} ms; stolen {run["stolen"]:.1%}'
     )
 
 
@@ -272,229 +270,10 @@ def _machine() -> str:
     if info.is_file():
         lines = info.read_text(encoding='utf-8').splitlines()
         model = next((line.split(':')[1].strip() for line in lines if 'model name' in line), model)
-    core = 'compiled' if is_compiled() else 'interpreted'
+    core = 'compiled' if thermo_comp.is_compiled() else 'interpreted'
     python = platform.python_version()
     return f'{model}, {os.cpu_count()} cores, Python {python}, {core} core'
 
-
-# --- the processes -------------------------------------------------------------------------------
-
-
-def _qos(reliability: str) -> Any:
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
-
-    return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy[reliability.upper()])
-
-
-def _source(arguments: argparse.Namespace) -> None:
-    """
-    Publish samples at the rate, temperatures at 10 Hz.
-
-    """
-    import rclpy
-    from geometry_msgs.msg import Vector3Stamped
-    from rclpy.serialization import serialize_message
-    from sensor_msgs.msg import Temperature
-
-    rclpy.init()
-    node = rclpy.create_node('source')
-    # Reliable, so that it matches either kind of subscription.
-    counts = node.create_publisher(Vector3Stamped, 'accel/counts', _qos('reliable'))
-    temperatures = [
-        node.create_publisher(Temperature, f'temperature/{name}', _qos('reliable'))
-        for name in ('board', 'case')
-    ]
-    reading = Temperature(temperature=21.0)
-
-    def publish_temperatures() -> None:
-        now = time.time_ns()
-        reading.header.stamp.sec, reading.header.stamp.nanosec = divmod(now, 1_000_000_000)
-        for publisher in temperatures:
-            publisher.publish(serialize_message(reading))
-
-    def publish(index: int, frame: bytes) -> None:
-        sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
-        # A unit that stands, with a count or two of noise: anything else the node would doubt.
-        x, y, z = 5.0 + index % 3, -3.0 + index % 2, 2950.0 + index % 5
-        counts.publish(COUNTS.pack(ENCAPSULATION, sec, nanosec, 7, frame, x, y, z))
-
-    def run(n: int, frame: bytes, until: Callable[[], bool]) -> None:
-        period, tenth = 1e9 / arguments.rate, max(1, arguments.rate // 10)
-        start = time.monotonic_ns()
-        n_sent = 0
-        while n_sent < n and not until():
-            due = min(n, int((time.monotonic_ns() - start) / period) + 1)
-            for index in range(n_sent, due):
-                if index % tenth == 0:
-                    publish_temperatures()
-                publish(index, frame)
-            n_sent = due
-            wait = start + n_sent * period - time.monotonic_ns()
-            if wait > 0:
-                time.sleep(wait * 1e-9)
-
-    # Warm up until the sink has seen something, and go on until then at the very rate.
-    run(sys.maxsize, WARM_UP, lambda: bool(select.select([sys.stdin], [], [], 0)[0]))
-    time.sleep(0.5)
-    print('start', flush=True)
-    run(round(arguments.rate * arguments.seconds), SAMPLE, lambda: False)
-    print('end', flush=True)
-    sys.stdin.read()
-
-
-def _sink(arguments: argparse.Namespace) -> None:
-    """
-    Receive Imu messages until all are there or silence; print count and latency percentiles.
-
-    The middleware notes when each message arrived, so they may wait here: a sink that woke up for
-    each would take the relay's core away.
-
-    """
-    import numpy as np
-    import rclpy
-    from sensor_msgs.msg import Imu
-
-    from thermo_comp.ros.waitloop import WaitLoop
-
-    rclpy.init()
-    loop = WaitLoop(rclpy.create_node('sink'))
-    imu = loop.subscribe(Imu, 'imu/data_raw', _qos(arguments.reliability))
-    stamp = struct.Struct('<iI')
-    latencies: list[int] = []
-    n_expected = round(arguments.rate * arguments.seconds)
-    last = time.monotonic() + PATIENCE_S
-    is_ready = False
-    while len(latencies) < n_expected and time.monotonic() - last < SILENCE_S:
-        time.sleep(SINK_REST_S)
-        messages, received_ns = imu.drain()
-        if messages and not is_ready:
-            is_ready = True
-            print('ready', flush=True)
-        for data, received in zip(messages, received_ns, strict=True):
-            if data[16:23] != WARM_UP:
-                sec, nanosec = stamp.unpack_from(data, 4)
-                latencies.append(received - sec * 1_000_000_000 - nanosec)
-        if messages and latencies:
-            last = time.monotonic()
-    loop.close()
-    if not latencies:
-        sys.exit('nothing came out of the relay')
-    percentiles = np.percentile(latencies, (50, 99, 99.9)) * 1e-6
-    figures = dict(zip(('p50_ms', 'p99_ms', 'p999_ms'), percentiles, strict=True))
-    print(json.dumps({'n': len(latencies), **figures}), flush=True)
-
-
-def _naive(arguments: argparse.Namespace) -> None:
-    """
-    Copy Vector3Stamped to Imu as the tutorials do it.
-
-    """
-    import rclpy
-    from geometry_msgs.msg import Vector3Stamped
-    from rclpy.executors import ExternalShutdownException
-    from sensor_msgs.msg import Imu
-
-    rclpy.init()
-    node = rclpy.create_node('naive')
-    publisher = node.create_publisher(Imu, 'imu/data_raw', _qos('reliable'))
-
-    def callback(message: Any) -> None:
-        imu = Imu()
-        imu.header = message.header
-        imu.linear_acceleration.x = message.vector.x
-        imu.linear_acceleration.y = message.vector.y
-        imu.linear_acceleration.z = message.vector.z
-        publisher.publish(imu)
-
-    node.create_subscription(Vector3Stamped, 'accel/counts', callback, _qos(arguments.reliability))
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
-
-
-def _floor(arguments: argparse.Namespace) -> None:
-    """
-    Copy the bytes of one subscription to a publisher around one wait set.
-
-    """
-    import rclpy
-    from geometry_msgs.msg import Vector3Stamped
-    from rclpy.impl.implementation_singleton import rclpy_implementation
-    from sensor_msgs.msg import Imu
-
-    from thermo_comp.ros.middleware import use_profile
-
-    use_profile()
-    rclpy.init()
-    node = rclpy.create_node('floor')
-    publisher = node.create_publisher(Imu, 'imu/data_raw', _qos('reliable'))
-    subscription = node.create_subscription(
-        Vector3Stamped, 'accel/counts', print, _qos(arguments.reliability), raw=True
-    )
-    take, publish = subscription.handle.take_message, publisher.handle.publish_raw
-    # The frame_id of both kinds of samples is as long, so the values always stand at the end.
-    head, frame = COUNTS.size - 24, bytearray(COUNTS.size - 24 + 37 * 8)
-    with subscription.handle, node.context.handle:
-        wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
-        while True:
-            wait_set.clear_entities()
-            wait_set.add_subscription(subscription.handle)
-            wait_set.wait(-1)
-            while (taken := take(Vector3Stamped, True)) is not None:
-                frame[:head] = taken[0][:head]
-                frame[-96:-72] = taken[0][head:]
-                publish(bytes(frame))
-
-
-def _node(arguments: argparse.Namespace) -> None:
-    """
-    Run the real node.
-
-    """
-    from thermo_comp.ros.node import main as run_node
-
-    overrides = [
-        f'calibration_file:={arguments.calibration}',
-        f'cpu_affinity:={arguments.core}',
-        f'qos_overrides./accel/counts.subscription.reliability:={arguments.reliability}',
-    ]
-    command = [argument for override in overrides for argument in ('-p', override)]
-    run_node(['thermo_comp_node', '--ros-args', '--log-level', 'FATAL', *command])
-
-
-def _reloader(arguments: argparse.Namespace) -> None:
-    """
-    Set `calibration_file` again and again; print how long each answer took.
-
-    """
-    import rclpy
-    from rcl_interfaces.srv import SetParameters
-    from rclpy.parameter import Parameter
-
-    rclpy.init()
-    node = rclpy.create_node('reloader')
-    client = node.create_client(SetParameters, 'thermo_comp/set_parameters')
-    client.wait_for_service()
-    value = Parameter('calibration_file', value=arguments.calibration).to_parameter_msg()
-    times: list[float] = []
-    print('ready', flush=True)
-    while not select.select([sys.stdin], [], [], 0.5)[0]:
-        start = time.monotonic()
-        future = client.call_async(SetParameters.Request(parameters=[value]))
-        rclpy.spin_until_future_complete(node, future, timeout_sec=10.0)
-        assert future.result().results[0].successful
-        times.append((time.monotonic() - start) * 1e3)
-    print(json.dumps(times), flush=True)
-    sys.stdin.read()
-
-
-_ROLES = {
-    'source': _source,
-    'sink': _sink,
-    'naive': _naive,
-    'floor': _floor,
-    'node': _node,
-    'reloader': _reloader,
-}
 
 if __name__ == '__main__':
     main()
