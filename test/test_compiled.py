@@ -381,4 +381,5 @@ def test_pip_is_asked_for_the_compiler(
     finished = run('-c', code, cwd=str(tmp_path), THERMO_COMP_COMPILE=wish)
     assert finished.returncode == 0, finished.stderr
     said = ast.literal_eval(finished.stdout.splitlines()[-1])
-    assert [requirement.split(';')[0] for requirement in said] == brought
+    # Older ones of setuptools add what they need themselves.
+    assert [r.split(';')[0] for r in said if not r.startswith('wheel')] == brought
