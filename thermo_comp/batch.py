@@ -11,6 +11,7 @@ the operations of `Compensator.process` in their order.
 
 from __future__ import annotations
 
+from array import array
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -35,7 +36,7 @@ class _Segments:
     """
     Runs of samples over which the correction is linear in time, as columns.
 
-    Lists of numbers, not a list of runs: objects that stay keep the garbage collector busy.
+    Columns of numbers, not a list of runs: objects that stay keep the garbage collector busy.
 
     """
 
@@ -61,8 +62,8 @@ class _Segments:
         self.is_too_fast: list[bool] = []
         self.noise_excess: list[float] = []
         #: The thermal states at both ends, one behind the other.
-        self.states: list[float] = []
-        self.end_states: list[float] = []
+        self.states = array('d')
+        self.end_states = array('d')
 
     def ends(self) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
         """
@@ -70,8 +71,8 @@ class _Segments:
 
         """
         n = len(self.start_ns)
-        states = np.array(self.states).reshape(n, -1)
-        end_states = np.array(self.end_states).reshape(n, -1)
+        states = np.frombuffer(self.states).reshape(n, -1)
+        end_states = np.frombuffer(self.end_states).reshape(n, -1)
         return tuple(states.T.copy()), tuple(end_states.T.copy())
 
 
@@ -242,8 +243,8 @@ def _add_segments(
         segments.is_new.append(is_new)
         segments.is_too_fast.append(is_too_fast)
         segments.noise_excess.append(compensator.noise_excess)
-        segments.states += tracker.sample(start_ns)
-        segments.end_states += tracker.sample(end_ns)
+        segments.states.extend(tracker.sample(start_ns))
+        segments.end_states.extend(tracker.sample(end_ns))
         first = stop
 
 

@@ -39,7 +39,7 @@ from .status import CompensatorConfig, Counters
 OUTPUT_TOPIC = 'imu/data_raw'
 REGIME_TOPIC = 'regime/dynamic'
 #: Messages corrected at once: enough that what is done per block costs little beside them.
-BLOCK_MESSAGES = 1 << 16
+BLOCK_MESSAGES = 1 << 17
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from .walk import Messages
 from .wire import Bytes, Encoding
 
 _N_LOADERS = 2
-_N_AHEAD = 3
+_N_AHEAD = 8
 _AHEAD_BYTES = 1 << 26
 _GROUP_BYTES = 1 << 20
 #: Places of one chunk are below this, so a chunk's number times it plus a place is unique.
