@@ -6,8 +6,9 @@
 # make lint   ruff, mypy --strict and the layering test
 # make nightly  the properties, ten thousand examples each
 # make fuzz   the fuzz targets, FUZZ_SECONDS (60) each
+# make bench  installs the package beside it, in .venv-bench, and measures its speed (half an hour)
 # make docs   builds the documentation as a site, in site/
-# make clean  removes .venv and everything made
+# make clean  removes .venv, .venv-bench and everything made
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -26,7 +27,7 @@ unexport COLCON_PREFIX_PATH
 unexport LD_LIBRARY_PATH
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test lint nightly fuzz docs clean help
+.PHONY: demo test lint nightly fuzz bench docs clean help
 .DEFAULT_GOAL := help
 
 help:
@@ -50,11 +51,20 @@ nightly: $(VENV)/.installed-test
 fuzz: $(VENV)/.installed-fuzz
 	$(BIN)/python fuzz/run.py all --seconds $(FUZZ_SECONDS)
 
+# Not in place: what is measured is what a user installs, compiled where there is a C compiler.
+bench: | $(BIN)/python
+	$(BIN)/python -m venv $(VENV)-bench
+	$(VENV)-bench/bin/python -m pip install -qq --disable-pip-version-check '.[ros,test]'
+	$(VENV)-bench/bin/python benchmarks/bag_read.py
+	$(VENV)-bench/bin/python benchmarks/replay.py --hours 24 --compression none
+	$(VENV)-bench/bin/python benchmarks/fit_scaling.py
+	$(VENV)-bench/bin/python benchmarks/node_relay.py
+
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir site
 
 clean:
-	rm -rf $(VENV) build install log out site *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(VENV)-bench build install log out site *.egg-info .mypy_cache .ruff_cache .pytest_cache
 
 $(BIN)/python:
 	@found=; \
