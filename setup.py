@@ -1,5 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
+import atexit
+import contextlib
 import importlib.metadata
 import importlib.util
 import os
@@ -7,6 +9,7 @@ import re
 import shutil
 import sys
 import sysconfig
+import tempfile
 from pathlib import Path
 
 from setuptools import Extension, find_packages, setup
@@ -94,7 +97,8 @@ def missing():
     """
     version = ''
     if importlib.util.find_spec('mypyc') is not None:
-        version = importlib.metadata.version(COMPILER)
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            version = importlib.metadata.version(COMPILER)
     found = tuple(int(digits) for digits in re.findall(r'\d+', version)[:2])
     if found < COMPILER_FLOOR:
         floor = '.'.join(map(str, COMPILER_FLOOR))
@@ -135,14 +139,19 @@ def compiled():
     if reason:
         stays_interpreted(f'it needs {reason}')
         return []
-    # Types of other libraries make no code here, so those need not be there.
+    # Types of other libraries make no code here, so those need not be there. Nothing is written
+    # beside the source: colcon builds elsewhere, and it may not be ours to write to.
     options = ['--config-file=', '--no-site-packages', '--ignore-missing-imports']
+    options += ['--follow-imports=silent', f'--cache-dir={os.devnull}']
+    made = tempfile.mkdtemp(prefix=f'{NAME}-')
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
     files = [f'{NAME}/{module}.py' for module in CORE]
     try:
         from mypyc.build import mypycify
 
         extensions = mypycify(
-            [*options, '--follow-imports=silent', *files],
+            [*options, *files],
+            target_dir=made,
             group_name=f'{NAME}._core',
             opt_level='1',
             debug_level='0',
