@@ -185,9 +185,9 @@ class Soak:
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
             time.sleep(1.0 / READINGS_HZ)
-        # What was sent before both ends knew each other is lost.
-        n_before = int(self.account.get('samples in', 0))
-        self.wait_for(lambda: int(self.account.get('samples in', 0)) > n_before, 'a report')
+        # What was sent before both ends knew each other is lost. A report may be here already, and
+        # be the last that says more than the one before.
+        self.wait_for(lambda: int(self.account.get('samples in', 0)) > 0, 'a report')
         n_in = -1
         while n_in != int(self.account['samples in']):
             n_in = int(self.account['samples in'])
