@@ -17,17 +17,11 @@ import pytest
 from build_helpers import ROOT, missing, run
 
 
-@pytest.mark.parametrize(
-    ('command', 'said'),
-    [
-        ('develop', 'does not go with an editable install'),
-        ('editable_wheel', 'does not go with an editable install'),
-    ],
-)
-def test_an_editable_install_is_refused(command: str, said: str) -> None:
+@pytest.mark.parametrize('command', ['develop', 'editable_wheel'])
+def test_an_editable_install_is_refused(command: str) -> None:
     finished = run('setup.py', command, cwd=str(ROOT), THERMO_COMP_COMPILE='1')
     assert finished.returncode == 1
-    assert said in finished.stderr
+    assert 'does not go with an editable install' in finished.stderr
     assert 'Traceback' not in finished.stderr
 
 
@@ -64,7 +58,7 @@ NO_MYPYC = r"^thermo_comp: the core stays interpreted: it needs mypyc .*'mypy>=1
 
 def test_without_mypyc_the_core_stays_interpreted(tmp_path: Path) -> None:
     """WHY: a vehicle's computer has no compiler, and has to get the package all the same."""
-    finished = build(tmp_path, '-c', HIDDEN)
+    finished = build(tmp_path, '-c', HIDDEN, THERMO_COMP_COMPILE='')
     assert finished.returncode == 0, finished.stderr
     assert re.search(NO_MYPYC, finished.stderr, re.MULTILINE)
     assert built(tmp_path) == []

@@ -37,6 +37,7 @@ from .walk import Messages
 from .wire import Bytes, Encoding
 
 _N_LOADERS = 2
+#: Pieces under way: what two threads read and decode while the caller works on one block.
 _N_AHEAD = 8
 _AHEAD_BYTES = 1 << 26
 _GROUP_BYTES = 1 << 20
