@@ -3,7 +3,7 @@
 """
 Measures the node against a naive relay: CPU time per sample, loss and latency, in one run.
 
-    python benchmarks/node_relay.py [--quick] [--floor] [--core 1] [--rates 400 2000] [--json FILE]
+    python benchmarks/node_relay.py [--quick] [--floor] [--core 1] [--sleep] [--rates 400]
 
 For each rate and reliability a source process publishes stamped samples at that rate and both
 temperatures at 10 Hz, a sink process receives the Imu messages, and between them runs either the
@@ -17,8 +17,12 @@ the node by its `cpu_affinity`. `--floor` measures a third relay, too: one wait 
 subscription, bytes copied, nothing computed, the node's profile. What is measured is the package
 that Python finds: the installed one, compiled or not, or the source of an editable install.
 
-A virtual machine may be stopped by its host; while it is, no process gets on. How much of the time
-that was stands behind each row ("stolen"): latencies say something where it is small.
+A core with nothing to do sleeps, and takes its time to wake; a virtual one is given to others
+meanwhile. Where the system allows it (Linux, as root) all cores are therefore kept awake for all
+relays alike, by a request for no latency in /dev/cpu_dma_latency, as cyclictest has it;
+`--sleep` leaves them alone. The host may stop a virtual machine all the same; while it does, no
+process gets on. How much of the time that was stands behind each row ("stolen"): latencies say
+something where it is small.
 
 """
 
@@ -34,7 +38,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +49,8 @@ import thermo_comp
 ROOT = Path(__file__).resolve().parent.parent
 RATES = (100, 400, 1000, 2000, 5000, 10000)
 ROLES = ROOT / 'benchmarks' / 'relay_roles.py'
+# Holds for as long as it is open: the longest time to wake, in us, a native 32-bit number.
+LATENCY_REQUEST = Path('/dev/cpu_dma_latency')
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 
 
@@ -56,9 +62,10 @@ def main() -> None:
     arguments = _arguments()
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    print(_machine(), flush=True)
     cases: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _cores_kept_awake(arguments.sleep) as awake:
+        machine = f'{_machine()}, cores {"kept awake" if awake else "may sleep"}'
+        print(machine, flush=True)
         for rate in arguments.rates:
             calibration = _calibration_for(rate, Path(folder))
             for reliability in RELIABILITIES:
@@ -79,7 +86,7 @@ def main() -> None:
         reload = _measure('node', rate, arguments.seconds, options, reloads=True)
         _print_reload(rate, reload)
     document = {
-        'machine': _machine(),
+        'machine': machine,
         **{name: getattr(arguments, name) for name in ('seconds', 'repeats', 'core')},
         'cases': cases,
         'reload': {'rate': rate, **reload},
@@ -96,6 +103,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument('--rates', type=int, nargs='+', help=f'default {RATES}')
     parser.add_argument('--floor', action='store_true', help='a loop that only copies, too')
     parser.add_argument('--core', type=int, default=-1, help='core for the relays (default any)')
+    parser.add_argument('--sleep', action='store_true', help='cores may sleep when idle')
     parser.add_argument('--json', help='write the figures to this file')
     arguments = parser.parse_args()
     arguments.seconds = arguments.seconds or (3.0 if arguments.quick else 10.0)
@@ -194,6 +202,22 @@ def _line(process: subprocess.Popen[str]) -> str:
 
 def _expect(process: subprocess.Popen[str], word: str) -> None:
     assert (line := _line(process).strip()) == word, line
+
+
+@contextmanager
+def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
+    """
+    Ask the system for cores that do not sleep while this is open; say whether it took the request.
+
+    """
+    with ExitStack() as stack:
+        asked = False
+        if not may_sleep:
+            with suppress(OSError):
+                request = stack.enter_context(LATENCY_REQUEST.open('wb', buffering=0))
+                request.write((0).to_bytes(4, sys.byteorder))
+                asked = True
+        yield asked
 
 
 @contextmanager
