@@ -35,10 +35,10 @@ ENCAPSULATION = b'\0\1\0\0'
 WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 
-def _qos(reliability: str) -> Any:
+def _qos(reliability: str, depth: int = DEPTH) -> Any:
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-    return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy[reliability.upper()])
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy[reliability.upper()])
 
 
 def _source(arguments: argparse.Namespace) -> None:
@@ -54,7 +54,8 @@ def _source(arguments: argparse.Namespace) -> None:
     rclpy.init()
     node = rclpy.create_node('source')
     # Reliable, so that it matches either kind of subscription.
-    counts = node.create_publisher(Vector3Stamped, 'accel/counts', _qos('reliable'))
+    qos = _qos('reliable', arguments.depth)
+    counts = node.create_publisher(Vector3Stamped, 'accel/counts', qos)
     temperatures = [
         node.create_publisher(Temperature, f'temperature/{name}', _qos('reliable'))
         for name in ('board', 'case')
@@ -263,6 +264,7 @@ def main() -> None:
     parser.add_argument('--reliability', choices=RELIABILITIES, required=True)
     parser.add_argument('--seconds', type=float, required=True)
     parser.add_argument('--core', type=int, default=-1)
+    parser.add_argument('--depth', type=int, required=True)
     parser.add_argument('--calibration', required=True)
     arguments = parser.parse_args()
     if arguments.role in ('naive', 'floor') and arguments.core >= 0:
