@@ -102,7 +102,7 @@ class Desk:
 
     def run(self, command: str) -> subprocess.CompletedProcess[str]:
         """
-        Run one example as it is written, in a fresh folder; it must succeed.
+        Run one example in a fresh folder, as it is written but for a wait; it must succeed.
 
         Parameters
         ----------
@@ -141,6 +141,8 @@ class Desk:
         ]
         if arguments[0] == 'play':
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+            # Nobody listens here, whom it would wait for.
+            arguments[1:1] = ['--wait', '0.5']
         if arguments[0] == 'view':
             return self._view(arguments, here)
         return self._cli(*arguments, cwd=here)
