@@ -21,6 +21,11 @@ The source keeps `--depth` samples to repeat them. With a reliable relay Fast DD
 at once what has arrived, every 859 of them; with 2000 kept, that holds the source itself up for 1
 to 3 ms each time, which says nothing of the relay.
 
+Processes that missed each other's first announcements meet at the next, 3 s later, and the one
+that then opens the other's shared memory may stand still for a third of a second: Fast DDS waits
+to see whether somebody reads there, and sends nothing meanwhile. So nothing is measured until all
+have met.
+
 A core with nothing to do sleeps, and takes its time to wake; a virtual one is given to others
 meanwhile. Where the system allows it (Linux, as root) all cores are therefore kept awake for all
 relays alike, by a request for no latency in /dev/cpu_dma_latency, as cyclictest has it;
@@ -53,6 +58,8 @@ import thermo_comp
 ROOT = Path(__file__).resolve().parent.parent
 RATES = (100, 400, 1000, 2000, 5000, 10000)
 ROLES = ROOT / 'benchmarks' / 'relay_roles.py'
+# From one announcement to the next, and three times a third of a second for those who meet.
+MEETING_S = 4.0
 # Holds for as long as it is open: the longest time to wake, in us, a native 32-bit number.
 LATENCY_REQUEST = Path('/dev/cpu_dma_latency')
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
@@ -148,6 +155,7 @@ def _measure(
         reloader = stack.enter_context(_process('reloader', options)) if reloads else None
         if reloader:
             _expect(reloader, 'ready')
+        time.sleep(MEETING_S)
         _say(source, 'go')
         _expect(source, 'start')
         before, times = _cpu_time(middle.pid), _machine_time()

@@ -203,7 +203,8 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Pee
         finally:
             stop.set()
             flooding.join(TIMEOUT)
-    assert OTHERS_PERIOD_NS <= 50_000_000
+    # A reload within 100 ms needs some for itself and some for its client.
+    assert OTHERS_PERIOD_NS <= 20_000_000
 
 
 def test_a_regular_call_goes_on_with_and_without_samples(node: Node, peer: Peer) -> None:

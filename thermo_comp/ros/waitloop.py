@@ -5,11 +5,11 @@ Owns the node's loop around one wait set, and everything that leaves rclpy's doc
 
 rclpy's executor builds a wait set, a generator and a coroutine for each message, which costs ten
 times the compensation itself. Here the subscriptions of the hot path are kept from the executor,
-one wait set is reused, and a wake-up empties their queues. Everything else of the node (services,
+their wait set is reused, and a wake-up empties their queues. The rest of the node (services,
 timers, other subscriptions, middleware events) is served by an ordinary executor, which is asked
-only when the wait set says that one of these is ready; while samples flow, the wait set holds them
-now and then only. With best effort, where wake-ups cost the most, messages that come faster than
-anybody waits for them may gather a little, so that one wake-up serves several.
+only when a wait set says that one of these is ready; while samples flow, the loop looks at it now
+and then, without waiting. With best effort, where wake-ups cost the most, messages that come
+faster than anybody waits for them may gather a little, so that one wake-up serves several.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message` and `publish_raw` of the handles, `SignalHandlerGuardCondition`, and the node's
@@ -45,9 +45,8 @@ from .scheduling import Courtesy
 #: The most messages taken in one go, so that a flood cannot keep the rest of the node waiting.
 DRAIN_LIMIT = 4096
 
-#: While samples flow, services and timers are looked after this often [ns]: a wake-up that holds
-#: them costs twice one that does not.
-OTHERS_PERIOD_NS = 50_000_000
+#: While samples flow, services and timers are looked after this often [ns].
+OTHERS_PERIOD_NS = 20_000_000
 
 #: Longer than any machine runs, and what the middleware can still count [ns].
 _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
@@ -151,35 +150,30 @@ class RawPublisher:
 @dataclass(frozen=True, slots=True)
 class _Entities:
     """
-    A wait set, and what goes into it: the hot subscriptions alone, or everything.
+    A wait set, and what goes into it; the first two guards are those that stop the loop.
 
     """
 
     wait_set: Any
-    hot: list[Any]
-    fill: list[tuple[Callable[[Any], Any], Any]]
+    content: list[tuple[Callable[[Any], Any], Any]]
     other_subscriptions: range
 
-    def fill_hot(self) -> None:
-        """
-        Leave just the hot subscriptions in the wait set.
-
-        """
-        wait_set = self.wait_set
-        # One that was ready is in there still, and is not put in anew.
-        if len(self.hot) != 1 or not wait_set.is_ready('subscription', 0):
-            wait_set.clear_entities()
-            for handle in self.hot:
-                wait_set.add_subscription(handle)
-
-    def fill_all(self) -> None:
+    def fill(self) -> None:
         """
         Put everything into the wait set.
 
         """
         self.wait_set.clear_entities()
-        for add, handle in self.fill:
+        for add, handle in self.content:
             add(handle)
+
+    def is_stop_asked(self) -> bool:
+        """
+        Tell whether one of the guards has been triggered.
+
+        """
+        is_ready = self.wait_set.is_ready
+        return bool(is_ready('guard_condition', 0) or is_ready('guard_condition', 1))
 
     def is_other_ready(self) -> bool:
         """
@@ -218,6 +212,7 @@ class WaitLoop:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._stop_guard = GuardCondition(None, None, context=node.context)
+        self._look_guard = GuardCondition(None, None, context=node.context)
         self._signal_guard = SignalHandlerGuardCondition(context=node.context)
         # Keeps the hot subscriptions from the executor.
         self._reserved = ReentrantCallbackGroup()
@@ -327,13 +322,13 @@ class WaitLoop:
         try:
             while not self._is_stopping:
                 with ExitStack() as in_use:
-                    entities = self._collect(in_use)
+                    wait_sets = self._collect(in_use)
                     rest_ns = 0
                     # Only there a wake-up costs more than to sleep a little.
                     if all(one.is_best_effort for one in self._hot):
                         in_use.enter_context(self._courtesy)
                         rest_ns = int(self._rest_s * 1e9)
-                    self._serve(on_data, entities, rest_ns)
+                    self._serve(on_data, wait_sets, rest_ns)
         except (RCLError, ExternalShutdownException):
             if self._node.context.ok():
                 raise
@@ -345,48 +340,61 @@ class WaitLoop:
         """
         self._executor.shutdown()
         self._stop_guard.destroy()
+        self._look_guard.destroy()
         self._signal_guard.destroy()
 
-    def _collect(self, in_use: ExitStack) -> _Entities:
+    def _collect(self, in_use: ExitStack) -> list[_Entities]:
         """
-        Build a wait set for all that the node has now, and the calls that fill it.
+        Build wait sets: of the hot subscriptions, of what the executor serves, of everything.
 
         """
+        node = self._node
         raw = [one.subscription for one in self._raw]
-        others = [one for one in self._node.subscriptions if one not in raw]
-        guards = [self._stop_guard, self._signal_guard]
-        timers, clients = list(self._node.timers), list(self._node.clients)
-        services = list(self._node.services)
-        for entity in (*raw, *others, *guards, *timers, *clients, *services):
+        hot = [one.subscription for one in self._hot]
+        others = [one for one in node.subscriptions if one not in raw]
+        guards = [self._stop_guard, self._signal_guard, self._look_guard]
+        served = [guards, list(node.timers), list(node.clients), list(node.services)]
+        for entity in (*raw, *others, *[one for kind in served for one in kind]):
             in_use.enter_context(entity.handle)
-        in_use.enter_context(self._node.context.handle)
-        wait_set = rclpy_implementation.WaitSet(
-            len(raw) + len(others),
-            len(guards),
-            len(timers),
-            len(clients),
-            len(services),
-            0,
-            self._node.context.handle,
-        )
-        hot = [one.subscription.handle for one in self._hot]
-        fill = [(wait_set.add_subscription, one.handle) for one in (*raw, *others)]
-        fill += [(wait_set.add_guard_condition, one.handle) for one in guards]
-        fill += [(wait_set.add_timer, one.handle) for one in timers]
-        fill += [(wait_set.add_client, one.handle) for one in clients]
-        fill += [(wait_set.add_service, one.handle) for one in services]
+        in_use.enter_context(node.context.handle)
         self._is_stale = False
-        return _Entities(wait_set, hot, fill, range(len(raw), len(raw) + len(others)))
+        return [
+            self._entities([hot, [], [], [], []], range(0)),
+            self._entities([others, *served], range(len(others))),
+            self._entities([raw + others, *served], range(len(raw), len(raw) + len(others))),
+        ]
 
-    def _serve(self, on_data: Callable[[], None], entities: _Entities, rest_ns: int) -> None:
+    def _entities(self, kinds: list[list[Any]], other_subscriptions: range) -> _Entities:
+        """
+        Build one wait set, for subscriptions, guard conditions, timers, clients and services.
+
+        """
+        counts = [len(kind) for kind in kinds]
+        wait_set = rclpy_implementation.WaitSet(*counts, 0, self._node.context.handle)
+        adds = (
+            wait_set.add_subscription,
+            wait_set.add_guard_condition,
+            wait_set.add_timer,
+            wait_set.add_client,
+            wait_set.add_service,
+        )
+        content = [
+            (add, one.handle) for add, kind in zip(adds, kinds, strict=True) for one in kind
+        ]
+        return _Entities(wait_set, content, other_subscriptions)
+
+    def _serve(
+        self, on_data: Callable[[], None], wait_sets: list[_Entities], rest_ns: int
+    ) -> None:
         """
         Wait and serve until the entities change or the loop is to stop.
 
         """
-        wait = entities.wait_set.wait
+        hot, others, everything = wait_sets
+        wait, is_ready, n_hot = hot.wait_set.wait, hot.wait_set.is_ready, len(self._hot)
         crowd_ns = rest_ns * 3 // 4
         now_ns, others_due_ns = time.monotonic_ns, 0
-        is_full = True
+        is_flowing = False
         while not (self._is_stopping or self._is_stale):
             now = now_ns()
             if now >= self._call_ns:
@@ -396,33 +404,48 @@ class WaitLoop:
                     self._call_ns = now + self._period_ns
                 self._guarded(self._callback)
                 continue
-            left_ns = min(others_due_ns, self._call_ns) - now
-            if now < others_due_ns and self._hot:
-                if is_full:
-                    entities.wait_set.clear_entities()
-                    is_full = False
-                entities.fill_hot()
-                wait(left_ns)
-                woken_ns = now_ns()
+            if not is_flowing:
+                everything.fill()
+                everything.wait_set.wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
                 on_data()
-                self._courtesy.note(self._hot[0].delay_ns, woken_ns)
-                # No interval at all: the middleware does not tell the time.
-                if 0 < self._hot[0].interval_ns < crowd_ns:
-                    left_ns = woken_ns + rest_ns - now_ns()
-                    if left_ns > 0:
-                        time.sleep(left_ns * 1e-9)
+                self._look_after(everything)
+                others_due_ns = now_ns() + OTHERS_PERIOD_NS
+                hot.fill()
+                is_flowing = n_hot > 0
                 continue
-            entities.fill_all()
-            is_full = True
-            wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
+            if n_hot > 1:
+                # One that was ready is in there still: the only one is not put in anew.
+                hot.fill()
+            wait(min(self._call_ns - now, OTHERS_PERIOD_NS))
+            woken_ns = now_ns()
+            is_flowing = any(is_ready('subscription', index) for index in range(n_hot))
             on_data()
-            others_due_ns = now_ns() + OTHERS_PERIOD_NS
-            if entities.wait_set.get_ready_entities('guard_condition'):
-                self._is_stopping = True
-            elif entities.is_other_ready():
-                # Runs one callback of the node.
-                self._guarded(partial(self._executor.spin_once, timeout_sec=0.0))
-                self._is_stale = True
+            first = self._hot[0]
+            self._courtesy.note(first.delay_ns, woken_ns)
+            if woken_ns >= others_due_ns:
+                others_due_ns = woken_ns + OTHERS_PERIOD_NS
+                # With one condition met beforehand the middleware does not prepare to wait.
+                self._look_guard.trigger()
+                others.fill()
+                others.wait_set.wait(0)
+                self._look_after(others)
+            # No interval at all: the middleware does not tell the time.
+            if 0 < first.interval_ns < crowd_ns:
+                left_ns = woken_ns + rest_ns - now_ns()
+                if left_ns > 0:
+                    time.sleep(left_ns * 1e-9)
+
+    def _look_after(self, entities: _Entities) -> None:
+        """
+        Serve one thing that is ready.
+
+        """
+        if entities.is_stop_asked():
+            self._is_stopping = True
+        elif entities.is_other_ready():
+            # Runs one callback of the node.
+            self._guarded(partial(self._executor.spin_once, timeout_sec=0.0))
+            self._is_stale = True
 
     def _guarded(self, callback: Callable[[], None]) -> None:
         """
