@@ -197,9 +197,12 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Pee
         flooding = threading.Thread(target=flood, daemon=True)
         flooding.start()
         try:
+            # Not before they flow: a loop that waits for anything serves the rest in any case.
+            running.wait_for(lambda: len(running.messages) > 100)
+            n_ticks = len(ticks)
             ordinary.publish(Bool(data=True))
             peer.call(Trigger, 'ask', Trigger.Request())
-            running.wait_for(lambda: len(ticks) > 3 and heard and len(running.messages) > 100)
+            running.wait_for(lambda: len(ticks) > n_ticks + 3 and heard)
         finally:
             stop.set()
             flooding.join(TIMEOUT)
