@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the node's loop around one wait set, and everything that leaves rclpy's documented API.
+Owns the node's loop around its wait sets, and everything that leaves rclpy's documented API.
 
 rclpy's executor builds a wait set, a generator and a coroutine for each message, which costs ten
 times the compensation itself. Here the subscriptions of the hot path are kept from the executor,
@@ -191,7 +191,7 @@ class _Entities:
 
 class WaitLoop:
     """
-    One wait set over a node: raw subscriptions for the caller, the rest for an executor.
+    A loop over a node: raw subscriptions for the caller, the rest for an executor.
 
     The node's entities are made before `run` or in a callback while it runs.
 
@@ -414,7 +414,7 @@ class WaitLoop:
                 is_flowing = n_hot > 0
                 continue
             if n_hot > 1:
-                # One that was ready is in there still: the only one is not put in anew.
+                # Those that were not ready are out; an only one is out just after a wait in vain.
                 hot.fill()
             wait(min(self._call_ns - now, OTHERS_PERIOD_NS))
             woken_ns = now_ns()
