@@ -1,0 +1,653 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the one regression: bias, scale, misalignment, attitudes, start states, given the prior.
+
+Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
+
+    N / K0 = kappa a (1 + S s) + b + B beta + o_p + walk + white,   a = (A u_p)_i g,  A = M^-1
+
+B and S are columns of one table (`unit.columns`), each in units of its RMS over the windows. All
+unknowns have Gaussian priors (attitudes: flat on the sphere); Gauss-Newton finds the mode, the
+inverse of the Hessian is the covariance. The windows enter only through the whitened columns of
+each position, so a step costs nothing that grows with the length of a recording but one product.
+
+References
+----------
+.. [1] D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992).
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve
+
+from .whitening import Whitener
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+# Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
+_JITTER = 1e-13
+_SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
+
+
+@dataclass(frozen=True)
+class Windows:
+    """
+    The data: windows sorted by position and time, with every column of the table.
+
+    Parameters
+    ----------
+    position, bag : ndarray of int, shape (n,)
+        Numbers from 0; a position lies in one bag.
+    time : ndarray, shape (n,)
+        Time since the bag's first sample [s].
+    weight : ndarray, shape (n,)
+        Samples of the window over those of a typical one.
+    mean : ndarray, shape (n, 3)
+        Mean raw samples, in input units.
+    columns : ndarray, shape (n, m)
+        Values of the columns, in their physical units, with start states at their prior mean.
+    groups : tuple of str
+        Group of each column.
+    lag : ndarray of int, shape (m,)
+        The lag whose start state moves a column; -1 for none.
+    start : ndarray, shape (n, m)
+        Derivative of each column by that state.
+    start_covariance : ndarray, shape (n_lags, n_lags)
+        Prior of the start states [K^2].
+
+    """
+
+    position: Ints
+    bag: Ints
+    time: Floats
+    weight: Floats
+    mean: Floats
+    columns: Floats
+    groups: tuple[str, ...]
+    lag: Ints
+    start: Floats
+    start_covariance: Floats
+
+    @property
+    def n_positions(self) -> int:
+        """
+        Number of positions.
+
+        """
+        return int(self.position[-1]) + 1
+
+    @property
+    def bag_of_position(self) -> Ints:
+        """
+        Bag of each position.
+
+        """
+        return self.bag[np.searchsorted(self.position, np.arange(self.n_positions))]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """
+    What is known beforehand; standard deviations, inf for nothing.
+
+    Parameters
+    ----------
+    bias_mean, bias_sd : ndarray, shape (3,)
+        [m/s^2].
+    scale_sd : float
+        Of kappa, about 1.
+    skew_sd : float
+        Of the elements of M [rad].
+    groups : dict
+        (part, group) -> sd of the weights of that group, part 'bias' [m/s^2] or 'scale'
+        (relative); a group that is absent takes no part.
+    offset_sd : float
+        Of the offset of each position and axis [m/s^2].
+    sigma : ndarray, shape (3,)
+        White noise of a typical window [m/s^2].
+    rho : ndarray, shape (3,)
+        Variance per second of the walk over that of the white noise.
+
+    """
+
+    bias_mean: Floats
+    bias_sd: Floats
+    scale_sd: float
+    skew_sd: float
+    groups: dict[tuple[str, str], float]
+    offset_sd: float
+    sigma: Floats
+    rho: Floats
+
+
+@dataclass(frozen=True)
+class State:
+    """
+    The unknowns; weights are of columns in units of their RMS.
+
+    """
+
+    kappa: Floats
+    bias: Floats
+    on_bias: Floats
+    on_scale: Floats
+    skew: Floats
+    up: Floats
+    offset: Floats
+    start: Floats
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    Places of the unknowns in the vector of parameters.
+
+    """
+
+    kappa: Ints
+    bias: Ints
+    on_bias: Ints
+    on_scale: Ints
+    skew: Ints
+    up: Ints
+    offset: Ints
+    start: Ints
+    #: All unknowns of each axis, shape (3, k); all of the unit; those of each bag.
+    axis: Ints
+    n_unit: int
+    blocks: tuple[slice, ...]
+    n: int
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """
+    The mode and its surroundings.
+
+    Parameters
+    ----------
+    state : State
+        The mode.
+    layout : Layout
+        Places of its elements.
+    precision : ndarray, shape (n,)
+        Inverse variances of the prior.
+    covariance : ndarray, shape (n_unit, n_unit)
+        Of what belongs to the unit.
+    variance : ndarray, shape (n,)
+        Of all unknowns.
+    residual : ndarray, shape (n_windows, 3)
+        Measured minus predicted [m/s^2].
+    whitened : ndarray, shape (n_windows, 3)
+        The same, whitened, in units of sigma.
+    log_evidence : float
+        Logarithm of the marginal likelihood, but for a constant of the data.
+
+    """
+
+    state: State
+    layout: Layout
+    precision: Floats
+    covariance: Floats
+    variance: Floats
+    residual: Floats
+    whitened: Floats
+    log_evidence: float
+
+
+@dataclass(frozen=True)
+class _Whitened:
+    """
+    Base columns of one axis, filtered; their Gram matrix in each position.
+
+    """
+
+    rho: float
+    gains: tuple[Floats, Floats]
+    base: Floats
+    grams: Floats
+    determinant: float
+
+
+def tangent_basis(up: Floats) -> Floats:
+    """
+    Two unit vectors across each given one, shape (n, 3, 2).
+
+    """
+    helper = np.zeros_like(up)
+    helper[np.arange(len(up)), np.argmin(np.abs(up), axis=1)] = 1.0
+    first = np.cross(up, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((first, np.cross(up, first)), axis=2)
+
+
+def inverse_misalignment(skew: Floats) -> Floats:
+    """
+    A = M^-1: from the frame to the sensitivity axes, lower triangular with a unit diagonal.
+
+    """
+    matrix = np.eye(3)
+    matrix[1, 0], matrix[2, 0], matrix[2, 1] = skew
+    return matrix
+
+
+class Regression:
+    """
+    The data of a fit, whitened once for each noise, and the Gauss-Newton on it.
+
+    Parameters
+    ----------
+    windows : Windows
+        The data.
+    gravity : float
+        Local gravity.
+    nominal_scale : ndarray, shape (3,)
+        K0 [input units per m/s^2].
+
+    """
+
+    def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:
+        self.windows = windows
+        self.gravity = gravity
+        self.measured = windows.mean / nominal_scale
+        self.rms = np.sqrt(np.mean(windows.columns**2, axis=0))
+        self.rms[self.rms == 0.0] = 1.0
+        self.weight = np.repeat(windows.weight[:, None], 3, axis=1)
+        self._whitener = Whitener(windows.position, windows.time)
+        self._columns = windows.columns / self.rms
+        # Start states move few distinct series: one per lag and power of t.
+        # What has died away is 0: numbers near the smallest that there are cost a hundred times more.
+        self._start = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
+        self.moved = np.flatnonzero(windows.lag >= 0)
+        self._base = np.hstack(
+            (np.ones((len(windows.time), 1)), self._columns, self._start[:, self.moved])
+        )
+        edges = np.searchsorted(windows.position, np.arange(windows.n_positions + 1))
+        self._rows = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        self._bags = windows.bag_of_position
+        self.n_bags = int(windows.bag.max()) + 1
+        n_lags = len(windows.start_covariance)
+        self._start_information = (
+            np.linalg.inv(windows.start_covariance) if n_lags else np.zeros((0, 0))
+        )
+        self._cache: list[_Whitened | None] = [None] * 3
+
+    def reweight(self, weight: Floats) -> None:
+        """
+        Take other weights of the windows, shape (n, 3).
+
+        """
+        self.weight = weight
+        self._cache = [None] * 3
+
+    def _whitened(self, axis: int, rho: float) -> _Whitened:
+        found = self._cache[axis]
+        if found is None or found.rho != rho:
+            gains = self._whitener.gains(self.weight[:, axis], rho)
+            base = self._whitener.filter(self._base, gains)
+            grams = np.stack([base[rows].T @ base[rows] for rows in self._rows])
+            determinant = self._whitener.log_determinant(gains)
+            found = self._cache[axis] = _Whitened(rho, gains, base, grams, determinant)
+        return found
+
+    def layout(self, prior: Prior) -> Layout:
+        """
+        Give every unknown its place, those of the unit first; -1 for columns that take no part.
+
+        """
+        groups = self.windows.groups
+        n = 0
+
+        def take(*shape: int) -> Ints:
+            nonlocal n
+            size = int(np.prod(shape))
+            n += size
+            return np.arange(n - size, n).reshape(shape)
+
+        uses = {
+            part: np.array([(part, group) in prior.groups for group in groups])
+            for part in ('bias', 'scale')
+        }
+        n_axis = 2 + sum(int(used.sum()) for used in uses.values())
+        axis = take(3, n_axis)
+        n_bias = int(uses['bias'].sum())
+        on_bias, on_scale = np.full((2, 3, len(groups)), -1)
+        on_bias[:, uses['bias']] = axis[:, 2 : 2 + n_bias]
+        on_scale[:, uses['scale']] = axis[:, 2 + n_bias :]
+        skew = take(3)
+        n_unit = n
+        n_positions = self.windows.n_positions
+        moves = uses['bias'] | uses['scale']
+        n_lags = len(self.windows.start_covariance) if (self.windows.lag[moves] >= 0).any() else 0
+        up = np.empty((n_positions, 2), dtype=np.int64)
+        offset = np.empty((n_positions, 3), dtype=np.int64)
+        start = np.empty((self.n_bags, n_lags), dtype=np.int64)
+        blocks = []
+        for bag in range(self.n_bags):
+            first = n
+            for p in np.flatnonzero(self._bags == bag):
+                up[p], offset[p] = take(2), take(3)
+            start[bag] = take(n_lags)
+            blocks.append(slice(first, n))
+        return Layout(axis[:, 0], axis[:, 1], on_bias, on_scale, skew, up, offset, start,
+                      axis, n_unit, tuple(blocks), n)
+
+    def precision(self, prior: Prior, layout: Layout) -> Floats:
+        """
+        Inverse variances of the prior, shape (n,); start states have a matrix of their own.
+
+        """
+        result = np.zeros(layout.n + 1)
+        result[layout.kappa] = prior.scale_sd**-2
+        result[layout.bias] = prior.bias_sd**-2.0
+        for part, places in (('bias', layout.on_bias), ('scale', layout.on_scale)):
+            for column, group in enumerate(self.windows.groups):
+                if (part, group) in prior.groups:
+                    result[places[:, column]] = prior.groups[part, group] ** -2
+        result[layout.skew] = prior.skew_sd**-2
+        result[layout.offset] = prior.offset_sd**-2
+        return result[:-1]
+
+    def prior_mean(self, prior: Prior, layout: Layout) -> Floats:
+        """
+        Mean of the prior; 0 for all but kappa and bias, shape (n,).
+
+        """
+        mean = np.zeros(layout.n)
+        mean[layout.kappa] = 1.0
+        mean[layout.bias] = prior.bias_mean
+        return mean
+
+    def vector(self, state: State, layout: Layout) -> Floats:
+        """
+        The unknowns as a vector; attitudes as 0, they move in the tangent plane.
+
+        """
+        result = np.zeros(layout.n + 1)
+        for name in ('kappa', 'bias', 'on_bias', 'on_scale', 'skew', 'offset'):
+            result[getattr(layout, name)] = getattr(state, name)
+        if layout.start.size:
+            result[layout.start] = state.start
+        return result[:-1]
+
+    def _moved(self, state: State, step: Floats, layout: Layout) -> State:
+        padded = np.append(step, 0.0)
+        up = state.up + np.einsum('pij,pj->pi', tangent_basis(state.up), padded[layout.up])
+        start = state.start
+        if layout.start.size:
+            start = start + padded[layout.start]
+        return State(
+            kappa=state.kappa + padded[layout.kappa],
+            bias=state.bias + padded[layout.bias],
+            on_bias=np.where(layout.on_bias >= 0, state.on_bias + padded[layout.on_bias], 0.0),
+            on_scale=np.where(layout.on_scale >= 0, state.on_scale + padded[layout.on_scale], 0.0),
+            skew=state.skew + padded[layout.skew],
+            up=up / np.linalg.norm(up, axis=1, keepdims=True),
+            offset=state.offset + padded[layout.offset],
+            start=start,
+        )
+
+    def _combination(self, state: State, p: int, axis: int, force: float) -> Floats:
+        """
+        The prediction of one position and axis, as a combination of the base columns.
+
+        """
+        n_columns = len(self.windows.groups)
+        weight = state.on_bias[axis] + state.kappa[axis] * force * state.on_scale[axis]
+        result = np.zeros(self._base.shape[1])
+        result[0] = state.kappa[axis] * force + state.bias[axis] + state.offset[p, axis]
+        result[1 : n_columns + 1] = weight
+        moved = self.moved
+        result[n_columns + 1 :] = weight[moved] * state.start[self._bags[p]][self.windows.lag[moved]]
+        return result
+
+    def residual(self, state: State) -> Floats:
+        """
+        Measured minus predicted, shape (n, 3) [m/s^2].
+
+        """
+        force = self.gravity * state.up @ inverse_misalignment(state.skew).T
+        result = np.empty_like(self.measured)
+        for p, rows in enumerate(self._rows):
+            for axis in range(3):
+                combination = self._combination(state, p, axis, float(force[p, axis]))
+                result[rows, axis] = self.measured[rows, axis] - self._base[rows] @ combination
+        return result
+
+    def _equations(self, state: State, prior: Prior, layout: Layout) -> _Equations:
+        """
+        Hessian and gradient of minus the log likelihood, and the residuals.
+
+        """
+        n_columns = len(self.windows.groups)
+        moved, lag = self.moved, self.windows.lag
+        A = inverse_misalignment(state.skew)
+        force = self.gravity * state.up @ A.T
+        tangent = tangent_basis(state.up)
+        hessian = np.zeros((layout.n, layout.n))
+        gradient = np.zeros(layout.n)
+        residual = self.residual(state)
+        white = np.empty_like(residual)
+        size = 0.0
+        used_b = np.flatnonzero(layout.on_bias[0] >= 0)
+        used_s = np.flatnonzero(layout.on_scale[0] >= 0)
+        has_start = layout.start.shape[1] > 0
+        width = layout.axis.shape[1]
+        behind = n_columns + 1 + np.arange(len(moved))
+        for axis in range(3):
+            found = self._whitened(axis, float(prior.rho[axis]))
+            sigma = float(prior.sigma[axis])
+            kappa = float(state.kappa[axis])
+            w = self._whitener.filter(residual[:, axis : axis + 1], found.gains)[:, 0]
+            white[:, axis] = w / sigma
+            size += float(w @ w) / sigma**2 + found.determinant + 2.0 * len(w) * np.log(sigma)
+            own = slice(layout.axis[axis, 0], layout.axis[axis, -1] + 1)
+            for p, rows in enumerate(self._rows):
+                a = float(force[p, axis])
+                m0 = state.start[self._bags[p]]
+                # How each unknown acts on the base: T; a weight takes its column along with what
+                # the start states add to it.
+                T = np.zeros((self._base.shape[1], width + 3 + 3 + layout.start.shape[1]))
+                scaled = T[:, 0]
+                scaled[0] = 1.0
+                scaled[1 : n_columns + 1] = state.on_scale[axis]
+                T[0, 1] = 1.0
+                at = np.arange(2, 2 + len(used_b))
+                T[1 + used_b, at] = 1.0
+                at_scale = np.arange(2 + len(used_b), width)
+                T[1 + used_s, at_scale] = kappa * a
+                if has_start:
+                    scaled[behind] = state.on_scale[axis, moved] * m0[lag[moved]]
+                    column = np.zeros((len(moved), n_columns))
+                    column[np.arange(len(moved)), moved] = m0[lag[moved]]
+                    T[n_columns + 1 :, at] = column[:, used_b]
+                    T[n_columns + 1 :, at_scale] = kappa * a * column[:, used_s]
+                    weight = state.on_bias[axis] + kappa * a * state.on_scale[axis]
+                    T[behind, width + 6 + lag[moved]] = weight[moved]
+                turned = kappa * self.gravity * scaled
+                for k, (row, source) in enumerate(_SKEW_ROWS):
+                    if row == axis:
+                        T[:, width + k] = state.up[p, source] * turned
+                T[:, width + 3 : width + 5] = np.outer(turned, A[axis] @ tangent[p])
+                T[0, width + 5] = 1.0
+                scaled *= a
+                G = T.T @ (found.grams[p] @ T) / sigma**2
+                g = T.T @ (found.base[rows].T @ w[rows]) / sigma**2
+                other = np.concatenate(
+                    (layout.skew, layout.up[p], layout.offset[p, axis : axis + 1],
+                     layout.start[self._bags[p]])
+                )
+                hessian[own, own] += G[:width, :width]
+                hessian[own, other] += G[:width, width:]
+                hessian[np.ix_(other, other)] += G[width:, width:]
+                gradient[own] += g[:width]
+                gradient[other] += g[width:]
+            hessian[layout.n_unit :, own] = hessian[own, layout.n_unit :].T
+            hessian[np.ix_(layout.skew, np.arange(own.start, own.stop))] = hessian[
+                own, layout.skew
+            ].T
+        return _Equations(hessian, gradient, residual, white, size)
+
+    def solve(
+        self, state: State, prior: Prior, n_steps: int = 6, tolerance: float = 1e-3
+    ) -> Posterior:
+        """
+        Find the mode under a prior.
+
+        Parameters
+        ----------
+        state : State
+            Where to begin.
+        prior : Prior
+            What is known, and the noise.
+        n_steps : int, optional
+            Gauss-Newton steps at most.
+        tolerance : float, optional
+            A step that promises less than this in log likelihood is the last.
+
+        Returns
+        -------
+        Posterior
+            The mode, its covariance and the evidence.
+
+        """
+        layout = self.layout(prior)
+        precision = self.precision(prior, layout)
+        mean = self.prior_mean(prior, layout)
+        for k in range(n_steps):
+            equations = self._equations(state, prior, layout)
+            hessian, away = equations.hessian, self.vector(state, layout) - mean
+            pull = precision * away
+            hessian[np.diag_indices(layout.n)] += precision
+            for places in layout.start:
+                if len(places):
+                    hessian[np.ix_(places, places)] += self._start_information
+                    pull[places] += self._start_information @ away[places]
+            factor = _Factor(hessian, layout)
+            gradient = equations.gradient - pull
+            step = factor.solve(gradient)
+            promised = 0.5 * float(step @ gradient)
+            if promised < tolerance or k == n_steps - 1:
+                break
+            state = self._moved(state, step, layout)
+        known = precision[precision > 0.0]
+        determinant = float(np.log(known).sum())
+        if layout.start.shape[1]:
+            each = np.linalg.slogdet(self._start_information)[1]
+            determinant += len(layout.start) * float(each)
+        evidence = -0.5 * (
+            equations.size
+            + float(away @ pull)
+            - 2.0 * promised
+            + factor.log_determinant
+            - determinant
+        )
+        covariance, local = factor.covariances()
+        return Posterior(
+            state,
+            layout,
+            precision,
+            covariance,
+            local,
+            equations.residual,
+            equations.white,
+            evidence,
+        )
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """
+    Of one linearisation: Hessian and gradient, residuals, whitened ones, minus twice the
+    log likelihood.
+
+    """
+
+    hessian: Floats
+    gradient: Floats
+    residual: Floats
+    white: Floats
+    size: float
+
+
+class _Factor:
+    """
+    The Hessian, factored: what belongs to one bag alone is eliminated first.
+
+    """
+
+    def __init__(self, hessian: Floats, layout: Layout) -> None:
+        n = layout.n_unit
+        self._n, self._blocks = n, layout.blocks
+        root = np.sqrt(np.diag(hessian))
+        self._root = root
+        scaled = hessian / np.outer(root, root)
+        unit = scaled[:n, :n].copy()
+        self.log_determinant = 2.0 * float(np.log(root).sum())
+        self._locals = []
+        for block in layout.blocks:
+            factor = cho_factor(scaled[block, block] + _JITTER * np.eye(block.stop - block.start))
+            cross = cho_solve(factor, scaled[block, :n])
+            unit -= scaled[:n, block] @ cross
+            self._locals.append((factor, cross))
+            self.log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
+        self._unit = cho_factor(unit + _JITTER * np.eye(n))
+        self.log_determinant += 2.0 * float(np.log(np.diag(self._unit[0])).sum())
+
+    def solve(self, right: Floats) -> Floats:
+        """
+        Solve for one right side.
+
+        """
+        n = self._n
+        right = right / self._root
+        first = right[:n].copy()
+        for block, (_, cross) in zip(self._blocks, self._locals, strict=True):
+            first -= cross.T @ right[block]
+        result = np.empty_like(right)
+        result[:n] = cho_solve(self._unit, first)
+        for block, (factor, cross) in zip(self._blocks, self._locals, strict=True):
+            result[block] = cho_solve(factor, right[block]) - cross @ result[:n]
+        return np.asarray(result / self._root)
+
+    def covariances(self) -> tuple[Floats, Floats]:
+        """
+        Covariance of what belongs to the unit, and variances of all unknowns.
+
+        """
+        n, root = self._n, self._root
+        unit = cho_solve(self._unit, np.eye(n))
+        variances = np.empty(len(root))
+        variances[:n] = np.diag(unit)
+        for block, (factor, cross) in zip(self._blocks, self._locals, strict=True):
+            alone = cho_solve(factor, np.eye(block.stop - block.start))
+            variances[block] = np.diag(alone) + np.sum((cross @ unit) * cross, axis=1)
+        return unit / np.outer(root[:n], root[:n]), variances / root**2
+
+
+def initial_state(
+    windows: Windows, n_bags: int, bias: Floats, kappa: Floats, skew: Floats, up: Floats
+) -> State:
+    """
+    A state without any thermal term.
+
+    """
+    m = len(windows.groups)
+    return State(
+        kappa=kappa,
+        bias=bias,
+        on_bias=np.zeros((3, m)),
+        on_scale=np.zeros((3, m)),
+        skew=skew,
+        up=up,
+        offset=np.zeros((len(up), 3)),
+        start=np.zeros((n_bags, len(windows.start_covariance))),
+    )
+
