@@ -251,7 +251,7 @@ def exact_unit(seed: int) -> UnitModel:
         'board', bias=axes(5.0), bias_curvature=axes(0.05), scale=axes(40.0),
         scale_curvature=axes(0.2),
     )  # fmt: skip
-    return replace(unit_preset('thermostatted', seed), drift=DriftModel(parts=(drift,)))
+    return replace(unit_preset('thermostatted', seed), drift=DriftModel((drift,)))
 
 
 def bound(unit: UnitModel, program: str, directions: Array, window_s: float) -> Array:
@@ -270,7 +270,7 @@ def bound(unit: UnitModel, program: str, directions: Array, window_s: float) -> 
     K = np.array(unit.scale_factor)
     sd = np.array(unit.noise_density) * 1e-6 * STANDARD_GRAVITY * K / np.sqrt(window_s)
     n = len(directions)
-    effect = unit.drift.parts[0]
+    effect = unit.drift.effects[0]
     micro = 1e-6 * STANDARD_GRAVITY * K
     start = np.concatenate(
         (

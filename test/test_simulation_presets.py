@@ -21,7 +21,7 @@ from thermo_comp.simulation import (
     MICRO_G,
     UNIT_NAMES,
     Cyclogram,
-    ThermalResponse,
+    PartHistory,
     UnitModel,
     cyclogram_preset,
     positions,
@@ -40,12 +40,14 @@ def _static(unit: UnitModel, board: NDArray[np.float64]) -> tuple[NDArray[np.flo
     """
     still = []
     for temperature in board:
-        air = unit.network.air_for('board', float(temperature))
-        response = ThermalResponse(
-            unit.network, [0.0, 1.0], [air, air], followers=unit.drift.followers
+        parts = unit.network.equilibrium(unit.network.air_for('board', float(temperature)))
+        deviation = (parts - unit.origin)[None]
+        history = PartHistory(
+            unit.network.nodes, deviation, np.zeros_like(deviation), unit.origin, 1.0
         )
-        still.append(response.states([0.0])[0])
-    return unit.drift.evaluate(unit.network, np.array(still), unit.origin)
+        still.append(unit.drift.evaluate(history))
+    bias, scale = zip(*still, strict=True)
+    return np.concatenate(bias), np.concatenate(scale)
 
 
 @pytest.mark.parametrize('name', UNIT_NAMES)

@@ -142,9 +142,14 @@ def test_axes_permute() -> None:
     def turned(value: tuple[float, float, float]) -> tuple[float, float, float]:
         return value[order[0]], value[order[1]], value[order[2]]
 
-    effect = PartEffect('magnet', (70.0, 80.0, 90.0), (0.3, 0.2, 0.1), (1.0, 2.0, 3.0))
-    permuted = PartEffect(
-        'magnet', turned(effect.scale), turned(effect.scale_curvature), turned(effect.bias)
+    effect = PartEffect(
+        'magnet', scale=(70.0, 80.0, 90.0), scale_curvature=(0.3, 0.2, 0.1), bias=(1.0, 2.0, 3.0)
+    )
+    permuted = replace(
+        effect,
+        scale=turned(effect.scale),
+        scale_curvature=turned(effect.scale_curvature),
+        bias=turned(effect.bias),
     )
     a = replace(base, drift=DriftModel((effect,)))
     b = replace(

@@ -340,6 +340,11 @@ def _chamber() -> Cyclogram:
     return ramps_and_soaks(20.0, 20.0, [(35, 0.75, 35), (5, 0.6, 45), (20, 0.75, 35), (8, 1, 23)])
 
 
+def _three_hours() -> Cyclogram:
+    # The shortest that shows the whole range, both directions and some rest.
+    return ramps_and_soaks(20.0, 10.0, [(35, 1, 30), (5, 1.2, 45), (22, 1, 38)])
+
+
 def _held_out() -> Cyclogram:
     # Other rates, other soak temperatures and another order than 'paper': what a fit never saw.
     return ramps_and_soaks(
@@ -377,6 +382,7 @@ def _soak() -> Cyclogram:
 _PRESETS: dict[str, Callable[[], Cyclogram]] = {
     'paper': _paper,
     'chamber': _chamber,
+    'three-hours': _three_hours,
     'held-out': _held_out,
     'staircase': _staircase,
     'triangle': _triangle,
