@@ -53,21 +53,21 @@ EXTRAS = {
 # arithmetic of many samples, which is numpy's otherwise, is written in C. Nothing here may log
 # through rclpy at more than one severity: it tells the callers apart by their Python frames.
 CORE = [
-    'batch',
-    'compensator',
-    'health',
-    'modes',
-    'onset',
-    'plausibility',
-    'reading_queue',
-    'regime',
+    'online/batch',
+    'online/compensator',
+    'online/health',
+    'thermal/modes',
+    'thermal/onset',
+    'thermal/plausibility',
+    'thermal/reading_queue',
+    'thermal/regime',
     'ros/conversions',
     'ros/relay',
     'ros/scheduling',
     'ros/waitloop',
-    'sample_guard',
-    'thermal',
-    'thermometer',
+    'online/sample_guard',
+    'thermal/tracker',
+    'thermal/thermometer',
 ]
 COMPILER = 'mypy'
 COMPILER_FLOOR = (1, 18)

@@ -30,12 +30,12 @@ from pathlib import Path
 import numpy as np
 
 from thermo_comp import is_compiled
-from thermo_comp.calibration import Calibration
-from thermo_comp.calibration_file import load_calibration
-from thermo_comp.compensator import Compensator
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter, open_recording
 from thermo_comp.replay import BLOCK_MESSAGES
 from thermo_comp.replay import replay as replay_bag
+from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.calibration_file import load_calibration
 
 START_NS = 1_700_000_000_000_000_000
 RATE_HZ = 400

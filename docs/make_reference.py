@@ -13,8 +13,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from thermo_comp.calibration_file import calibration_schema
 from thermo_comp.ros.parameters import parameters_table
+from thermo_comp.unit.calibration_file import calibration_schema
 
 ROOT = Path(__file__).resolve().parent.parent
 AXES = ('x', 'y', 'z')

@@ -20,12 +20,12 @@ from pathlib import Path
 import lz4.frame
 import zstandard
 
-from thermo_comp.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
-from thermo_comp.calibration_file import dump_calibration, parse_calibration
-from thermo_comp.compensator import Compensator
 from thermo_comp.errors import CalibrationError, RecordingError
-from thermo_comp.functions import Polynomial
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import open_mcap
+from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
+from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
+from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 MAGIC = b'\x89MCAP0\r\n'

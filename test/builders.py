@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermo_comp.calibration import (
+from thermo_comp.unit.calibration import (
     Axes,
     AxisReference,
     AxisSet,
@@ -21,7 +21,7 @@ from thermo_comp.calibration import (
     RegimeSet,
     Unit,
 )
-from thermo_comp.functions import Polynomial
+from thermo_comp.unit.functions import Polynomial
 
 GRAVITY = 9.80665
 SECOND_NS = 1_000_000_000

@@ -19,9 +19,10 @@ from dataclasses import replace
 import numpy as np
 from builders import SECOND_NS, columns_from_events, rich_calibration
 
-from thermo_comp import is_compiled, thermal
-from thermo_comp.compensator import Compensator, CompensatorConfig
-from thermo_comp.settings import DetectorSettings, ThermometerSettings
+from thermo_comp import is_compiled
+from thermo_comp.online.compensator import Compensator, CompensatorConfig
+from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.thermal.tracker import tracker as thermal
 
 START_NS = 1_767_225_600 * SECOND_NS
 #: A sensor of its own noise, one whose quantum hides it, one of whole degrees.

@@ -20,9 +20,16 @@ from typing import Any
 import numpy as np
 from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set
 
-from thermo_comp.calibration import Axes, AxisReference, Calibration, LinearTerm, MemoryTerm, Unit
-from thermo_comp.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.status import CompensatorConfig
+from thermo_comp.online.status import CompensatorConfig
+from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.unit.calibration import (
+    Axes,
+    AxisReference,
+    Calibration,
+    LinearTerm,
+    MemoryTerm,
+    Unit,
+)
 
 START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5

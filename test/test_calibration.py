@@ -16,8 +16,9 @@ from builders import axis_set, calibration, regime_set, rich_calibration
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.calibration import LinearTerm, MemoryTerm
-from thermo_comp.calibration_file import (
+from thermo_comp.errors import CalibrationError
+from thermo_comp.unit.calibration import LinearTerm, MemoryTerm
+from thermo_comp.unit.calibration_file import (
     SIZE_LIMIT,
     calibration_schema,
     dump_calibration,
@@ -25,8 +26,7 @@ from thermo_comp.calibration_file import (
     parse_calibration,
     save_calibration,
 )
-from thermo_comp.errors import CalibrationError
-from thermo_comp.functions import CubicSpline, Exponential
+from thermo_comp.unit.functions import CubicSpline, Exponential
 
 REPOSITORY = Path(__file__).parents[1]
 number = st.floats(-1e6, 1e6)

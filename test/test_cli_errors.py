@@ -18,8 +18,8 @@ import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration
 from conftest import Cli
 
-from thermo_comp.calibration_file import save_calibration
 from thermo_comp.recording import BagWriter, Topics
+from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000

@@ -23,8 +23,8 @@ from builders import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.calibration import Axes, AxisReference, LinearTerm
-from thermo_comp.compensator import Compensator, CompensatorConfig
+from thermo_comp.online.compensator import Compensator, CompensatorConfig
+from thermo_comp.unit.calibration import Axes, AxisReference, LinearTerm
 
 UNIQUE = [0, 1, 2, 4, 5, 8]
 

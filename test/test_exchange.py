@@ -12,7 +12,9 @@ from dataclasses import replace
 
 import pytest
 
-from thermo_comp.calibration import (
+from thermo_comp.convert.exchange import export_ardupilot, export_px4, import_parameters
+from thermo_comp.errors import CalibrationError
+from thermo_comp.unit.calibration import (
     Axes,
     AxisReference,
     AxisSet,
@@ -21,9 +23,7 @@ from thermo_comp.calibration import (
     RegimeSet,
     Unit,
 )
-from thermo_comp.errors import CalibrationError
-from thermo_comp.exchange import export_ardupilot, export_px4, import_parameters
-from thermo_comp.functions import CubicSpline, Polynomial
+from thermo_comp.unit.functions import CubicSpline, Polynomial
 
 ONE = Polynomial((1.0,))
 

@@ -203,5 +203,5 @@ def test_help_starts_without_the_heavy_libraries() -> None:
 
 
 def test_core_imports_no_files_and_no_ros() -> None:
-    statement = 'import thermo_comp.compensator'
+    statement = 'import thermo_comp.online.compensator'
     assert loaded_after(statement, 'rclpy', 'rosbags', 'mcap', 'matplotlib', 'scipy') == []

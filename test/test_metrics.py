@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermo_comp.metrics import (
+from thermo_comp.unit.metrics import (
     MICRO_G,
     norm_residual,
     residual_statistics,

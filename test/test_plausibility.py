@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from builders import SECOND_NS
 
-from thermo_comp.plausibility import STILL_READINGS, Fault, still_readings
-from thermo_comp.regime import Regime
-from thermo_comp.settings import DetectorSettings, ThermalConfig, ThermometerSettings
 from thermo_comp.simulation import ChamberRipple, cyclogram_preset, simulate, unit_preset
-from thermo_comp.thermal import GRADIENT, VAR_BOARD, VAR_GRADIENT, ThermalTracker
+from thermo_comp.thermal.plausibility import STILL_READINGS, Fault, still_readings
+from thermo_comp.thermal.regime import Regime
+from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig, ThermometerSettings
+from thermo_comp.thermal.tracker import GRADIENT, VAR_BOARD, VAR_GRADIENT, ThermalTracker
 
 SENSORS = {
     'continuous': ThermometerSettings(noise_sd_c=0.005),

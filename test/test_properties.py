@@ -23,12 +23,12 @@ from fault_rig import unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.calibration import AxisSet, Calibration, RegimeSet
-from thermo_comp.calibration_file import dump_calibration, parse_calibration
-from thermo_comp.compensator import Compensator
 from thermo_comp.errors import CalibrationError
-from thermo_comp.functions import Polynomial
-from thermo_comp.status import CompensatorConfig
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.online.status import CompensatorConfig
+from thermo_comp.unit.calibration import AxisSet, Calibration, RegimeSet
+from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
+from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 UNITS = (rich_calibration(), unit())

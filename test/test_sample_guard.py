@@ -15,16 +15,16 @@ from builders import GRAVITY, SECOND_NS, calibration, columns_from_events
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.calibration import Axes, AxisReference, Unit
-from thermo_comp.compensator import Compensator, CompensatorConfig
-from thermo_comp.sample_guard import (
+from thermo_comp.online.compensator import Compensator, CompensatorConfig
+from thermo_comp.online.sample_guard import (
     BURST_SAMPLES,
     LARGEST_RATE,
     STUCK_SAMPLES,
     RateWatch,
     StuckWatch,
 )
-from thermo_comp.status import DROPPED, Counters
+from thermo_comp.online.status import DROPPED, Counters
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 
 K = 300.0
 UP = (0.36, -0.48, 0.8)

@@ -15,11 +15,11 @@ import yaml
 from builders import calibration
 from conftest import ROOT
 
-from thermo_comp.calibration import Unit
-from thermo_comp.calibration_file import save_calibration
 from thermo_comp.errors import RecordingError
 from thermo_comp.plain_yaml import load_plain_yaml
 from thermo_comp.recording import BagWriter, inspect_recording
+from thermo_comp.unit.calibration import Unit
+from thermo_comp.unit.calibration_file import save_calibration
 
 NODE = 'thermo_comp'
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from builders import SECOND_NS
 
-from thermo_comp.regime import Regime
-from thermo_comp.settings import DetectorSettings, ThermalConfig
-from thermo_comp.thermal import LOST_GRADIENT_RELATIVE_SD, ThermalTracker
+from thermo_comp.thermal.regime import Regime
+from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
+from thermo_comp.thermal.tracker import LOST_GRADIENT_RELATIVE_SD, ThermalTracker
 
 TAU_S = 900.0
 

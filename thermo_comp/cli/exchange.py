@@ -65,9 +65,9 @@ def export(
       thermo_comp export unit42.yaml --to ardupilot --up 0 0 1 -o unit42.parm
 
     """
-    from ..calibration_file import load_calibration
-    from ..exchange import export_ardupilot, export_px4
+    from ..convert.exchange import export_ardupilot, export_px4
     from ..files import write_atomically
+    from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
     if device_id and to is not Autopilot.px4:
@@ -130,10 +130,10 @@ def import_(
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml
 
     """
-    from ..calibration_file import save_calibration
-    from ..exchange import import_parameters
+    from ..convert.exchange import import_parameters
     from ..files import read_bounded
-    from ..metrics import MICRO_G
+    from ..unit.calibration_file import save_calibration
+    from ..unit.metrics import MICRO_G
 
     out = Output(as_json, quiet)
     options.refuse_existing(output, force)

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from .. import __version__
+from ..typing import Floats, Ints
 from .columns import ColumnMap, Thermometer
 from .log import ForeignLog, Readings, thin
-from .table import NO_STAMP, Array, Column, IntArray, Table, read_table
+from .table import NO_STAMP, Column, Table, read_table
 
 
 def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
@@ -111,11 +112,11 @@ def _wanted(columns: ColumnMap) -> list[Column]:
     return list(dict.fromkeys(wanted))
 
 
-def _stack(table: Table, names: tuple[Column, Column, Column]) -> Array:
+def _stack(table: Table, names: tuple[Column, Column, Column]) -> Floats:
     return np.column_stack([table.values[name] for name in names])
 
 
-def _stamps(table: Table, columns: ColumnMap) -> IntArray:
+def _stamps(table: Table, columns: ColumnMap) -> Ints:
     if table.stamp_ns is not None:
         return table.stamp_ns
     rate = columns.stamp.rate_hz or 1.0
@@ -125,9 +126,7 @@ def _stamps(table: Table, columns: ColumnMap) -> IntArray:
     return np.asarray(start_ns + steps.astype(np.int64))
 
 
-def _readings(
-    table: Table, stamp_ns: IntArray, thermometer: Thermometer | None
-) -> Readings | None:
+def _readings(table: Table, stamp_ns: Ints, thermometer: Thermometer | None) -> Readings | None:
     if thermometer is None:
         return None
     slope, offset = thermometer.linear

@@ -11,11 +11,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from ..calibration import Calibration, Unit
 from ..errors import FitError
-from ..settings import DetectorSettings, ThermalConfig
+from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..unit.calibration import Calibration, Unit
 from .assembly import UNKNOWN_SKEW, UnitFacts, build_calibration
 from .evidence import (
     PositionReport,
@@ -50,7 +49,6 @@ from .verdict import (
 )
 from .warm_up import find_warm_up
 
-Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 # Usual full scales of units that report m/s^2.

@@ -13,14 +13,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
+from ..typing import Floats
 from .branches import Event, find_branches
 from .options import FitOptions
 from .reduction import ReducedBag, StillInterval
 from .verdict import Finding
-
-Array = npt.NDArray[np.float64]
 
 #: One attitude: the directions of all still intervals lie this close together.
 ONE_ATTITUDE_DEG = 10.0
@@ -162,6 +160,6 @@ def describe(event: Event, per_mg: float) -> str:
     return f'at {event.time:.1f} s the unit {what}: the reading changed by {size}'
 
 
-def _directions(intervals: Sequence[StillInterval]) -> Array:
+def _directions(intervals: Sequence[StillInterval]) -> Floats:
     means = np.array([np.average(i.mean, axis=0, weights=i.count) for i in intervals])
     return np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True))

@@ -10,7 +10,7 @@ times the Schuler oscillation bounds it, with a peak of ``2 b R / g``.
 
 from __future__ import annotations
 
-from ..metrics import MICRO_G
+from ..unit.metrics import MICRO_G
 
 #: Times at which a navigator's user asks [s].
 TIMES_S = (60.0, 300.0, 600.0)

@@ -29,8 +29,8 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
-from ..compensator import Compensator
 from ..errors import ThermoCompError
+from ..online.compensator import Compensator
 from . import parameters
 from .affinity import Affinity, AffinityError
 from .conversions import SampleConverter

@@ -16,8 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
+
+from ..typing import Floats
 
 Triple = tuple[float, float, float]
 ZERO: Triple = (0.0, 0.0, 0.0)
@@ -42,19 +43,19 @@ class PartHistory:
     """
 
     nodes: tuple[str, ...]
-    deviation: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    origin: NDArray[np.float64]
+    deviation: Floats
+    rate: Floats
+    origin: Floats
     step: float
 
-    def of(self, part: str) -> NDArray[np.float64]:
+    def of(self, part: str) -> Floats:
         """
         Return the deviation of one part, shape (m,), K.
 
         """
         return self.deviation[:, self.nodes.index(part)]
 
-    def lagged(self, signal: NDArray[np.float64], time_constant: float) -> NDArray[np.float64]:
+    def lagged(self, signal: Floats, time_constant: float) -> Floats:
         """
         Return the first-order lag of a signal that is straight on the grid, settled at its start.
 
@@ -62,7 +63,7 @@ class PartHistory:
         kept = np.exp(-self.step / time_constant)
         new = 1.0 - time_constant / self.step * (1.0 - kept)
         moved = lfilter([new, 1.0 - kept - new], [1.0, -kept], signal - signal[0])
-        result: NDArray[np.float64] = moved + signal[0]
+        result: Floats = moved + signal[0]
         return result
 
 
@@ -85,13 +86,11 @@ class Effect:
     bias: Triple = ZERO
     bias_curvature: Triple = ZERO
 
-    def _signals(
-        self, history: PartHistory
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats | float]:
         # The first and the second signal, shape (m,).
         raise NotImplementedError
 
-    def change(self, history: PartHistory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def change(self, history: PartHistory) -> tuple[Floats, Floats]:
         """
         Return the change of the bias [ug] and of the scale [ppm], shape (m, 3).
 
@@ -111,7 +110,7 @@ class PartEffect(Effect):
 
     part: str
 
-    def _signals(self, history: PartHistory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
         d = history.of(self.part)
         return d, d * d
 
@@ -128,7 +127,7 @@ class DifferenceEffect(Effect):
     hot: str
     cold: str
 
-    def _signals(self, history: PartHistory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
         hot, cold = history.of(self.hot), history.of(self.cold)
         return hot - cold, hot * hot - cold * cold
 
@@ -147,7 +146,7 @@ class FlowEffect(Effect):
     cold: str
     exponent: float = 1.25
 
-    def _signals(self, history: PartHistory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
         at = [history.nodes.index(part) for part in (self.hot, self.cold)]
         rest = history.origin[at[0]] - history.origin[at[1]]
         difference = history.deviation[:, at[0]] - history.deviation[:, at[1]] + rest
@@ -165,7 +164,7 @@ class LeakageEffect(Effect):
     part: str
     growth: float
 
-    def _signals(self, history: PartHistory) -> tuple[NDArray[np.float64], float]:
+    def _signals(self, history: PartHistory) -> tuple[Floats, float]:
         return np.expm1(history.of(self.part) / self.growth), 0.0
 
 
@@ -179,7 +178,7 @@ class CreepEffect(Effect):
     part: str
     time_constant: float
 
-    def _signals(self, history: PartHistory) -> tuple[NDArray[np.float64], float]:
+    def _signals(self, history: PartHistory) -> tuple[Floats, float]:
         d = history.of(self.part)
         return d - history.lagged(d, self.time_constant), 0.0
 
@@ -198,7 +197,7 @@ class SlipEffect(Effect):
     width: float
     is_gradual: bool = False
 
-    def _signals(self, history: PartHistory) -> tuple[NDArray[np.float64], float]:
+    def _signals(self, history: PartHistory) -> tuple[Floats, float]:
         strain = np.diff(history.of(self.part), prepend=history.of(self.part)[:1])
         width, now = self.width, 0.0
         kept = np.exp(-np.abs(strain) / width).tolist()
@@ -241,7 +240,7 @@ class LoadEffect(Effect):
     settle: float = 60.0
     power: int = 0
 
-    def _signals(self, history: PartHistory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
         rate = np.abs(history.rate[:, history.nodes.index(self.part)]) * 60.0
         is_on, load = False, np.empty(len(rate))
         for k, value in enumerate(rate.tolist()):
@@ -260,7 +259,7 @@ class DriftModel:
 
     effects: tuple[Effect, ...] = ()
 
-    def evaluate(self, history: PartHistory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def evaluate(self, history: PartHistory) -> tuple[Floats, Floats]:
         """
         Return the change of the bias [ug] and the relative change of the scale, shape (m, 3).
 

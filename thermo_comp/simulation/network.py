@@ -15,7 +15,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..typing import Floats
 
 AIR = 'air'
 _HELD = 1e-6  # change with the air's below which a part counts as held, K/K
@@ -141,7 +142,7 @@ class ThermalNetwork:
         """
         return any(link.exponent != 1.0 for link in self.links)
 
-    def system(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def system(self) -> tuple[Floats, Floats, Floats]:
         """
         Return the matrices of ``dx/dt = A x + b u + p``, convection left out.
 
@@ -188,9 +189,7 @@ class ThermalNetwork:
         p[:n] /= rows
         return A, b, p
 
-    def flow(
-        self, state: NDArray[np.float64], air: float, drive: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def flow(self, state: Floats, air: float, drive: Floats) -> Floats:
         """
         Return ``dx/dt`` of one state, convection included.
 
@@ -212,9 +211,7 @@ class ThermalNetwork:
         A, b, _ = self.system()
         return np.asarray(A @ state + b * air + drive + self._convection(state, air)[0])
 
-    def _convection(
-        self, state: NDArray[np.float64], air: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
         """
         Return the convective flows into the state and their derivatives by it.
 
@@ -236,7 +233,7 @@ class ThermalNetwork:
                         slope[i, j] += sign * other * link.exponent * size / self.capacity[name]
         return flow, slope
 
-    def settled(self, air: float, drive: NDArray[np.float64]) -> NDArray[np.float64]:
+    def settled(self, air: float, drive: Floats) -> Floats:
         """
         Return the whole state after an endless soak under a constant drive, shape (k,).
 
@@ -251,7 +248,7 @@ class ThermalNetwork:
             state = state - np.linalg.solve(A + slope, A @ state + b * air + drive + flow)
         return state
 
-    def equilibrium(self, air: float) -> NDArray[np.float64]:
+    def equilibrium(self, air: float) -> Floats:
         """
         Return the temperatures after an endless soak.
 

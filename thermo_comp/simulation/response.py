@@ -15,9 +15,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
+from ..typing import Floats
 from .network import ThermalNetwork
 
 _CHUNK = 65536  # instants evaluated at once; bounds the memory of the mode table
@@ -100,9 +101,7 @@ class ThermalResponse:
             amplitude[k] = decayed - jump[k - 1]
         self._amplitude = amplitude
 
-    def _first_state(
-        self, air: float, drive: NDArray[np.float64], is_warm: bool
-    ) -> NDArray[np.float64]:
+    def _first_state(self, air: float, drive: Floats, is_warm: bool) -> Floats:
         if is_warm:
             return self.network.settled(air, drive)
         state = np.zeros(len(drive))
@@ -111,15 +110,11 @@ class ThermalResponse:
             state[-1] = air
         return state
 
-    def _integrate(
-        self, air: NDArray[np.float64], drive: NDArray[np.float64], state: NDArray[np.float64]
-    ) -> None:
+    def _integrate(self, air: Floats, drive: Floats, state: Floats) -> None:
         slope = np.diff(air) / np.diff(self._time)
         for k, (begin, end) in enumerate(pairwise(self._time)):
 
-            def flow(
-                t: float, x: NDArray[np.float64], k: int = k, begin: float = begin
-            ) -> NDArray[np.float64]:
+            def flow(t: float, x: Floats, k: int = k, begin: float = begin) -> Floats:
                 return self.network.flow(x, air[k] + slope[k] * (t - begin), drive[k])
 
             solved = solve_ivp(
@@ -128,7 +123,7 @@ class ThermalResponse:
             state = solved.y[:, -1]
             self._integrated.append(solved.sol)
 
-    def states(self, time: ArrayLike) -> NDArray[np.float64]:
+    def states(self, time: ArrayLike) -> Floats:
         """
         Return the whole state.
 
@@ -145,14 +140,14 @@ class ThermalResponse:
         """
         return self._evaluate(time)[0]
 
-    def rates(self, time: ArrayLike) -> NDArray[np.float64]:
+    def rates(self, time: ArrayLike) -> Floats:
         """
         Return the derivative of the whole state, shape (m, k), per second.
 
         """
         return self._evaluate(time)[1]
 
-    def _evaluate(self, time: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _evaluate(self, time: ArrayLike) -> tuple[Floats, Floats]:
         time = np.atleast_1d(np.asarray(time, dtype=float))
         k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
         size = len(self.network.system()[1])
@@ -173,7 +168,7 @@ class ThermalResponse:
             rates[piece] = self._beta[at] + ((decaying * self._rate) @ self._modes.T).real
         return states, rates
 
-    def temperatures(self, time: ArrayLike) -> NDArray[np.float64]:
+    def temperatures(self, time: ArrayLike) -> Floats:
         """
         Return the temperatures of the parts.
 
@@ -190,7 +185,7 @@ class ThermalResponse:
         """
         return self.states(time)[:, : len(self.network.nodes)]
 
-    def heater_power(self, time: ArrayLike) -> NDArray[np.float64]:
+    def heater_power(self, time: ArrayLike) -> Floats:
         """
         Return what the thermostat spends, 0 W without one.
 

@@ -12,8 +12,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..typing import Floats, Ints
 from .attitude import Attitude, Handling
 from .cyclogram import Cyclogram
 from .drift import PartHistory
@@ -221,7 +222,7 @@ class ThermalTruth:
             unit.network, knots, air, power=power, is_warm=options.warm
         )
         n_grid = math.ceil(cyclogram.duration_s / options.grid_step) + 1
-        self.grid: NDArray[np.float64] = np.arange(n_grid, dtype=float) * options.grid_step
+        self.grid: Floats = np.arange(n_grid, dtype=float) * options.grid_step
         self.air = np.interp(self.grid, knots, air)
         n_nodes = len(unit.network.nodes)
         self.temperatures = self.response.states(self.grid)[:, :n_nodes]
@@ -319,7 +320,7 @@ class Chamber:
                 truth=truth,
             )
 
-    def _truth(self, cycle_s: NDArray[np.float64], vibration: list[np.random.Generator]) -> Truth:
+    def _truth(self, cycle_s: Floats, vibration: list[np.random.Generator]) -> Truth:
         thermal = self.thermal
         return Truth(
             unit=self._unit,
@@ -337,9 +338,7 @@ class Chamber:
         )
 
 
-def _knots(
-    cyclogram: Cyclogram, options: RunOptions
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _knots(cyclogram: Cyclogram, options: RunOptions) -> tuple[Floats, Floats]:
     time = np.array(cyclogram.time_s)
     ripple = options.ripple
     if ripple is not None and ripple.amplitude > 0.0:
@@ -356,8 +355,8 @@ def _knots(
 
 
 def _switched(
-    unit: UnitModel, knots: NDArray[np.float64], air: NDArray[np.float64], seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    unit: UnitModel, knots: Floats, air: Floats, seed: int
+) -> tuple[Floats, Floats, Floats]:
     """
     Return the knots with the switching of the loads among them, and the power between them.
 
@@ -377,7 +376,7 @@ def _switched(
     return fine, np.interp(fine, knots, air), power
 
 
-def _wander(unit: UnitModel, grid: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+def _wander(unit: UnitModel, grid: Floats, seed: int) -> Floats:
     """
     Return what the bias does of itself, counts/cycle: another one in each mounting, and a walk.
 
@@ -393,8 +392,6 @@ def _wander(unit: UnitModel, grid: NDArray[np.float64], seed: int) -> NDArray[np
     return result * unit.counts_per_micro_g
 
 
-def _between(
-    readings: tuple[NDArray[np.int64], NDArray[np.float64]], after: int, until: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _between(readings: tuple[Ints, Floats], after: int, until: int) -> tuple[Ints, Floats]:
     first, last = np.searchsorted(readings[0], (after, until), side='right')
     return readings[0][first:last], readings[1][first:last]

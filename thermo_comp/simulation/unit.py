@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..typing import Floats
 from .converter import Converter
 from .drift import ZERO, DriftModel, Effect, Triple
 from .network import ThermalNetwork
@@ -110,7 +110,7 @@ class UnitModel:
         return np.array(self.scale_factor) * MICRO_G
 
     @property
-    def M(self) -> NDArray[np.float64]:
+    def M(self) -> Floats:
         """
         Misalignment matrix, shape (3, 3).
 
@@ -118,7 +118,7 @@ class UnitModel:
         return np.array(self.misalignment)
 
     @property
-    def origin(self) -> NDArray[np.float64]:
+    def origin(self) -> Floats:
         """
         Temperatures of the parts in the still state of the reference, shape (n_parts,), degC.
 

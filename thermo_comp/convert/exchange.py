@@ -20,9 +20,10 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from .calibration import (
+from ..errors import CalibrationError
+from ..typing import Floats
+from ..unit.calibration import (
     Axes,
     AxisReference,
     AxisSet,
@@ -32,10 +33,7 @@ from .calibration import (
     RegimeSet,
     Unit,
 )
-from .errors import CalibrationError
-from .functions import Polynomial
-
-Array = npt.NDArray[np.float64]
+from ..unit.functions import Polynomial
 
 ARDUPILOT_REFERENCE_C = 35.0
 _ARDUPILOT_SCALE = 1e6
@@ -253,7 +251,7 @@ def import_parameters(
 
 def _cubics(
     calibration: Calibration, reference: float, up: tuple[float, float, float] | None
-) -> tuple[Array, list[str]]:
+) -> tuple[Floats, list[str]]:
     """
     Cubic of each axis' offset [m/s^2] about a reference, shape (3, 4), and what it lacks.
 
@@ -349,7 +347,7 @@ def _need(values: dict[str, float], name: str) -> float:
 
 def _read_px4(
     values: dict[str, float], number: int
-) -> tuple[Array, float, tuple[float, float], str]:
+) -> tuple[Floats, float, tuple[float, float], str]:
     prefix = f'TC_A{number}_'
     if values.get('TC_A_ENABLE', 1.0) != 1.0:
         raise CalibrationError('is 0: the set is not in use', key='TC_A_ENABLE')
@@ -362,7 +360,7 @@ def _read_px4(
 
 def _read_ardupilot(
     values: dict[str, float], number: int
-) -> tuple[Array, float, tuple[float, float], str]:
+) -> tuple[Floats, float, tuple[float, float], str]:
     prefix = f'INS_TCAL{number}_'
     if _need(values, f'{prefix}ENABLE') != 1.0:
         raise CalibrationError('is not 1: the set is not in use', key=f'{prefix}ENABLE')

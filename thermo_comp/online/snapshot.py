@@ -11,7 +11,7 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from .regime import Regime
+from ..thermal.regime import Regime
 from .status import CompensatorStatus
 
 if TYPE_CHECKING:

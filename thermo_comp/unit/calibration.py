@@ -24,11 +24,11 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
+from ..thermal.settings import DetectorSettings
+from ..typing import Floats
 from .functions import CubicSpline, Exponential, Polynomial
-from .settings import DetectorSettings
 
 #: The version of the file's layout that this code writes and reads.
 FORMAT_VERSION = 1
@@ -418,7 +418,7 @@ def _smallest_scale(axis_set: AxisSet, regime_set: RegimeSet, reference: float) 
     return result if math.isfinite(result) else -math.inf
 
 
-def _extremes(function: Polynomial, lower: float, upper: float) -> npt.NDArray[np.float64]:
+def _extremes(function: Polynomial, lower: float, upper: float) -> Floats:
     """
     Find where a polynomial can have its extremes inside a range.
 

@@ -20,9 +20,9 @@ from typing import Any
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
+from ..errors import CalibrationError
+from ..files import read_bounded, write_atomically
 from .calibration import FORMAT_VERSION, Calibration
-from .errors import CalibrationError
-from .files import read_bounded, write_atomically
 
 #: A calibration of the largest model takes some 60 kB.
 SIZE_LIMIT = 1 << 20

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from .plausibility import Fault
-from .regime import Regime
-from .settings import ThermalConfig, refuse_outside
+from ..thermal.plausibility import Fault
+from ..thermal.regime import Regime
+from ..thermal.settings import ThermalConfig, refuse_outside
 
 
 @dataclass(frozen=True)

@@ -23,18 +23,18 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from ..thermal.reading_queue import ReadingQueue
+from ..thermal.regime import Regime
+from ..thermal.settings import ThermalConfig
+from ..thermal.tracker import ThermalTracker
+from ..unit.calibration import Calibration
+from ..unit.correction import Correction
 from .batch import SEGMENT_NS, TIME_JUMP_NS, process_block
 from .blocks import AccelBlock, CompensatedBlock
-from .calibration import Calibration
-from .correction import Correction
 from .health import GravityMonitor
-from .reading_queue import ReadingQueue
-from .regime import Regime
 from .sample_guard import RateWatch, StuckWatch
-from .settings import ThermalConfig
 from .snapshot import snapshot
 from .status import CompensatorConfig, CompensatorStatus, Counters
-from .thermal import ThermalTracker
 
 #: Samples this much faster than calibrated, relative, still have the calibrated noise.
 RATE_TOLERANCE: Final = 0.1
