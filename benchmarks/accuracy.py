@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
+from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
@@ -139,7 +140,7 @@ def held_out(calibration: Calibration, unit: UnitModel, seed: int, rate_hz: floa
         sums: dict[int, Floats] = {}
         start_ns = None
         for block in blocks(unit, 'held-out', up, 1000 * seed + 500 + number, rate_hz):
-            found = compensator.process_block(block)
+            found = process_block(compensator, block)
             if not len(found.stamp_ns):
                 continue
             start_ns = int(found.stamp_ns[0]) if start_ns is None else start_ns

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from accuracy import SimulatedBlock
 
 from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
@@ -199,7 +200,7 @@ def compensated(
     compensator = Compensator(calibration, CompensatorConfig(stuck_timeout_s=0.0))
     if weight is not None:
         compensator.tracker.weight_at = lambda _stamp_ns: weight
-    found = compensator.process_block(block)
+    found = process_block(compensator, block)
     return found.specific_force, found.stamp_ns, compensator.take_flags()
 
 

@@ -17,13 +17,13 @@ from builders import calibration
 from conftest import Cli
 
 from thermo_comp.convert import ColumnMap, load_column_map, table_log, write_log
-from thermo_comp.convert.columns import STANDARD_GRAVITY
 from thermo_comp.convert.log import Readings, thin
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import read_recording
 from thermo_comp.replay import replay
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import save_calibration
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 ROOT = Path(__file__).resolve().parent.parent
 STEP_NS = 10_000_000

@@ -17,6 +17,7 @@ import pytest
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, assess, fit
 from thermo_comp.fitting.sources import SourceBlock
+from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
@@ -28,7 +29,8 @@ from thermo_comp.simulation import (
 )
 from thermo_comp.typing import Floats, Ints
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
-from thermo_comp.unit.metrics import MICRO_G, norm_residual, residual_statistics
+from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.metrics import norm_residual, residual_statistics
 
 RATE_HZ = 25.0
 TEMPERATURE_RATE_HZ = 0.5
@@ -167,7 +169,7 @@ def test_the_compensator_does_what_the_fit_promised(chosen: FitResult) -> None:
     forces = []
     for block in source_of(UNIT, up, 3).blocks():
         online = CausalBlock.of(block)
-        forces.append(compensator.process_block(online).specific_force)
+        forces.append(process_block(compensator, online).specific_force)
     force = np.concatenate(forces)
     per_window = round(10.0 * RATE_HZ)
     n = len(force) // per_window
@@ -184,7 +186,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
         if weight is not None:
             compensator.tracker.weight_at = lambda _stamp_ns: weight  # type: ignore[method-assign]
         blocks = source_of(UNIT, positions(1, 5)[0], 905).blocks()
-        found = [compensator.process_block(CausalBlock.of(block)) for block in blocks]
+        found = [process_block(compensator, CausalBlock.of(block)) for block in blocks]
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return np.concatenate([each.specific_force for each in found])
 

@@ -31,7 +31,7 @@ from thermo_comp.fitting.verdict import (
     judge_table,
 )
 from thermo_comp.simulation import positions
-from thermo_comp.unit.metrics import MICRO_G
+from thermo_comp.unit.gravity import MICRO_G
 
 
 def findings_of(table: WindowTable, up: np.ndarray, **options: bool) -> dict[str, Finding]:

@@ -34,7 +34,7 @@ from thermo_comp.report.evidence import CHOSEN, ONE_SET, RAW
 from thermo_comp.report.plates import PLATES, png_files
 from thermo_comp.simulation import ideal_regime, parse_cyclogram
 from thermo_comp.thermal.regime import Regime
-from thermo_comp.unit.metrics import MICRO_G
+from thermo_comp.unit.gravity import MICRO_G
 
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 

@@ -38,7 +38,7 @@ from thermo_comp.report.trace import thermal_trace
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import AxisReference
-from thermo_comp.unit.metrics import MICRO_G
+from thermo_comp.unit.gravity import MICRO_G
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(1, 20))

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from thermo_comp.simulation import (
     MICRO_G,
@@ -31,12 +30,13 @@ from thermo_comp.simulation import (
     simulate,
     unit_preset,
 )
+from thermo_comp.typing import Floats
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
 STATION = Position('one', PROGRAM, np.array([0.48, -0.6, 0.64]))
 
 
-def _history(temperature: NDArray[np.float64], step: float = 1.0) -> PartHistory:
+def _history(temperature: Floats, step: float = 1.0) -> PartHistory:
     deviation = np.reshape(temperature, (len(temperature), -1))
     nodes = ('a', 'b')[: deviation.shape[1]]
     rate = np.gradient(deviation, step, axis=0)

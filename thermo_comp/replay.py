@@ -19,6 +19,7 @@ import numpy as np
 
 from . import __version__
 from .errors import CalibrationError
+from .online.batch import process_block
 from .online.blocks import CompensatedBlock
 from .online.compensator import Compensator
 from .online.status import CompensatorConfig, Counters
@@ -166,7 +167,7 @@ def corrected_blocks(
 
     """
     for block in blocks:
-        corrected = compensator.process_block(block)
+        corrected = process_block(compensator, block)
         yield CorrectedBlock(block, corrected, compensator.take_flags())
 
 
@@ -249,7 +250,7 @@ def replay(
         return ReplayResult(
             info=reader.info,
             output=Path(output),
-            counters=compensator.status.counters,
+            counters=compensator.counters,
             n_flags=len(flags),
             switches=switches(flags),
         )

@@ -182,7 +182,7 @@ def _say_axes(out: Output, verdict: Assessment) -> None:
     Print what is known axis by axis: wander always, shifts where the positions tell.
 
     """
-    from ..unit.metrics import MICRO_G
+    from ..unit.gravity import MICRO_G
 
     columns = ['axis', 'static ug', 'dynamic ug']
     if verdict.shifts:

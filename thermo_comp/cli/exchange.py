@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from ..errors import CalibrationError
+from ..unit.gravity import STANDARD_GRAVITY
 from . import options
 from .output import Output
 
@@ -109,7 +110,7 @@ def import_(
     number: Annotated[
         int | None, typer.Option(help='Which set, where there are several (TC_A0, INS_TCAL1).')
     ] = None,
-    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = 9.80665,
+    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = STANDARD_GRAVITY,
     rate_hz: Annotated[float, typer.Option(help='Samples per second of the unit.', min=0.1)] = 200,
     full_scale_g: Annotated[float, typer.Option(help='Full scale in g.', min=0.1)] = 16.0,
     noise_ug: Annotated[
@@ -133,7 +134,7 @@ def import_(
     from ..convert.exchange import import_parameters
     from ..files import read_bounded
     from ..unit.calibration_file import save_calibration
-    from ..unit.metrics import MICRO_G
+    from ..unit.gravity import MICRO_G
 
     out = Output(as_json, quiet)
     options.refuse_existing(output, force)

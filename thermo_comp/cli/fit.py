@@ -159,7 +159,7 @@ def _say_positions(out: Output, result: FitResult) -> None:
     Print every rest: where, when, how long, which way was up, what the fit leaves of |f| - g.
 
     """
-    from ..unit.metrics import MICRO_G
+    from ..unit.gravity import MICRO_G
 
     out.table(
         ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', '|f| - g ug'),
@@ -182,7 +182,7 @@ def _say_candidates(out: Output, result: FitResult) -> None:
     Print what each model left per axis; the held-out error decides, ties go to the simpler one.
 
     """
-    from ..unit.metrics import MICRO_G
+    from ..unit.gravity import MICRO_G
 
     out.table(
         ('candidate', 'parameters', 'fitted ug', 'held out ug', 'BIC', ''),

@@ -107,7 +107,7 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
 
 def _calibration(out: Output, path: Path) -> None:
     from ..unit.calibration_file import load_calibration
-    from ..unit.metrics import MICRO_G
+    from ..unit.gravity import MICRO_G
 
     calibration = load_calibration(path)
     unit, provenance = calibration.unit, calibration.provenance

@@ -157,7 +157,8 @@ def _words(row: dict[str, Any]) -> str:
 
 def _say_triad(out: Output, result: Partial, triad: TriadFit) -> None:
     from ..fitting.partial import temperature_span
-    from ..unit.metrics import MICRO_G, residual_statistics
+    from ..unit.gravity import MICRO_G
+    from ..unit.metrics import residual_statistics
 
     out.table(
         ('axis', 'bias', 'sd', 'scale', 'sd'),

@@ -23,7 +23,7 @@ from ..fitting.fit_sources import digest
 from ..recording import Topics, inspect_recording, read_recording
 from ..recording.columns import Role
 from ..typing import Floats, Ints
-from .columns import STANDARD_GRAVITY
+from ..unit.gravity import STANDARD_GRAVITY
 from .log import ForeignLog, Readings
 
 _IMU = 'sensor_msgs/msg/Imu'

@@ -16,7 +16,8 @@ from .. import __version__
 from ..typing import Floats, Ints
 from .columns import ColumnMap, Thermometer
 from .log import ForeignLog, Readings, thin
-from .table import NO_STAMP, Column, Table, read_table
+from .parquet import read_parquet
+from .table import NO_STAMP, Column, Table, read_text
 
 
 def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
@@ -41,14 +42,15 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
         If the file cannot be read or lacks a column.
 
     """
-    table = read_table(
-        path,
-        _wanted(columns),
-        stamp=columns.stamp.column,
-        stamp_exponent=columns.stamp.exponent,
-        delimiter=columns.format.character,
-        has_header=columns.format.header,
-    )
+    path = Path(path)
+    wanted, stamp = _wanted(columns), columns.stamp
+    if path.suffix.lower() in ('.parquet', '.pq'):
+        table = read_parquet(path, wanted, stamp.column, stamp.exponent)
+    else:
+        separated = columns.format
+        table = read_text(
+            path, wanted, stamp.column, stamp.exponent, separated.character, separated.header
+        )
     stamp_ns = _stamps(table, columns)
     gyro = None
     if columns.gyro is not None:

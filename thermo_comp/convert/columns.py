@@ -18,9 +18,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import load_plain_yaml
+from ..unit.gravity import STANDARD_GRAVITY
 from .table import Column
 
-STANDARD_GRAVITY = 9.80665
 #: A map takes some kB.
 _SIZE_LIMIT = 1 << 20
 _STAMP_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}

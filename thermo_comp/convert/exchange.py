@@ -34,14 +34,13 @@ from ..unit.calibration import (
     Unit,
 )
 from ..unit.functions import Polynomial
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 ARDUPILOT_REFERENCE_C = 35.0
 _ARDUPILOT_SCALE = 1e6
 # ArduPilot's value for a temperature of calibration that was never recorded.
 _NO_TEMPERATURE = -273.0
 _AXES = ('X', 'Y', 'Z')
-_STANDARD_GRAVITY = 9.80665
-_MICRO_G = 1e-6 * _STANDARD_GRAVITY
 _GRID = 257
 _NAME = re.compile(r'\b(TC_A\d_\w+|TC_A_ENABLE|INS_TCAL\d_\w+|INS_ACC\d_CALTEMP)\b')
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
@@ -174,10 +173,10 @@ def import_parameters(
     *,
     serial: str,
     number: int | None = None,
-    gravity: float = _STANDARD_GRAVITY,
+    gravity: float = STANDARD_GRAVITY,
     cycle_time_s: float = 0.005,
-    full_scale: float = 16.0 * _STANDARD_GRAVITY,
-    noise_density: float = 200.0 * _MICRO_G,
+    full_scale: float = 16.0 * STANDARD_GRAVITY,
+    noise_density: float = 200.0 * MICRO_G,
 ) -> Calibration:
     """
     Read PX4 or ArduPilot parameters as a calibration of a unit that speaks m/s^2.
@@ -285,8 +284,8 @@ def _losses(
     up: tuple[float, float, float] | None,
 ) -> list[str]:
     notes = []
-    if misfit > 0.01 * _MICRO_G:
-        notes.append(f'bias functions replaced by cubics, off by {misfit / _MICRO_G:.2g} ug')
+    if misfit > 0.01 * MICRO_G:
+        notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
     if scale_drift > 1e-8:
         rest = 'folded into the offset at one attitude' if up else 'lost'
         notes.append(f'scale over temperature is {rest}: up to {1e6 * scale_drift:.2g} ppm')

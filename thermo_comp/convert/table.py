@@ -60,8 +60,8 @@ class Table:
 NO_STAMP = np.iinfo(np.int64).min
 
 
-def read_table(
-    path: str | Path,
+def read_text(
+    path: Path,
     columns: Sequence[Column],
     stamp: Column | None = None,
     stamp_exponent: int = 0,
@@ -69,12 +69,12 @@ def read_table(
     has_header: bool | None = None,
 ) -> Table:
     """
-    Read some columns of a table.
+    Read some columns of a table of text.
 
     Parameters
     ----------
-    path : str or Path
-        The file; ``.parquet`` is read with pyarrow, all else as text.
+    path : Path
+        The file.
     columns : sequence of str or int
         Headings, or numbers counted from 0.
     stamp : str or int or None, optional
@@ -97,11 +97,6 @@ def read_table(
         If the file cannot be read, is empty, or lacks a column.
 
     """
-    path = Path(path)
-    if path.suffix.lower() in ('.parquet', '.pq'):
-        from .parquet import read_parquet
-
-        return read_parquet(path, columns, stamp, stamp_exponent)
     try:
         with path.open(encoding='utf-8-sig', errors='replace', newline='') as file:
             head = file.read(_SNIFF_BYTES)

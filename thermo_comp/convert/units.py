@@ -16,10 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..typing import Floats, Ints
+from ..unit.gravity import STANDARD_GRAVITY
 
 # |a| of a still sensor in each unit. A cheap one is off by a few per cent (bias and scale), a
 # thermal chamber adds some more; 20 % is beyond all of them and far below the ratios to be told.
-_UNITS = {'g': 1.0, 'm/s^2': 9.80665, 'mg': 1000.0}
+_UNITS = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # The usual sensitivities, from +-16 g to +-2 g of a 16-bit sensor.
 _SENSITIVITIES = (2048, 4096, 8192, 16384)

@@ -23,7 +23,8 @@ from ..thermal.tracker import WEIGHT, ThermalTracker
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction
-from ..unit.metrics import MICRO_G, ResidualStatistics, norm_residual, statistics_by_regime
+from ..unit.gravity import MICRO_G
+from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from .assembly import parameter_covariance
 from .evidence import inflation
 from .history import thermal_states

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..typing import Floats
+from ..unit.gravity import STANDARD_GRAVITY
 from .branches import Event, find_branches
 from .options import FitOptions
 from .reduction import ReducedBag, StillInterval
@@ -24,7 +25,6 @@ from .verdict import Finding
 ONE_ATTITUDE_DEG = 10.0
 # Neighbours this close in time and direction may be one rest with a step in it.
 _NEAR_S, _NEAR_DEG = 30.0, 10.0
-_STANDARD_GRAVITY = 9.80665
 
 
 def attitudes_apart(bags: Sequence[ReducedBag]) -> float:
@@ -120,7 +120,7 @@ def milli_g(bags: Sequence[ReducedBag], kind: str) -> float:
 
     """
     if kind == 'm/s^2':
-        return _STANDARD_GRAVITY * 1e-3
+        return STANDARD_GRAVITY * 1e-3
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
     return float(np.median(np.linalg.norm(means, axis=1))) * 1e-3
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import FitError
 from ..typing import Floats
-from ..unit.metrics import MICRO_G
+from ..unit.gravity import MICRO_G
 from .evidence import ResidualRow
 from .options import FitOptions
 from .reduction import ReducedBag

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..unit.metrics import MICRO_G
+from ..unit.gravity import MICRO_G
 from .ladder import model_spec
 from .regression import Freedom, Outcome
 from .selection import fit_model

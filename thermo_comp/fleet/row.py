@@ -16,7 +16,7 @@ import numpy as np
 
 from ..fitting import FitResult, predicted_sd
 from ..unit.calibration import AXES, Calibration
-from ..unit.metrics import MICRO_G
+from ..unit.gravity import MICRO_G
 
 Cell = str | int | float | None
 Row = Mapping[str, Cell]

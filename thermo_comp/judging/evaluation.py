@@ -19,13 +19,15 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..fitting.stillness import CellAccumulator, Cells, still_intervals
+from ..online.batch import process_block
 from ..online.compensator import Compensator
 from ..online.status import CompensatorConfig, Counters
 from ..recording import Block, Input, RecordingInfo, Topics, open_recording
 from ..replay import check_unit, input_for
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration
-from ..unit.metrics import MICRO_G, ResidualStatistics, norm_residual, statistics_by_regime
+from ..unit.gravity import MICRO_G
+from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 
 #: Name of the column without thermal correction.
 RAW = 'raw'
@@ -261,7 +263,7 @@ class _Model:
         if self.compensator is None:
             self._sum(block.accel_stamp_ns, self._constant(block.accel), None)
             return []
-        corrected = self.compensator.process_block(block)
+        corrected = process_block(self.compensator, block)
         self._sum(corrected.stamp_ns, corrected.specific_force, corrected.covariance)
         return self.compensator.take_flags()
 

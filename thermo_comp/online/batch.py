@@ -12,21 +12,14 @@ the operations of `Compensator.process` in their order.
 from __future__ import annotations
 
 from array import array
-from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ..typing import Bools, Floats, Ints, Stamps
 from .blocks import AccelBlock, CompensatedBlock
+from .compensator import SEGMENT_NS, TIME_JUMP_NS, Compensator
 from .kernel import Lines, correct
 
-if TYPE_CHECKING:
-    from .compensator import Compensator
-
-#: Longest time over which bias and scale are taken as linear in time.
-SEGMENT_NS: Final = 1_000_000_000
-#: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
-TIME_JUMP_NS: Final = 1_000_000_000
 #: Where xx, xy, xz, yy, yz, zz stand in a row of the covariance.
 _UNIQUE = [0, 1, 2, 4, 5, 8]
 
@@ -77,7 +70,9 @@ class _Segments:
 
 def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
     """
-    Correct a block of samples; see `Compensator.process_block`.
+    Correct a block, e.g. a `recording.Block`, with the bits that `Compensator.process` gives.
+
+    Flags wait in `Compensator.take_flags`, counts in its `counters`.
 
     """
     counters = compensator.counters

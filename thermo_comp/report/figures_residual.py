@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from ..typing import Bools, Floats
-from ..unit.metrics import MICRO_G
+from ..unit.gravity import MICRO_G
 from .evidence import RAW, Evidence
 from .figures_thermal import shade_dynamic, shown_bag
 from .style import (

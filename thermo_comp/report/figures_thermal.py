@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from ..thermal.regime import Regime
 from ..typing import Floats
-from ..unit.metrics import MICRO_G
+from ..unit.gravity import MICRO_G
 from .evidence import BagFacts, Evidence, ShownBag
 from .style import (
     AXIS_LINES,

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..typing import Floats
 from ..unit.calibration import AXES, AxisReference, AxisSet, Calibration, RegimeSet
-from ..unit.metrics import MICRO_G
+from ..unit.gravity import MICRO_G
 from .evidence import RAW, Evidence, Position
 from .style import (
     DYNAMIC_LINE,

@@ -32,6 +32,7 @@ from ..thermal.settings import DetectorSettings
 from ..typing import Floats, Ints
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction
+from ..unit.gravity import STANDARD_GRAVITY
 from .evidence import CHOSEN, RAW, STATIC_ALONE, BagFacts, Evidence, ShownBag, Windows
 from .trace import ThermalTrace, thermal_trace
 
@@ -39,7 +40,7 @@ Progress = Callable[[float], None]
 
 # A recorded program is text that somebody else wrote; no real one is longer.
 _LONGEST_PROGRAM = 4096
-_STANDARD = FitOptions(gravity=9.80665)
+_STANDARD = FitOptions(gravity=STANDARD_GRAVITY)
 
 
 @dataclass(frozen=True)

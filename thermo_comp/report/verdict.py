@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ..unit.calibration import Calibration
-from ..unit.metrics import MICRO_G
+from ..unit.gravity import MICRO_G
 from .evidence import CHOSEN, RAW, Evidence
 from .text import number
 

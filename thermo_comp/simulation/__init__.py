@@ -16,6 +16,7 @@ Nothing here is built from a compensator's regressors, reads a file or a clock.
 
 """
 
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .attitude import Handling, positions
 from .campaign import PLAN_NAMES, Position, Record, arrays, plan
 from .converter import Converter
@@ -45,7 +46,7 @@ from .response import ThermalResponse
 from .run import START_NS, ChamberRipple, simulate, simulate_blocks
 from .thermometers import ThermometerModel
 from .truth import SimulatedRun, Truth, ideal_regime
-from .unit import MICRO_G, STANDARD_GRAVITY, SwitchedLoad, UnitModel
+from .unit import SwitchedLoad, UnitModel
 
 __all__ = [
     'AIR',

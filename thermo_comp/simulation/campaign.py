@@ -13,13 +13,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..typing import Floats, Ints
+from ..unit.gravity import STANDARD_GRAVITY
 from .attitude import positions
 from .cyclogram import Cyclogram, cyclogram_preset
 from .run import Chamber, RunOptions, ThermalTruth
 from .streams import Stream, generator
-from .unit import STANDARD_GRAVITY, UnitModel
+from .unit import UnitModel
 
 # Each axis has both signs, and none sees the same gravity throughout.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
@@ -35,7 +36,7 @@ class Position:
 
     name: str
     program: Cyclogram
-    up: NDArray[np.float64]
+    up: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,27 +63,27 @@ class Record:
     """
 
     name: str
-    time_s: NDArray[np.float64]
-    counts: NDArray[np.float64]
-    board_time_s: NDArray[np.float64]
-    board: NDArray[np.float64]
-    case_time_s: NDArray[np.float64]
-    case: NDArray[np.float64]
-    specific_force: NDArray[np.float64]
-    bias: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    time_s: Floats
+    counts: Floats
+    board_time_s: Floats
+    board: Floats
+    case_time_s: Floats
+    case: Floats
+    specific_force: Floats
+    bias: Floats
+    scale: Floats
 
-    def means(self, window_s: float = 60.0) -> NDArray[np.float64]:
+    def means(self, window_s: float = 60.0) -> Floats:
         """
         Return the means of the counts over whole windows, shape (w, 3).
 
         """
         per = round(window_s / self.time_s[0])
         n = len(self.counts) // per
-        result: NDArray[np.float64] = self.counts[: n * per].reshape(n, per, 3).mean(axis=1)
+        result: Floats = self.counts[: n * per].reshape(n, per, 3).mean(axis=1)
         return result
 
-    def corrected_by_truth(self, unit: UnitModel, window_s: float = 60.0) -> NDArray[np.float64]:
+    def corrected_by_truth(self, unit: UnitModel, window_s: float = 60.0) -> Floats:
         """
         Return the specific force that a perfect model makes of the counts, shape (w, 3), m/s^2.
 
@@ -90,7 +91,7 @@ class Record:
         counts, per = self.means(window_s), round(window_s)
         at = slice(0, len(counts) * per)
         bias, scale = (x[at].reshape(-1, per, 3).mean(axis=1) for x in (self.bias, self.scale))
-        result: NDArray[np.float64] = ((counts - bias) / scale / unit.scale_factor) @ unit.M.T
+        result: Floats = ((counts - bias) / scale / unit.scale_factor) @ unit.M.T
         return result
 
 
@@ -139,7 +140,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     return (*bench, *_positions('chamber', cyclogram_preset('three-hours'), ups))
 
 
-def _positions(name: str, program: Cyclogram, ups: NDArray[np.float64]) -> tuple[Position, ...]:
+def _positions(name: str, program: Cyclogram, ups: Floats) -> tuple[Position, ...]:
     ups = ups / np.linalg.norm(ups, axis=1, keepdims=True)
     names = [name] if len(ups) == 1 else [f'{name}-{i:02d}' for i in range(1, len(ups) + 1)]
     return tuple(Position(name, program, up) for name, up in zip(names, ups, strict=True))
@@ -210,17 +211,17 @@ def arrays(
     return records
 
 
-def _seconds(stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _seconds(stamp_ns: Ints) -> Floats:
     return stamp_ns.astype(np.float64) * 1e-9
 
 
 def _window_means(
     unit: UnitModel,
     chamber: Chamber,
-    up: NDArray[np.float64],
+    up: Floats,
     options: RunOptions,
     window_s: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """
     Return ends and means of whole windows: a window is one long cycle of a converter to match.
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .converter import Converter
 from .drift import (
     CreepEffect,
@@ -34,7 +35,7 @@ from .drift import (
 from .network import AIR, Link, ThermalNetwork, Thermostat
 from .streams import Stream, generator
 from .thermometers import ThermometerModel
-from .unit import MICRO_G, STANDARD_GRAVITY, SwitchedLoad, UnitModel
+from .unit import SwitchedLoad, UnitModel
 
 
 class _Specimen:

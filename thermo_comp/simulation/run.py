@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..typing import Floats, Ints
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .attitude import Attitude, Handling
 from .cyclogram import Cyclogram
 from .drift import PartHistory
 from .response import ThermalResponse
 from .streams import Stream, generator
 from .truth import SimulatedRun, Truth
-from .unit import MICRO_G, STANDARD_GRAVITY, UnitModel
+from .unit import UnitModel
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000

@@ -18,9 +18,6 @@ from .network import ThermalNetwork
 from .streams import Stream, generator
 from .thermometers import ThermometerModel
 
-STANDARD_GRAVITY = 9.80665
-MICRO_G = STANDARD_GRAVITY * 1e-6
-
 
 @dataclass(frozen=True)
 class SwitchedLoad:

@@ -18,10 +18,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from ..online.status import ThermalState
 from .plausibility import Fault, LeadWatch, SensorGuard
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
+from .state import ThermalState
 from .thermometer import Thermometer
 
 #: A unit that starts in the middle of a ramp has a memory that nobody saw: its sd then [K].

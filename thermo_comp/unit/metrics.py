@@ -16,9 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..typing import Bools, Floats
-
-#: One micro-g: a unit of accelerometer errors, from the conventional 9.80665 m/s^2.
-MICRO_G = 9.80665e-6
+from .gravity import MICRO_G
 
 
 @dataclass(frozen=True)
