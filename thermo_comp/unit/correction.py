@@ -17,10 +17,9 @@ from ..thermal import tracker as thermal
 from .axis_correction import AxisCorrection, BiasScale, Excess, Regressors, Variance
 from .calibration import Calibration, RegimeSet
 from .functions import Number, hold
-from .gravity import MICRO_G
 
 #: While the sets cross over, the output moves no faster than this [m/s^3] (1 ug per second) ...
-GENTLE_RATE = MICRO_G
+GENTLE_RATE = 9.80665e-6
 #: ... unless that took more than this many transition times.
 LONGEST_TRANSITION = 10.0
 _GAP_TEMPERATURES = 33

@@ -10,4 +10,4 @@ from __future__ import annotations
 #: [m/s^2], exact by definition: 3rd General Conference on Weights and Measures, 1901.
 STANDARD_GRAVITY = 9.80665
 #: One micro-g, a unit of accelerometer errors [m/s^2].
-MICRO_G = 9.80665e-6
+MICRO_G = 1e-6 * STANDARD_GRAVITY
