@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..typing import Floats
+from ..unit.gravity import MICRO_G
 from .converter import Converter
 from .drift import ZERO, DriftModel, Effect, Triple
 from .network import ThermalNetwork
@@ -99,7 +100,7 @@ class UnitModel:
     loads: tuple[SwitchedLoad, ...] = ()
 
     @property
-    def counts_per_micro_g(self) -> NDArray[np.float64]:
+    def counts_per_micro_g(self) -> Floats:
         """
         What a micro-g is per axis, shape (3,), counts/cycle.
 
@@ -256,6 +257,6 @@ class UnitModel:
         return replace(self, drift=DriftModel())
 
 
-def _triple(values: NDArray[np.float64]) -> Triple:
+def _triple(values: Floats) -> Triple:
     x, y, z = values.tolist()
     return x, y, z
