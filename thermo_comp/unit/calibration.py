@@ -6,12 +6,12 @@ Owns the Calibration value: everything that is known about one unit, validated a
 The dataclasses mirror the calibration file key by key. One object is one unit; it is immutable,
 so a running node swaps it by one reference.
 
-Measurement model, per axis i and regime r (eqs 6-9, and beyond the paper the gradient, rate and
-memory terms), with ``t = T_board - T_ref``, ``g = T_case - T_board``, ``q = dT_board/dt`` and
-``m_k = T_board - L_k`` where ``dL_k/dt = (T_board - L_k) / tau_k``::
+Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
+(0..1), and phi_j the columns of the response (`columns`), common to both sets (eqs 6-9, and
+beyond the paper the response)::
 
-    bias  = bias_i + delta + Fs(t) + gradient.bias g + rate.bias q + sum_k memory.bias[k] m_k
-    scale = K_i (Fc(t) + gradient.scale g + rate.scale q + sum_k memory.scale[k] m_k)
+    bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
+    scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
     x_i   = (N_i - bias) / scale
     f     = M x
 
@@ -23,27 +23,23 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-import numpy as np
-from pydantic import Field
-
 from ..thermal.settings import DetectorSettings
-from ..typing import Floats
-from .functions import CubicSpline, Exponential, Polynomial
+from .columns import Column
+from .extremes import smallest_value
+from .functions import TemperatureFunction
+from .posterior import Block, ParameterLayout, Posterior
+from .schema import Bounds, NotNegative, Positive
 
-#: The version of the file's layout that this code writes and reads.
-FORMAT_VERSION = 1
+#: The version of the file's layout that this code writes.
+FORMAT_VERSION = 2
 AXES = ('x', 'y', 'z')
 #: A scale function, with every term at its worst, must stay above this fraction of the reference.
 SMALLEST_RELATIVE_SCALE = 0.1
 #: How exactly a function must meet its value at the reference.
 NORMALISATION_TOLERANCE = 1e-9
 
-_STRICT = {'extra': 'forbid', 'strict': True, 'allow_inf_nan': False}
-
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 Range = tuple[float, float]
-Function = Annotated[Polynomial | CubicSpline | Exponential, Field(discriminator='kind')]
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -53,20 +49,15 @@ class Unit:
 
     """
 
-    __pydantic_config__ = _STRICT
-
-    serial: Annotated[str, Field(min_length=1, description='Serial number of the unit.')]
+    serial: Annotated[str, Bounds(shortest=1), 'Serial number of the unit.']
     input: Annotated[
         Literal['counts', 'm/s^2'],
-        Field(description='Unit of the raw samples: counts per conversion cycle, or m/s^2.'),
+        'Unit of the raw samples: counts per conversion cycle, or m/s^2.',
     ]
     full_scale: Annotated[
-        Positive,
-        Field(description='A sample at or beyond this magnitude is saturated, in input units.'),
+        Positive, 'A sample at or beyond this magnitude is saturated, in input units.'
     ]
-    cycle_time_s: Annotated[
-        Positive, Field(description='Length of a conversion cycle = sample interval [s].')
-    ]
+    cycle_time_s: Annotated[Positive, 'Length of a conversion cycle = sample interval [s].']
 
 
 @dataclass(frozen=True)
@@ -76,18 +67,12 @@ class AxisReference:
 
     """
 
-    __pydantic_config__ = _STRICT
-
-    scale_factor: Annotated[
-        float, Field(description='K: input units per m/s^2 at the reference temperature.')
-    ]
-    bias: Annotated[
-        float, Field(description='dNs(0): zero offset at the reference, in input units.')
-    ]
+    scale_factor: Annotated[float, 'K: input units per m/s^2 at the reference temperature.']
+    bias: Annotated[float, 'dNs(0): zero offset at the reference, in input units.']
 
     def __post_init__(self) -> None:
         if not self.scale_factor:
-            raise ValueError('`scale_factor` must not be 0')
+            raise ValueError('`scale_factor` must not be 0, got 0.0')
 
 
 @dataclass(frozen=True)
@@ -97,71 +82,24 @@ class Axes:
 
     """
 
-    __pydantic_config__ = _STRICT
-
     x: AxisReference
     y: AxisReference
     z: AxisReference
 
 
 @dataclass(frozen=True)
-class LinearTerm:
-    """
-    Coefficients of one thermal regressor, on the bias and on the scale.
-
-    """
-
-    __pydantic_config__ = _STRICT
-
-    bias: Annotated[float, Field(description='Input units per unit of the regressor.')] = 0.0
-    scale: Annotated[float, Field(description='Relative, per unit of the regressor.')] = 0.0
-
-
-@dataclass(frozen=True)
-class MemoryTerm:
-    """
-    Coefficients of the thermal memory, one per time constant.
-
-    """
-
-    __pydantic_config__ = _STRICT
-
-    bias: Annotated[tuple[float, ...], Field(description='Input units per K.')] = ()
-    scale: Annotated[tuple[float, ...], Field(description='Relative, per K.')] = ()
-
-
-@dataclass(frozen=True)
 class AxisSet:
     """
-    The correction of one axis in one regime (method section 3: items 2 to 4, and more).
+    The curves of one axis in one regime (method section 3: items 2 to 4).
 
     """
 
-    __pydantic_config__ = _STRICT
-
-    bias_function: Annotated[Function, Field(description='Fs(t), input units; Fs(0) = 0.')]
-    scale_function: Annotated[Function, Field(description='Fc(t), dimensionless; Fc(0) = 1.')]
-    delta: Annotated[
-        float, Field(description='Bias of this regime relative to axes.bias, input units.')
-    ] = 0.0
-    gradient: Annotated[LinearTerm, Field(description='Terms in T_case - T_board [K].')] = (
-        LinearTerm()
-    )
-    rate: Annotated[LinearTerm, Field(description='Terms in dT_board/dt [K/s].')] = LinearTerm()
-    memory: Annotated[MemoryTerm, Field(description='Terms in T_board minus its lags [K].')] = (
-        MemoryTerm()
-    )
+    bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
+    scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
+    delta: Annotated[float, 'Bias of this regime relative to axes.bias, input units.'] = 0.0
     residual_sd_m_s2: Annotated[
-        NotNegative, Field(description='What this set leaves unexplained, as a slow error.')
+        NotNegative, 'What this set leaves unexplained, as a slow error.'
     ] = 0.0
-    covariance: Annotated[
-        tuple[tuple[float, ...], ...],
-        Field(
-            description='Lower triangle of the covariance of [bias level, Fs free coefficients, '
-            'gradient.bias, rate.bias, memory.bias.., relative scale level, Fc free '
-            'coefficients, gradient.scale, rate.scale, memory.scale..]; empty when unknown.'
-        ),
-    ] = ()
 
     def __post_init__(self) -> None:
         for name, function, expected in (
@@ -171,29 +109,6 @@ class AxisSet:
             value = function.value(0.0)
             if not abs(value - expected) <= NORMALISATION_TOLERANCE:
                 raise ValueError(f'`{name}` must be {expected:g} at the reference, got {value:g}')
-        if len(self.memory.bias) != len(self.memory.scale):
-            raise ValueError(
-                '`memory` must have as many bias as scale coefficients, '
-                f'got {len(self.memory.bias)} and {len(self.memory.scale)}'
-            )
-        if self.covariance:
-            _check_covariance(self.covariance, self.n_bias_parameters + self.n_scale_parameters)
-
-    @property
-    def n_bias_parameters(self) -> int:
-        """
-        Number of bias entries in `covariance`.
-
-        """
-        return 3 + self.bias_function.n_free + len(self.memory.bias)
-
-    @property
-    def n_scale_parameters(self) -> int:
-        """
-        Number of scale entries in `covariance`.
-
-        """
-        return 3 + self.scale_function.n_free + len(self.memory.scale)
 
 
 @dataclass(frozen=True)
@@ -205,26 +120,14 @@ class RegimeSet:
 
     """
 
-    __pydantic_config__ = _STRICT
-
-    temperature_range_c: Annotated[Range, Field(description='Board temperature [degC].')]
-    rate_range_k_min: Annotated[Range, Field(description='dT_board/dt [K/min].')]
+    temperature_range_c: Annotated[Range, 'Board temperature [degC].']
+    rate_range_k_min: Annotated[Range, 'dT_board/dt [K/min].']
     x: AxisSet
     y: AxisSet
     z: AxisSet
-    gradient_range_k: Annotated[Range, Field(description='T_case - T_board [K].')] = (-50.0, 50.0)
-    memory_range_k: Annotated[Range, Field(description='T_board minus its lags [K].')] = (
-        -50.0,
-        50.0,
-    )
 
     def __post_init__(self) -> None:
-        for name in (
-            'temperature_range_c',
-            'rate_range_k_min',
-            'gradient_range_k',
-            'memory_range_k',
-        ):
+        for name in ('temperature_range_c', 'rate_range_k_min'):
             lower, upper = getattr(self, name)
             if not lower < upper:
                 raise ValueError(f'`{name}` must be [lower, upper] with lower < upper')
@@ -238,13 +141,39 @@ class RegimeSet:
 
 
 @dataclass(frozen=True)
+class ResponseTerm(Column):
+    """
+    A column of the thermal response with its weights on the three axes.
+
+    """
+
+    bias: Annotated[Vector, 'Input units per unit of the column.'] = field(kw_only=True)
+    scale: Annotated[Vector, 'Relative, per unit of the column.'] = field(kw_only=True)
+
+
+@dataclass(frozen=True)
+class GroupEvidence:
+    """
+    What one group of columns is worth to the data it was fitted on.
+
+    """
+
+    group: Annotated[str, 'The group, as in `response`.']
+    part: Annotated[Literal['bias', 'scale'], 'Which of the two it corrects.']
+    explains_m_s2: Annotated[NotNegative, 'RMS of what it explains.']
+    effective_parameters: Annotated[NotNegative, 'How many of its weights the data determine.']
+    log_evidence_change: Annotated[float, 'By how much the log evidence falls without it.']
+    prior_sd: Annotated[
+        tuple[NotNegative, ...], 'Standard deviation of its weights before the data were seen.'
+    ]
+
+
+@dataclass(frozen=True)
 class Source:
     """
     One bag that the calibration was fitted on.
 
     """
-
-    __pydantic_config__ = _STRICT
 
     name: str
     sha256: str = ''
@@ -257,8 +186,6 @@ class ResidualSummary:
     |g| error of one section of the fitted data, before and after.
 
     """
-
-    __pydantic_config__ = _STRICT
 
     section: str
     n_windows: int
@@ -273,8 +200,6 @@ class Provenance:
     Where the numbers come from.
 
     """
-
-    __pydantic_config__ = _STRICT
 
     created: str = ''
     tool_version: str = ''
@@ -296,43 +221,50 @@ class Calibration:
 
     """
 
-    __pydantic_config__ = _STRICT
-
-    format_version: Annotated[int, Field(description='Version of this layout: 1.')]
+    format_version: Annotated[int, f'Version of this layout: {FORMAT_VERSION}.']
     unit: Unit
-    reference_temperature_c: Annotated[float, Field(description='T_ref; the paper uses 20.')]
-    gravity_m_s2: Annotated[
-        float, Field(gt=9.0, lt=10.5, description='Local gravity used by the fit.')
-    ]
+    reference_temperature_c: Annotated[float, 'T_ref; the paper uses 20.']
+    gravity_m_s2: Annotated[float, Bounds(above=9.0, below=10.5), 'Local gravity used by the fit.']
     axes: Axes
-    static: Annotated[RegimeSet, Field(description='The set of the static regime, S = 0.')]
-    dynamic: Annotated[RegimeSet, Field(description='The set of the dynamic regime, S = 1.')]
+    static: Annotated[RegimeSet, 'The set of the static regime, S = 0.']
+    dynamic: Annotated[RegimeSet, 'The set of the dynamic regime, S = 1.']
     noise_density_m_s2_sqrt_hz: Annotated[
         tuple[Positive, Positive, Positive],
-        Field(description='White noise of each axis; variance of a sample = density^2 / cycle.'),
+        'White noise of each axis; variance of a sample = density^2 / cycle, and rounding.',
     ]
+    slow_noise_m_s2_sqrt_h: Annotated[
+        tuple[NotNegative, NotNegative, NotNegative],
+        'Random walk of the bias of each axis, per root hour.',
+    ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
-        tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]],
-        Field(description='M: lower triangular, unit diagonal; sensitivity axes to frame.'),
+        tuple[Vector, Vector, Vector],
+        'M: lower triangular, unit diagonal; sensitivity axes to frame.',
     ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     misalignment_sd: Annotated[
         tuple[NotNegative, NotNegative, NotNegative],
-        Field(description='Standard deviations of M[1][0], M[2][0], M[2][1].'),
+        'Standard deviations of M[1][0], M[2][0], M[2][1], where there is no `posterior`.',
     ] = (0.0, 0.0, 0.0)
-    memory_time_constants_s: Annotated[
-        tuple[Positive, ...], Field(description='tau_k of the lags of T_board.')
+    sensors: Annotated[
+        tuple[str, ...], 'Thermometers beside the board; the first one leads in a ramp.'
+    ] = ('case',)
+    response: Annotated[
+        tuple[ResponseTerm, ...], 'The thermal response, common to both sets.'
     ] = ()
     board_lag_s: Annotated[
         Positive,
-        Field(
-            description='Time constant of T_board behind T_case: stands in for the gradient '
-            '(lag times rate) while the case sensor is lost.'
-        ),
+        'Time constant of T_board behind T_case: stands in for the gradient (lag times rate) '
+        'while the case sensor is lost.',
     ] = 900.0
-    detector: Annotated[
-        DetectorSettings, Field(description='The thermometers and the regime detector.')
-    ] = field(default_factory=DetectorSettings)
+    detector: Annotated[DetectorSettings, 'The thermometers and the regime detector.'] = field(
+        default_factory=DetectorSettings
+    )
     provenance: Provenance = Provenance()
+    evidence: Annotated[
+        tuple[GroupEvidence, ...], 'What each group of columns is worth, by part.'
+    ] = ()
+    posterior: Annotated[
+        Posterior | None, 'Covariance of all parameters; null where it is unknown.'
+    ] = None
 
     def __post_init__(self) -> None:
         if self.format_version != FORMAT_VERSION:
@@ -340,21 +272,21 @@ class Calibration:
                 f'`format_version` must be {FORMAT_VERSION}, got {self.format_version}'
             )
         self._check_misalignment()
+        self._check_sensors()
         for regime, regime_set in (('static', self.static), ('dynamic', self.dynamic)):
-            for axis, axis_set in zip(AXES, regime_set.axes(), strict=True):
-                n_memory = len(axis_set.memory.bias)
-                if n_memory not in (0, len(self.memory_time_constants_s)):
-                    raise ValueError(
-                        f'`{regime}.{axis}.memory` must have one coefficient per '
-                        f'memory_time_constants_s ({len(self.memory_time_constants_s)}), '
-                        f'got {n_memory}'
-                    )
-                smallest = _smallest_scale(axis_set, regime_set, self.reference_temperature_c)
+            for axis, name in enumerate(AXES):
+                smallest = self._smallest_scale(regime, regime_set, axis)
                 if not smallest > SMALLEST_RELATIVE_SCALE:
                     raise ValueError(
-                        f'`{regime}.{axis}.scale_function` must stay above '
+                        f'`{regime}.{name}.scale_function` must stay above '
                         f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {smallest:.4g}'
                     )
+        expected = parameter_layout(self).n_parameters
+        if self.posterior is not None and self.posterior.n_parameters != expected:
+            raise ValueError(
+                f'`posterior.rest` must have one number per parameter ({expected}), '
+                f'got {self.posterior.n_parameters}'
+            )
 
     def _check_misalignment(self) -> None:
         for row in range(3):
@@ -368,6 +300,40 @@ class Calibration:
                 if column < row and not abs(value) < 0.5:
                     raise ValueError(f'{key} must be below 0.5 in magnitude, got {value:g}')
 
+    def _check_sensors(self) -> None:
+        names = self.sensors
+        if not names or len(set(names)) != len(names) or not all(names) or 'board' in names:
+            raise ValueError(
+                '`sensors` must be different names, at least one, none of them board, '
+                f'got {list(names)}'
+            )
+        for k, term in enumerate(self.response):
+            if term.kind in ('now', 'neighbour', 'even') and term.sensor not in names:
+                raise ValueError(
+                    f'`response[{k}].sensor` must be one of sensors {list(names)}, '
+                    f'got {term.sensor!r}'
+                )
+
+    def _smallest_scale(self, regime: str, regime_set: RegimeSet, axis: int) -> float:
+        """
+        Lower bound of the relative scale over a set's ranges, every term at its worst.
+
+        """
+        reference = self.reference_temperature_c
+        lower, upper = (edge - reference for edge in regime_set.temperature_range_c)
+        result = smallest_value(regime_set.axes()[axis].scale_function, lower, upper)
+        farthest = max(
+            abs(edge - reference) for one in self.regime_sets() for edge in one.temperature_range_c
+        )
+        for term in self.response:
+            if term.during in ('always', regime) and term.scale[axis]:
+                largest = max(abs(edge) for edge in term.range)
+                try:
+                    result -= largest * farthest**term.power * abs(term.scale[axis])
+                except OverflowError:
+                    result = -math.inf
+        return result if math.isfinite(result) else -math.inf
+
     def regime_sets(self) -> tuple[RegimeSet, RegimeSet]:
         """
         Return the static and the dynamic set.
@@ -376,63 +342,34 @@ class Calibration:
         return self.static, self.dynamic
 
 
-def _check_covariance(rows: tuple[tuple[float, ...], ...], expected: int) -> None:
-    if len(rows) != expected or any(len(row) != i + 1 for i, row in enumerate(rows)):
-        raise ValueError(
-            f'`covariance` must be the {expected} rows of a lower triangle, '
-            f'got rows of {[len(row) for row in rows]}'
+def parameter_layout(calibration: Calibration) -> ParameterLayout:
+    """
+    Say where each parameter of a calibration stands in its posterior.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The unit; only the sizes of its functions and of its response count.
+
+    Returns
+    -------
+    ParameterLayout
+        The offsets.
+
+    """
+    blocks = []
+    at = 0
+    for static, dynamic in zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True):
+        pairs: tuple[tuple[TemperatureFunction, TemperatureFunction], ...] = (
+            (static.bias_function, dynamic.bias_function),
+            (static.scale_function, dynamic.scale_function),
         )
-    matrix = np.zeros((expected, expected))
-    for i, row in enumerate(rows):
-        matrix[i, : i + 1] = row
-    diagonal = np.diag(matrix).copy()
-    if not np.all(diagonal >= 0.0):
-        raise ValueError('`covariance` must not have a negative variance')
-    # Scaled to correlations first: entries in counts^2 and in relative^2 differ by 10 decades.
-    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    with np.errstate(over='ignore'):
-        correlation = (matrix + np.tril(matrix, -1).T) / scale / scale[:, np.newaxis]
-    # Eigenvalues exist of what is finite; beyond 1 there is no correlation anyway.
-    is_bounded = np.abs(correlation).max(initial=0.0) < 2.0
-    if not (is_bounded and np.linalg.eigvalsh(correlation)[0] > -1e-6):
-        raise ValueError('`covariance` must be positive semidefinite')
-
-
-def _smallest_scale(axis_set: AxisSet, regime_set: RegimeSet, reference: float) -> float:
-    """
-    Lower bound of the relative scale over a set's ranges, every term at its worst.
-
-    """
-    lower, upper = (edge - reference for edge in regime_set.temperature_range_c)
-    function = axis_set.scale_function
-    temperatures = np.linspace(lower, upper, 513)
-    if isinstance(function, Polynomial):
-        temperatures = np.append(temperatures, _extremes(function, lower, upper))
-    with np.errstate(all='ignore'):
-        smallest = float(np.min(function.value(temperatures)))
-    worst = _largest(regime_set.gradient_range_k) * abs(axis_set.gradient.scale)
-    worst += _largest(regime_set.rate_range_k_min) / 60.0 * abs(axis_set.rate.scale)
-    for coefficient in axis_set.memory.scale:
-        worst += _largest(regime_set.memory_range_k) * abs(coefficient)
-    result = smallest - worst
-    return result if math.isfinite(result) else -math.inf
-
-
-def _extremes(function: Polynomial, lower: float, upper: float) -> Floats:
-    """
-    Find where a polynomial can have its extremes inside a range.
-
-    """
-    reach = max(abs(lower), abs(upper), 1.0)
-    slope = [power * c for power, c in enumerate(function.coefficients)][1:]
-    # A term that cannot move the function by 1e-12 anywhere in the range moves no extreme either,
-    # and as a leading coefficient it would overflow the companion matrix.
-    while slope and not abs(slope[-1]) * reach ** len(slope) > 1e-12:
-        slope.pop()
-    if len(slope) < 2 or not np.all(np.isfinite(slope)):
-        return np.empty(0)
-    return np.clip(np.roots(slope[::-1]).real, lower, upper)
-
-
-def _largest(edges: Range) -> float:
-    return max(abs(edges[0]), abs(edges[1]))
+        for of_static, of_dynamic in pairs:
+            middle = at + 1 + of_static.n_free
+            response = middle + 1 + of_dynamic.n_free
+            end = response + len(calibration.response)
+            blocks.append(Block(at, middle, response, end))
+            at = end
+    return ParameterLayout(
+        (blocks[0], blocks[2], blocks[4]), (blocks[1], blocks[3], blocks[5]), at, at + 3
+    )

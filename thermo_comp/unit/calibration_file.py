@@ -11,29 +11,24 @@ is built (no aliases, so no alias bombs; no tags, so no objects; no duplicate ke
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import TypeAdapter, ValidationError
 
 from ..errors import CalibrationError
 from ..files import read_bounded, write_atomically
 from .calibration import FORMAT_VERSION, Calibration
+from .schema import SchemaError, build, json_schema, plain
+from .version_1 import read_version_1
 
-#: A calibration of the largest model takes some 60 kB.
+#: A calibration with the whole bank of columns takes some 600 kB, most of it the posterior.
 SIZE_LIMIT = 1 << 20
 DEPTH_LIMIT = 12
 #: Digits of the longest integer accepted; a float64 needs no more.
 _INTEGER_DIGITS = 20
-#: Longer than any key that there is.
-_LONGEST_NAME = 60
-_NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)')
 
-_ADAPTER: TypeAdapter[Calibration] = TypeAdapter(Calibration)
 _BASE: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
@@ -160,7 +155,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     if not isinstance(data, dict):
         raise CalibrationError('expected a mapping of keys at the top level', path)
     version = data.get('format_version')
-    if isinstance(version, int) and not isinstance(version, bool) and version > FORMAT_VERSION:
+    if type(version) is int and version > FORMAT_VERSION:
         raise CalibrationError(
             f'this file is of version {version}, newer than the {FORMAT_VERSION} that this '
             'release reads; update thermo_comp',
@@ -168,10 +163,11 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
             'format_version',
         )
     try:
-        return _ADAPTER.validate_json(json.dumps(data))
-    except ValidationError as error:
-        message, key = _first_problem(error)
-        raise CalibrationError(message, path, key) from error
+        if type(version) is int and version == 1:
+            return read_version_1(data)
+        return build(Calibration, data)
+    except SchemaError as error:
+        raise CalibrationError(error.message, path, error.key or None) from error
 
 
 def dump_calibration(calibration: Calibration) -> str:
@@ -195,7 +191,7 @@ def dump_calibration(calibration: Calibration) -> str:
 
     """
     text: str = yaml.dump(
-        _plain(calibration),
+        plain(calibration),
         Dumper=_Dumper,
         sort_keys=False,
         default_flow_style=None,
@@ -238,7 +234,7 @@ def calibration_schema() -> dict[str, Any]:
     """
     return {
         '$schema': 'https://json-schema.org/draft/2020-12/schema',
-        **_ADAPTER.json_schema(mode='validation'),
+        **json_schema(Calibration),
     }
 
 
@@ -262,16 +258,6 @@ def _represent_str(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
 
 
 _Dumper.add_representer(str, _represent_str)
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        items = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        # `kind` decides how the rest is read, so it stands first.
-        return {'kind': items.pop('kind'), **items} if 'kind' in items else items
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return value
 
 
 def _parse_yaml(content: bytes, path: str | Path | None) -> Any:
@@ -308,36 +294,3 @@ def _check_events(text: str, path: str | Path | None) -> None:
 
 def _line(event: Any) -> str:
     return f'line {event.start_mark.line + 1}'
-
-
-def _first_problem(error: ValidationError) -> tuple[str, str | None]:
-    problems = error.errors(include_url=False, include_context=False)
-    # A misspelt key gives two problems, and the spelling is the one to be told about.
-    unknown = [p for p in problems if p['type'] == 'unexpected_keyword_argument']
-    problem = (unknown or problems)[0]
-    kinds = ('polynomial', 'spline', 'exponential')
-    location = [part for part in problem['loc'] if part not in kinds]
-    key = ''
-    for part in location:
-        if isinstance(part, int):
-            key += f'[{part}]'
-        else:
-            # What is no name can be anything: lines, or pages of text.
-            name = part if part.isprintable() and len(part) < _LONGEST_NAME else repr(part)
-            key += ('.' if key else '') + f'{name:.{_LONGEST_NAME}}'
-    message = problem['msg'].removeprefix('Value error, ')
-    # What two keys have to do with each other is checked where both are known, and named there.
-    named = _NAMED_FIRST.fullmatch(message)
-    if named and problem['type'] == 'value_error':
-        key += f'.{named["key"]}' if key else named['key']
-        message = named['rest']
-    shown = problem.get('input')
-    if problem['type'] == 'missing':
-        message = 'this key is missing'
-    elif problem['type'] == 'unexpected_keyword_argument':
-        message = 'unknown key'
-    elif isinstance(shown, str | int | float | bool) or shown is None:
-        message += f', got {shown!r:.60}'
-    if len(problems) > 1:
-        message += f' (and {len(problems) - 1} more)'
-    return message, key or None
