@@ -11,7 +11,6 @@ is built (no aliases, so no alias bombs; no tags, so no objects; no duplicate ke
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -19,85 +18,13 @@ import yaml
 
 from ..errors import CalibrationError
 from ..files import read_bounded, write_atomically
+from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
 from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, json_schema, plain
 from .version_1 import read_version_1
 
 #: A calibration with the whole bank of columns takes some 600 kB, most of it the posterior.
 SIZE_LIMIT = 1 << 20
-DEPTH_LIMIT = 12
-#: Digits of the longest integer accepted; a float64 needs no more.
-_INTEGER_DIGITS = 20
-
-_BASE: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-
-
-class _Loader(_BASE):  # type: ignore[valid-type, misc]
-    """
-    YAML 1.2 core scalars (so 1e-05 is a number and `no` is a text), no duplicate keys.
-
-    """
-
-    #: Only what JSON knows: an explicit !!binary, !!set or !!timestamp is undefined here.
-    yaml_constructors = {  # noqa: RUF012
-        tag: constructor
-        for tag, constructor in _BASE.yaml_constructors.items()
-        if tag is None or tag.rpartition(':')[2] in ('null', 'str', 'seq')
-    }
-    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
-
-
-def _construct_int(loader: Any, node: yaml.ScalarNode) -> int:
-    text = loader.construct_scalar(node)
-    if len(text) > _INTEGER_DIGITS:
-        raise yaml.constructor.ConstructorError(
-            None, None, f'an integer of {len(text)} digits is not accepted', node.start_mark
-        )
-    return int(text, 10)
-
-
-def _construct_float(loader: Any, node: yaml.ScalarNode) -> float:
-    return float(loader.construct_scalar(node).replace('.inf', 'inf').replace('.nan', 'nan'))
-
-
-def _construct_bool(loader: Any, node: yaml.ScalarNode) -> bool:
-    return bool(loader.construct_scalar(node) == 'true')
-
-
-def _construct_mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:
-    result: dict[str, Any] = {}
-    for key_node, value_node in node.value:
-        key = loader.construct_object(key_node, deep=True)
-        if not isinstance(key, str):
-            raise yaml.constructor.ConstructorError(
-                None, None, f'a key must be a text, got {key!r:.40}', key_node.start_mark
-            )
-        if key in result:
-            raise yaml.constructor.ConstructorError(
-                None, None, f'the key {key!r:.60} stands twice', key_node.start_mark
-            )
-        result[key] = loader.construct_object(value_node, deep=True)
-    return result
-
-
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:null', re.compile(r'^(?:~|null|)$'), ['~', 'n', '']
-)
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:bool', re.compile(r'^(?:true|false)$'), list('tf')
-)
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:int', re.compile(r'^[-+]?[0-9]+$'), list('-+0123456789')
-)
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:float',
-    re.compile(r'^[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf)$|^\.nan$'),
-    list('-+.0123456789'),
-)
-_Loader.add_constructor('tag:yaml.org,2002:int', _construct_int)
-_Loader.add_constructor('tag:yaml.org,2002:float', _construct_float)
-_Loader.add_constructor('tag:yaml.org,2002:bool', _construct_bool)
-_Loader.add_constructor('tag:yaml.org,2002:map', _construct_mapping)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -151,7 +78,12 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
         As `load_calibration`.
 
     """
-    data = _parse_yaml(content, path)
+    try:
+        data = load_plain_yaml(content.decode('utf-8'))
+    except UnicodeDecodeError as error:
+        raise CalibrationError(f'not UTF-8 text (byte {error.start})', path) from error
+    except PlainYamlError as error:
+        raise CalibrationError(str(error), path) from error
     if not isinstance(data, dict):
         raise CalibrationError('expected a mapping of keys at the top level', path)
     version = data.get('format_version')
@@ -250,47 +182,8 @@ class _Dumper(yaml.SafeDumper):
 
 def _represent_str(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
     # A text that one of the two YAML versions would take for a number is quoted: '1e5', 'no'.
-    resolved = _Loader.yaml_implicit_resolvers.get(value[:1], [])
-    quoted = any(pattern.match(value) for _, pattern in resolved)
-    return dumper.represent_scalar(
-        'tag:yaml.org,2002:str', value, style="'" if quoted or not value else None
-    )
+    style = None if is_plain_text(value) else "'"
+    return dumper.represent_scalar('tag:yaml.org,2002:str', value, style=style)
 
 
 _Dumper.add_representer(str, _represent_str)
-
-
-def _parse_yaml(content: bytes, path: str | Path | None) -> Any:
-    try:
-        text = content.decode('utf-8')
-        _check_events(text, path)
-        return yaml.load(text, Loader=_Loader)  # noqa: S506 - a SafeLoader with less, not more
-    except UnicodeDecodeError as error:
-        raise CalibrationError(f'not UTF-8 text (byte {error.start})', path) from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, 'problem_mark', None)
-        where = f' (line {mark.line + 1})' if mark is not None else ''
-        problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
-        raise CalibrationError(f'not valid YAML: {problem}{where}', path) from error
-
-
-def _check_events(text: str, path: str | Path | None) -> None:
-    depth = 0
-    documents = 0
-    for event in yaml.parse(text, Loader=_BASE):
-        if isinstance(event, yaml.AliasEvent):
-            raise CalibrationError(f'YAML aliases are not accepted ({_line(event)})', path)
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > DEPTH_LIMIT:
-                raise CalibrationError(f'nested deeper than {DEPTH_LIMIT} ({_line(event)})', path)
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        elif isinstance(event, yaml.DocumentStartEvent):
-            documents += 1
-            if documents > 1:
-                raise CalibrationError('expected one YAML document, found more', path)
-
-
-def _line(event: Any) -> str:
-    return f'line {event.start_mark.line + 1}'

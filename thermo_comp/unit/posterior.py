@@ -10,7 +10,6 @@ Owns the covariance of all parameters of a calibration, as a factor that fits in
 from __future__ import annotations
 
 import base64
-import binascii
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -51,15 +50,7 @@ class Posterior:
     ]
 
     def __post_init__(self) -> None:
-        for key in ('factor', 'rest'):
-            try:
-                numbers = _decoded(getattr(self, key))
-            except (binascii.Error, ValueError) as error:
-                raise ValueError(f'`{key}` must be base64 of float32 numbers: {error}') from error
-            if not np.isfinite(numbers).all():
-                raise ValueError(f'`{key}` must hold finite numbers')
-        n = self.n_parameters
-        size = _decoded(self.factor).size
+        n, size = len(self.variances), self._factor.size
         if size != n * self.rank:
             raise ValueError(
                 f'`factor` must hold {n} x {self.rank} numbers (`rest` x `rank`), got {size}'
@@ -83,13 +74,13 @@ class Posterior:
         """
         return len(self.variances)
 
-    @cached_property
+    @property
     def matrix(self) -> Floats:
         """
         The factor, shape (n_parameters, rank).
 
         """
-        return _read_only(_decoded(self.factor).reshape(-1, self.rank))
+        return self._factor.reshape(-1, self.rank)
 
     @cached_property
     def variances(self) -> Floats:
@@ -97,7 +88,11 @@ class Posterior:
         The variances that stand on the diagonal beside the factor, shape (n_parameters,).
 
         """
-        return _read_only(_decoded(self.rest))
+        return _decoded('rest', self.rest)
+
+    @cached_property
+    def _factor(self) -> Floats:
+        return _decoded('factor', self.factor)
 
     def covariance(self) -> Floats:
         """
@@ -190,10 +185,13 @@ def _encoded(numbers: Floats) -> str:
         return base64.b64encode(numbers.astype(_FLOAT32).tobytes()).decode('ascii')
 
 
-def _decoded(text: str) -> Floats:
-    return np.frombuffer(base64.b64decode(text, validate=True), _FLOAT32).astype(np.float64)
-
-
-def _read_only(array: Floats) -> Floats:
-    array.flags.writeable = False
-    return array
+def _decoded(key: str, text: str) -> Floats:
+    try:
+        numbers = np.frombuffer(base64.b64decode(text, validate=True), _FLOAT32)
+    except ValueError as error:
+        raise ValueError(f'`{key}` must be base64 of float32 numbers: {error}') from error
+    if not np.isfinite(numbers).all():
+        raise ValueError(f'`{key}` must hold finite numbers')
+    result = numbers.astype(np.float64)
+    result.flags.writeable = False
+    return result
