@@ -22,10 +22,9 @@ VERSION = re.search(
     r"^__version__ = '([^']+)'$", (ROOT / NAME / '__init__.py').read_text(), re.MULTILINE
 ).group(1)
 
-# On Ubuntu 24.04 apt satisfies every floor but those of pydantic, typer, rosbags and mcap.
+# On Ubuntu 24.04 apt satisfies every floor but those of typer, rosbags and mcap.
 INSTALL = [
     'numpy>=1.26',
-    'pydantic>=2.10',
     'PyYAML>=6.0',
     'scipy>=1.11',
     'typer>=0.20',

@@ -261,15 +261,20 @@ class TestColumnMap:
         ('changes', 'key', 'message'),
         [
             ({'gravity': 9.8}, 'gravity', 'unknown key'),
-            ({'stamp': {'column': 't'}}, 'stamp', '`unit` of the stamp column'),
+            ({'stamp': {'column': 't'}}, 'stamp.unit', 'ns where there is a column'),
             ({'stamp': {}}, 'stamp', 'give either `column` and `unit`, or `rate_hz`'),
             ({'stamp': {'column': 't', 'unit': 's', 'rate_hz': 1.0}}, 'stamp', 'give either'),
             ({'stamp': {'rate_hz': 0.0}}, 'stamp.rate_hz', 'greater than 0'),
-            ({'stamp': {'column': 't', 'unit': 'min'}}, 'stamp.unit', "'s', 'ms', 'us' or 'ns'"),
+            (
+                {'stamp': {'column': 't', 'unit': 'min'}},
+                'stamp.unit',
+                "'s', 'ms', 'us' or 'ns', got 'min'",
+            ),
+            ({'stamp': {'column': 1.5, 'unit': 's'}}, 'stamp.column', 'text or integer, got 1.5'),
             (
                 {'accel': {'columns': ['x', 'y'], 'unit': 'g', 'output': 'imu'}},
-                'accel',
-                'required',
+                'accel.columns',
+                'must have 3 entries, got 2',
             ),
             (
                 {'accel': {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'counts'}},

@@ -207,7 +207,7 @@ def test_node_starts_without_the_offline_libraries() -> None:
 
 
 def test_help_starts_without_the_heavy_libraries() -> None:
-    heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'pydantic', 'rclpy', 'dask')
+    heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
 
 

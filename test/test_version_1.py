@@ -34,7 +34,7 @@ def old_regressors(one, state):
 
 
 def new_columns(state, weight):
-    t, gradient, rate, lags = state
+    _, gradient, rate, lags = state
     values = {'now': gradient, 'rate': rate, ('board', 600.0): lags[0], ('board', 2400.0): lags[1]}
     factor = {'static': 1.0 - weight, 'dynamic': weight, 'always': 1.0}
     return np.array(

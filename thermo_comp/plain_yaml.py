@@ -35,14 +35,14 @@ class PlainYamlError(ValueError):
 
 
 def load_plain_yaml(
-    text: str, depth_limit: int = DEPTH_LIMIT, node_limit: int = NODE_LIMIT
+    text: str | bytes, depth_limit: int = DEPTH_LIMIT, node_limit: int = NODE_LIMIT
 ) -> Any:
     """
     Read one YAML document of plain values.
 
     Parameters
     ----------
-    text : str
+    text : str or bytes
         The document.
     depth_limit, node_limit : int, optional
         The deepest nesting and the most values accepted.
@@ -77,7 +77,7 @@ def is_plain_text(text: str) -> bool:
     return not (text in _WORDS or _INTEGER.fullmatch(text) or _FLOAT.fullmatch(text))
 
 
-def _load(text: str, depth_limit: int, node_limit: int) -> Any:
+def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
     document: list[Any] = []
     #: The open collections, innermost last; a mapping with the key that waits for its value.
     open_ones: list[Any] = [document]
@@ -88,7 +88,7 @@ def _load(text: str, depth_limit: int, node_limit: int) -> Any:
             raise PlainYamlError(f'more than {node_limit} keys and values')
         kind = type(event)
         if kind is yaml.ScalarEvent or kind in (yaml.SequenceStartEvent, yaml.MappingStartEvent):
-            if event.tag is not None:
+            if event.tag not in (None, '!'):
                 raise PlainYamlError(f'YAML tags are not accepted ({_line(event)})')
             holder = open_ones[-1]
             if kind is yaml.ScalarEvent:
