@@ -292,9 +292,9 @@ def track(freezer: Freezer, detector: DetectorSettings | None = None) -> Tracked
     rows = []
     for stamp, is_case, value in sorted(readings):
         if is_case:
-            tracker.case_reading(int(stamp), float(value))
+            tracker.read('case', int(stamp), float(value))
             continue
-        tracker.board_reading(int(stamp), float(value))
+        tracker.read('board', int(stamp), float(value))
         board = tracker.board
         rows.append(
             (

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..thermal.settings import DetectorSettings, ThermalConfig
-from ..thermal.tracker import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, WEIGHT, ThermalTracker
+from ..thermal.state import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, WEIGHT
+from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats, Ints
 from .reduction import ReducedBag
 
@@ -128,7 +129,7 @@ def thermal_history(
         From the first board reading to the last sample.
 
     """
-    tracker = ThermalTracker(detector, (), config)
+    tracker = ThermalTracker(detector, None, config)
     start_s, states = thermal_states(bag, tracker, step_s)
     return ThermalHistory(
         start_s=start_s,
@@ -182,8 +183,8 @@ def thermal_states(
     stamp_list, value_list, case_list = stamps.tolist(), values.tolist(), is_case.tolist()
     for stamp, stop in zip(grid.tolist(), due.tolist(), strict=True):
         while reading < stop:
-            take = tracker.case_reading if case_list[reading] else tracker.board_reading
-            take(stamp_list[reading], value_list[reading])
+            name = 'case' if case_list[reading] else 'board'
+            tracker.read(name, stamp_list[reading], value_list[reading])
             reading += 1
         rows.append(tracker.sample(stamp))
     return (begin - bag.start_ns) * 1e-9, np.array(rows)
