@@ -51,7 +51,7 @@ def small_calibration() -> Calibration:
     axis = AxisSet(Polynomial((0.0, 0.5)), Polynomial((1.0, 1e-5)))
     sets = RegimeSet(x=axis, y=axis, z=axis, temperature_range_c=(5, 35), rate_range_k_min=(-1, 1))
     return Calibration(
-        format_version=1,
+        format_version=2,
         unit=Unit('T-1', 'counts', 32767.0, 0.01),
         reference_temperature_c=20.0,
         gravity_m_s2=9.80665,
@@ -95,7 +95,7 @@ _SET = f'{{temperature_range_c: [5, 35], rate_range_k_min: [-1, 1], x: {_FUNCTIO
 _SET += f', y: {_FUNCTIONS}, z: {_FUNCTIONS}}}'
 _AXIS = '{scale_factor: 300, bias: 0}'
 SMALLEST = f"""\
-format_version: 1
+format_version: 2
 unit: {{serial: T, input: counts, full_scale: 9999, cycle_time_s: 0.01}}
 reference_temperature_c: 20
 gravity_m_s2: 9.8

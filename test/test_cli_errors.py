@@ -217,7 +217,7 @@ class TestCalibrations:
         self.used(cli, tmp_path, '{', r'not valid YAML')
 
     def test_a_newer_format(self, cli: Cli, tmp_path: Path, unit: Path) -> None:
-        text = unit.read_text().replace('format_version: 1', 'format_version: 2')
+        text = unit.read_text().replace('format_version: 2', 'format_version: 3')
         self.used(cli, tmp_path, text, r'format_version: .*newer')
 
     def test_missing_file(self, cli: Cli, tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def constant_calibration(fit: TriadFit, unit: Handheld, serial: str) -> Calibrat
     )
     matrix = tuple(tuple(float(v) for v in line) for line in fit.misalignment)
     return Calibration(
-        format_version=1,
+        format_version=2,
         unit=Unit(serial, 'm/s^2', 4.0 * GRAVITY, 0.01),
         reference_temperature_c=ROOM_C,
         gravity_m_s2=GRAVITY,

@@ -24,11 +24,11 @@ import numpy as np
 from ..errors import CalibrationError
 from ..typing import Floats
 from ..unit.calibration import (
+    FORMAT_VERSION,
     Axes,
     AxisReference,
     AxisSet,
     Calibration,
-    LinearTerm,
     Provenance,
     RegimeSet,
     Unit,
@@ -225,12 +225,11 @@ def import_parameters(
         raise CalibrationError(f'temperature range {edges[0]:g}..{edges[1]:g} degC is empty')
     one = Polynomial((1.0,))
     axes = [
-        AxisSet(Polynomial((0.0, *(float(c) for c in bias[axis, 1:]))), one, 0.0, LinearTerm())
-        for axis in range(3)
+        AxisSet(Polynomial((0.0, *(float(c) for c in bias[axis, 1:]))), one) for axis in range(3)
     ]
     regime = RegimeSet(edges, (-60.0, 60.0), axes[0], axes[1], axes[2])
     return Calibration(
-        format_version=1,
+        format_version=FORMAT_VERSION,
         unit=Unit(serial, 'm/s^2', full_scale, cycle_time_s),
         reference_temperature_c=reference,
         gravity_m_s2=gravity,
@@ -293,14 +292,11 @@ def _losses(
     worst = float(np.max(np.abs(matrix - np.eye(3))))
     if worst:
         notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
-    terms = {
-        'gradient': any(s.gradient != LinearTerm() for s in _sets(calibration)),
-        'rate': any(s.rate != LinearTerm() for s in _sets(calibration)),
-        'memory': any(any(s.memory.bias + s.memory.scale) for s in _sets(calibration)),
-    }
-    lost = [name for name, is_there in terms.items() if is_there]
+    lost = sorted({term.group for term in calibration.response if any(term.bias + term.scale)})
     if lost:
-        notes.append(f'{", ".join(lost)} terms are lost: heating and cooling read the same')
+        notes.append(
+            f'the thermal response is lost ({", ".join(lost)}): heating and cooling read the same'
+        )
     curves = [
         [(one.delta, one.bias_function, one.scale_function) for one in regime.axes()]
         for regime in calibration.regime_sets()
@@ -310,11 +306,6 @@ def _losses(
     if calibration.unit.input == 'counts':
         notes.append('offsets are counts divided by K: the driver must scale by these K')
     return notes
-
-
-def _sets(calibration: Calibration) -> list[AxisSet]:
-    static, dynamic = calibration.regime_sets()
-    return [*static.axes(), *dynamic.axes()]
 
 
 def _parse(text: str) -> dict[str, float]:
