@@ -22,10 +22,9 @@ VERSION = re.search(
     r"^__version__ = '([^']+)'$", (ROOT / NAME / '__init__.py').read_text(), re.MULTILINE
 ).group(1)
 
-# On Ubuntu 24.04 apt satisfies every floor but those of pydantic, typer, rosbags and mcap.
+# On Ubuntu 24.04 apt satisfies every floor but those of typer, rosbags and mcap.
 INSTALL = [
     'numpy>=1.26',
-    'pydantic>=2.10',
     'PyYAML>=6.0',
     'scipy>=1.11',
     'typer>=0.20',
@@ -53,21 +52,21 @@ EXTRAS = {
 # arithmetic of many samples, which is numpy's otherwise, is written in C. Nothing here may log
 # through rclpy at more than one severity: it tells the callers apart by their Python frames.
 CORE = [
-    'batch',
-    'compensator',
-    'health',
-    'modes',
-    'onset',
-    'plausibility',
-    'reading_queue',
-    'regime',
+    'online/batch',
+    'online/compensator',
+    'online/health',
+    'thermal/modes',
+    'thermal/onset',
+    'thermal/plausibility',
+    'thermal/reading_queue',
+    'thermal/regime',
     'ros/conversions',
     'ros/relay',
     'ros/scheduling',
     'ros/waitloop',
-    'sample_guard',
-    'thermal',
-    'thermometer',
+    'online/sample_guard',
+    'thermal/tracker',
+    'thermal/thermometer',
 ]
 COMPILER = 'mypy'
 COMPILER_FLOOR = (1, 18)

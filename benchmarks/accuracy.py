@@ -21,12 +21,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from thermo_comp.calibration import Calibration
-from thermo_comp.compensator import Compensator
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
-from thermo_comp.metrics import norm_residual, residual_statistics
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
     DriftModel,
@@ -38,8 +36,10 @@ from thermo_comp.simulation import (
     simulate_blocks,
     unit_preset,
 )
+from thermo_comp.typing import Floats, Ints
+from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.metrics import norm_residual, residual_statistics
 
-Array = npt.NDArray[np.float64]
 WINDOW_S = 60.0
 TEST_POSITIONS = 4
 LIMITS = {'thermostatted': (1.0, 1.8, 5.0), 'bare-quartz': (2.0, 3.0, 5.0)}
@@ -52,21 +52,21 @@ class SimulatedBlock:
 
     """
 
-    accel_stamp_ns: npt.NDArray[np.int64]
-    accel: Array
-    board_stamp_ns: npt.NDArray[np.int64]
-    board: Array
-    board_after: npt.NDArray[np.int64]
-    case_stamp_ns: npt.NDArray[np.int64]
-    case: Array
-    case_after: npt.NDArray[np.int64]
-    truth: Array
+    accel_stamp_ns: Ints
+    accel: Floats
+    board_stamp_ns: Ints
+    board: Floats
+    board_after: Ints
+    case_stamp_ns: Ints
+    case: Floats
+    case_after: Ints
+    truth: Floats
 
 
 def blocks(
     unit: UnitModel,
     program: str,
-    up: Array,
+    up: Floats,
     seed: int,
     rate_hz: float,
     temperature_rate_hz: float | None = None,
@@ -137,10 +137,10 @@ def held_out(calibration: Calibration, unit: UnitModel, seed: int, rate_hz: floa
     norms, vectors, inside = [], [], []
     for number, up in enumerate(positions(TEST_POSITIONS, seed + 500)):
         compensator = Compensator(calibration)
-        sums: dict[int, Array] = {}
+        sums: dict[int, Floats] = {}
         start_ns = None
         for block in blocks(unit, 'held-out', up, 1000 * seed + 500 + number, rate_hz):
-            found = compensator.process_block(block)
+            found = process_block(compensator, block)
             if not len(found.stamp_ns):
                 continue
             start_ns = int(found.stamp_ns[0]) if start_ns is None else start_ns
@@ -251,10 +251,10 @@ def exact_unit(seed: int) -> UnitModel:
         'board', bias=axes(5.0), bias_curvature=axes(0.05), scale=axes(40.0),
         scale_curvature=axes(0.2),
     )  # fmt: skip
-    return replace(unit_preset('thermostatted', seed), drift=DriftModel(parts=(drift,)))
+    return replace(unit_preset('thermostatted', seed), drift=DriftModel((drift,)))
 
 
-def bound(unit: UnitModel, program: str, directions: Array, window_s: float) -> Array:
+def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) -> Floats:
     """
     Cramer-Rao bound of bias [counts] and ln K at the reference, shape (2, 3), as sd.
 
@@ -270,7 +270,7 @@ def bound(unit: UnitModel, program: str, directions: Array, window_s: float) -> 
     K = np.array(unit.scale_factor)
     sd = np.array(unit.noise_density) * 1e-6 * STANDARD_GRAVITY * K / np.sqrt(window_s)
     n = len(directions)
-    effect = unit.drift.parts[0]
+    effect = unit.drift.effects[0]
     micro = 1e-6 * STANDARD_GRAVITY * K
     start = np.concatenate(
         (
@@ -284,7 +284,7 @@ def bound(unit: UnitModel, program: str, directions: Array, window_s: float) -> 
     )  # fmt: skip
     across = [np.linalg.svd(u[None])[2][1:] for u in directions]
 
-    def predicted(p: Array) -> Array:
+    def predicted(p: Floats) -> Floats:
         A = np.eye(3)
         A[1, 0], A[2, 0], A[2, 1] = p[18:21]
         angles = p[21:].reshape(n, 2)
@@ -319,8 +319,8 @@ def part_efficiency(options: argparse.Namespace) -> None:
     )
     print('|---|---|---|---|---|---|---|---|')
     for n_positions in (18, 24):
-        ratios: list[Array] = []
-        claimed: list[Array] = []
+        ratios: list[Floats] = []
+        claimed: list[Floats] = []
         for seed in range(1, options.units + 1):
             unit = exact_unit(seed)
             up = positions(n_positions, seed)

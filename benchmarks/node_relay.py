@@ -131,7 +131,7 @@ def _calibration_for(rate: int, folder: Path) -> str:
     """
     from dataclasses import replace
 
-    from thermo_comp.calibration_file import load_calibration, save_calibration
+    from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
     calibration = load_calibration(CALIBRATION)
     unit = replace(calibration.unit, cycle_time_s=1.0 / rate)

@@ -41,8 +41,8 @@ from regime_runs import (
     tuned,
 )
 
-from thermo_comp.regime import Regime
 from thermo_comp.simulation import UNIT_NAMES
+from thermo_comp.thermal.regime import Regime
 
 SOAK_H = 5.0
 # ramps per scene, by the rate of the readings [Hz]: ten times the readings, ten times the work

@@ -11,16 +11,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 from regime_regret import PROGRAMS, Unit
 
-Array = npt.NDArray[np.float64]
+from thermo_comp.typing import Bools, Floats
+
 BLUE, RED, GREEN, GREY = '#0072b2', '#d55e00', '#009e73', '#808080'
 
 
 def plot_rules(
-    t: Array, case: Array, board: Array, flags: Mapping[str, npt.NDArray[np.bool_]], folder: Path
+    t: Floats, case: Floats, board: Floats, flags: Mapping[str, Bools], folder: Path
 ) -> None:
     """
     Draw one ramp and its relaxation: temperatures, derivatives of the case, the flag of each rule.

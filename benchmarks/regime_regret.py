@@ -19,9 +19,9 @@ import numpy as np
 import numpy.typing as npt
 from accuracy import SimulatedBlock
 
-from thermo_comp.calibration import Calibration
-from thermo_comp.compensator import Compensator, CompensatorConfig
 from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
     SimulatedRun,
@@ -30,8 +30,9 @@ from thermo_comp.simulation import (
     simulate,
     unit_preset,
 )
+from thermo_comp.typing import Floats, Ints
+from thermo_comp.unit.calibration import Calibration
 
-Array = npt.NDArray[np.float64]
 MICRO_G = 1e-6 * STANDARD_GRAVITY
 N_POSITIONS = 12
 N_JUDGED = 2
@@ -63,16 +64,16 @@ class Judged:
     """
 
     program: str
-    time: Array
-    ours: Array
-    static: Array
-    dynamic: Array
+    time: Floats
+    ours: Floats
+    static: Floats
+    dynamic: Floats
     flag: npt.NDArray[np.int8]
-    noise: Array
-    jumps: Array
+    noise: Floats
+    jumps: Floats
 
     @property
-    def perfect(self) -> Array:
+    def perfect(self) -> Floats:
         """
         |f| - g under the perfect flag [ug].
 
@@ -92,7 +93,7 @@ class Unit:
     density: float
 
 
-def rms(values: Array) -> float:
+def rms(values: Floats) -> float:
     """
     Root of the mean square.
 
@@ -100,7 +101,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def seconds(values: Array) -> Array:
+def seconds(values: Floats) -> Floats:
     """
     Means over a second.
 
@@ -117,7 +118,7 @@ def judge_unit(job: tuple[str, int]) -> Unit:
     name, seed = job
     unit = unit_preset(name, seed)
 
-    def run(program: str, up: Array, number: int) -> SimulatedRun:
+    def run(program: str, up: Floats, number: int) -> SimulatedRun:
         return simulate(
             unit, cyclogram_preset(program), up, rate_hz=RATE_HZ, seed=1000 * seed + number
         )
@@ -139,7 +140,7 @@ def judge_unit(job: tuple[str, int]) -> Unit:
     )
 
 
-def block_of(run: SimulatedRun, accel: Array | None = None) -> SimulatedBlock:
+def block_of(run: SimulatedRun, accel: Floats | None = None) -> SimulatedBlock:
     """
     Give a run the form of a recording's block, with its counts or other samples.
 
@@ -190,7 +191,7 @@ def judge_bag(program: str, calibration: Calibration, run: SimulatedRun) -> Judg
 
 def compensated(
     calibration: Calibration, block: SimulatedBlock, weight: float | None = None
-) -> tuple[Array, npt.NDArray[np.int64], list[tuple[int, bool]]]:
+) -> tuple[Floats, Ints, list[tuple[int, bool]]]:
     """
     Specific force, stamps and flags of one bag; with a weight of the dynamic set, under that.
 
@@ -199,11 +200,11 @@ def compensated(
     compensator = Compensator(calibration, CompensatorConfig(stuck_timeout_s=0.0))
     if weight is not None:
         compensator.tracker.weight_at = lambda _stamp_ns: weight
-    found = compensator.process_block(block)
+    found = process_block(compensator, block)
     return found.specific_force, found.stamp_ns, compensator.take_flags()
 
 
-def norm_error(force: Array) -> Array:
+def norm_error(force: Floats) -> Floats:
     """
     |f| - g in ug.
 
@@ -211,7 +212,7 @@ def norm_error(force: Array) -> Array:
     return np.asarray((np.linalg.norm(force, axis=1) - STANDARD_GRAVITY) / MICRO_G)
 
 
-def jumps_of(both: Array, static: Array, dynamic: Array) -> Array:
+def jumps_of(both: Floats, static: Floats, dynamic: Floats) -> Floats:
     """
     Change of the output from one second to the next that each crossing over made, at most [ug].
 

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import oaconvolve
 
-Array = npt.NDArray[np.float64]
+from thermo_comp.typing import Floats
+
 RIPPLE_C = 0.1
 DRIFT_K_MIN = 0.01
 DRIFT_S = 5400.0
@@ -47,7 +47,7 @@ class Scene:
         return f'{1e3 * self.noise_sd:g} mK{quantum}'
 
 
-def first_order(t: Array, lag: float) -> Array:
+def first_order(t: Floats, lag: float) -> Floats:
     """
     Response of a lag to a unit ramp that starts at 0.
 
@@ -56,7 +56,7 @@ def first_order(t: Array, lag: float) -> Array:
     return x - lag * (1.0 - np.exp(-x / lag))
 
 
-def second_order(t: Array, lag: float, other: float) -> Array:
+def second_order(t: Floats, lag: float, other: float) -> Floats:
     """
     Response of two different lags in a row to a unit ramp that starts at 0.
 
@@ -67,8 +67,8 @@ def second_order(t: Array, lag: float, other: float) -> Array:
 
 
 def temperatures(
-    scene: Scene, t: Array, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
-) -> tuple[Array, Array]:
+    scene: Scene, t: Floats, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
+) -> tuple[Floats, Floats]:
     """
     Case and board for a ramp from 0 to `duration`; no ramp when the duration is 0.
 
@@ -91,7 +91,7 @@ def temperatures(
     return case, board
 
 
-def read(truth: Array, scene: Scene, rng: np.random.Generator) -> Array:
+def read(truth: Floats, scene: Scene, rng: np.random.Generator) -> Floats:
     """
     Let a sensor read.
 
@@ -100,7 +100,7 @@ def read(truth: Array, scene: Scene, rng: np.random.Generator) -> Array:
     return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
 
 
-def moving_fit(readings: Array, n: int, powers: int, wanted: int, at_end: bool) -> Array:
+def moving_fit(readings: Floats, n: int, powers: int, wanted: int, at_end: bool) -> Floats:
     """
     Derive a least-squares polynomial over the last n readings, per sample period.
 
@@ -113,7 +113,7 @@ def moving_fit(readings: Array, n: int, powers: int, wanted: int, at_end: bool) 
     return out
 
 
-def second_derivative(scene: Scene, readings: Array) -> Array:
+def second_derivative(scene: Scene, readings: Floats) -> Floats:
     """
     |d2T/dt2| of a parabola over the window, K/s^2.
 
@@ -122,7 +122,7 @@ def second_derivative(scene: Scene, readings: Array) -> Array:
     return np.abs(moving_fit(readings, n, 2, 2, at_end=False)) * scene.rate_hz**2
 
 
-def first_derivative(scene: Scene, readings: Array) -> Array:
+def first_derivative(scene: Scene, readings: Floats) -> Floats:
     """
     |dT/dt| of a straight line over the window, K/s.
 
@@ -131,7 +131,7 @@ def first_derivative(scene: Scene, readings: Array) -> Array:
     return np.abs(moving_fit(readings, n, 1, 1, at_end=False)) * scene.rate_hz
 
 
-def savitzky_golay(scene: Scene, readings: Array) -> Array:
+def savitzky_golay(scene: Scene, readings: Floats) -> Floats:
     """
     |dT/dt| at the newest end of a parabola over the window, K/s.
 
@@ -140,7 +140,7 @@ def savitzky_golay(scene: Scene, readings: Array) -> Array:
     return np.abs(moving_fit(readings, n, 2, 1, at_end=True)) * scene.rate_hz
 
 
-def exponential_fit(scene: Scene, readings: Array) -> Array:
+def exponential_fit(scene: Scene, readings: Floats) -> Floats:
     """
     |dT/dt| of an exponential with the unit's lag, fitted over the last 600 s of updates, K/s.
 
@@ -178,7 +178,7 @@ def exponential_fit(scene: Scene, readings: Array) -> Array:
     return out
 
 
-Rule = Callable[[Scene, Array], Array]
+Rule = Callable[[Scene, Floats], Floats]
 RIVALS: dict[str, Rule] = {
     '|d2T/dt2|': second_derivative,
     '|dT/dt|': first_derivative,
@@ -205,7 +205,7 @@ def known_signature_delays(
     longest = round(2.0 * (20.0 * dt * (4.5 * scene.noise_sd / bend) ** 2) ** 0.2 / dt)
     signature = scene.ramp_k_min / 60.0 * first_order(np.arange(1, longest + 1) * dt, scene.lag_s)
 
-    def cusum(x: Array) -> Array:
+    def cusum(x: Floats) -> Floats:
         best = np.zeros(len(x))
         energy = np.cumsum(signature**2)
         sums = np.zeros(len(x))

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from regime_rules import BOARD_LAG_S, RIPPLE_C, RIVALS, Array, Scene, read, temperatures
+from regime_rules import BOARD_LAG_S, RIPPLE_C, RIVALS, Scene, read, temperatures
 
-from thermo_comp.regime import Regime, RegimeDetector
-from thermo_comp.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.thermometer import Thermometer
+from thermo_comp.thermal.regime import Regime, RegimeDetector
+from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.thermal.thermometer import Thermometer
+from thermo_comp.typing import Bools, Floats
 
 SEGMENT_H = 2.5
 OURS = 'ours'
@@ -58,7 +59,7 @@ def rng_of(seed: int, purpose: int, scene: Scene) -> np.random.Generator:
     return np.random.default_rng([seed, purpose, *(round(1e6 * v) for v in vars(scene).values())])
 
 
-def ours(scene: Scene, case: Array, board: Array) -> npt.NDArray[np.int8]:
+def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
     """
     Flag of the shipped detector at each reading: 1 dynamic, 0 static, -1 unknown.
 
@@ -78,7 +79,7 @@ def ours(scene: Scene, case: Array, board: Array) -> npt.NDArray[np.int8]:
     return flags
 
 
-def judge(flags: Iterable[tuple[Array, npt.NDArray[np.bool_]]], duration: float) -> Outcome:
+def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
     """
     Delay, flips and flagged share of ramps from 0 to `duration`.
 
@@ -140,7 +141,7 @@ def run_ramps(
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)
-    flags: dict[str, list[tuple[Array, npt.NDArray[np.bool_]]]] = {OURS: []}
+    flags: dict[str, list[tuple[Floats, Bools]]] = {OURS: []}
     for _ in range(n):
         case, board = temperatures(scene, t, duration, rng, RIPPLE_C if is_rippled else 0.0)
         readings = read(case, scene, rng)

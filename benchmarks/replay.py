@@ -30,12 +30,13 @@ from pathlib import Path
 import numpy as np
 
 from thermo_comp import is_compiled
-from thermo_comp.calibration import Calibration
-from thermo_comp.calibration_file import load_calibration
-from thermo_comp.compensator import Compensator
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter, open_recording
 from thermo_comp.replay import BLOCK_MESSAGES
 from thermo_comp.replay import replay as replay_bag
+from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.calibration_file import load_calibration
 
 START_NS = 1_700_000_000_000_000_000
 RATE_HZ = 400
@@ -90,7 +91,7 @@ def read_and_compensate(path: Path) -> int:
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
         return sum(
-            len(compensator.process_block(block).index)
+            len(process_block(compensator, block).index)
             for block in reader.blocks(n_messages=BLOCK_MESSAGES)
         )
 
@@ -107,7 +108,7 @@ def compensate(path: Path) -> tuple[int, float]:
         for block in reader.blocks(n_messages=BLOCK_MESSAGES):
             # The thread's own clock: the reader decompresses ahead in others.
             begin = time.thread_time()
-            n += len(compensator.process_block(block).index)
+            n += len(process_block(compensator, block).index)
             spent += time.thread_time() - begin
     return n, spent
 

@@ -296,8 +296,8 @@ def calibrations(rate: int, folder: Path) -> list[str]:
     Write two calibrations of the example's unit at a rate, with quick lags, to change between.
 
     """
-    from thermo_comp.calibration_file import load_calibration, save_calibration
-    from thermo_comp.settings import DetectorSettings, ThermometerSettings
+    from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+    from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
     example = load_calibration(CALIBRATION)
     case, board = (

@@ -13,8 +13,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from thermo_comp.calibration_file import calibration_schema
 from thermo_comp.ros.parameters import parameters_table
+from thermo_comp.unit.calibration_file import calibration_schema
 
 ROOT = Path(__file__).resolve().parent.parent
 AXES = ('x', 'y', 'z')
@@ -24,13 +24,20 @@ CALIBRATION_HEAD = """\
 
 One file = one unit = one object, in YAML, written by `thermo_comp fit`. An annotated example is
 `config/calibration.example.yaml`, the JSON Schema
-`config/calibration.schema.json`; this page is made from it.
+`config/calibration.schema.json`; this page is made from it. Files of version 1 are read as well: the
+terms of their sets become columns of the response, `during` one regime; what is written is version 2.
 
 The reader refuses, with the file, the key, the value and what was expected: unknown or missing
 keys, texts where numbers belong, NaN and infinity, ranges that do not rise, functions that are not
-normalised at the reference, a scale that could reach zero within its ranges, a covariance that is
-none, a newer `format_version`, YAML aliases and tags, files above 1 MiB. Numbers are written with
-all their digits, so a file that is read and written again is the same file.
+normalised at the reference, a scale that could reach zero within its ranges, a posterior of another
+size, a newer `format_version`, YAML aliases and tags, files above 1 MiB. Numbers are written with all
+their digits and the posterior in single precision, so a file that is read and written again is the
+same file.
+
+The parameters of the posterior are, for each axis x, y, z: the bias (level of the static set, free
+coefficients of its Fs, level of the dynamic set, free coefficients of its Fs, weights of the response
+in the order of the file), in input units; then the scale in the same order, relative; at the end
+M[1][0], M[2][0], M[2][1]. `covariance = factor @ factor.T + diag(rest)`.
 """
 
 INTERFACE = """\
@@ -128,8 +135,9 @@ def calibration_page() -> str:
         'Polynomial',
         'CubicSpline',
         'Exponential',
-        'LinearTerm',
-        'MemoryTerm',
+        'ResponseTerm',
+        'Posterior',
+        'GroupEvidence',
         'DetectorSettings',
         'ThermometerSettings',
         'Provenance',

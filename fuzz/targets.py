@@ -20,12 +20,12 @@ from pathlib import Path
 import lz4.frame
 import zstandard
 
-from thermo_comp.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
-from thermo_comp.calibration_file import dump_calibration, parse_calibration
-from thermo_comp.compensator import Compensator
 from thermo_comp.errors import CalibrationError, RecordingError
-from thermo_comp.functions import Polynomial
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import open_mcap
+from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
+from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
+from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 MAGIC = b'\x89MCAP0\r\n'
@@ -51,7 +51,7 @@ def small_calibration() -> Calibration:
     axis = AxisSet(Polynomial((0.0, 0.5)), Polynomial((1.0, 1e-5)))
     sets = RegimeSet(x=axis, y=axis, z=axis, temperature_range_c=(5, 35), rate_range_k_min=(-1, 1))
     return Calibration(
-        format_version=1,
+        format_version=2,
         unit=Unit('T-1', 'counts', 32767.0, 0.01),
         reference_temperature_c=20.0,
         gravity_m_s2=9.80665,
@@ -95,7 +95,7 @@ _SET = f'{{temperature_range_c: [5, 35], rate_range_k_min: [-1, 1], x: {_FUNCTIO
 _SET += f', y: {_FUNCTIONS}, z: {_FUNCTIONS}}}'
 _AXIS = '{scale_factor: 300, bias: 0}'
 SMALLEST = f"""\
-format_version: 1
+format_version: 2
 unit: {{serial: T, input: counts, full_scale: 9999, cycle_time_s: 0.01}}
 reference_temperature_c: 20
 gravity_m_s2: 9.8

@@ -7,21 +7,22 @@ Owns the small calibrations and blocks that the tests of the core are built on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermo_comp.calibration import (
+from thermo_comp.unit.calibration import (
     Axes,
     AxisReference,
     AxisSet,
     Calibration,
-    LinearTerm,
-    MemoryTerm,
     RegimeSet,
+    ResponseTerm,
     Unit,
+    parameter_layout,
 )
-from thermo_comp.functions import Polynomial
+from thermo_comp.unit.functions import Polynomial
+from thermo_comp.unit.posterior import posterior_of
 
 GRAVITY = 9.80665
 SECOND_NS = 1_000_000_000
@@ -39,7 +40,7 @@ def regime_set(x=None, y=None, z=None, **keys):
 def calibration(**keys):
     """Make a unit of 300 counts per m/s^2; with no arguments it only scales."""
     values = {
-        'format_version': 1,
+        'format_version': 2,
         'unit': Unit('T-1', 'counts', 32767.0, 0.01),
         'reference_temperature_c': 20.0,
         'gravity_m_s2': GRAVITY,
@@ -52,34 +53,46 @@ def calibration(**keys):
     return Calibration(**values)
 
 
+def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
+    """Make a term of the response; its group is its kind, its range wide."""
+    values = {'group': kind, 'range': (-50.0, 50.0), **keys}
+    return ResponseTerm(kind=kind, bias=tuple(bias), scale=tuple(scale), **values)
+
+
 def rich_calibration():
-    """Put every term to work, on every axis, in both regimes, with a covariance."""
+    """Put every term to work, on every axis, in both regimes, with a posterior."""
 
     def one(sign, dynamic):
         size = 2 if dynamic else 1
         bias = (0.0, *(sign * 0.3 / k for k in range(1, size + 1)))
         scale = (1.0, *(sign * 7e-5 / k for k in range(1, size + 1)))
-        n = len(bias) + len(scale) - 2 + 2 * 5
-        rows = tuple(tuple(1e-8 if i == j else 1e-10 for j in range(i + 1)) for i in range(n))
-        return axis_set(
-            bias,
-            scale,
-            delta=sign * 0.2 * size,
-            gradient=LinearTerm(0.5 * sign, 2e-5),
-            rate=LinearTerm(3.0, 1e-3 * sign),
-            memory=MemoryTerm((0.1, -0.05), (1e-6, 2e-6 * sign)),
-            residual_sd_m_s2=1e-5 * size,
-            covariance=rows,
-        )
+        return axis_set(bias, scale, delta=sign * 0.2 * size, residual_sd_m_s2=1e-5 * size)
 
-    return calibration(
+    value = calibration(
         axes=Axes(AxisReference(300.0, 5.0), AxisReference(-295.0, -3.0), AxisReference(310, 1)),
         static=regime_set(one(1, False), one(-1, False), one(1, False)),
         dynamic=regime_set(one(-1, True), one(1, True), one(-1, True)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (-2e-3, 3e-4, 1.0)),
         misalignment_sd=(1e-6, 1e-6, 2e-6),
-        memory_time_constants_s=(600.0, 2400.0),
+        slow_noise_m_s2_sqrt_h=(1e-5, 2e-5, 1e-5),
+        sensors=('case', 'frame'),
+        response=(
+            term('now', (0.5, -0.5, 0.5), (2e-5, 2e-5, 2e-5)),
+            term('now', (0.1, 0.2, -0.1), (0.0, 1e-6, 0.0), sensor='frame', during='dynamic'),
+            term(
+                'rate', (3.0, 3.0, -2.0), (1e-3, -1e-3, 1e-3), during='static', range=(-0.1, 0.1)
+            ),
+            term('board', (0.1, 0.1, 0.2), (1e-6, 2e-6, 1e-6), tau_s=600.0),
+            term('board', (-0.05, 0.02, 0.0), (2e-6, -2e-6, 2e-6), tau_s=2400.0),
+            term('neighbour', (0.2, -0.1, 0.1), (1e-6, 0.0, -1e-6), tau_s=240.0),
+            term('board', (1e-3, -2e-3, 1e-3), group='product', tau_s=600.0, power=1),
+            term('even', (0.3, 0.2, 0.1), (1e-6,) * 3, width_k=1.5, power=1, range=(0.0, 1.0)),
+            term('play', (0.1, 0.05, -0.1), (1e-6,) * 3, width_k=0.8, range=(-1.0, 1.0)),
+            term('play', (0.1, -0.1, 0.1), width_k=1.6, tau_s=900.0, range=(-2.0, 2.0)),
+        ),
     )
+    n = parameter_layout(value).n_parameters
+    return replace(value, posterior=posterior_of(1e-8 * np.eye(n) + np.full((n, n), 1e-10)))
 
 
 @dataclass

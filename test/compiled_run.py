@@ -19,9 +19,12 @@ from dataclasses import replace
 import numpy as np
 from builders import SECOND_NS, columns_from_events, rich_calibration
 
-from thermo_comp import is_compiled, thermal
-from thermo_comp.compensator import Compensator, CompensatorConfig
-from thermo_comp.settings import DetectorSettings, ThermometerSettings
+from thermo_comp import is_compiled
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator, CompensatorConfig
+from thermo_comp.online.snapshot import take_snapshot
+from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.thermal.tracker import tracker as thermal
 
 START_NS = 1_767_225_600 * SECOND_NS
 #: A sensor of its own noise, one whose quantum hides it, one of whole degrees.
@@ -75,7 +78,7 @@ def events_of(quantum):
 
 def status_row(compensator):
     """Give what diagnostics see as text: a float's text has all its bits."""
-    return repr(compensator.status)
+    return repr(take_snapshot(compensator))
 
 
 def streamed(calibration, events):
@@ -104,7 +107,7 @@ def in_blocks(calibration, events):
     compensator = Compensator(calibration)
     rows, texts = [], []
     for first in range(0, len(events), 7000):
-        block = compensator.process_block(columns_from_events(events[first : first + 7000]))
+        block = process_block(compensator, columns_from_events(events[first : first + 7000]))
         rows.append(np.column_stack((block.index, block.specific_force, block.covariance)))
         texts.append(status_row(compensator))
     return np.concatenate(rows), [*texts, repr(compensator.take_flags())]

@@ -18,11 +18,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set
+from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
 
-from thermo_comp.calibration import Axes, AxisReference, Calibration, LinearTerm, MemoryTerm, Unit
-from thermo_comp.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.status import CompensatorConfig
+from thermo_comp.online.status import CompensatorConfig
+from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.unit.calibration import (
+    Axes,
+    AxisReference,
+    Calibration,
+    Unit,
+)
 
 START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
@@ -67,12 +72,10 @@ def unit(**changes: Any) -> Calibration:
         return axis_set(
             (0.0, BIAS_SLOPE, BIAS_CURVE),
             (1.0, SCALE_SLOPE),
-            gradient=LinearTerm(BY_GRADIENT if dynamic else 0.0),
-            memory=MemoryTerm((BY_MEMORY,), (0.0,)),
             residual_sd_m_s2=DYNAMIC_RESIDUAL if dynamic else STATIC_RESIDUAL,
         )
 
-    ranges = {'rate_range_k_min': (-8.0, 8.0), 'gradient_range_k': (-6.0, 6.0)}
+    ranges = {'rate_range_k_min': (-8.0, 8.0)}
     sensor = ThermometerSettings(READING_SD, 0.0, 12.0, CASE_LAG_S)
     values = {
         'unit': Unit('F-1', 'counts', FULL_SCALE, 1.0 / RATE_HZ),
@@ -80,7 +83,10 @@ def unit(**changes: Any) -> Calibration:
         'static': regime_set(*[one(False)] * 3, **ranges),
         'dynamic': regime_set(*[one(True)] * 3, **ranges),
         'noise_density_m_s2_sqrt_hz': (NOISE_SD / math.sqrt(RATE_HZ),) * 3,
-        'memory_time_constants_s': (MEMORY_S,),
+        'response': (
+            term('now', (BY_GRADIENT,) * 3, during='dynamic', range=(-6.0, 6.0)),
+            term('board', (BY_MEMORY,) * 3, tau_s=MEMORY_S),
+        ),
         'board_lag_s': BOARD_LAG_S,
         'detector': DetectorSettings(
             smallest_ramp_k_min=1.0,

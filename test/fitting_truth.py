@@ -11,13 +11,12 @@ from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 
 from thermo_comp.fitting.history import ThermalHistory
 from thermo_comp.fitting.table import WindowTable
 from thermo_comp.simulation import positions
+from thermo_comp.typing import Floats
 
-Array = npt.NDArray[np.float64]
 GRAVITY = 9.81
 #: Chamber program: up, down and back, an hour's soak at each end.
 PROGRAM_S = np.array([0.0, 1200.0, 3000.0, 5400.0, 9000.0, 11400.0, 12600.0])
@@ -31,16 +30,16 @@ class Truth:
 
     """
 
-    bias: Array = field(default_factory=lambda: np.array([5.0, -8.0, 2.0]))
-    scale: Array = field(default_factory=lambda: np.array([1000.0, 1010.0, 990.0]))
+    bias: Floats = field(default_factory=lambda: np.array([5.0, -8.0, 2.0]))
+    scale: Floats = field(default_factory=lambda: np.array([1000.0, 1010.0, 990.0]))
     #: Per axis: t, t^2.
-    bias_curve: Array = field(default_factory=lambda: np.outer([1.0, -0.5, 2.0], [2e-2, 1e-4]))
-    scale_curve: Array = field(default_factory=lambda: np.outer([1.0, 1.2, 0.8], [5e-5, 3e-7]))
+    bias_curve: Floats = field(default_factory=lambda: np.outer([1.0, -0.5, 2.0], [2e-2, 1e-4]))
+    scale_curve: Floats = field(default_factory=lambda: np.outer([1.0, 1.2, 0.8], [5e-5, 3e-7]))
     #: A[1, 0], A[2, 0], A[2, 1].
-    skew: Array = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
-    time_constants_s: Array = field(default_factory=lambda: np.array([400.0, 2500.0]))
-    bias_memory: Array = field(default_factory=lambda: np.outer([1.0, -2.0, 1.5], [2e-2, 1e-2]))
-    scale_memory: Array = field(default_factory=lambda: np.outer([1.0, 0.7, 1.3], [1e-5, 4e-6]))
+    skew: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
+    time_constants_s: Floats = field(default_factory=lambda: np.array([400.0, 2500.0]))
+    bias_memory: Floats = field(default_factory=lambda: np.outer([1.0, -2.0, 1.5], [2e-2, 1e-2]))
+    scale_memory: Floats = field(default_factory=lambda: np.outer([1.0, 0.7, 1.3], [1e-5, 4e-6]))
     noise_sd: float = 0.01
 
 
@@ -66,7 +65,7 @@ def history(step_s: float = 2.0, board_lag_s: float = 600.0) -> ThermalHistory:
     )
 
 
-def lagged(temperature: Array, step_s: float, tau_s: float) -> Array:
+def lagged(temperature: Floats, step_s: float, tau_s: float) -> Floats:
     """
     First-order lag by fine Euler steps: the slow road, on purpose not the fit's formula.
 
@@ -95,8 +94,8 @@ def table_of(
     *,
     window_s: float = 60.0,
     thermal: ThermalHistory | None = None,
-    up: Array | None = None,
-) -> tuple[WindowTable, Array]:
+    up: Floats | None = None,
+) -> tuple[WindowTable, Floats]:
     """
     Draw a table of windows, one bag per position; also return the true directions.
 

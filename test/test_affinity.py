@@ -21,9 +21,9 @@ if not hasattr(os, 'sched_setaffinity'):
 from builders import calibration
 from ros_helpers import Peer
 
-from thermo_comp.calibration_file import save_calibration
 from thermo_comp.ros.affinity import ANY, Affinity, AffinityError
 from thermo_comp.ros.round_trip import NodeProcess
+from thermo_comp.unit.calibration_file import save_calibration
 
 ALLOWED = os.sched_getaffinity(0)
 CORE = max(ALLOWED)

@@ -20,10 +20,10 @@ import pytest
 from builders import rich_calibration
 from conftest import Cli
 
-from thermo_comp.calibration_file import save_calibration
 from thermo_comp.cli import output
 from thermo_comp.cli.app import app, split_ros_arguments
 from thermo_comp.recording import inspect_recording, read_recording
+from thermo_comp.unit.calibration_file import save_calibration
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMANDS = sorted(

@@ -18,8 +18,8 @@ import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration
 from conftest import Cli
 
-from thermo_comp.calibration_file import save_calibration
 from thermo_comp.recording import BagWriter, Topics
+from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000
@@ -217,7 +217,7 @@ class TestCalibrations:
         self.used(cli, tmp_path, '{', r'not valid YAML')
 
     def test_a_newer_format(self, cli: Cli, tmp_path: Path, unit: Path) -> None:
-        text = unit.read_text().replace('format_version: 1', 'format_version: 2')
+        text = unit.read_text().replace('format_version: 2', 'format_version: 3')
         self.used(cli, tmp_path, text, r'format_version: .*newer')
 
     def test_missing_file(self, cli: Cli, tmp_path: Path) -> None:

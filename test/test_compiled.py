@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 from build_helpers import ROOT, missing, run
 
-from thermo_comp import kernel
-from thermo_comp.blocks import Floats, Stamps
-from thermo_comp.kernel import Lines
-from thermo_comp.status import DROPPED
+from thermo_comp.online import kernel
+from thermo_comp.online.kernel import Lines
+from thermo_comp.online.status import DROPPED
+from thermo_comp.typing import Floats, Stamps
 
 HERE = Path(__file__).resolve().parent
 

@@ -16,14 +16,14 @@ import yaml
 from builders import calibration
 from conftest import Cli
 
-from thermo_comp.calibration import Axes, AxisReference, Unit
-from thermo_comp.calibration_file import save_calibration
 from thermo_comp.convert import ColumnMap, load_column_map, table_log, write_log
-from thermo_comp.convert.columns import STANDARD_GRAVITY
 from thermo_comp.convert.log import Readings, thin
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import read_recording
 from thermo_comp.replay import replay
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration_file import save_calibration
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 ROOT = Path(__file__).resolve().parent.parent
 STEP_NS = 10_000_000
@@ -261,15 +261,20 @@ class TestColumnMap:
         ('changes', 'key', 'message'),
         [
             ({'gravity': 9.8}, 'gravity', 'unknown key'),
-            ({'stamp': {'column': 't'}}, 'stamp', '`unit` of the stamp column'),
+            ({'stamp': {'column': 't'}}, 'stamp.unit', 'ns where there is a column'),
             ({'stamp': {}}, 'stamp', 'give either `column` and `unit`, or `rate_hz`'),
             ({'stamp': {'column': 't', 'unit': 's', 'rate_hz': 1.0}}, 'stamp', 'give either'),
             ({'stamp': {'rate_hz': 0.0}}, 'stamp.rate_hz', 'greater than 0'),
-            ({'stamp': {'column': 't', 'unit': 'min'}}, 'stamp.unit', "'s', 'ms', 'us' or 'ns'"),
+            (
+                {'stamp': {'column': 't', 'unit': 'min'}},
+                'stamp.unit',
+                "'s', 'ms', 'us' or 'ns', got 'min'",
+            ),
+            ({'stamp': {'column': 1.5, 'unit': 's'}}, 'stamp.column', 'text or integer, got 1.5'),
             (
                 {'accel': {'columns': ['x', 'y'], 'unit': 'g', 'output': 'imu'}},
-                'accel',
-                'required',
+                'accel.columns',
+                'must have 3 entries, got 2',
             ),
             (
                 {'accel': {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'counts'}},

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert.table import NO_STAMP, exact_ns, read_table, sniff
+from thermo_comp.convert.parquet import read_parquet
+from thermo_comp.convert.table import NO_STAMP, exact_ns, read_text, sniff
 from thermo_comp.errors import RecordingError
 
 ROWS = [(1000, 0.5, -1.25), (1001, 0.25, 2e-3), (1003, -7.0, 1.5)]
@@ -40,7 +41,7 @@ def test_every_layout_reads_alike(
     lines = [delimiter.join(('t', 'a', 'b'))]
     lines += [delimiter.join(map(str, row)) for row in ROWS]
     path = write(tmp_path / 'log.txt', prefix + newline.join(lines) + newline)
-    table = read_table(path, ['b', 'a'], stamp='t', stamp_exponent=6)
+    table = read_text(path, ['b', 'a'], stamp='t', stamp_exponent=6)
     assert table.stamp_ns is not None
     assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
     assert table.values['a'].tolist() == [row[1] for row in ROWS]
@@ -50,15 +51,15 @@ def test_every_layout_reads_alike(
 
 def test_headings_are_optional(tmp_path: Path) -> None:
     path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
-    assert read_table(path, [2]).values[2].tolist() == [3.0, 6.0]
+    assert read_text(path, [2]).values[2].tolist() == [3.0, 6.0]
     # A table whose first line is all words has headings, unless the user says otherwise.
     path = write(tmp_path / 'words.txt', 'nan inf\n1 2\n')
-    assert read_table(path, [0], has_header=True).values[0].tolist() == [1.0]
+    assert read_text(path, [0], has_header=True).values[0].tolist() == [1.0]
 
 
 def test_line_numbers_are_those_of_an_editor(tmp_path: Path) -> None:
     path = write(tmp_path / 'log.csv', '# made by hand\na,b\n\n1,2\nx,3\n4\n5,6\n')
-    table = read_table(path, ['a', 'b'])
+    table = read_text(path, ['a', 'b'])
     assert table.line.tolist() == [4, 5, 7]
     np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
     # The row with one cell is not silently shifted: it is counted and left out.
@@ -68,9 +69,9 @@ def test_line_numbers_are_those_of_an_editor(tmp_path: Path) -> None:
 def test_chunks_make_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = '\n'.join(f'{i},{i * i}' for i in range(1000))
     path = write(tmp_path / 'log.csv', 'a,b\n' + rows + '\n')
-    whole = read_table(path, ['b'], stamp='a')
+    whole = read_text(path, ['b'], stamp='a')
     monkeypatch.setattr('thermo_comp.convert.table._CHUNK_ROWS', 7)
-    parts = read_table(path, ['b'], stamp='a')
+    parts = read_text(path, ['b'], stamp='a')
     assert whole.values['b'].tolist() == parts.values['b'].tolist()
     assert whole.line.tolist() == parts.line.tolist()
 
@@ -115,13 +116,13 @@ def test_bad_tables_are_refused(
 ) -> None:
     path = write(tmp_path / 'log.csv', text)
     with pytest.raises(RecordingError, match=message) as caught:
-        read_table(path, [column])
+        read_text(path, [column])
     assert str(path) in str(caught.value)
 
 
 def test_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='No such file'):
-        read_table(tmp_path / 'absent.csv', ['a'])
+        read_text(tmp_path / 'absent.csv', ['a'])
 
 
 class TestParquet:
@@ -140,7 +141,7 @@ class TestParquet:
         path = self.table(
             tmp_path, t=[row[0] for row in ROWS], a=[row[1] for row in ROWS], b=[1, None, 3]
         )
-        table = read_table(path, ['a', 'b'], stamp='t', stamp_exponent=6)
+        table = read_parquet(path, ['a', 'b'], 't', 6)
         assert table.stamp_ns is not None
         assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
         assert table.values['a'].tolist() == [row[1] for row in ROWS]
@@ -150,24 +151,24 @@ class TestParquet:
         path = self.table(
             tmp_path, t=np.array([1767225600123, 0], dtype='datetime64[ms]'), a=[1.0, 2.0]
         )
-        table = read_table(path, ['a'], stamp='t', stamp_exponent=9)
+        table = read_parquet(path, ['a'], 't', 9)
         assert table.stamp_ns is not None
         assert table.stamp_ns.tolist() == [1767225600123 * 10**6, 0]
 
     def test_floats_of_seconds(self, tmp_path: Path) -> None:
         path = self.table(tmp_path, t=[0.5, float('nan')], a=[1.0, 2.0])
-        table = read_table(path, ['a'], stamp='t', stamp_exponent=9)
+        table = read_parquet(path, ['a'], 't', 9)
         assert table.stamp_ns is not None
         assert table.stamp_ns.tolist() == [500_000_000, NO_STAMP]
 
     def test_refusals(self, tmp_path: Path) -> None:
         path = self.table(tmp_path, a=['one', 'two'])
         with pytest.raises(RecordingError, match="column 'a' holds string"):
-            read_table(path, ['a'])
+            read_parquet(path, ['a'], None, 0)
         with pytest.raises(RecordingError, match="no column 'b'"):
-            read_table(path, ['b'])
+            read_parquet(path, ['b'], None, 0)
         with pytest.raises(RecordingError, match='the table is empty'):
-            read_table(self.table(tmp_path, a=np.array([], dtype=float)), ['a'])
+            read_parquet(self.table(tmp_path, a=np.array([], dtype=float)), ['a'], None, 0)
         path.write_text('a,b\n')
         with pytest.raises(RecordingError, match='not a readable Parquet file'):
-            read_table(path, ['a'])
+            read_parquet(path, ['a'], None, 0)

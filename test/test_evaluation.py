@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from builders import GRAVITY, axis_set, calibration, regime_set
 
-from thermo_comp.calibration import Calibration, Provenance, ResidualSummary
 from thermo_comp.errors import CalibrationError, RecordingError
-from thermo_comp.evaluation import RAW, evaluate, joined
-from thermo_comp.metrics import MICRO_G
+from thermo_comp.judging.evaluation import RAW, evaluate, joined
 from thermo_comp.recording import BagWriter, Topics
+from thermo_comp.unit.calibration import Calibration, Provenance, ResidualSummary
+from thermo_comp.unit.gravity import MICRO_G
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000

@@ -11,19 +11,19 @@ import re
 from dataclasses import replace
 
 import pytest
+from builders import term
 
-from thermo_comp.calibration import (
+from thermo_comp.convert.exchange import export_ardupilot, export_px4, import_parameters
+from thermo_comp.errors import CalibrationError
+from thermo_comp.unit.calibration import (
     Axes,
     AxisReference,
     AxisSet,
     Calibration,
-    LinearTerm,
     RegimeSet,
     Unit,
 )
-from thermo_comp.errors import CalibrationError
-from thermo_comp.exchange import export_ardupilot, export_px4, import_parameters
-from thermo_comp.functions import CubicSpline, Polynomial
+from thermo_comp.unit.functions import CubicSpline, Polynomial
 
 ONE = Polynomial((1.0,))
 
@@ -32,7 +32,7 @@ def calibration_of(bias: list[Polynomial], **change: object) -> Calibration:
     axes = [AxisSet(function, ONE) for function in bias]
     regime = RegimeSet((5.0, 45.0), (-2.0, 2.0), *axes)
     base = Calibration(
-        format_version=1,
+        format_version=2,
         unit=Unit('7', 'm/s^2', 160.0, 0.005),
         reference_temperature_c=20.0,
         gravity_m_s2=9.81,
@@ -153,15 +153,21 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic: Calibration) -> None:
 def test_what_is_lost_is_said(cubic: Calibration) -> None:
     spline = CubicSpline((-15.0, 0.0, 10.0, 25.0), (0.01, 0.0, 0.02, -0.01))
     static = replace(cubic.static, x=AxisSet(spline, ONE))
-    dynamic = replace(static, y=replace(static.y, gradient=LinearTerm(1e-3, 0.0), delta=0.1))
+    dynamic = replace(static, y=replace(static.y, delta=0.1))
     calibration = replace(
         cubic,
         static=static,
         dynamic=dynamic,
+        response=(term('now', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (0.0, 0.0, 1.0)),
     )
     text = export_ardupilot(calibration)
-    for expected in ('replaced by cubics', '1e+03 urad', 'gradient terms', 'dynamic set is lost'):
+    for expected in (
+        'replaced by cubics',
+        '1e+03 urad',
+        r'response is lost (now): ',
+        'dynamic set is lost',
+    ):
         assert any(expected in note for note in text.notes), expected
         assert expected in text.text
 

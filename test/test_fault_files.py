@@ -19,8 +19,8 @@ import pytest
 from builders import rich_calibration
 from conftest import ROOT, Cli
 
-from thermo_comp.calibration_file import load_calibration, save_calibration
 from thermo_comp.recording import BagWriter, read_recording
+from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
 FIT = [*sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))]
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'

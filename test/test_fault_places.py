@@ -18,7 +18,7 @@ from fault_rig import CONFIG, Inject, bag, chain, force_at, frozen, seconds_of, 
 from fault_rows import ROWS
 from fault_told import TOLD
 
-from thermo_comp.compensator import Compensator
+from thermo_comp.online.compensator import Compensator
 
 SIGMAS = 5.0
 

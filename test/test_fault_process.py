@@ -22,9 +22,9 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 from fault_bench import Bench, Heard, bench
 from fault_rig import CONFIG, RATE_HZ, START_NS, bag, force_at, seconds_of, unit
 
-from thermo_comp.calibration import Unit
-from thermo_comp.calibration_file import SIZE_LIMIT, dump_calibration, save_calibration
-from thermo_comp.compensator import Compensator
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.unit.calibration import Unit
+from thermo_comp.unit.calibration_file import SIZE_LIMIT, dump_calibration, save_calibration
 
 SIGMAS = 5.0
 

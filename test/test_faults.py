@@ -18,8 +18,8 @@ from fault_bench import Bench, Heard, bench
 from fault_rig import CONFIG, bag, force_at, unit
 from fault_rows import ROWS, Row, true_seconds
 
-from thermo_comp.calibration_file import save_calibration
-from thermo_comp.compensator import Compensator
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.unit.calibration_file import save_calibration
 
 #: Wrong is what is off by more than this many of the standard deviations it was published with.
 SIGMAS = 5.0

@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from thermo_comp.calibration_file import load_calibration, save_calibration
-from thermo_comp.compensator import Compensator
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, assess, fit
 from thermo_comp.fitting.sources import SourceBlock
-from thermo_comp.metrics import MICRO_G, norm_residual, residual_statistics
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
     UnitModel,
@@ -29,6 +27,10 @@ from thermo_comp.simulation import (
     simulate_blocks,
     unit_preset,
 )
+from thermo_comp.typing import Floats, Ints
+from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.metrics import norm_residual, residual_statistics
 
 RATE_HZ = 25.0
 TEMPERATURE_RATE_HZ = 0.5
@@ -67,8 +69,8 @@ class CausalBlock(ArrayBlock):
 
     """
 
-    board_after: npt.NDArray[np.int64]
-    case_after: npt.NDArray[np.int64]
+    board_after: Ints
+    case_after: Ints
 
     @staticmethod
     def of(block: SourceBlock) -> CausalBlock:
@@ -167,7 +169,7 @@ def test_the_compensator_does_what_the_fit_promised(chosen: FitResult) -> None:
     forces = []
     for block in source_of(UNIT, up, 3).blocks():
         online = CausalBlock.of(block)
-        forces.append(compensator.process_block(online).specific_force)
+        forces.append(process_block(compensator, online).specific_force)
     force = np.concatenate(forces)
     per_window = round(10.0 * RATE_HZ)
     n = len(force) // per_window
@@ -179,12 +181,12 @@ def test_the_compensator_does_what_the_fit_promised(chosen: FitResult) -> None:
 def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> None:
     # An INS at rest beside it must not notice: at most 1 ug and 0.3 sd of the mean from one
     # second to the next, and 1e-5 m/s within a second.
-    def forces(weight: float | None) -> npt.NDArray[np.float64]:
+    def forces(weight: float | None) -> Floats:
         compensator = Compensator(golovach.calibration)
         if weight is not None:
             compensator.tracker.weight_at = lambda _stamp_ns: weight  # type: ignore[method-assign]
         blocks = source_of(UNIT, positions(1, 5)[0], 905).blocks()
-        found = [compensator.process_block(CausalBlock.of(block)) for block in blocks]
+        found = [process_block(compensator, CausalBlock.of(block)) for block in blocks]
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return np.concatenate([each.specific_force for each in found])
 

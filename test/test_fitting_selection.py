@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from fitting_truth import GRAVITY, Truth, history, table_of, without_memory
 
-from thermo_comp.calibration import Unit
 from thermo_comp.errors import FitError
 from thermo_comp.fitting.assembly import UnitFacts, build_calibration
 from thermo_comp.fitting.evidence import (
@@ -37,8 +36,9 @@ from thermo_comp.fitting.start import constant_calibration, position_means
 from thermo_comp.fitting.table import WindowTable
 from thermo_comp.fitting.uncertainty import full_covariance, predicted_sd
 from thermo_comp.fitting.warm_up import find_warm_up
-from thermo_comp.functions import CubicSpline, Exponential
-from thermo_comp.settings import DetectorSettings
+from thermo_comp.thermal.settings import DetectorSettings
+from thermo_comp.unit.calibration import Unit
+from thermo_comp.unit.functions import CubicSpline, Exponential
 
 
 def selector_of(table: WindowTable) -> Selector:

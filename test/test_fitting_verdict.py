@@ -30,8 +30,8 @@ from thermo_comp.fitting.verdict import (
     judge_result,
     judge_table,
 )
-from thermo_comp.metrics import MICRO_G
 from thermo_comp.simulation import positions
+from thermo_comp.unit.gravity import MICRO_G
 
 
 def findings_of(table: WindowTable, up: np.ndarray, **options: bool) -> dict[str, Finding]:

@@ -20,7 +20,6 @@ from typing import Any
 import pytest
 from fleet_helpers import OPTIONS, damage, write_unit
 
-from thermo_comp.calibration_file import load_calibration
 from thermo_comp.cli.app import run as run_command
 from thermo_comp.errors import FleetError
 from thermo_comp.fitting import FitOptions
@@ -30,6 +29,7 @@ from thermo_comp.fleet.engine import Job, connected, outcome_of, run
 from thermo_comp.fleet.ledger import Ledger
 from thermo_comp.fleet.storage import Storage
 from thermo_comp.recording import Topics
+from thermo_comp.unit.calibration_file import load_calibration
 
 distributed = pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
 pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')

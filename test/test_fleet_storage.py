@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermo_comp.errors import FleetError
-from thermo_comp.fit_sources import digest
+from thermo_comp.fitting.fit_sources import digest
 from thermo_comp.fleet.bag import FoundBag, group_files, reduce_found
 from thermo_comp.fleet.discovery import find_units
 from thermo_comp.fleet.storage import HashingFile, Storage, StoredFile

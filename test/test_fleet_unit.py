@@ -19,10 +19,8 @@ from fleet_helpers import OPTIONS, damage, write_unit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.calibration import Calibration
-from thermo_comp.calibration_file import parse_calibration
-from thermo_comp.fit_sources import fit_sources
 from thermo_comp.fitting import fit
+from thermo_comp.fitting.fit_sources import fit_sources
 from thermo_comp.fleet.discovery import FoundUnit, find_units
 from thermo_comp.fleet.row import COLUMNS
 from thermo_comp.fleet.storage import Storage
@@ -34,6 +32,8 @@ from thermo_comp.fleet.unit import (
     process_unit,
     reduce_unit,
 )
+from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.calibration_file import parse_calibration
 
 pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
 

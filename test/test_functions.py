@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline as ReferenceSpline
 
-from thermo_comp.functions import CubicSpline, Exponential, Polynomial, hold
+from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial, hold
 
 KNOTS = (-15.0, -6.0, 0.0, 4.0, 15.0)
 FUNCTIONS = [

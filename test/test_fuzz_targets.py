@@ -21,8 +21,8 @@ from pathlib import Path
 
 import targets
 
-from thermo_comp.calibration_file import parse_calibration
 from thermo_comp.recording import open_mcap
+from thermo_comp.unit.calibration_file import parse_calibration
 
 TARGETS = targets.targets()
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from builders import GRAVITY
 
-from thermo_comp.health import GravityMonitor
+from thermo_comp.online.health import GravityMonitor
 
 NOISE_SD = 2e-3
 BIAS_SD = 1e-4

@@ -20,9 +20,9 @@ from builders import GRAVITY, SECOND_NS, calibration
 from conftest import ROOT
 from rosbags.typesys import Stores, get_typestore
 
-from thermo_comp.calibration import Axes, AxisReference, Unit
 from thermo_comp.recording import BagWriter, inspect_recording
 from thermo_comp.replay import replay
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 
 FOXGLOVE = ROOT / 'config' / 'thermo_comp.foxglove.json'
 PLOTJUGGLER = ROOT / 'config' / 'plotjuggler_layout.xml'

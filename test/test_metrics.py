@@ -10,12 +10,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermo_comp.metrics import (
-    MICRO_G,
-    norm_residual,
-    residual_statistics,
-    statistics_by_regime,
-)
+from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.metrics import norm_residual, residual_statistics, statistics_by_regime
 
 
 def test_statistics_of_scalars_by_hand() -> None:

@@ -33,10 +33,10 @@ from ros_helpers import (
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
-from thermo_comp.calibration import Calibration, Unit
-from thermo_comp.calibration_file import save_calibration
-from thermo_comp.compensator import Compensator
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.ros.round_trip import lossless
+from thermo_comp.unit.calibration import Calibration, Unit
+from thermo_comp.unit.calibration_file import save_calibration
 
 START_NS = 1_767_225_600 * SECOND_NS
 CYCLE_NS = 10_000_000

@@ -18,12 +18,12 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 from builders import rich_calibration
 from rosbags.highlevel import AnyReader
 
-from thermo_comp.calibration import Calibration, Unit
-from thermo_comp.calibration_file import save_calibration
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.recording import BagWriter, Block, ImuColumns, Topics, read_recording
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, replay
 from thermo_comp.ros.round_trip import round_trip
+from thermo_comp.unit.calibration import Calibration, Unit
+from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000

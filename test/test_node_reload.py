@@ -22,9 +22,9 @@ from rcl_interfaces.srv import GetParameters
 from ros_helpers import SECOND_NS, TIMEOUT, Driver, Peer, stamp_of, standing
 from sensor_msgs.msg import Imu
 
-from thermo_comp.calibration import Axes, AxisReference, Unit
-from thermo_comp.calibration_file import dump_calibration, save_calibration
 from thermo_comp.ros.round_trip import NodeProcess, lossless
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
 START_NS = 1_767_225_600 * SECOND_NS
 CYCLE_NS = 10_000_000

@@ -20,9 +20,9 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 from builders import calibration
 from ros_helpers import TIMEOUT, Peer
 
-from thermo_comp.calibration_file import dump_calibration, save_calibration
 from thermo_comp.ros.node import main
 from thermo_comp.ros.round_trip import NodeProcess
+from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
 
 def arguments(*overrides: str) -> list[str]:

@@ -123,7 +123,7 @@ def test_no_source_is_too_long_to_read() -> None:
 
 def test_dependencies_of_the_manifest_are_those_of_setup() -> None:
     # What pip must add because rosdep has no (or too old) a package for it; README says so.
-    pip_only = {'pydantic', 'typer', 'mcap', 'zstandard', 'lz4'}
+    pip_only = {'typer', 'mcap', 'zstandard', 'lz4'}
     keys = {'pyyaml': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
     install = setup_literals()['INSTALL']
     assert isinstance(install, list)

@@ -23,10 +23,10 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.ros import parameters
 from thermo_comp.ros.node import CompensationNode
 from thermo_comp.ros.parameters import NodeConfig, ParameterError
-from thermo_comp.status import CompensatorConfig
 
 
 @contextmanager

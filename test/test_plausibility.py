@@ -14,12 +14,15 @@ import numpy as np
 import pytest
 from builders import SECOND_NS
 
-from thermo_comp.plausibility import STILL_READINGS, Fault, still_readings
-from thermo_comp.regime import Regime
-from thermo_comp.settings import DetectorSettings, ThermalConfig, ThermometerSettings
 from thermo_comp.simulation import ChamberRipple, cyclogram_preset, simulate, unit_preset
-from thermo_comp.thermal import GRADIENT, VAR_BOARD, VAR_GRADIENT, ThermalTracker
+from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.thermal.plausibility import STILL_READINGS, Fault, still_readings
+from thermo_comp.thermal.regime import Regime
+from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig, ThermometerSettings
+from thermo_comp.thermal.state import GRADIENT, VAR_BOARD, VAR_GRADIENT
+from thermo_comp.thermal.tracker import ThermalTracker
 
+LAG = MemorySpec(lags=(('board', 900.0),))
 SENSORS = {
     'continuous': ThermometerSettings(noise_sd_c=0.005),
     'sixteenths': ThermometerSettings(noise_sd_c=0.005, quantum_c=0.0625),
@@ -27,7 +30,7 @@ SENSORS = {
 }
 
 
-def tracker_of(sensor='continuous', memory=(), **config):
+def tracker_of(sensor='continuous', memory=None, **config):
     settings = SENSORS[sensor]
     return ThermalTracker(
         DetectorSettings(case=settings, board=settings), memory, ThermalConfig(**config)
@@ -38,8 +41,8 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
     """Feed both sensors once a second with a flicker, as live ones have it; return the end."""
     for second in range(start_s, start_s + seconds):
         flicker = 0.004 * (-1) ** second
-        tracker.board_reading(second * SECOND_NS, celsius + flicker)
-        tracker.case_reading(second * SECOND_NS, celsius - flicker)
+        tracker.read('board', second * SECOND_NS, celsius + flicker)
+        tracker.read('case', second * SECOND_NS, celsius - flicker)
     return start_s + seconds
 
 
@@ -52,19 +55,19 @@ def test_a_step_of_40_degrees_is_no_temperature():
     tracker = tracker_of()
     now = soak(tracker)
     for second in range(now, now + 30):
-        assert not tracker.board_reading(second * SECOND_NS, 60.0 + 0.01 * second)
-        assert tracker.board_guard.fault == Fault.STEP
-        assert tracker.board_guard.step == pytest.approx(40.0, abs=1.0)
+        assert not tracker.read('board', second * SECOND_NS, 60.0 + 0.01 * second)
+        assert tracker.guards['board'].fault == Fault.STEP
+        assert tracker.guards['board'].step == pytest.approx(40.0, abs=1.0)
     assert tracker.board.temperature == pytest.approx(20.0, abs=0.01)
-    assert tracker.board_reading((now + 30) * SECOND_NS, 20.01)
-    assert tracker.board_guard.fault == Fault.NONE
+    assert tracker.read('board', (now + 30) * SECOND_NS, 20.01)
+    assert tracker.guards['board'].fault == Fault.NONE
 
 
 def test_a_step_that_stays_is_a_new_beginning_after_the_time_out():
-    tracker = tracker_of(memory=(600.0,), temperature_timeout_s=20.0)
+    tracker = tracker_of(memory=LAG, temperature_timeout_s=20.0)
     now = soak(tracker, seconds=4000)
     assert tracker.state_at(now * SECOND_NS).is_settled
-    taken = [tracker.board_reading((now + k) * SECOND_NS, 60.0 + 0.01 * k) for k in range(30)]
+    taken = [tracker.read('board', (now + k) * SECOND_NS, 60.0 + 0.01 * k) for k in range(30)]
     # The last good reading came a second before: what is older than 20 s is 19 readings later.
     assert taken == [False] * 20 + [True] * 10
     state = tracker.state_at((now + 29) * SECOND_NS)
@@ -97,9 +100,9 @@ def test_what_a_sensor_says_first_may_be_wrong():
 
     """
     tracker = tracker_of()
-    tracker.board_reading(0, 85.0)
-    tracker.board_reading(SECOND_NS, 85.0)
-    taken = [tracker.board_reading(k * SECOND_NS, 20.0 + 0.001 * k) for k in range(2, 12)]
+    tracker.read('board', 0, 85.0)
+    tracker.read('board', SECOND_NS, 85.0)
+    taken = [tracker.read('board', k * SECOND_NS, 20.0 + 0.001 * k) for k in range(2, 12)]
     assert sum(taken) >= 6
     assert tracker.board.temperature == pytest.approx(20.0, abs=0.1)
 
@@ -123,13 +126,13 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
         if second > 250:
             values[frozen] = last[frozen]
         last = values
-        tracker.board_reading(second * SECOND_NS, values['board'])
-        tracker.case_reading(second * SECOND_NS, values['case'])
-        guard = getattr(tracker, f'{frozen}_guard')
+        tracker.read('board', second * SECOND_NS, values['board'])
+        tracker.read('case', second * SECOND_NS, values['case'])
+        guard = tracker.guards[frozen]
         if guard.fault == Fault.FROZEN:
             break
         assert second < 1200
-    other = tracker.case_guard if frozen == 'board' else tracker.board_guard
+    other = tracker.guards['case'] if frozen == 'board' else tracker.guards['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
     # Until then the sensor was off by what the other told: some quanta and a kelvin; a case is
@@ -140,8 +143,8 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
     state = tracker.sample(second * SECOND_NS)
     assert math.sqrt(state[VAR_BOARD if frozen == 'board' else VAR_GRADIENT]) > 0.5
     # Nothing it says counts until it says something else.
-    assert not getattr(tracker, f'{frozen}_reading')((second + 1) * SECOND_NS, last[frozen])
-    assert getattr(tracker, f'{frozen}_reading')((second + 2) * SECOND_NS, last[frozen] + 0.07)
+    assert not tracker.read(frozen, (second + 1) * SECOND_NS, last[frozen])
+    assert tracker.read(frozen, (second + 2) * SECOND_NS, last[frozen] + 0.07)
     assert guard.fault == Fault.NONE
 
 
@@ -153,13 +156,13 @@ def test_two_sensors_that_stand_still_count_with_growing_doubt():
     """
     tracker = tracker_of()
     for second in range(600):
-        assert tracker.board_reading(second * SECOND_NS, 20.0)
-        assert tracker.case_reading(second * SECOND_NS, 20.0)
-    assert tracker.board_guard.fault == tracker.case_guard.fault == Fault.STILL
+        assert tracker.read('board', second * SECOND_NS, 20.0)
+        assert tracker.read('case', second * SECOND_NS, 20.0)
+    assert tracker.guards['board'].fault == tracker.guards['case'].fault == Fault.STILL
     # The fastest ramp it is made for, 3 K/min, for ten minutes.
     sd = math.sqrt(tracker.sample(600 * SECOND_NS)[VAR_BOARD])
     assert sd == pytest.approx(30.0, rel=1e-3)
-    assert tracker.board_reading(600 * SECOND_NS, 20.004)
+    assert tracker.read('board', 600 * SECOND_NS, 20.004)
     assert math.sqrt(tracker.sample(600 * SECOND_NS)[VAR_BOARD]) < 0.01
 
 
@@ -170,18 +173,18 @@ def test_a_ramp_does_not_end_because_a_sensor_stands_still():
         # The ramp stops in the readings only.
         flicker = 0.004 * (-1) ** second
         ramp = min(second, 1900) - 1500
-        tracker.board_reading(second * SECOND_NS, 20.0 + ramp / 90.0 + flicker * (ramp < 400))
-        tracker.case_reading(second * SECOND_NS, 20.0 + ramp / 60.0 + flicker * (ramp < 400))
-    assert tracker.case_guard.fault == Fault.STILL
+        tracker.read('board', second * SECOND_NS, 20.0 + ramp / 90.0 + flicker * (ramp < 400))
+        tracker.read('case', second * SECOND_NS, 20.0 + ramp / 60.0 + flicker * (ramp < 400))
+    assert tracker.guards['case'].fault == Fault.STILL
     assert tracker.detector.regime == Regime.DYNAMIC
 
 
 def test_a_standstill_within_the_quantum_is_no_fault():
     tracker = tracker_of('sixteenths')
     for second in range(3600):
-        tracker.board_reading(second * SECOND_NS, 20.0)
-        tracker.case_reading(second * SECOND_NS, 20.0)
-    assert tracker.board_guard.fault == tracker.case_guard.fault == Fault.NONE
+        tracker.read('board', second * SECOND_NS, 20.0)
+        tracker.read('case', second * SECOND_NS, 20.0)
+    assert tracker.guards['board'].fault == tracker.guards['case'].fault == Fault.NONE
 
 
 def test_readings_that_chance_may_repeat():
@@ -209,16 +212,16 @@ def test_a_unit_in_its_chamber_is_never_doubted_and_swapped_topics_are(preset, s
     tracker = tracker_of(sensor)
     readings = [(int(s), 0, float(v)) for s, v in zip(run.board_stamp_ns, run.board, strict=True)]
     readings += [(int(s), 1, float(v)) for s, v in zip(run.case_stamp_ns, run.case, strict=True)]
-    take = [tracker.board_reading, tracker.case_reading]
+    names = ['board', 'case']
     if is_swapped:
-        take.reverse()
+        names.reverse()
     was_reversed = False
     for stamp_ns, kind, celsius in sorted(readings):
-        take[kind](stamp_ns, celsius)
+        tracker.read(names[kind], stamp_ns, celsius)
         was_reversed = was_reversed or tracker.lead.is_reversed
         if not is_swapped:
-            assert tracker.board_guard.fault == Fault.NONE
-            assert tracker.case_guard.fault == Fault.NONE
+            assert tracker.guards['board'].fault == Fault.NONE
+            assert tracker.guards['case'].fault == Fault.NONE
     if not is_swapped:
         assert not was_reversed
     elif (preset, sensor) != ('bare-quartz', 'degrees') and preset != 'mems':
@@ -242,7 +245,7 @@ def test_a_regime_that_nobody_watched_is_unknown():
 
 
 def test_a_jump_of_the_clock_forgets_the_memory():
-    tracker = tracker_of(memory=(900.0,))
+    tracker = tracker_of(memory=LAG)
     now = soak(tracker, seconds=6000)
     assert tracker.state_at(now * SECOND_NS).is_settled
     soak(tracker, seconds=2, start_s=now + 86400)

@@ -23,12 +23,13 @@ from fault_rig import unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.calibration import AxisSet, Calibration, RegimeSet
-from thermo_comp.calibration_file import dump_calibration, parse_calibration
-from thermo_comp.compensator import Compensator
 from thermo_comp.errors import CalibrationError
-from thermo_comp.functions import Polynomial
-from thermo_comp.status import CompensatorConfig
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.online.snapshot import take_snapshot
+from thermo_comp.online.status import CompensatorConfig
+from thermo_comp.unit.calibration import AxisSet, Calibration, RegimeSet
+from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
+from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 UNITS = (rich_calibration(), unit())
@@ -169,7 +170,7 @@ def test_any_messages_give_sound_numbers(
         xx, xy, xz, yy, yz, zz = row[3:]
         covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         assert np.linalg.eigvalsh(covariance).min() > 0.0
-    assert compensator.status.counters.n_out <= n_counts
+    assert take_snapshot(compensator).counters.n_out <= n_counts
 
 
 finite = st.floats(-1e3, 1e3)

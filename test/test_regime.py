@@ -24,10 +24,10 @@ from thermal_signals import (
     switches,
 )
 
-from thermo_comp.onset import OnsetTest
-from thermo_comp.regime import Regime, RegimeDetector
-from thermo_comp.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.thermometer import Thermometer
+from thermo_comp.thermal.onset import OnsetTest
+from thermo_comp.thermal.regime import Regime, RegimeDetector
+from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.thermal.thermometer import Thermometer
 
 UNKNOWN, STATIC, DYNAMIC = Regime.UNKNOWN, Regime.STATIC, Regime.DYNAMIC
 SENSORS = {

@@ -16,11 +16,11 @@ import pytest
 from builders import rich_calibration
 from rosbags.highlevel import AnyReader
 
-from thermo_comp.calibration import Calibration, Unit
-from thermo_comp.compensator import Compensator
 from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter, Block, ImuColumns, Topics, read_recording
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, ReplayResult, replay, switches
+from thermo_comp.unit.calibration import Calibration, Unit
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000

@@ -18,12 +18,10 @@ import pytest
 from report_helpers import PROGRAM, RATE_HZ, certificate, evidence, fitted, run, write_bag
 
 from thermo_comp import __version__
-from thermo_comp.compensator import Compensator
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.fitting.reduction import Readings
-from thermo_comp.metrics import MICRO_G
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter
-from thermo_comp.regime import Regime
 from thermo_comp.report import (
     Evidence,
     evidence_of_bags,
@@ -35,6 +33,8 @@ from thermo_comp.report import (
 from thermo_comp.report.evidence import CHOSEN, ONE_SET, RAW
 from thermo_comp.report.plates import PLATES, png_files
 from thermo_comp.simulation import ideal_regime, parse_cyclogram
+from thermo_comp.thermal.regime import Regime
+from thermo_comp.unit.gravity import MICRO_G
 
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 

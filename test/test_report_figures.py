@@ -19,10 +19,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import StepPatch
 from report_helpers import evidence, run
 
-from thermo_comp.calibration import AxisReference
 from thermo_comp.fitting.reduction import Readings
-from thermo_comp.metrics import MICRO_G
-from thermo_comp.regime import Regime
 from thermo_comp.report.decimate import thin
 from thermo_comp.report.figures_residual import draw_gravity, draw_histograms, draw_residuals
 from thermo_comp.report.figures_thermal import draw_dynamics, draw_temperatures
@@ -38,7 +35,10 @@ from thermo_comp.report.plates import PLATES
 from thermo_comp.report.style import NARROW, WIDE, drawing, svg
 from thermo_comp.report.text import label_text, number
 from thermo_comp.report.trace import thermal_trace
-from thermo_comp.settings import DetectorSettings
+from thermo_comp.thermal.regime import Regime
+from thermo_comp.thermal.settings import DetectorSettings
+from thermo_comp.unit.calibration import AxisReference
+from thermo_comp.unit.gravity import MICRO_G
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(1, 20))

@@ -24,8 +24,8 @@ import pytest
 from conftest import ROOT
 from report_helpers import certificate, fitted, write_bag
 
-from thermo_comp.calibration_file import save_calibration
 from thermo_comp.report.live import LiveReport, LiveServer
+from thermo_comp.unit.calibration_file import save_calibration
 
 TIMEOUT_S = 60.0
 

@@ -15,16 +15,18 @@ from builders import GRAVITY, SECOND_NS, calibration, columns_from_events
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.calibration import Axes, AxisReference, Unit
-from thermo_comp.compensator import Compensator, CompensatorConfig
-from thermo_comp.sample_guard import (
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator, CompensatorConfig
+from thermo_comp.online.sample_guard import (
     BURST_SAMPLES,
     LARGEST_RATE,
     STUCK_SAMPLES,
     RateWatch,
     StuckWatch,
 )
-from thermo_comp.status import DROPPED, Counters
+from thermo_comp.online.snapshot import take_snapshot
+from thermo_comp.online.status import DROPPED, Counters
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 
 K = 300.0
 UP = (0.36, -0.48, 0.8)
@@ -153,12 +155,12 @@ def test_counts_at_another_rate_are_of_another_scale(rng):
         5 * SECOND_NS,
     )
     stamps, _ = run(compensator, fast)
-    assert compensator.status.is_too_fast
+    assert take_snapshot(compensator).is_too_fast
     # Noticed at the first event after the surplus has passed 50 samples: within 1 s.
     assert len(stamps) <= 2000
     assert compensator.counters.n_too_fast == 20_000 - len(stamps)
     after, _ = run(compensator, recording(500, 100.0, lambda _: at_rest(rng), 16 * SECOND_NS))
-    assert not compensator.status.is_too_fast
+    assert not take_snapshot(compensator).is_too_fast
     # The surplus is forgiven within a second or two.
     assert after[-1] == 16 * SECOND_NS + 4_990_000_000
     assert len(after) > 250
@@ -210,7 +212,7 @@ def test_a_reversed_axis_is_refused_when_the_platform_stands(rng):
     assert not ((published > 46.0) & (published < 60.0)).any()
     assert ((published > 76.0) & (published < 90.0)).any()
     assert compensator.counters.n_refuted > 1400
-    assert not compensator.status.is_refuted
+    assert not take_snapshot(compensator).is_refuted
     assert compensator.counters.n_in == 9000
 
 
@@ -218,7 +220,7 @@ def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
     for local, expected in ((0.0, 0.0), (GRAVITY + 2e-3, -2e-3)):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
-        gravity = compensator.status.gravity
+        gravity = take_snapshot(compensator).gravity
         # 0.3 counts of noise, 0.29 of rounding: 1.4 mm/s^2 per probe, some 110 probes; and the
         # fractions of a count that noise this small does not average out, a tenth of 0.5.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
@@ -279,9 +281,9 @@ def test_the_batch_refuses_what_the_stream_refuses(events, chunk, stuck_s):
     unit = calibration(axes=Axes(*[AxisReference(K, 60.0)] * 3))
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
     stamps, rows = run(streamed, events)
-    blocks = [whole.process_block(columns_from_events(events))]
+    blocks = [process_block(whole, columns_from_events(events))]
     pieces = [
-        cut.process_block(columns_from_events(events[k : k + chunk]))
+        process_block(cut, columns_from_events(events[k : k + chunk]))
         for k in range(0, len(events), chunk)
     ]
     for parts in (blocks, pieces):
@@ -292,4 +294,4 @@ def test_the_batch_refuses_what_the_stream_refuses(events, chunk, stuck_s):
         np.testing.assert_array_equal(force, table[:, :3])
         np.testing.assert_array_equal(covariance[:, UNIQUE], table[:, 3:])
     assert streamed.counters == whole.counters == cut.counters
-    assert streamed.status == whole.status == cut.status
+    assert take_snapshot(streamed) == take_snapshot(whole) == take_snapshot(cut)

@@ -14,38 +14,40 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from thermo_comp.simulation import (
     MICRO_G,
     UNIT_NAMES,
     Cyclogram,
-    ThermalResponse,
+    PartHistory,
     UnitModel,
     cyclogram_preset,
     positions,
     simulate,
     unit_preset,
 )
+from thermo_comp.typing import Floats
 
 RATE_HZ = 10.0
 MINUTE = 60
 
 
-def _static(unit: UnitModel, board: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+def _static(unit: UnitModel, board: Floats) -> tuple[Floats, ...]:
     """
     Return bias [ug] and relative scale after endless soaks, by the board's temperature.
 
     """
     still = []
     for temperature in board:
-        air = unit.network.air_for('board', float(temperature))
-        response = ThermalResponse(
-            unit.network, [0.0, 1.0], [air, air], followers=unit.drift.followers
+        parts = unit.network.equilibrium(unit.network.air_for('board', float(temperature)))
+        deviation = (parts - unit.origin)[None]
+        history = PartHistory(
+            unit.network.nodes, deviation, np.zeros_like(deviation), unit.origin, 1.0
         )
-        still.append(response.states([0.0])[0])
-    return unit.drift.evaluate(unit.network, np.array(still), unit.origin)
+        still.append(unit.drift.evaluate(history))
+    bias, scale = zip(*still, strict=True)
+    return np.concatenate(bias), np.concatenate(scale)
 
 
 @pytest.mark.parametrize('name', UNIT_NAMES)
@@ -102,7 +104,7 @@ class _Campaign:
 
     def __init__(self, unit: UnitModel, program: Cyclogram, seed: int) -> None:
         self.unit = unit
-        self.columns: list[dict[str, NDArray[np.float64]]] = []
+        self.columns: list[dict[str, Floats]] = []
         counts, force = [], []
         for k, up in enumerate(positions(9, seed)):
             run = simulate(unit, program, up, rate_hz=RATE_HZ, seed=100 * seed + k)
@@ -113,7 +115,7 @@ class _Campaign:
         self.accel = (np.concatenate(counts) - unit.bias_at_reference) / unit.scale_factor
         self.force = np.concatenate(force)
 
-    def regressors(self, kind: str, lags: NDArray[np.float64]) -> NDArray[np.float64]:
+    def regressors(self, kind: str, lags: Floats) -> Floats:
         pieces = []
         for readings in self.columns:
             n = int(readings['n'])
@@ -130,11 +132,11 @@ class _Campaign:
         return np.concatenate(pieces)
 
 
-def _means(values: NDArray[np.float64], size: int, n: int) -> NDArray[np.float64]:
+def _means(values: Floats, size: int, n: int) -> Floats:
     return values[: n * size].reshape(n, size, *values.shape[1:]).mean(axis=1)
 
 
-def _lagged(readings: NDArray[np.float64], tau: float) -> NDArray[np.float64]:
+def _lagged(readings: Floats, tau: float) -> Floats:
     # First-order lag of a signal that is straight between readings 1 s apart.
     kept = np.exp(-1.0 / tau)
     new = 1.0 - tau * (1.0 - kept)
@@ -142,7 +144,7 @@ def _lagged(readings: NDArray[np.float64], tau: float) -> NDArray[np.float64]:
     return lagged + readings[0]
 
 
-def _inner_time_constants(unit: UnitModel) -> NDArray[np.float64]:
+def _inner_time_constants(unit: UnitModel) -> Floats:
     # How the parts relax with the case, the board and whatever the thermostat holds nailed down.
     A, _, _ = unit.network.system()
     free = [

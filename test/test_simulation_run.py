@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import welch
 
 from thermo_comp.simulation import (
@@ -32,6 +31,7 @@ from thermo_comp.simulation import (
     simulate_blocks,
     unit_preset,
 )
+from thermo_comp.typing import Floats
 
 UP = np.array([0.48, -0.6, 0.64])
 DEMO = cyclogram_preset('demo')
@@ -45,9 +45,7 @@ def unit() -> UnitModel:
     return unit_preset('thermostatted', 4)
 
 
-def _joined(
-    blocks: list[SimulatedRun], name: str, *, is_truth: bool = False
-) -> NDArray[np.float64]:
+def _joined(blocks: list[SimulatedRun], name: str, *, is_truth: bool = False) -> Floats:
     return np.concatenate([getattr(b.truth if is_truth else b, name) for b in blocks])
 
 
@@ -142,9 +140,14 @@ def test_axes_permute() -> None:
     def turned(value: tuple[float, float, float]) -> tuple[float, float, float]:
         return value[order[0]], value[order[1]], value[order[2]]
 
-    effect = PartEffect('magnet', (70.0, 80.0, 90.0), (0.3, 0.2, 0.1), (1.0, 2.0, 3.0))
-    permuted = PartEffect(
-        'magnet', turned(effect.scale), turned(effect.scale_curvature), turned(effect.bias)
+    effect = PartEffect(
+        'magnet', scale=(70.0, 80.0, 90.0), scale_curvature=(0.3, 0.2, 0.1), bias=(1.0, 2.0, 3.0)
+    )
+    permuted = replace(
+        effect,
+        scale=turned(effect.scale),
+        scale_curvature=turned(effect.scale_curvature),
+        bias=turned(effect.bias),
     )
     a = replace(base, drift=DriftModel((effect,)))
     b = replace(

@@ -11,25 +11,27 @@ import numpy as np
 import pytest
 from builders import SECOND_NS
 
-from thermo_comp.regime import Regime
-from thermo_comp.settings import DetectorSettings, ThermalConfig
-from thermo_comp.thermal import LOST_GRADIENT_RELATIVE_SD, ThermalTracker
+from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.thermal.regime import Regime
+from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
+from thermo_comp.thermal.tracker import LOST_GRADIENT_RELATIVE_SD, ThermalTracker
 
 TAU_S = 900.0
+LAG = MemorySpec(lags=(('board', TAU_S),))
 
 
 def feed(tracker, board, case=None, *, start_s=0, step_s=1):
     for k, celsius in enumerate(board):
         stamp_ns = (start_s + k * step_s) * SECOND_NS
-        tracker.board_reading(stamp_ns, float(celsius))
+        tracker.read('board', stamp_ns, float(celsius))
         if case is not None:
-            tracker.case_reading(stamp_ns, float(case[k]))
+            tracker.read('case', stamp_ns, float(case[k]))
 
 
 @pytest.mark.parametrize('step_s', [1, 10])
 def test_memory_of_a_ramp_is_the_closed_form(step_s):
     # After a soak, a ramp of rate r: m = T - L = r tau (1 - exp(-t / tau)).
-    tracker = ThermalTracker(DetectorSettings(), (TAU_S,))
+    tracker = ThermalTracker(DetectorSettings(), LAG)
     soak_s, ramp_s, rate = 6000, 1800, 0.5 / 60.0
     t = np.arange(0, soak_s + ramp_s + 1, step_s)
     feed(tracker, 20.0 + rate * np.maximum(t - soak_s, 0.0), step_s=step_s)
@@ -37,30 +39,30 @@ def test_memory_of_a_ramp_is_the_closed_form(step_s):
     expected = rate * TAU_S * (1.0 - math.exp(-ramp_s / TAU_S))
     # The thermometer needs some readings to bend into the ramp: m remembers at most that lag,
     # tens of mK, of a value of 6.5 K.
-    assert state.memory[0] == pytest.approx(expected, abs=0.05)
+    assert state.lags[0] == pytest.approx(expected, abs=0.05)
     assert state.is_settled
 
 
 def test_memory_start_is_unknown_and_settles():
-    tracker = ThermalTracker(DetectorSettings(), (TAU_S,))
+    tracker = ThermalTracker(DetectorSettings(), LAG)
     feed(tracker, np.full(10, 20.0))
     assert not tracker.state_at(10 * SECOND_NS).is_settled
     feed(tracker, np.full(5000, 20.0), start_s=10)
     state = tracker.state_at(5010 * SECOND_NS)
-    # 3 K of doubt after 5010 s: 3 exp(-5.6) = 11 mK.
-    assert math.sqrt(state.var_memory[0]) == pytest.approx(3.0 * math.exp(-5010 / TAU_S), rel=1e-3)
+    # 3 K for a lag of an hour are 1.5 K for one of 900 s; after 5010 s: 1.5 exp(-5.6) = 6 mK.
+    assert math.sqrt(state.var_lags[0]) == pytest.approx(1.5 * math.exp(-5010 / TAU_S), rel=1e-3)
     assert state.is_settled
 
 
 def test_state_does_not_depend_on_when_it_is_asked_for():
-    one = ThermalTracker(DetectorSettings(), (TAU_S,))
-    other = ThermalTracker(DetectorSettings(), (TAU_S,))
+    one = ThermalTracker(DetectorSettings(), LAG)
+    other = ThermalTracker(DetectorSettings(), LAG)
     t = np.arange(0, 3000)
     board = 20.0 + 0.005 * t
     feed(one, board, board + 1.0)
     for k, celsius in enumerate(board.tolist()):
-        other.board_reading(k * SECOND_NS, celsius)
-        other.case_reading(k * SECOND_NS, celsius + 1.0)
+        other.read('board', k * SECOND_NS, celsius)
+        other.read('case', k * SECOND_NS, celsius + 1.0)
         other.sample(k * SECOND_NS + 123)
         other.state_at(k * SECOND_NS + 456_000_000)
     at = 3000 * SECOND_NS
@@ -69,8 +71,8 @@ def test_state_does_not_depend_on_when_it_is_asked_for():
 
 def test_results_do_not_depend_on_the_origin_of_time():
     epoch_ns = 1_790_000_000 * SECOND_NS
-    one = ThermalTracker(DetectorSettings(), (TAU_S,))
-    other = ThermalTracker(DetectorSettings(), (TAU_S,))
+    one = ThermalTracker(DetectorSettings(), LAG)
+    other = ThermalTracker(DetectorSettings(), LAG)
     board = 20.0 + 0.01 * np.arange(500)
     feed(one, board, board + 2.0)
     feed(other, board, board + 2.0, start_s=1_790_000_000)
@@ -86,15 +88,15 @@ def ramp(tracker):
     for k in range(1, 600):
         case = 20.0 + k / 60.0
         stamp_ns = (1199 + k) * SECOND_NS
-        tracker.board_reading(stamp_ns, 20.0 + (k / 60.0) * 0.2)
-        tracker.case_reading(stamp_ns, case)
+        tracker.read('board', stamp_ns, 20.0 + (k / 60.0) * 0.2)
+        tracker.read('case', stamp_ns, case)
         weights.append(tracker.weight_at(stamp_ns))
     assert tracker.detector.regime == Regime.DYNAMIC
     return np.array(weights)
 
 
 def test_cross_over_moves_linearly_over_the_transition_time():
-    tracker = ThermalTracker(DetectorSettings(), (), ThermalConfig(transition_time_s=20.0))
+    tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(transition_time_s=20.0))
     weights = ramp(tracker)
     steps = np.diff(weights)
     moving = steps[steps > 0.0]
@@ -104,13 +106,13 @@ def test_cross_over_moves_linearly_over_the_transition_time():
 
 
 def test_no_transition_time_is_the_hard_switch_of_the_paper():
-    tracker = ThermalTracker(DetectorSettings(), (), ThermalConfig(transition_time_s=0.0))
+    tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(transition_time_s=0.0))
     assert set(ramp(tracker).tolist()) == {0.0, 1.0}
 
 
 def test_lost_case_is_replaced_by_the_boards_rate():
     config = ThermalConfig(case_timeout_s=10.0, board_lag_s=600.0)
-    tracker = ThermalTracker(DetectorSettings(), (), config)
+    tracker = ThermalTracker(DetectorSettings(), None, config)
     t = np.arange(0, 1000)
     board = 20.0 + 0.01 * t
     feed(tracker, board, board + 6.0)
@@ -119,12 +121,12 @@ def test_lost_case_is_replaced_by_the_boards_rate():
     state = tracker.state_at(1099 * SECOND_NS)
     # lag times rate, the closed form of a first-order lag in a ramp.
     assert state.gradient == pytest.approx(600.0 * 0.01, abs=0.1)
-    assert math.sqrt(state.var_gradient) >= LOST_GRADIENT_RELATIVE_SD * 5.9
+    assert math.sqrt(state.var_gradients['case']) >= LOST_GRADIENT_RELATIVE_SD * 5.9
 
 
 def test_reset_is_a_new_tracker():
-    tracker = ThermalTracker(DetectorSettings(), (TAU_S,))
-    fresh = ThermalTracker(DetectorSettings(), (TAU_S,))
+    tracker = ThermalTracker(DetectorSettings(), LAG)
+    fresh = ThermalTracker(DetectorSettings(), LAG)
     board = 20.0 + 0.01 * np.arange(500)
     feed(tracker, board, board + 2.0)
     tracker.reset()

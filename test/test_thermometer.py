@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from thermal_signals import LAG_S, SECOND_NS, lagged, read
 
-from thermo_comp.modes import blend, correct, predict
-from thermo_comp.settings import ThermometerSettings
-from thermo_comp.thermometer import Thermometer
+from thermo_comp.thermal.modes import blend, correct, predict
+from thermo_comp.thermal.settings import ThermometerSettings
+from thermo_comp.thermal.thermometer import Thermometer
 
 SOAK_S, RAMP_S = 1800.0, 2400.0
 SENSORS = {

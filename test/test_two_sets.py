@@ -12,12 +12,12 @@ import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration
 from fitting_truth import GRAVITY, Truth, table_of, without_memory
 
-from thermo_comp.correction import Correction
 from thermo_comp.fitting.ladder import golovach_spec
 from thermo_comp.fitting.regression import Freedom, regress
 from thermo_comp.fitting.selection import Selector
 from thermo_comp.fitting.start import constant_calibration, position_means, starting_solution
 from thermo_comp.fitting.two_sets import even_handed, may_bend
+from thermo_comp.unit.correction import Correction
 
 
 @pytest.mark.parametrize(('power', 'order'), [(1, 1), (2, 2)])

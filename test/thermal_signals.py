@@ -7,9 +7,9 @@ Closed-form temperatures behind thermal lags, and sensors that read them, for th
 
 import numpy as np
 
-from thermo_comp.regime import Regime, RegimeDetector
-from thermo_comp.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.thermometer import Thermometer
+from thermo_comp.thermal.regime import Regime, RegimeDetector
+from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.thermal.thermometer import Thermometer
 
 SECOND_NS = 1_000_000_000
 LAG_S = 900.0

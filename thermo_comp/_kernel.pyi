@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-from .blocks import Floats, Stamps
+from thermo_comp.typing import Floats, Stamps
 
 def correct(
     start_ns: Stamps,

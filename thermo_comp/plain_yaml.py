@@ -1,23 +1,42 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns YAML of strangers: plain values without aliases, so that a small text stays a small object.
+Owns YAML as plain values: mappings, lists, texts, numbers, true, false and null, of bounded size.
 
-The calibration file has a stricter reader of its own.
+Scalars are those of YAML 1.2, so 1e-05 is a number and `no` is a text. No aliases, so no alias
+bombs; no tags, so no objects; no key twice. One pass over the events of the parser, without
+recursion, so no depth and no number of nodes is reached before it is refused.
 
 """
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import yaml
 
-DEPTH_LIMIT = 50
+DEPTH_LIMIT = 12
+#: Keys, values, lists and mappings: some ten times those of the largest calibration.
+NODE_LIMIT = 20_000
+#: Digits of the longest integer accepted; a float64 needs no more.
+_INTEGER_DIGITS = 20
+_INTEGER = re.compile(r'[-+]?[0-9]+')
+_FLOAT = re.compile(r'[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf)|\.nan')
+_WORDS = {'': None, '~': None, 'null': None, 'true': True, 'false': False}
 _LOADER: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
-def load_plain_yaml(text: str | bytes) -> Any:
+class PlainYamlError(ValueError):
+    """
+    A text that is not YAML of plain values; says what and in which line.
+
+    """
+
+
+def load_plain_yaml(
+    text: str | bytes, depth_limit: int = DEPTH_LIMIT, node_limit: int = NODE_LIMIT
+) -> Any:
     """
     Read one YAML document of plain values.
 
@@ -25,27 +44,106 @@ def load_plain_yaml(text: str | bytes) -> Any:
     ----------
     text : str or bytes
         The document.
+    depth_limit, node_limit : int, optional
+        The deepest nesting and the most values accepted.
 
     Returns
     -------
-    Any
-        Mappings, lists, texts, numbers, dates.
+    object
+        Mappings, lists, texts, numbers, true, false, null; null of an empty text.
 
     Raises
     ------
-    yaml.YAMLError
-        If it is no YAML, has aliases (with merge keys a few lines of them make billions of
-        objects) or is nested too deeply.
+    PlainYamlError
+        If it is no YAML or has what is not accepted here.
 
     """
-    depth = 0
-    for event in yaml.parse(text, Loader=_LOADER):
-        if isinstance(event, yaml.AliasEvent):
-            raise yaml.YAMLError('YAML aliases are not accepted')
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > DEPTH_LIMIT:
-                raise yaml.YAMLError(f'nested deeper than {DEPTH_LIMIT}')
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-    return yaml.load(text, Loader=_LOADER)  # noqa: S506 - the safe one, in C where there is one
+    try:
+        return _load(text, depth_limit, node_limit)
+    except yaml.YAMLError as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f' (line {mark.line + 1})' if mark is not None else ''
+        problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
+        raise PlainYamlError(f'not valid YAML: {problem}{where}') from error
+    except UnicodeEncodeError as error:
+        raise PlainYamlError(f'not valid YAML: {error.reason}') from error
+
+
+def is_plain_text(text: str) -> bool:
+    """
+    Say whether an unquoted scalar is a text here.
+
+    """
+    return not (text in _WORDS or _INTEGER.fullmatch(text) or _FLOAT.fullmatch(text))
+
+
+def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
+    document: list[Any] = []
+    #: The open collections, innermost last; a mapping with the key that waits for its value.
+    open_ones: list[Any] = [document]
+    keys: list[Any] = [None]
+    has_document = False
+    for n, event in enumerate(yaml.parse(text, Loader=_LOADER)):
+        if n > node_limit:
+            raise PlainYamlError(f'more than {node_limit} keys and values')
+        kind = type(event)
+        if kind is yaml.ScalarEvent or kind in (yaml.SequenceStartEvent, yaml.MappingStartEvent):
+            if event.tag not in (None, '!'):
+                raise PlainYamlError(f'YAML tags are not accepted ({_line(event)})')
+            holder = open_ones[-1]
+            if kind is yaml.ScalarEvent:
+                value = _scalar(event) if event.implicit[0] else event.value
+            else:
+                value = [] if kind is yaml.SequenceStartEvent else {}
+            if type(holder) is list:
+                holder.append(value)
+            elif keys[-1] is None:
+                if type(value) is not str:
+                    raise PlainYamlError(
+                        f'not valid YAML: a key must be a text, got {value!r:.40} ({_line(event)})'
+                    )
+                if value in holder:
+                    raise PlainYamlError(
+                        f'not valid YAML: the key {value!r:.60} stands twice ({_line(event)})'
+                    )
+                keys[-1] = value
+            else:
+                holder[keys[-1]] = value
+                keys[-1] = None
+            if kind is not yaml.ScalarEvent:
+                if len(open_ones) > depth_limit:
+                    raise PlainYamlError(f'nested deeper than {depth_limit} ({_line(event)})')
+                open_ones.append(value)
+                keys.append(None)
+        elif kind in (yaml.SequenceEndEvent, yaml.MappingEndEvent):
+            open_ones.pop()
+            keys.pop()
+        elif kind is yaml.AliasEvent:
+            raise PlainYamlError(f'YAML aliases are not accepted ({_line(event)})')
+        elif kind is yaml.DocumentStartEvent:
+            if has_document:
+                raise PlainYamlError('expected one YAML document, found more')
+            has_document = True
+    return document[0] if document else None
+
+
+def _scalar(event: yaml.ScalarEvent) -> Any:
+    text: str = event.value
+    if text in _WORDS:
+        return _WORDS[text]
+    if text[0] not in '-+.0123456789':
+        return text
+    if _INTEGER.fullmatch(text):
+        if len(text) > _INTEGER_DIGITS:
+            raise PlainYamlError(
+                f'not valid YAML: an integer of {len(text)} digits is not accepted '
+                f'({_line(event)})'
+            )
+        return int(text)
+    if _FLOAT.fullmatch(text):
+        return float(text.replace('.inf', 'inf').replace('.nan', 'nan'))
+    return text
+
+
+def _line(event: Any) -> str:
+    return f'line {event.start_mark.line + 1}'

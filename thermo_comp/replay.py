@@ -16,13 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from . import __version__
-from .blocks import CompensatedBlock
-from .calibration import Calibration
-from .compensator import Compensator
 from .errors import CalibrationError
+from .online.batch import process_block
+from .online.blocks import CompensatedBlock
+from .online.compensator import Compensator
+from .online.status import CompensatorConfig, Counters
 from .recording import (
     BagWriter,
     Block,
@@ -34,7 +34,8 @@ from .recording import (
     Topics,
     open_recording,
 )
-from .status import CompensatorConfig, Counters
+from .typing import Ints
+from .unit.calibration import Calibration
 
 OUTPUT_TOPIC = 'imu/data_raw'
 REGIME_TOPIC = 'regime/dynamic'
@@ -166,7 +167,7 @@ def corrected_blocks(
 
     """
     for block in blocks:
-        corrected = compensator.process_block(block)
+        corrected = process_block(compensator, block)
         yield CorrectedBlock(block, corrected, compensator.take_flags())
 
 
@@ -249,7 +250,7 @@ def replay(
         return ReplayResult(
             info=reader.info,
             output=Path(output),
-            counters=compensator.status.counters,
+            counters=compensator.counters,
             n_flags=len(flags),
             switches=switches(flags),
         )
@@ -293,7 +294,7 @@ def _write_block(writer: BagWriter, item: CorrectedBlock, frame_id: str) -> None
         writer.write_bool(REGIME_TOPIC, np.array(stamps, dtype=np.int64), np.array(values))
 
 
-def _rows(imu: ImuColumns, index: npt.NDArray[np.int64]) -> ImuColumns:
+def _rows(imu: ImuColumns, index: Ints) -> ImuColumns:
     return ImuColumns(
         imu.orientation[index],
         imu.orientation_covariance[index],

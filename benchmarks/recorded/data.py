@@ -12,16 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from thermo_comp.convert import load_column_map, table_log, write_log
 from thermo_comp.convert.columns import ColumnMap
 from thermo_comp.fitting.reduction import ReducedBag, reduce_source
 from thermo_comp.fitting.sources import FitSource
+from thermo_comp.typing import Floats
 
 from . import ROOT
 
-Array = npt.NDArray[np.float64]
 GRAVITY = 9.80665
 FREEZER = 'freezer-mpu6050/temp-calibration.csv'
 HANDHELD = 'mikoff-mpu9150/mk_imu{}.log'
@@ -41,7 +40,7 @@ def freezer_bag(folder: Path, work: Path) -> Path:
     return bag
 
 
-def freezer_column(folder: Path, name: str) -> Array:
+def freezer_column(folder: Path, name: str) -> Floats:
     """
     Read one column of the freezer run as it is.
 
@@ -91,8 +90,8 @@ class Samples:
 
     """
 
-    time: Array
-    accel: Array
+    time: Floats
+    accel: Floats
 
 
 def samples_of(source: FitSource) -> Samples:

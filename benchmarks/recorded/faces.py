@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from thermo_comp.errors import FitError
+from thermo_comp.fitting.partial import recording_source
 from thermo_comp.fitting.triad import TriadFit, fit_triad
-from thermo_comp.partial import recording_source
+from thermo_comp.typing import Floats
 
 from .data import GRAVITY, faces_bag, still_bag
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -44,8 +42,8 @@ class Faces:
     n_positions: int
     fit: TriadFit
     refusal: str
-    by_hand_bias: Array
-    by_hand_scale: Array
+    by_hand_bias: Floats
+    by_hand_scale: Floats
 
 
 def read_faces(folder: Path, work: Path) -> Faces:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
@@ -29,17 +28,15 @@ from thermo_comp.fitting.one_pose import (
     fit_whole,
     read_pose,
 )
+from thermo_comp.fitting.partial import recording_source
 from thermo_comp.fitting.sources import FitSource
-from thermo_comp.partial import recording_source
-from thermo_comp.regime import Regime
-from thermo_comp.settings import DetectorSettings
-from thermo_comp.thermal import ThermalTracker
+from thermo_comp.thermal.regime import Regime
+from thermo_comp.thermal.settings import DetectorSettings
+from thermo_comp.thermal.tracker import ThermalTracker
+from thermo_comp.typing import Bools, Floats, Ints
 
 from .data import GRAVITY, freezer_column
 from .peers import PEERS, residual
-
-Array = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 BLOCK_S = 20.0
 HOT_C, COLD_C = 36.0, 15.0
@@ -79,10 +76,10 @@ class Freezer:
     fits: tuple[BranchFit, ...]
     refusal: str
     full_refusal: str
-    die: Array
+    die: Floats
 
     @property
-    def time(self) -> Array:
+    def time(self) -> Floats:
         """
         The log's clock at each window [s].
 
@@ -137,7 +134,7 @@ class Split:
     """
 
     name: str
-    folds: tuple[tuple[BoolArray, BoolArray], ...]
+    folds: tuple[tuple[Bools, Bools], ...]
 
 
 def interleaved(freezer: Freezer, shift_s: float = 0.0) -> Split:
@@ -241,14 +238,14 @@ class Tracked:
 
     """
 
-    time: Array
-    reading: Array
-    estimate: Array
-    sd: Array
-    reference: Array
-    rate: Array
-    case: Array
-    regime: npt.NDArray[np.int64]
+    time: Floats
+    reading: Floats
+    estimate: Floats
+    sd: Floats
+    reference: Floats
+    rate: Floats
+    case: Floats
+    regime: Ints
 
     def errors(self, low_s: float, high_s: float) -> tuple[float, float, float, float]:
         """
@@ -295,9 +292,9 @@ def track(freezer: Freezer, detector: DetectorSettings | None = None) -> Tracked
     rows = []
     for stamp, is_case, value in sorted(readings):
         if is_case:
-            tracker.case_reading(int(stamp), float(value))
+            tracker.read('case', int(stamp), float(value))
             continue
-        tracker.board_reading(int(stamp), float(value))
+        tracker.read('board', int(stamp), float(value))
         board = tracker.board
         rows.append(
             (
@@ -323,7 +320,7 @@ def track(freezer: Freezer, detector: DetectorSettings | None = None) -> Tracked
     )
 
 
-def _centred(time: Array, values: Array, half_s: float) -> Array:
+def _centred(time: Floats, values: Floats, half_s: float) -> Floats:
     """
     Fit a parabola to the readings around each time.
 

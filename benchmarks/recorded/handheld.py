@@ -15,17 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from thermo_comp.fitting.partial import recording_source
 from thermo_comp.fitting.reduction import StillInterval
 from thermo_comp.fitting.triad import TriadFit, fit_triad
-from thermo_comp.metrics import norm_residual
-from thermo_comp.partial import recording_source
+from thermo_comp.typing import Floats
+from thermo_comp.unit.metrics import norm_residual
 
 from .data import GRAVITY, handheld_bag, still_bag
 
-Array = npt.NDArray[np.float64]
 MG = GRAVITY * 1e-3
 FOLDS = 5
 PARAMETERS = ('b_x', 'b_y', 'b_z', 'K_x', 'K_y', 'K_z', 'M10', 'M20', 'M21')
@@ -56,10 +55,10 @@ class Handheld:
     unit: int
     intervals: tuple[StillInterval, ...]
     ours: TriadFit
-    direct: Array
+    direct: Floats
     in_sample: tuple[float, float]
     held_out: tuple[float, float]
-    jackknife_sd: Array
+    jackknife_sd: Floats
 
     @property
     def ratio(self) -> float:
@@ -70,7 +69,7 @@ class Handheld:
         return self.held_out[0] / self.held_out[1]
 
     @property
-    def pulls(self) -> Array:
+    def pulls(self) -> Floats:
         """
         Ours less direct, in our sd.
 
@@ -88,7 +87,7 @@ def read_handheld(folder: Path, work: Path, unit: int, jackknife: bool = True) -
     ours = fit_triad(intervals, GRAVITY)
     direct = direct_solution(windows_of(intervals))
     in_sample = (rms(ours.residual), rms(direct_residual(direct, windows_of(intervals))))
-    left: tuple[list[Array], list[Array]] = ([], [])
+    left: tuple[list[Floats], list[Floats]] = ([], [])
     for fold in range(FOLDS):
         train = [one for i, one in enumerate(intervals) if i % FOLDS != fold]
         test = windows_of([one for i, one in enumerate(intervals) if i % FOLDS == fold])
@@ -115,7 +114,7 @@ def read_handheld(folder: Path, work: Path, unit: int, jackknife: bool = True) -
     )
 
 
-def windows_of(intervals: Sequence[StillInterval]) -> Array:
+def windows_of(intervals: Sequence[StillInterval]) -> Floats:
     """
     Stack the window means of some positions, shape (n, 3).
 
@@ -123,7 +122,7 @@ def windows_of(intervals: Sequence[StillInterval]) -> Array:
     return np.concatenate([interval.mean for interval in intervals])
 
 
-def direct_residual(parameters: Array, windows: Array) -> Array:
+def direct_residual(parameters: Floats, windows: Floats) -> Floats:
     """
     Evaluate ``|M (N - b) / K| - g`` for nine parameters.
 
@@ -134,7 +133,7 @@ def direct_residual(parameters: Array, windows: Array) -> Array:
     return np.asarray(np.linalg.norm(force, axis=1) - GRAVITY)
 
 
-def direct_solution(windows: Array) -> Array:
+def direct_solution(windows: Floats) -> Floats:
     """
     Minimise its squares, from a perfect sensor.
 
@@ -146,7 +145,7 @@ def direct_solution(windows: Array) -> Array:
     return np.asarray(found.x)
 
 
-def rms(residual: Array) -> float:
+def rms(residual: Floats) -> float:
     """
     Root mean square in mg.
 

@@ -12,7 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from thermo_comp.calibration import (
+from thermo_comp.fitting.one_pose import PoseOptions, fit_branches, read_pose
+from thermo_comp.fitting.partial import recording_source
+from thermo_comp.fitting.triad import TriadFit
+from thermo_comp.judging.evaluation import evaluate
+from thermo_comp.recording import BagWriter
+from thermo_comp.unit.calibration import (
     Axes,
     AxisReference,
     AxisSet,
@@ -22,12 +27,7 @@ from thermo_comp.calibration import (
     ResidualSummary,
     Unit,
 )
-from thermo_comp.evaluation import evaluate
-from thermo_comp.fitting.one_pose import PoseOptions, fit_branches, read_pose
-from thermo_comp.fitting.triad import TriadFit
-from thermo_comp.functions import Polynomial
-from thermo_comp.partial import recording_source
-from thermo_comp.recording import BagWriter
+from thermo_comp.unit.functions import Polynomial
 
 from .data import GRAVITY, samples_of
 from .handheld import Handheld
@@ -92,7 +92,7 @@ def constant_calibration(fit: TriadFit, unit: Handheld, serial: str) -> Calibrat
     )
     matrix = tuple(tuple(float(v) for v in line) for line in fit.misalignment)
     return Calibration(
-        format_version=1,
+        format_version=2,
         unit=Unit(serial, 'm/s^2', 4.0 * GRAVITY, 0.01),
         reference_temperature_c=ROOM_C,
         gravity_m_s2=GRAVITY,

@@ -14,19 +14,21 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from thermo_comp.typing import Floats
+
 #: Training vectors and temperatures in, a predictor of the norm out; told whether to carry the
 #: polynomial on beyond the training temperatures instead of holding its edge, as they all do.
-Peer = Callable[[Array, Array], Callable[[Array, Array, bool], Array]]
+Peer = Callable[[Floats, Floats], Callable[[Floats, Floats, bool], Floats]]
 
 _ARDUPILOT_REFERENCE = 35.0
 _ARDUPILOT_STEP = 0.5
 _ARDUPILOT_MEANS = 4
 
 
-def no_correction(_vectors: Array, _temperature: Array) -> Callable[[Array, Array, bool], Array]:
+def no_correction(
+    _vectors: Floats, _temperature: Floats
+) -> Callable[[Floats, Floats, bool], Floats]:
     """
     Leave the reading as it is.
 
@@ -34,7 +36,7 @@ def no_correction(_vectors: Array, _temperature: Array) -> Callable[[Array, Arra
     return lambda vectors, _temperature, _extend: vectors
 
 
-def linear(vectors: Array, temperature: Array) -> Callable[[Array, Array, bool], Array]:
+def linear(vectors: Floats, temperature: Floats) -> Callable[[Floats, Floats, bool], Floats]:
     """
     Correct each axis by a straight line in T.
 
@@ -42,7 +44,7 @@ def linear(vectors: Array, temperature: Array) -> Callable[[Array, Array, bool],
     return _polynomial(vectors, temperature, float(np.mean(temperature)), 1, temperature)
 
 
-def px4_cubic(vectors: Array, temperature: Array) -> Callable[[Array, Array, bool], Array]:
+def px4_cubic(vectors: Floats, temperature: Floats) -> Callable[[Floats, Floats, bool], Floats]:
     """
     Fit a cubic per axis about the middle of the range, on all windows, as PX4's tools do.
 
@@ -51,7 +53,9 @@ def px4_cubic(vectors: Array, temperature: Array) -> Callable[[Array, Array, boo
     return _polynomial(vectors, temperature, reference, 3, temperature)
 
 
-def ardupilot_cubic(vectors: Array, temperature: Array) -> Callable[[Array, Array, bool], Array]:
+def ardupilot_cubic(
+    vectors: Floats, temperature: Floats
+) -> Callable[[Floats, Floats, bool], Floats]:
     """
     Fit a cubic per axis about 35 degC on means per half a kelvin, as ArduPilot's learning does.
 
@@ -72,8 +76,8 @@ def ardupilot_cubic(vectors: Array, temperature: Array) -> Callable[[Array, Arra
 
 
 def _polynomial(
-    vectors: Array, temperature: Array, reference: float, order: int, seen: Array
-) -> Callable[[Array, Array, bool], Array]:
+    vectors: Floats, temperature: Floats, reference: float, order: int, seen: Floats
+) -> Callable[[Floats, Floats, bool], Floats]:
     columns = np.vander(temperature - reference, order + 1, increasing=True)
     coefficients = np.linalg.lstsq(columns, vectors, rcond=None)[0]
     low, high = float(seen.min()), float(seen.max())
@@ -81,7 +85,7 @@ def _polynomial(
     # the middle of what was seen. The reference itself may be far outside.
     usual = np.vander([0.5 * (low + high) - reference], order + 1, increasing=True) @ coefficients
 
-    def correct(measured: Array, at: Array, extend: bool) -> Array:
+    def correct(measured: Floats, at: Floats, extend: bool) -> Floats:
         held = at if extend else np.clip(at, low, high)
         powers = np.vander(held - reference, order + 1, increasing=True)
         return np.asarray(measured - (powers @ coefficients - usual))
@@ -99,10 +103,10 @@ PEERS: dict[str, Peer] = {
 
 def residual(
     peer: Peer,
-    train: tuple[Array, Array],
-    test: tuple[Array, Array],
+    train: tuple[Floats, Floats],
+    test: tuple[Floats, Floats],
     extend: bool,
-) -> Array:
+) -> Floats:
     """
     Train a peer on some windows, correct others, and say what the norm misses its level by.
 

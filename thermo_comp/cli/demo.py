@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import ThermoCompError
+from ..unit.gravity import STANDARD_GRAVITY
 from . import options
 from .output import Cell, Output, micro_g
 from .play import require_ros
 
 if TYPE_CHECKING:
-    from ..calibration import Calibration
-    from ..evaluation import Evaluation
+    from ..judging.evaluation import Evaluation
+    from ..unit.calibration import Calibration
 
-_GRAVITY = 9.80665
 _SAMPLES, _OUTPUT = 'accel/counts', 'imu/data_raw'
 # Two hours in eight seconds.
 _RATE = 1000.0
@@ -134,15 +134,15 @@ def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
     Fit the three calibrations that are compared, and write the one for the node.
 
     """
-    from ..calibration_file import save_calibration
-    from ..fit_sources import fit_sources
     from ..fitting import FitOptions, fit
+    from ..fitting.fit_sources import fit_sources
+    from ..unit.calibration_file import save_calibration
 
     sources, _ = fit_sources(bags)
     calibrations = {}
     with out.progress('fitting', total=len(_MODELS)) as done:
         for before, (name, model) in enumerate(_MODELS.items()):
-            result = fit(sources, FitOptions(gravity=_GRAVITY, model=model))
+            result = fit(sources, FitOptions(gravity=STANDARD_GRAVITY, model=model))
             calibrations[name] = result.calibration
             done(before + 1)
     for name, file in (('node', 'unit.yaml'), ('one set', 'one_set.yaml')):
@@ -180,7 +180,7 @@ def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool
     """
     import numpy as np
 
-    from ..compensator import Compensator
+    from ..online.compensator import Compensator
     from ..recording import Topics, open_recording, read_recording
     from ..replay import corrected_blocks
 
@@ -200,14 +200,14 @@ def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool
 
 
 def _judge(bag: Path, calibrations: dict[str, Calibration]) -> Evaluation:
-    from ..evaluation import evaluate
+    from ..judging.evaluation import evaluate
 
     judged = ['node', *(name for name in calibrations if name != 'node')]
-    return evaluate(bag, [(name, calibrations[name]) for name in judged], gravity=_GRAVITY)
+    return evaluate(bag, [(name, calibrations[name]) for name in judged], gravity=STANDARD_GRAVITY)
 
 
 def _say(out: Output, result: Evaluation, model: str) -> None:
-    from ..evaluation import RAW
+    from ..judging.evaluation import RAW
 
     columns = [RAW, *_MODELS]
     rows: list[tuple[Cell, ...]] = []
@@ -232,6 +232,6 @@ def _draw(bag: Path, calibration: Calibration, output: Path) -> tuple[Path, Path
     from ..report import evidence_of_bags, open_bag, write_report
 
     page, figures = output / 'report.html', output / 'figures'
-    evidence = evidence_of_bags([open_bag(bag)], calibration, gravity=_GRAVITY)
+    evidence = evidence_of_bags([open_bag(bag)], calibration, gravity=STANDARD_GRAVITY)
     write_report(evidence, page, figures=figures)
     return page, next(figures.glob('*gravity.png'))

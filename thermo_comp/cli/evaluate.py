@@ -19,8 +19,8 @@ from . import options
 from .output import Cell, Output, micro_g
 
 if TYPE_CHECKING:
-    from ..evaluation import Evaluation
     from ..fitting import Assessment
+    from ..judging.evaluation import Evaluation
 
 
 def evaluate(
@@ -58,13 +58,13 @@ def evaluate(
       thermo_comp evaluate held_out.mcap -c unit42.yaml
 
     """
-    from ..calibration_file import load_calibration
-    from ..evaluation import evaluate as run
-    from ..evaluation import joined
-    from ..fit_sources import fit_sources
     from ..fitting import assess
+    from ..fitting.fit_sources import fit_sources
+    from ..judging.evaluation import evaluate as run
+    from ..judging.evaluation import joined
+    from ..online.status import CompensatorConfig
     from ..replay import input_for
-    from ..status import CompensatorConfig
+    from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
     if not window > 0.0:
@@ -182,7 +182,7 @@ def _say_axes(out: Output, verdict: Assessment) -> None:
     Print what is known axis by axis: wander always, shifts where the positions tell.
 
     """
-    from ..metrics import MICRO_G
+    from ..unit.gravity import MICRO_G
 
     columns = ['axis', 'static ug', 'dynamic ug']
     if verdict.shifts:

@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from ..errors import CalibrationError
+from ..unit.gravity import STANDARD_GRAVITY
 from . import options
 from .output import Output
 
@@ -65,9 +66,9 @@ def export(
       thermo_comp export unit42.yaml --to ardupilot --up 0 0 1 -o unit42.parm
 
     """
-    from ..calibration_file import load_calibration
-    from ..exchange import export_ardupilot, export_px4
+    from ..convert.exchange import export_ardupilot, export_px4
     from ..files import write_atomically
+    from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
     if device_id and to is not Autopilot.px4:
@@ -109,7 +110,7 @@ def import_(
     number: Annotated[
         int | None, typer.Option(help='Which set, where there are several (TC_A0, INS_TCAL1).')
     ] = None,
-    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = 9.80665,
+    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = STANDARD_GRAVITY,
     rate_hz: Annotated[float, typer.Option(help='Samples per second of the unit.', min=0.1)] = 200,
     full_scale_g: Annotated[float, typer.Option(help='Full scale in g.', min=0.1)] = 16.0,
     noise_ug: Annotated[
@@ -130,10 +131,10 @@ def import_(
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml
 
     """
-    from ..calibration_file import save_calibration
-    from ..exchange import import_parameters
+    from ..convert.exchange import import_parameters
     from ..files import read_bounded
-    from ..metrics import MICRO_G
+    from ..unit.calibration_file import save_calibration
+    from ..unit.gravity import MICRO_G
 
     out = Output(as_json, quiet)
     options.refuse_existing(output, force)

@@ -69,10 +69,10 @@ def fit(
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
 
     """
-    from ..calibration_file import save_calibration
-    from ..fit_sources import fit_sources
     from ..fitting import FitOptions, resolve_gravity
     from ..fitting import fit as run
+    from ..fitting.fit_sources import fit_sources
+    from ..unit.calibration_file import save_calibration
 
     out = Output(as_json, quiet)
     gravity = options.place(gravity, latitude, height)
@@ -159,7 +159,7 @@ def _say_positions(out: Output, result: FitResult) -> None:
     Print every rest: where, when, how long, which way was up, what the fit leaves of |f| - g.
 
     """
-    from ..metrics import MICRO_G
+    from ..unit.gravity import MICRO_G
 
     out.table(
         ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', '|f| - g ug'),
@@ -182,7 +182,7 @@ def _say_candidates(out: Output, result: FitResult) -> None:
     Print what each model left per axis; the held-out error decides, ties go to the simpler one.
 
     """
-    from ..metrics import MICRO_G
+    from ..unit.gravity import MICRO_G
 
     out.table(
         ('candidate', 'parameters', 'fitted ug', 'held out ug', 'BIC', ''),

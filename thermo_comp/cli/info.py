@@ -43,7 +43,7 @@ def info(
 
 
 def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
-    from ..survey import survey_recording
+    from ..fitting.survey import survey_recording
 
     with out.progress(f'reading {path.name}', total=1.0) as done:
         survey = survey_recording(path, options.topics_of(*topics), done)
@@ -106,8 +106,8 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
 
 
 def _calibration(out: Output, path: Path) -> None:
-    from ..calibration_file import load_calibration
-    from ..metrics import MICRO_G
+    from ..unit.calibration_file import load_calibration
+    from ..unit.gravity import MICRO_G
 
     calibration = load_calibration(path)
     unit, provenance = calibration.unit, calibration.provenance

@@ -16,8 +16,8 @@ from .output import Output
 
 if TYPE_CHECKING:
     from ..fitting.one_pose import BranchFit, Pose
+    from ..fitting.partial import Partial
     from ..fitting.triad import TriadFit
-    from ..partial import Partial
 
 _HOUR_S = 3600.0
 
@@ -54,7 +54,7 @@ def partial(
     """
     from ..fitting import resolve_gravity
     from ..fitting.one_pose import PoseOptions
-    from ..partial import tell
+    from ..fitting.partial import tell
 
     out = Output(as_json, quiet)
     if gravity is not None or latitude is not None or height is not None:
@@ -156,8 +156,9 @@ def _words(row: dict[str, Any]) -> str:
 
 
 def _say_triad(out: Output, result: Partial, triad: TriadFit) -> None:
-    from ..metrics import MICRO_G, residual_statistics
-    from ..partial import temperature_span
+    from ..fitting.partial import temperature_span
+    from ..unit.gravity import MICRO_G
+    from ..unit.metrics import residual_statistics
 
     out.table(
         ('axis', 'bias', 'sd', 'scale', 'sd'),

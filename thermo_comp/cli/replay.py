@@ -61,9 +61,9 @@ def replay(
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
 
     """
-    from ..calibration_file import load_calibration
+    from ..online.status import CompensatorConfig
     from ..replay import replay as run
-    from ..status import CompensatorConfig
+    from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
     given = {
@@ -94,7 +94,7 @@ def replay(
 
 
 def _say(out: Output, result: ReplayResult) -> None:
-    from ..status import DROPPED
+    from ..online.status import DROPPED
 
     counters = result.counters
     is_torn = out.torn([result.info])

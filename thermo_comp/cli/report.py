@@ -56,9 +56,9 @@ def report(
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
 
     """
-    from ..calibration_file import load_calibration
     from ..replay import input_for
     from ..report import evidence_of_bags, open_bag, write_report
+    from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
     if not bags and calibration is None:

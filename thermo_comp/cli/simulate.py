@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..unit.gravity import STANDARD_GRAVITY
 from . import options
 from .output import Output
 
@@ -47,7 +48,7 @@ def simulate(
         float | None, typer.Option(help="Temperature readings per second, else the sensors' own.")
     ] = None,
     seed: Annotated[int, typer.Option(help='Seed of the noise.', min=0)] = 0,
-    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = 9.80665,
+    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = STANDARD_GRAVITY,
     cold_start: Annotated[
         bool, typer.Option('--cold-start', help='Switch the unit on when the recording starts.')
     ] = False,

@@ -19,10 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
+from ..typing import Bools, Floats, Ints
 from .columnar import origin
 from .log import ForeignLog, Readings, thin
 from .table import NO_STAMP
-from .units import Array, BoolArray, IntArray, find_stillness
+from .units import find_stillness
 
 T = TypeVar('T')
 
@@ -53,10 +54,10 @@ class ImuRows:
 
     """
 
-    stamp_ns: IntArray
-    accel: Array
-    gyro: Array | None
-    celsius: Array
+    stamp_ns: Ints
+    accel: Floats
+    gyro: Floats | None
+    celsius: Floats
     serial: str = ''
     n_short: int = 0
 
@@ -133,7 +134,7 @@ def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = No
     )
 
 
-def stamps_ns(microseconds: npt.NDArray[Any]) -> IntArray:
+def stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
     """
     Turn microseconds since the autopilot's start into stamps.
 
@@ -169,7 +170,7 @@ def _reported(readings: Readings) -> Readings:
     Leave out what no thermometer said: NaN, and the zeros of a sensor that has none.
 
     """
-    use: BoolArray = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
+    use: Bools = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
     if not readings.celsius[use].any():
         use = np.zeros(len(use), dtype=np.bool_)
     return Readings(readings.stamp_ns[use], readings.celsius[use])

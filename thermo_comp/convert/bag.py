@@ -19,12 +19,12 @@ import numpy as np
 
 from .. import __version__
 from ..errors import RecordingError
-from ..fit_sources import digest
+from ..fitting.fit_sources import digest
 from ..recording import Topics, inspect_recording, read_recording
 from ..recording.columns import Role
-from .columns import STANDARD_GRAVITY
+from ..typing import Floats, Ints
+from ..unit.gravity import STANDARD_GRAVITY
 from .log import ForeignLog, Readings
-from .units import Array, IntArray
 
 _IMU = 'sensor_msgs/msg/Imu'
 _TEMPERATURE = 'sensor_msgs/msg/Temperature'
@@ -180,6 +180,6 @@ def _most(path: Path, names: list[str], what: str, option: str) -> str | None:
     return names[0] if names else None
 
 
-def _readings(stamp_ns: IntArray, celsius: Array) -> Readings | None:
+def _readings(stamp_ns: Ints, celsius: Floats) -> Readings | None:
     use = np.isfinite(celsius)
     return Readings(stamp_ns[use], celsius[use]) if use.any() else None

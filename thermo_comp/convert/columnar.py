@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from .. import __version__
+from ..typing import Floats, Ints
 from .columns import ColumnMap, Thermometer
 from .log import ForeignLog, Readings, thin
-from .table import NO_STAMP, Array, Column, IntArray, Table, read_table
+from .parquet import read_parquet
+from .table import NO_STAMP, Column, Table, read_text
 
 
 def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
@@ -40,14 +42,15 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
         If the file cannot be read or lacks a column.
 
     """
-    table = read_table(
-        path,
-        _wanted(columns),
-        stamp=columns.stamp.column,
-        stamp_exponent=columns.stamp.exponent,
-        delimiter=columns.format.character,
-        has_header=columns.format.header,
-    )
+    path = Path(path)
+    wanted, stamp = _wanted(columns), columns.stamp
+    if path.suffix.lower() in ('.parquet', '.pq'):
+        table = read_parquet(path, wanted, stamp.column, stamp.exponent)
+    else:
+        separated = columns.format
+        table = read_text(
+            path, wanted, stamp.column, stamp.exponent, separated.character, separated.header
+        )
     stamp_ns = _stamps(table, columns)
     gyro = None
     if columns.gyro is not None:
@@ -111,11 +114,11 @@ def _wanted(columns: ColumnMap) -> list[Column]:
     return list(dict.fromkeys(wanted))
 
 
-def _stack(table: Table, names: tuple[Column, Column, Column]) -> Array:
+def _stack(table: Table, names: tuple[Column, Column, Column]) -> Floats:
     return np.column_stack([table.values[name] for name in names])
 
 
-def _stamps(table: Table, columns: ColumnMap) -> IntArray:
+def _stamps(table: Table, columns: ColumnMap) -> Ints:
     if table.stamp_ns is not None:
         return table.stamp_ns
     rate = columns.stamp.rate_hz or 1.0
@@ -125,9 +128,7 @@ def _stamps(table: Table, columns: ColumnMap) -> IntArray:
     return np.asarray(start_ns + steps.astype(np.int64))
 
 
-def _readings(
-    table: Table, stamp_ns: IntArray, thermometer: Thermometer | None
-) -> Readings | None:
+def _readings(table: Table, stamp_ns: Ints, thermometer: Thermometer | None) -> Readings | None:
     if thermometer is None:
         return None
     slope, offset = thermometer.linear

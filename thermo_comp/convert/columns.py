@@ -9,31 +9,24 @@ A map is a small YAML file beside the log; config/columns/ has examples.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
-
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import load_plain_yaml
+from ..unit.gravity import STANDARD_GRAVITY
+from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
 from .table import Column
 
-STANDARD_GRAVITY = 9.80665
 #: A map takes some kB.
 _SIZE_LIMIT = 1 << 20
 _STAMP_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra='forbid', frozen=True, strict=True)
-
-
-class Format(_Section):
+@dataclass(frozen=True)
+class Format:
     """
     How the text is laid out; found out where it is not said.
 
@@ -52,7 +45,8 @@ class Format(_Section):
         return None if self.delimiter is None else names.get(self.delimiter, self.delimiter)
 
 
-class Stamp(_Section):
+@dataclass(frozen=True)
+class Stamp:
     """
     A column of time stamps, or a fixed rate.
 
@@ -63,15 +57,13 @@ class Stamp(_Section):
     column: Column | None = None
     unit: Literal['s', 'ms', 'us', 'ns'] | None = None
     rate_hz: Positive | None = None
-    start_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 1.0
+    start_s: NotNegative = 1.0
 
-    @model_validator(mode='after')
-    def _one_way(self) -> Stamp:
+    def __post_init__(self) -> None:
         if (self.column is None) == (self.rate_hz is None):
             raise ValueError('give either `column` and `unit`, or `rate_hz`')
         if self.column is not None and self.unit is None:
-            raise ValueError('`unit` of the stamp column must be s, ms, us or ns')
-        return self
+            raise ValueError('`unit` must be s, ms, us or ns where there is a column')
 
     @property
     def exponent(self) -> int:
@@ -82,7 +74,8 @@ class Stamp(_Section):
         return _STAMP_EXPONENTS[self.unit or 'ns']
 
 
-class Accel(_Section):
+@dataclass(frozen=True)
+class Accel:
     """
     The accelerometer's three columns.
 
@@ -96,17 +89,15 @@ class Accel(_Section):
     unit: Literal['counts', 'm/s^2', 'g', 'mg']
     output: Literal['counts', 'imu']
     counts_per_g: Positive | None = None
-    clip: tuple[Finite, Finite] | None = None
+    clip: tuple[float, float] | None = None
 
-    @model_validator(mode='after')
-    def _units_fit(self) -> Accel:
+    def __post_init__(self) -> None:
         if self.unit == 'counts' and self.output == 'imu' and self.counts_per_g is None:
             raise ValueError('counts become an Imu only with `counts_per_g`')
         if self.unit != 'counts' and self.output == 'counts':
             raise ValueError(f'{self.unit} cannot become counts: output must be imu')
         if self.clip is not None and not self.clip[0] < self.clip[1]:
             raise ValueError('`clip` must be [lowest, highest]')
-        return self
 
     @property
     def factor(self) -> float:
@@ -120,7 +111,8 @@ class Accel(_Section):
         return STANDARD_GRAVITY / per_g.get(self.unit, self.counts_per_g or 1.0)
 
 
-class Gyro(_Section):
+@dataclass(frozen=True)
+class Gyro:
     """
     The gyroscope's three columns; they travel in the Imu message.
 
@@ -130,7 +122,8 @@ class Gyro(_Section):
     unit: Literal['rad/s', 'deg/s']
 
 
-class Thermometer(_Section):
+@dataclass(frozen=True)
+class Thermometer:
     """
     One temperature column; unit raw: ``degC = reading * degc_per_count + degc_at_zero``.
 
@@ -142,21 +135,19 @@ class Thermometer(_Section):
 
     column: Column
     unit: Literal['degC', 'K', 'degF', 'raw'] = 'degC'
-    degc_per_count: Finite | None = None
-    degc_at_zero: Finite | None = None
+    degc_per_count: float | None = None
+    degc_at_zero: float | None = None
     publish: Literal['change', 'period', 'all'] = 'change'
     heartbeat_s: Positive = 10.0
     period_s: Positive | None = None
 
-    @model_validator(mode='after')
-    def _complete(self) -> Thermometer:
+    def __post_init__(self) -> None:
         if (self.unit == 'raw') != (self.degc_per_count is not None):
             raise ValueError('unit raw needs `degc_per_count`, the other units forbid it')
         if (self.unit == 'raw') != (self.degc_at_zero is not None):
             raise ValueError('unit raw needs `degc_at_zero`, the other units forbid it')
         if (self.publish == 'period') != (self.period_s is not None):
             raise ValueError('publish: period needs `period_s`, the other ways forbid it')
-        return self
 
     @property
     def linear(self) -> tuple[float, float]:
@@ -169,7 +160,8 @@ class Thermometer(_Section):
         return {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}[self.unit]
 
 
-class ColumnMap(_Section):
+@dataclass(frozen=True)
+class ColumnMap:
     """
     The whole map.
 
@@ -182,13 +174,11 @@ class ColumnMap(_Section):
     gyro: Gyro | None = None
     format: Format = Format()
     frame_id: str = 'imu_link'
-    serial: Annotated[str, Field(min_length=1)] | None = None
+    serial: Annotated[str, Bounds(shortest=1)] | None = None
 
-    @model_validator(mode='after')
-    def _gyro_needs_imu(self) -> ColumnMap:
+    def __post_init__(self) -> None:
         if self.gyro is not None and self.accel.output == 'counts':
             raise ValueError('a gyro travels in an Imu message: accel output must be imu')
-        return self
 
 
 def load_column_map(path: str | Path) -> ColumnMap:
@@ -219,26 +209,9 @@ def load_column_map(path: str | Path) -> ColumnMap:
         raise RecordingError('a column map is YAML text in UTF-8', path=path) from failure
     except ValueError as failure:
         raise RecordingError(str(failure), path=path) from failure
-    except yaml.YAMLError as failure:
-        reason = ' '.join(str(failure).split())
-        raise RecordingError(f'not valid YAML ({reason})', path=path) from failure
     if not isinstance(data, dict):
         raise RecordingError('a column map is a mapping of keys (see config/columns)', path=path)
     try:
-        # Strict types: a list may stand for a tuple, nothing else is converted.
-        return ColumnMap.model_validate(_tuples(data))
-    except ValidationError as failure:
-        first = failure.errors()[0]
-        key = '.'.join(str(part) for part in first['loc'] if part not in ('str', 'int'))
-        message = first['msg'].removeprefix('Value error, ')
-        if first['type'] == 'extra_forbidden':
-            message = 'unknown key'
-        raise RecordingError(message, path=path, topic=key or None) from failure
-
-
-def _tuples(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return tuple(_tuples(item) for item in value)
-    return value
+        return build(ColumnMap, data)
+    except SchemaError as failure:
+        raise RecordingError(failure.message, path=path, topic=failure.key or None) from failure

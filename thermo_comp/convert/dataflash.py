@@ -26,9 +26,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
+from ..typing import Bools, Floats, Ints
 from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
 from .log import ForeignLog, Readings
-from .units import Array, IntArray
 
 _HEADER_BYTES = 3
 # What struct calls a field -> what numpy calls it; strings and arrays are kept as bytes.
@@ -173,7 +173,7 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[dict[str, npt.NDArray
     return scaled, n_short
 
 
-def _stamps(columns: dict[str, npt.NDArray[Any]]) -> IntArray | None:
+def _stamps(columns: dict[str, npt.NDArray[Any]]) -> Ints | None:
     if 'TimeUS' in columns:
         return stamps_ns(columns['TimeUS'])
     if 'TimeMS' in columns:
@@ -181,9 +181,7 @@ def _stamps(columns: dict[str, npt.NDArray[Any]]) -> IntArray | None:
     return None
 
 
-def _instances(
-    name: str, columns: dict[str, npt.NDArray[Any]], n: int
-) -> list[tuple[int, npt.NDArray[np.bool_]]]:
+def _instances(name: str, columns: dict[str, npt.NDArray[Any]], n: int) -> list[tuple[int, Bools]]:
     if 'I' in columns:
         return [(int(number), columns['I'] == number) for number in np.unique(columns['I'])]
     digit = name[-1]
@@ -191,7 +189,7 @@ def _instances(
     return [(int(digit) - 1 if digit.isdigit() else 0, np.ones(n, dtype=np.bool_))]
 
 
-def _temperature(columns: dict[str, npt.NDArray[Any]], n: int) -> Array:
+def _temperature(columns: dict[str, npt.NDArray[Any]], n: int) -> Floats:
     for title in _TEMPERATURES:
         if title in columns:
             return columns[title].astype(np.float64)

@@ -18,16 +18,9 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..recording import BagWriter, ImuColumns, Topics
+from ..typing import Bools, Floats, Ints
 from .table import NO_STAMP
-from .units import (
-    Array,
-    BoolArray,
-    IntArray,
-    Stillness,
-    believed_unit,
-    contradiction,
-    find_stillness,
-)
+from .units import Stillness, believed_unit, contradiction, find_stillness
 
 # No sensor on a circuit board is read outside this range; kelvins and raw counts are.
 _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
@@ -50,8 +43,8 @@ class Readings:
 
     """
 
-    stamp_ns: IntArray
-    celsius: Array
+    stamp_ns: Ints
+    celsius: Floats
 
 
 @dataclass(frozen=True)
@@ -96,12 +89,12 @@ class ForeignLog:
     input: Literal['counts', 'imu']
     unit: Literal['counts', 'm/s^2', 'g', 'mg']
     factor: float
-    stamp_ns: IntArray
-    accel: Array
-    gyro: Array | None
+    stamp_ns: Ints
+    accel: Floats
+    gyro: Floats | None
     board: Readings | None
     case: Readings | None
-    line: IntArray
+    line: Ints
     counts_per_g: float | None = None
     clip: tuple[float, float] | None = None
     frame_id: str = 'imu_link'
@@ -259,7 +252,7 @@ def write_log(
     rises = np.concatenate(([True], stamp_ns[1:] > newest[:-1]))
     back = np.concatenate(([False], stamp_ns[1:] < stamp_ns[:-1]))
     repeat = np.concatenate(([False], stamp_ns[1:] == stamp_ns[:-1]))
-    clipped: BoolArray = np.zeros(len(accel), dtype=np.bool_)
+    clipped: Bools = np.zeros(len(accel), dtype=np.bool_)
     if log.clip is not None:
         beyond = (accel <= log.clip[0]) | (accel >= log.clip[1])
         clipped = np.asarray(np.any(beyond, axis=1))
@@ -292,14 +285,14 @@ def write_log(
     )
 
 
-def _usable(log: ForeignLog) -> BoolArray:
-    usable: BoolArray = (log.stamp_ns != NO_STAMP) & np.isfinite(log.accel).all(axis=1)
+def _usable(log: ForeignLog) -> Bools:
+    usable: Bools = (log.stamp_ns != NO_STAMP) & np.isfinite(log.accel).all(axis=1)
     if log.gyro is not None:
         usable &= np.isfinite(log.gyro).all(axis=1)
     return usable
 
 
-def _finding(rows: BoolArray, line: IntArray) -> Finding:
+def _finding(rows: Bools, line: Ints) -> Finding:
     found = np.flatnonzero(rows)
     return Finding(len(found), tuple(line[found[:_EXAMPLES]].tolist()))
 
@@ -326,8 +319,8 @@ def _write(
     log: ForeignLog,
     output: Path,
     force: bool,
-    usable: BoolArray,
-    newest: IntArray,
+    usable: Bools,
+    newest: Ints,
     progress: Callable[[float], None] | None,
 ) -> None:
     """
@@ -382,13 +375,13 @@ def _write(
                 progress(last / len(stamp_ns))
 
 
-def _log_times(readings: Readings | None) -> IntArray:
+def _log_times(readings: Readings | None) -> Ints:
     if readings is None:
         return np.empty(0, dtype=np.int64)
     return np.maximum.accumulate(readings.stamp_ns)
 
 
-def _imu_columns(n: int, gyro: Array | None) -> ImuColumns:
+def _imu_columns(n: int, gyro: Floats | None) -> ImuColumns:
     """
     Return the rest of an Imu message: what the log has not is marked with -1, REP 145.
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
-from .table import NO_STAMP, Array, Column, IntArray, Table, place
+from ..typing import Floats, Ints
+from .table import NO_STAMP, Column, Table, place
 
 
 def read_parquet(
@@ -82,7 +83,7 @@ def read_parquet(
     )
 
 
-def _floats(path: Path, name: str, column: Any) -> Array:
+def _floats(path: Path, name: str, column: Any) -> Floats:
     import pyarrow as pa
 
     try:
@@ -92,7 +93,7 @@ def _floats(path: Path, name: str, column: Any) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
-def _stamps(path: Path, name: str, column: Any, exponent: int) -> IntArray:
+def _stamps(path: Path, name: str, column: Any, exponent: int) -> Ints:
     import pyarrow as pa
 
     known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)

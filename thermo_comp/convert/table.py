@@ -19,12 +19,9 @@ from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from ..errors import RecordingError
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from ..typing import Floats, Ints
 
 Column = str | int
 
@@ -54,17 +51,17 @@ class Table:
     """
 
     path: str
-    line: IntArray
-    values: dict[Column, Array]
-    stamp_ns: IntArray | None
+    line: Ints
+    values: dict[Column, Floats]
+    stamp_ns: Ints | None
     n_short: int
 
 
 NO_STAMP = np.iinfo(np.int64).min
 
 
-def read_table(
-    path: str | Path,
+def read_text(
+    path: Path,
     columns: Sequence[Column],
     stamp: Column | None = None,
     stamp_exponent: int = 0,
@@ -72,12 +69,12 @@ def read_table(
     has_header: bool | None = None,
 ) -> Table:
     """
-    Read some columns of a table.
+    Read some columns of a table of text.
 
     Parameters
     ----------
-    path : str or Path
-        The file; ``.parquet`` is read with pyarrow, all else as text.
+    path : Path
+        The file.
     columns : sequence of str or int
         Headings, or numbers counted from 0.
     stamp : str or int or None, optional
@@ -100,11 +97,6 @@ def read_table(
         If the file cannot be read, is empty, or lacks a column.
 
     """
-    path = Path(path)
-    if path.suffix.lower() in ('.parquet', '.pq'):
-        from .parquet import read_parquet
-
-        return read_parquet(path, columns, stamp, stamp_exponent)
     try:
         with path.open(encoding='utf-8-sig', errors='replace', newline='') as file:
             head = file.read(_SNIFF_BYTES)
@@ -196,9 +188,9 @@ def _collect(
     stamp_place = None if stamp is None else place(path, stamp, headings, width)
     needed = 1 + max([*places.values(), -1 if stamp_place is None else stamp_place])
 
-    lines: list[IntArray] = []
-    blocks: list[Array] = []
-    stamps: list[IntArray] = []
+    lines: list[Ints] = []
+    blocks: list[Floats] = []
+    stamps: list[Ints] = []
     n_short = 0
     while chunk := list(islice(rows, _CHUNK_ROWS)):
         whole = [(number, row) for number, row in chunk if len(row) >= needed]
@@ -268,7 +260,7 @@ def place(path: Path, name: Column, headings: Sequence[str], width: int) -> int:
     return headings.index(name)
 
 
-def _floats(cells: Sequence[str]) -> Array:
+def _floats(cells: Sequence[str]) -> Floats:
     try:
         return np.array(cells, dtype=np.float64)
     except ValueError:
@@ -285,7 +277,7 @@ def _float(cell: str) -> float:
 _WHOLE = re.compile(r'\s*[+-]?\d{1,19}\s*')
 
 
-def exact_ns(cells: Sequence[str], exponent: int) -> IntArray:
+def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
     """
     Return stamps in nanoseconds, exact to the last digit.
 

@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
+from ..typing import Floats, Ints
 from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
 from .log import ForeignLog, Readings
 from .table import NO_STAMP
-from .units import Array, IntArray
 
 _TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_baro')
 _AXES = ('x', 'y', 'z')
@@ -125,22 +125,22 @@ def _imu(columns: dict[str, Any], gyro: dict[str, Any] | None) -> ImuRows:
     )
 
 
-def _stamps(columns: dict[str, Any]) -> IntArray:
+def _stamps(columns: dict[str, Any]) -> Ints:
     # When the sample was taken, where the log says it; older logs only say when it was published.
     microseconds = columns.get('timestamp_sample', columns['timestamp'])
     return stamps_ns(microseconds)
 
 
-def _column(columns: dict[str, Any], name: str) -> Array:
+def _column(columns: dict[str, Any], name: str) -> Floats:
     n = len(columns['timestamp'])
     return np.asarray(columns.get(name, np.full(n, np.nan)), dtype=np.float64)
 
 
-def _vectors(columns: dict[str, Any]) -> Array:
+def _vectors(columns: dict[str, Any]) -> Floats:
     return np.column_stack([_column(columns, axis) for axis in _AXES])
 
 
-def _matched(stamp_ns: IntArray, gyro_ns: IntArray, gyro: Array) -> Array | None:
+def _matched(stamp_ns: Ints, gyro_ns: Ints, gyro: Floats) -> Floats | None:
     """
     Interpolate the rate to the accelerometer's stamps; None where it was logged more sparsely.
 

@@ -14,15 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from ..typing import Floats, Ints
+from ..unit.gravity import STANDARD_GRAVITY
 
 # |a| of a still sensor in each unit. A cheap one is off by a few per cent (bias and scale), a
 # thermal chamber adds some more; 20 % is beyond all of them and far below the ratios to be told.
-_UNITS = {'g': 1.0, 'm/s^2': 9.80665, 'mg': 1000.0}
+_UNITS = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # The usual sensitivities, from +-16 g to +-2 g of a 16-bit sensor.
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
@@ -61,7 +59,7 @@ class Stillness:
     moving_ns: tuple[tuple[int, int], ...]
 
 
-def find_stillness(stamp_ns: IntArray, accel: Array) -> Stillness:
+def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     """
     Find where a recording rests, from its noise alone, whatever its unit.
 
@@ -102,7 +100,7 @@ def find_stillness(stamp_ns: IntArray, accel: Array) -> Stillness:
     )
 
 
-def _merge(start: IntArray, end: IntArray) -> tuple[tuple[int, int], ...]:
+def _merge(start: Ints, end: Ints) -> tuple[tuple[int, int], ...]:
     parts: list[tuple[int, int]] = []
     for first, last in zip(start.tolist(), end.tolist(), strict=True):
         if parts and first - parts[-1][1] <= _MERGE_S * 1e9:

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 
 import numpy as np
-import numpy.typing as npt
 
 from .. import __version__
-from ..calibration import (
+from ..thermal.settings import DetectorSettings
+from ..typing import Floats
+from ..unit.calibration import (
     Axes,
     AxisReference,
     Calibration,
@@ -25,7 +26,6 @@ from ..calibration import (
     Source,
     Unit,
 )
-from ..settings import DetectorSettings
 from .evidence import ResidualRow, inflation
 from .model import RegimeName
 from .reduction import ReducedBag
@@ -34,7 +34,6 @@ from .solution import regressors
 from .table import WindowTable
 from .verdict import Finding
 
-Array = npt.NDArray[np.float64]
 # Edges are widened by this part of the span, so that the run that was fitted is inside them.
 _EDGE_MARGIN = 0.02
 # A regime that the bags do not show has no range of its own: it takes all of them.
@@ -66,12 +65,12 @@ class UnitFacts:
     """
 
     unit: Unit
-    noise_density: Array
+    noise_density: Floats
     board_lag: float
-    slow_error: Array
+    slow_error: Floats
 
 
-def parameter_covariance(outcome: Outcome) -> Array:
+def parameter_covariance(outcome: Outcome) -> Floats:
     """
     Covariance of all free parameters, as far as the data tell them apart.
 
@@ -202,12 +201,12 @@ def build_calibration(
     )
 
 
-def _triple(values: Array) -> tuple[float, float, float]:
+def _triple(values: Floats) -> tuple[float, float, float]:
     a, b, c = (float(v) + 0.0 for v in values)  # no -0.0
     return a, b, c
 
 
-def _misalignment_sd(outcome: Outcome, covariance: Array) -> tuple[float, float, float]:
+def _misalignment_sd(outcome: Outcome, covariance: Floats) -> tuple[float, float, float]:
     where = outcome.layout.skew
     if where[0] < 0:
         return (UNKNOWN_SKEW,) * 3
@@ -243,12 +242,12 @@ def _ranges(
     }
 
 
-def _widened(values: Array, reach: float) -> tuple[float, float]:
+def _widened(values: Floats, reach: float) -> tuple[float, float]:
     lower, upper = _range(values, 0.01)
     return min(lower, reach * lower), max(upper, reach * upper)
 
 
-def _range(values: Array, smallest_margin: float) -> tuple[float, float]:
+def _range(values: Floats, smallest_margin: float) -> tuple[float, float]:
     lower, upper = float(np.min(values)), float(np.max(values))
     margin = max(_EDGE_MARGIN * (upper - lower), smallest_margin)
     return lower - margin, upper + margin

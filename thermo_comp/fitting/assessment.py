@@ -15,15 +15,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from ..calibration import Calibration
-from ..correction import Correction
 from ..errors import FitError
-from ..metrics import MICRO_G, ResidualStatistics, norm_residual, statistics_by_regime
-from ..settings import ThermalConfig
-from ..status import CompensatorConfig
-from ..thermal import WEIGHT, ThermalTracker
+from ..online.status import CompensatorConfig
+from ..thermal.settings import ThermalConfig
+from ..thermal.tracker import WEIGHT, ThermalTracker
+from ..typing import Bools, Floats, Ints
+from ..unit.calibration import Calibration
+from ..unit.correction import Correction
+from ..unit.gravity import MICRO_G
+from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from .assembly import parameter_covariance
 from .evidence import inflation
 from .history import thermal_states
@@ -35,8 +36,6 @@ from .sources import FitSource
 from .start import position_means
 from .table import WindowTable
 from .verdict import POSITIONS_NEEDED, can_tell_misalignment, distinct_directions
-
-Array = npt.NDArray[np.float64]
 
 #: A calibration holds while its error is within this many times what it claims.
 LARGEST_RATIO = 2.0
@@ -115,7 +114,7 @@ class Assessment:
     """
 
     rows: tuple[AssessmentRow, ...]
-    wander: Array
+    wander: Floats
     shifts: tuple[AxisShift, ...]
     n_positions: int
     ratio: float
@@ -200,14 +199,14 @@ class _Corrected:
 
     """
 
-    position: npt.NDArray[np.int64]
-    bag: npt.NDArray[np.int64]
-    time: Array
-    count: Array
-    raw: Array
-    force: Array
-    variance: Array
-    weight: Array
+    position: Ints
+    bag: Ints
+    time: Floats
+    count: Floats
+    raw: Floats
+    force: Floats
+    variance: Floats
+    weight: Floats
 
 
 def _corrected(
@@ -316,7 +315,7 @@ def _judged(calibration: Calibration, gravity: float, data: _Corrected) -> Asses
     return Assessment(rows, wander, shifts, len(directions), ratio, is_valid, verdict)
 
 
-def _table(data: _Corrected, dynamic: npt.NDArray[np.bool_]) -> WindowTable:
+def _table(data: _Corrected, dynamic: Bools) -> WindowTable:
     _, position = np.unique(data.position, return_inverse=True)
     zero = np.zeros_like(data.time)
     return WindowTable(
@@ -335,7 +334,7 @@ def _table(data: _Corrected, dynamic: npt.NDArray[np.bool_]) -> WindowTable:
 
 
 def _shifts(
-    calibration: Calibration, table: WindowTable, gravity: float, directions: Array
+    calibration: Calibration, table: WindowTable, gravity: float, directions: Floats
 ) -> tuple[AxisShift, ...]:
     """
     Fit the corrected windows by constants once more; empty when the positions are too few.

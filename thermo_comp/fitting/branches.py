@@ -19,13 +19,10 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from ..typing import Floats, Ints
 from .reduction import ReducedBag
 from .sources import FitSource
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 # Still intervals further apart than this are not looked at for a step: too much can have happened.
 _LONGEST_GAP_S = 30.0
@@ -159,16 +156,16 @@ class _Near:
 
     """
 
-    time: Array
-    stamp_ns: IntArray
-    accel: Array
-    gyro: Array | None
+    time: Floats
+    stamp_ns: Ints
+    accel: Floats
+    gyro: Floats | None
 
 
 def _near(
     source: FitSource, start_ns: int, gaps: Sequence[tuple[float, float]]
 ) -> Iterable[_Near]:
-    parts: list[list[tuple[IntArray, Array, Array | None]]] = [[] for _ in gaps]
+    parts: list[list[tuple[Ints, Floats, Floats | None]]] = [[] for _ in gaps]
     if gaps:
         for block in source.blocks():
             time = _seconds(block.accel_stamp_ns, start_ns)
@@ -192,12 +189,12 @@ def _near(
         yield _Near(_seconds(stamps, start_ns), stamps, accel, gyro)
 
 
-def _seconds(stamp_ns: IntArray, start_ns: int) -> Array:
-    since: Array = (stamp_ns - start_ns).astype(np.float64) * 1e-9
+def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
+    since: Floats = (stamp_ns - start_ns).astype(np.float64) * 1e-9
     return since
 
 
-def _angular_velocity(block: object) -> Array | None:
+def _angular_velocity(block: object) -> Floats | None:
     """
     Angular rate of a block that has one: a recording's, when its input is an Imu.
 
@@ -209,7 +206,7 @@ def _angular_velocity(block: object) -> Array | None:
 
 
 def _examine(
-    near: _Near, gap: tuple[float, float], quiet_sd: Array, bag: ReducedBag
+    near: _Near, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
 ) -> Event | None:
     beside = (near.time <= gap[0]) | (near.time >= gap[1])
     if min(np.sum(near.time <= gap[0]), np.sum(near.time >= gap[1])) < _FEWEST_SAMPLES:
@@ -269,7 +266,7 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
     return float(parameters[2]), float(np.sqrt(spread * covariance[2, 2]))
 
 
-def _place_of_step(time: Array, accel: Array, quiet_sd: Array) -> int:
+def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats) -> int:
     """
     Find the first sample after the step that explains most, beside a straight drift.
 
@@ -287,7 +284,7 @@ def _place_of_step(time: Array, accel: Array, quiet_sd: Array) -> int:
     return int(candidates[int(np.argmax(gain))])
 
 
-def _step(time: Array, accel: Array, at: float, quiet_sd: Array) -> tuple[Array, Array]:
+def _step(time: Floats, accel: Floats, at: float, quiet_sd: Floats) -> tuple[Floats, Floats]:
     """
     Estimate a step at a known time, beside a straight drift, and its sd from the quiet noise.
 
@@ -299,7 +296,7 @@ def _step(time: Array, accel: Array, at: float, quiet_sd: Array) -> tuple[Array,
     return np.asarray(jump @ accel / square), np.asarray(quiet_sd / np.sqrt(square))
 
 
-def _trend(time: Array) -> Array:
+def _trend(time: Floats) -> Floats:
     """
     Columns of a level and a drift, orthonormal, shape (n, 2).
 
@@ -308,7 +305,7 @@ def _trend(time: Array) -> Array:
     return np.column_stack([np.full(len(t), len(t) ** -0.5), t / np.sqrt(t @ t)])
 
 
-def _local_variance(samples: Array) -> Array:
+def _local_variance(samples: Floats) -> Floats:
     """
     Noise from neighbouring differences, which a drift does not widen.
 
@@ -316,7 +313,7 @@ def _local_variance(samples: Array) -> Array:
     return np.asarray(0.5 * np.mean(np.diff(samples, axis=0) ** 2, axis=0))
 
 
-def _turn(time: Array, gyro: Array, at: int) -> float:
+def _turn(time: Floats, gyro: Floats, at: int) -> float:
     """
     Angle turned through within a second of the step, against the gyro's own level on each side.
 

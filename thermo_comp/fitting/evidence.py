@@ -11,15 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from ..metrics import ResidualStatistics, norm_residual, statistics_by_regime
+from ..typing import Bools, Floats
+from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from .reduction import ReducedBag, StillInterval
 from .regression import Outcome
 from .solution import Solution, correct, regressors, warming_up
 from .table import WindowTable
-
-Array = npt.NDArray[np.float64]
 
 # Slow errors are told from white noise by what averaging over so many windows takes away.
 _BLOCK = 6
@@ -108,7 +106,7 @@ def residual_rows(
     )
 
 
-def corrected(table: WindowTable, solution: Solution) -> Array:
+def corrected(table: WindowTable, solution: Solution) -> Floats:
     """
     Correct a table's windows with a solution, shape (n, 3).
 
@@ -117,7 +115,7 @@ def corrected(table: WindowTable, solution: Solution) -> Array:
     return correct(table, solution, columns)
 
 
-def reference_constants(table: WindowTable, solution: Solution) -> tuple[Array, Array]:
+def reference_constants(table: WindowTable, solution: Solution) -> tuple[Floats, Floats]:
     """
     Bias and scale at the reference temperature in still air.
 
@@ -192,7 +190,7 @@ def _interval_at(bag: ReducedBag, time: float) -> StillInterval:
     return bag.intervals[max(0, int(np.searchsorted(starts, time, side='right')) - 1)]
 
 
-def slow_error(table: WindowTable, outcome: Outcome) -> Array:
+def slow_error(table: WindowTable, outcome: Outcome) -> Floats:
     """
     Split what is left into white noise and a slow part, and return the slow part.
 
@@ -226,7 +224,7 @@ def slow_error(table: WindowTable, outcome: Outcome) -> Array:
     return result
 
 
-def noise_density(table: WindowTable, bags: Sequence[ReducedBag], outcome: Outcome) -> Array:
+def noise_density(table: WindowTable, bags: Sequence[ReducedBag], outcome: Outcome) -> Floats:
     """
     White noise of the specific force as a density, from the scatter of the window means.
 
@@ -262,7 +260,7 @@ def noise_density(table: WindowTable, bags: Sequence[ReducedBag], outcome: Outco
     return np.asarray(np.maximum(density, 1e-9))
 
 
-def inflation(table: WindowTable, outcome: Outcome) -> Array:
+def inflation(table: WindowTable, outcome: Outcome) -> Floats:
     """
     Tell by how much correlated residuals make the covariance of white ones too small.
 
@@ -296,8 +294,8 @@ def inflation(table: WindowTable, outcome: Outcome) -> Array:
 
 
 def _variances(
-    table: WindowTable, residual: Array, wanted: npt.NDArray[np.bool_], size: int
-) -> tuple[Array, Array | None]:
+    table: WindowTable, residual: Floats, wanted: Bools, size: int
+) -> tuple[Floats, Floats | None]:
     """
     Mean squares of single windows and of block means; None when there are too few blocks.
 
@@ -316,7 +314,7 @@ def _variances(
     return _trimmed_square(single), _trimmed_square(block)
 
 
-def _trimmed_square(values: Array) -> Array:
+def _trimmed_square(values: Floats) -> Floats:
     """
     Mean square with outliers pulled in to 4 robust sd.
 

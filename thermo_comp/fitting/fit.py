@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from ..calibration import Calibration, Unit
 from ..errors import FitError
-from ..settings import DetectorSettings, ThermalConfig
+from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..unit.calibration import Calibration, Unit
+from ..unit.gravity import STANDARD_GRAVITY
 from .assembly import UNKNOWN_SKEW, UnitFacts, build_calibration
 from .evidence import (
     PositionReport,
@@ -50,12 +50,10 @@ from .verdict import (
 )
 from .warm_up import find_warm_up
 
-Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 # Usual full scales of units that report m/s^2.
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-_STANDARD_GRAVITY = 9.80665
 # Stands in where the bags do not tell how far the board lags behind the case.
 _USUAL_BOARD_LAG_S = 900.0
 
@@ -458,7 +456,7 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale is None:
         largest = max(float(np.abs(i.mean).max()) for bag in bags for i in bag.intervals)
         full_scale = next(
-            (r * _STANDARD_GRAVITY for r in _G_RANGES if r * _STANDARD_GRAVITY > 1.1 * largest),
+            (r * STANDARD_GRAVITY for r in _G_RANGES if r * STANDARD_GRAVITY > 1.1 * largest),
             2.0 * largest,
         )
     cycle = float(np.median([bag.cycle_s for bag in bags]))

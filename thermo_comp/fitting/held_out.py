@@ -11,13 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..typing import Bools, Floats
 from .one_pose import AlongGravity
 from .pose_series import PoseSeries
-
-Array = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -32,9 +29,9 @@ class HeldOut:
 
     """
 
-    time: Array
-    residual: Array
-    predicted_sd: Array
+    time: Floats
+    residual: Floats
+    predicted_sd: Floats
 
     @property
     def rms(self) -> float:
@@ -73,7 +70,7 @@ class HeldOut:
 
 
 def held_out(
-    model: AlongGravity, series: PoseSeries, rows: BoolArray | Sequence[bool], extend: bool = False
+    model: AlongGravity, series: PoseSeries, rows: Bools | Sequence[bool], extend: bool = False
 ) -> HeldOut:
     """
     Judge a model on windows that were not in its fit.

@@ -13,15 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from ..settings import DetectorSettings, ThermalConfig
-from ..thermal import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, WEIGHT, ThermalTracker
+from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..thermal.state import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, WEIGHT
+from ..thermal.tracker import ThermalTracker
+from ..typing import Bools, Floats, Ints
 from .reduction import ReducedBag
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 # Rates are seen over two minutes; below this the chamber rests [K/s].
 _SECTION_HALF_WIDTH_S = 60.0
@@ -48,15 +45,15 @@ class ThermalHistory:
 
     start_s: float
     step_s: float
-    board: Array
-    var_board: Array
-    rate: Array
-    gradient: Array
-    weight: Array
-    is_unknown: BoolArray
+    board: Floats
+    var_board: Floats
+    rate: Floats
+    gradient: Floats
+    weight: Floats
+    is_unknown: Bools
 
     @property
-    def time(self) -> Array:
+    def time(self) -> Floats:
         """
         Times of the grid points since the bag's first sample, shape (n,).
 
@@ -74,7 +71,7 @@ class ThermalHistory:
         }
         return replace(self, step_s=self.step_s * factor, **kept)
 
-    def sections(self) -> IntArray:
+    def sections(self) -> Ints:
         """
         Give each grid point the number of its stretch of the program: ramp up, soak, ramp down.
 
@@ -132,7 +129,7 @@ def thermal_history(
         From the first board reading to the last sample.
 
     """
-    tracker = ThermalTracker(detector, (), config)
+    tracker = ThermalTracker(detector, None, config)
     start_s, states = thermal_states(bag, tracker, step_s)
     return ThermalHistory(
         start_s=start_s,
@@ -146,7 +143,9 @@ def thermal_history(
     )
 
 
-def thermal_states(bag: ReducedBag, tracker: ThermalTracker, step_s: float) -> tuple[float, Array]:
+def thermal_states(
+    bag: ReducedBag, tracker: ThermalTracker, step_s: float
+) -> tuple[float, Floats]:
     """
     Drive a tracker with a bag's readings and sample it on a grid.
 
@@ -184,8 +183,8 @@ def thermal_states(bag: ReducedBag, tracker: ThermalTracker, step_s: float) -> t
     stamp_list, value_list, case_list = stamps.tolist(), values.tolist(), is_case.tolist()
     for stamp, stop in zip(grid.tolist(), due.tolist(), strict=True):
         while reading < stop:
-            take = tracker.case_reading if case_list[reading] else tracker.board_reading
-            take(stamp_list[reading], value_list[reading])
+            name = 'case' if case_list[reading] else 'board'
+            tracker.read(name, stamp_list[reading], value_list[reading])
             reading += 1
         rows.append(tracker.sample(stamp))
     return (begin - bag.start_ns) * 1e-9, np.array(rows)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import FitError
-from ..functions import CubicSpline, Exponential, TemperatureFunction
+from ..unit.functions import CubicSpline, Exponential, TemperatureFunction
 from .model import ModelSpec, polynomial
 from .table import WindowTable
 

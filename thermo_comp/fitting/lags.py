@@ -16,11 +16,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import lfilter
 
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from ..typing import Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -41,10 +39,10 @@ class Memory:
 
     """
 
-    value: Array
-    slope: Array
-    decay: Array
-    decay_slope: Array
+    value: Floats
+    slope: Floats
+    decay: Floats
+    decay_slope: Floats
 
 
 @dataclass(frozen=True)
@@ -65,13 +63,13 @@ class BoardHistories:
 
     """
 
-    change: Array
+    change: Floats
     step_s: float
-    bag: IntArray
-    since: Array
+    bag: Ints
+    since: Floats
 
     @staticmethod
-    def of(boards: Sequence[Array], step_s: float, bag: IntArray, since: Array) -> BoardHistories:
+    def of(boards: Sequence[Floats], step_s: float, bag: Ints, since: Floats) -> BoardHistories:
         """
         Stack temperature histories.
 
@@ -97,7 +95,7 @@ class BoardHistories:
             change[1 : len(board), number] = np.diff(board)
         return BoardHistories(change, step_s, bag, since)
 
-    def memory(self, time_constants_s: Array) -> Memory:
+    def memory(self, time_constants_s: Floats) -> Memory:
         """
         Run the lags over the histories and take them at the windows.
 

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from ..calibration import AxisSet, LinearTerm, MemoryTerm
-from ..functions import CubicSpline, Exponential, Polynomial, TemperatureFunction
+from ..typing import Floats
+from ..unit.calibration import AxisSet, LinearTerm, MemoryTerm
+from ..unit.functions import CubicSpline, Exponential, Polynomial, TemperatureFunction
 from .table import WindowTable
 
-Array = npt.NDArray[np.float64]
 Part = Literal['bias', 'scale']
 RegimeName = Literal['static', 'dynamic']
 
@@ -82,7 +81,7 @@ class ModelSpec:
         """
         return 3 * (self.n_columns('bias') + self.n_columns('scale')) + self.n_lags
 
-    def columns(self, table: WindowTable, memory: Array, part: Part) -> Array:
+    def columns(self, table: WindowTable, memory: Floats, part: Part) -> Floats:
         """
         Evaluate the regressor columns.
 
@@ -116,14 +115,14 @@ class ModelSpec:
         result += [live * memory[:, k] for k in range(self.n_lags)]
         return np.column_stack(result)
 
-    def live_weight(self, table: WindowTable) -> Array:
+    def live_weight(self, table: WindowTable) -> Floats:
         """
         Weight of the thermal terms, shape (n,).
 
         """
         return np.ones(len(table.t)) if self.live == 'both' else table.weight
 
-    def selection(self, regime: RegimeName, part: Part) -> Array:
+    def selection(self, regime: RegimeName, part: Part) -> Floats:
         """
         Map the column parameters onto one regime's set.
 
@@ -168,9 +167,9 @@ class ModelSpec:
     def axis_set(
         self,
         regime: RegimeName,
-        bias: Array,
-        scale: Array,
-        covariance: Array | None,
+        bias: Floats,
+        scale: Floats,
+        covariance: Floats | None,
         residual_sd: float,
     ) -> AxisSet:
         """
@@ -221,7 +220,7 @@ class ModelSpec:
 
 
 def normalised(
-    shape: TemperatureFunction, free: Array, at_reference: float
+    shape: TemperatureFunction, free: Floats, at_reference: float
 ) -> TemperatureFunction:
     """
     Put free coefficients and the value at the reference into a function's shape.

@@ -23,10 +23,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from ..errors import FitError
-from ..settings import DetectorSettings
+from ..thermal.settings import DetectorSettings
+from ..typing import Bools, Floats
 from .branches import Branch, Event, find_branches
 from .history import ThermalHistory
 from .pose_series import PoseSeries, pose_series
@@ -35,9 +35,6 @@ from .rests import ONE_ATTITUDE_DEG, attitudes_apart, describe, milli_g
 from .sensors import learn_detector
 from .sources import FitSource
 from .wander import Noise, WanderFit, fit_with_wander
-
-Array = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Temperature span below which nothing is said, and the spans up to which an order is enough [K].
 SPAN_NEEDED = 3.0
@@ -147,7 +144,7 @@ class AlongGravity:
         """
         return len(self.coefficients) - 1
 
-    def columns(self, temperature: Array, extend: bool = False) -> Array:
+    def columns(self, temperature: Floats, extend: bool = False) -> Floats:
         """
         Powers of ``T - T_ref``, shape (n, order + 1).
 
@@ -157,7 +154,7 @@ class AlongGravity:
             at = np.clip(at, *self.temperature_range)
         return np.vander(at - self.reference_temperature, self.order + 1, increasing=True)
 
-    def reading(self, temperature: Array, extend: bool = False) -> Array:
+    def reading(self, temperature: Floats, extend: bool = False) -> Floats:
         """
         Predict ``|a|``.
 
@@ -176,14 +173,14 @@ class AlongGravity:
         """
         return np.asarray(self.columns(temperature, extend) @ np.array(self.coefficients))
 
-    def thermal_error(self, temperature: Array, extend: bool = False) -> Array:
+    def thermal_error(self, temperature: Floats, extend: bool = False) -> Floats:
         """
         Predict what ``|a|`` reads more than at T_ref, shape (n,) [input units].
 
         """
         return self.reading(temperature, extend) - self.coefficients[0]
 
-    def thermal_error_sd(self, temperature: Array) -> Array:
+    def thermal_error_sd(self, temperature: Floats) -> Floats:
         """
         Predict the sd of `thermal_error` as a curve, shape (n,) [input units].
 
@@ -462,10 +459,10 @@ def _clipped(bag: ReducedBag, options: PoseOptions) -> ReducedBag:
     return replace(bag, intervals=tuple(kept))
 
 
-def _inliers(columns: Array, data: Array) -> BoolArray:
+def _inliers(columns: Floats, data: Floats) -> Bools:
     parameters = np.linalg.lstsq(columns, data, rcond=None)[0]
     left = data - columns @ parameters
     left = left - np.median(left)
     spread = 1.4826 * float(np.median(np.abs(left)))
-    use: BoolArray = np.abs(left) <= _OUTLIER_SDS * max(spread, 1e-300)
+    use: Bools = np.abs(left) <= _OUTLIER_SDS * max(spread, 1e-300)
     return use

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from ..settings import DetectorSettings
+from ..thermal.settings import DetectorSettings
 
 #: The converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0

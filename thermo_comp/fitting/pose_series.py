@@ -11,17 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from ..settings import DetectorSettings, ThermalConfig
+from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..typing import Bools, Floats, Ints
 from .branches import Branch
 from .history import ThermalHistory, thermal_history
 from .reduction import ReducedBag
 from .sources import FitSource
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 _HISTORY_STEP_S = 2.0
 # A window that takes this many times as long as usual holds a gap.
@@ -52,23 +48,23 @@ class PoseSeries:
 
     """
 
-    time: Array
-    count: Array
-    mean: Array
-    temperature: Array
-    rate: Array
-    branch: IntArray
-    is_still: BoolArray
+    time: Floats
+    count: Floats
+    mean: Floats
+    temperature: Floats
+    rate: Floats
+    branch: Ints
+    is_still: Bools
 
     @property
-    def norm(self) -> Array:
+    def norm(self) -> Floats:
         """
         Norm of the mean reading, shape (n,).
 
         """
         return np.asarray(np.linalg.norm(self.mean, axis=1))
 
-    def select(self, rows: BoolArray) -> PoseSeries:
+    def select(self, rows: Bools) -> PoseSeries:
         """
         Keep some windows.
 
@@ -95,7 +91,7 @@ class PoseSeries:
         first = np.flatnonzero((within % size) == 0)
         total = np.add.reduceat(self.count, first)
 
-        def mean(column: Array) -> Array:
+        def mean(column: Floats) -> Floats:
             weights = self.count if column.ndim == 1 else self.count[:, None]
             shape = total if column.ndim == 1 else total[:, None]
             return np.asarray(np.add.reduceat(column * weights, first, axis=0) / shape)
@@ -144,8 +140,8 @@ def pose_series(
 
     """
     history = thermal_history(bag, detector, _HISTORY_STEP_S, ThermalConfig())
-    times: list[Array] = []
-    means: list[Array] = []
+    times: list[Floats] = []
+    means: list[Floats] = []
     rest_time, rest = np.zeros(0), np.zeros((0, 3))
     for block in source.blocks():
         use = np.isfinite(block.accel).all(axis=1)

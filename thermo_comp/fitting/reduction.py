@@ -16,13 +16,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..typing import Floats, Ints
 from .sources import FitSource
 from .stillness import CellAccumulator, Cells, still_intervals
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 # Faster readings are averaged to this interval: no thermometer of this kind is that fast, and the
 # thermometers' recursion runs in Python.
@@ -45,8 +42,8 @@ class Readings:
 
     """
 
-    stamp_ns: IntArray
-    value: Array
+    stamp_ns: Ints
+    value: Floats
     n_read: int
 
 
@@ -75,10 +72,10 @@ class StillInterval:
     bag: int
     start_ns: int
     end_ns: int
-    time: Array
-    count: Array
-    mean: Array
-    sample_sd: Array
+    time: Floats
+    count: Floats
+    mean: Floats
+    sample_sd: Floats
 
 
 @dataclass(frozen=True)
@@ -207,12 +204,12 @@ class _ReadingCollector:
     """
 
     def __init__(self) -> None:
-        self._stamps: list[IntArray] = []
-        self._values: list[Array] = []
+        self._stamps: list[Ints] = []
+        self._values: list[Floats] = []
         self._last_ns: int | None = None
         self._n_read = 0
 
-    def add(self, stamp_ns: IntArray, value: Array) -> None:
+    def add(self, stamp_ns: Ints, value: Floats) -> None:
         if not len(stamp_ns):
             return
         stamp_ns = np.asarray(stamp_ns, dtype=np.int64)

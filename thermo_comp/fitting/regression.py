@@ -16,15 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
 from ..errors import FitError
+from ..typing import Floats, Ints
 from .lags import Memory
 from .solution import Regressors, Solution, predict, regressors
 from .table import WindowTable
-
-Array = npt.NDArray[np.float64]
 
 # Huber's bend: at 3 sd the efficiency in pure noise is 99.6 %, and a wild window pulls no more
 # than one of 3 sd.
@@ -96,9 +94,9 @@ class Outcome:
     cost: float
     n_steps: int
     is_converged: bool
-    residual: Array
-    robust_weight: Array
-    information: Array
+    residual: Floats
+    robust_weight: Floats
+    information: Floats
     layout: Layout
 
 
@@ -128,13 +126,13 @@ class Layout:
 
     """
 
-    axis: npt.NDArray[np.int64]
-    skew: npt.NDArray[np.int64]
-    lags: npt.NDArray[np.int64]
-    up: npt.NDArray[np.int64]
-    start: npt.NDArray[np.int64]
-    transient: npt.NDArray[np.int64]
-    transient_lag: npt.NDArray[np.int64]
+    axis: Ints
+    skew: Ints
+    lags: Ints
+    up: Ints
+    start: Ints
+    transient: Ints
+    transient_lag: Ints
     n: int
 
 
@@ -159,7 +157,7 @@ def layout_of(solution: Solution, freedom: Freedom, table: WindowTable) -> Layou
     """
     n = 0
 
-    def take(shape: tuple[int, ...], is_free: bool) -> npt.NDArray[np.int64]:
+    def take(shape: tuple[int, ...], is_free: bool) -> Ints:
         nonlocal n
         size = int(np.prod(shape))
         if not is_free:
@@ -245,7 +243,7 @@ def regress(
     return replace(inner, n_steps=n_steps)
 
 
-def noise_of(table: WindowTable, residual: Array, base: Array) -> Array:
+def noise_of(table: WindowTable, residual: Floats, base: Floats) -> Floats:
     """
     Estimate the residual sd of a typical window, per regime and axis, robustly.
 
@@ -276,7 +274,7 @@ def noise_of(table: WindowTable, residual: Array, base: Array) -> Array:
     return np.maximum(result, floor)
 
 
-def _robust_sd(values: Array) -> float:
+def _robust_sd(values: Floats) -> float:
     """
     Winsorised standard deviation: near the plain one in noise, blind to a few outliers.
 
@@ -293,7 +291,7 @@ def _minimise(
     table: WindowTable,
     start: Solution,
     freedom: Freedom,
-    base: Array,
+    base: Floats,
     slices: list[slice],
     is_robust: bool,
     max_steps: int,
@@ -343,11 +341,11 @@ def _minimise(
 def _evaluate(
     table: WindowTable,
     state: Solution,
-    root_weight: Array,
+    root_weight: Floats,
     is_robust: bool,
     memory: Memory,
     skew_sd: float,
-) -> tuple[float, Regressors, Array, Array]:
+) -> tuple[float, Regressors, Floats, Floats]:
     columns = regressors(table, state.spec, state.time_constants_s, state.start_memory, memory)
     residual = table.mean - predict(table, state, columns)
     size = np.abs(residual * root_weight)
@@ -362,7 +360,7 @@ def _evaluate(
     return float(loss.sum()) + prior, columns, residual, huber
 
 
-def tangent_basis(up: Array) -> Array:
+def tangent_basis(up: Floats) -> Floats:
     """
     Two unit vectors across each given one.
 
@@ -388,12 +386,12 @@ def _normal_equations(
     table: WindowTable,
     state: Solution,
     columns: Regressors,
-    residual: Array,
-    root_weight: Array,
+    residual: Floats,
+    root_weight: Floats,
     layout: Layout,
     slices: list[slice],
     skew_sd: float,
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     spec, g = state.spec, state.gravity
     inverse = state.inverse_misalignment
     tangents = tangent_basis(state.up)
@@ -445,7 +443,7 @@ def _normal_equations(
     return normal[:n, :n], gradient[:n]
 
 
-def _solve(normal: Array, gradient: Array, damping: float) -> tuple[Array, float]:
+def _solve(normal: Floats, gradient: Floats, damping: float) -> tuple[Floats, float]:
     """
     Solve the damped, column-scaled equations; also return the decrease they promise.
 
@@ -462,7 +460,7 @@ def _solve(normal: Array, gradient: Array, damping: float) -> tuple[Array, float
     return np.asarray(solved / diagonal), 0.5 * float(right @ solved)
 
 
-def _moved(state: Solution, step: Array, layout: Layout, freedom: Freedom) -> Solution:
+def _moved(state: Solution, step: Floats, layout: Layout, freedom: Freedom) -> Solution:
     padded = np.append(step, 0.0)
     axis = padded[layout.axis]
     n_bias = state.bias.shape[1]

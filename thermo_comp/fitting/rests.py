@@ -13,20 +13,18 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
+from ..typing import Floats
+from ..unit.gravity import STANDARD_GRAVITY
 from .branches import Event, find_branches
 from .options import FitOptions
 from .reduction import ReducedBag, StillInterval
 from .verdict import Finding
 
-Array = npt.NDArray[np.float64]
-
 #: One attitude: the directions of all still intervals lie this close together.
 ONE_ATTITUDE_DEG = 10.0
 # Neighbours this close in time and direction may be one rest with a step in it.
 _NEAR_S, _NEAR_DEG = 30.0, 10.0
-_STANDARD_GRAVITY = 9.80665
 
 
 def attitudes_apart(bags: Sequence[ReducedBag]) -> float:
@@ -122,7 +120,7 @@ def milli_g(bags: Sequence[ReducedBag], kind: str) -> float:
 
     """
     if kind == 'm/s^2':
-        return _STANDARD_GRAVITY * 1e-3
+        return STANDARD_GRAVITY * 1e-3
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
     return float(np.median(np.linalg.norm(means, axis=1))) * 1e-3
 
@@ -162,6 +160,6 @@ def describe(event: Event, per_mg: float) -> str:
     return f'at {event.time:.1f} s the unit {what}: the reading changed by {size}'
 
 
-def _directions(intervals: Sequence[StillInterval]) -> Array:
+def _directions(intervals: Sequence[StillInterval]) -> Floats:
     means = np.array([np.average(i.mean, axis=0, weights=i.count) for i in intervals])
     return np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True))

@@ -17,9 +17,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from ..functions import Exponential
+from ..typing import Bools, Floats, Ints
+from ..unit.functions import Exponential
 from .ladder import E_FOLDS_K, FUNCTION_NAMES, TERM_NAMES, golovach_spec, model_spec
 from .model import ModelSpec
 from .regression import Freedom, Outcome, regress
@@ -27,9 +27,6 @@ from .solution import Solution, predict, regressors
 from .start import ConstantCalibration, starting_solution
 from .table import WindowTable
 from .two_sets import is_worth_a_bend, may_bend
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 N_FOLDS = 5
 #: First guesses of the lags, relative to the bounds they must stay in.
@@ -92,8 +89,8 @@ class Trial:
     spec: ModelSpec
     outcome: Outcome
     fitted_rms: float
-    fold_squares: Array
-    fold_counts: Array
+    fold_squares: Floats
+    fold_counts: Floats
 
     @property
     def held_out_rms(self) -> float:
@@ -269,7 +266,7 @@ class Selector:
         best = min(tried, key=lambda outcome: float(np.mean(outcome.residual**2)))
         return best.solution.spec
 
-    def _held_out(self, whole: Outcome, out: npt.NDArray[np.bool_]) -> tuple[float, float]:
+    def _held_out(self, whole: Outcome, out: Bools) -> tuple[float, float]:
         """
         Sum of squares and number of the residuals of one fold, per axis, in m/s^2.
 
@@ -371,7 +368,7 @@ def begin(
     return replace(start, skew=like.skew, up=like.up, noise_sd=like.noise_sd)
 
 
-def fold_numbers(table: WindowTable) -> IntArray:
+def fold_numbers(table: WindowTable) -> Ints:
     """
     Assign each window to a fold: stretches of its bag between regime switches.
 

@@ -14,13 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from ..settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
+from ..thermal.settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
+from ..typing import Bools, Floats
 from .reduction import Readings, ReducedBag
-
-Array = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 # Below this no thermometer is worth believing, and the recursion would follow rounding errors.
 _SMALLEST_NOISE = 1e-4
@@ -49,11 +46,11 @@ class Course:
 
     """
 
-    rate: Array
+    rate: Floats
     rate_sd: float
 
     @property
-    def is_resting(self) -> BoolArray:
+    def is_resting(self) -> Bools:
         """
         Where the chamber rests: no ramp for five minutes before and after.
 
@@ -148,7 +145,7 @@ def learn_thermometer(
     )
 
 
-def quantum_of(values: Array) -> float:
+def quantum_of(values: Floats) -> float:
     """
     Find the step of a rounded sensor.
 
@@ -173,7 +170,7 @@ def quantum_of(values: Array) -> float:
     return round(step, 9) if is_grid.mean() > 0.9 else 0.0
 
 
-def _noise_of(values: Sequence[Array], quantum: float) -> float:
+def _noise_of(values: Sequence[Floats], quantum: float) -> float:
     # A straight ramp has no second difference; white noise of sd s gives s sqrt(6).
     second = np.concatenate([np.diff(value, 2) for value in values])
     if not quantum:

@@ -14,13 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from ..typing import Floats
 from .lags import Memory
 from .model import ModelSpec
 from .table import WindowTable
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -57,18 +55,18 @@ class Solution:
 
     spec: ModelSpec
     gravity: float
-    bias: Array
-    scale: Array
-    skew: Array
-    up: Array
-    time_constants_s: Array
-    start_memory: Array
-    noise_sd: Array
-    transient: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    bias: Floats
+    scale: Floats
+    skew: Floats
+    up: Floats
+    time_constants_s: Floats
+    start_memory: Floats
+    noise_sd: Floats
+    transient: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     transient_s: float = 1800.0
 
     @property
-    def inverse_misalignment(self) -> Array:
+    def inverse_misalignment(self) -> Floats:
         """
         A: from the frame to the sensitivity axes, lower triangular with a unit diagonal.
 
@@ -78,7 +76,7 @@ class Solution:
         return matrix
 
     @property
-    def misalignment(self) -> Array:
+    def misalignment(self) -> Floats:
         """
         M, from the sensitivity axes to the frame.
 
@@ -106,18 +104,18 @@ class Regressors:
 
     """
 
-    bias: Array
-    scale: Array
-    live: Array
-    slope: Array
-    decay: Array
+    bias: Floats
+    scale: Floats
+    live: Floats
+    slope: Floats
+    decay: Floats
 
 
 def regressors(
     table: WindowTable,
     spec: ModelSpec,
-    time_constants_s: Array,
-    start_memory: Array,
+    time_constants_s: Floats,
+    start_memory: Floats,
     memory: Memory | None = None,
 ) -> Regressors:
     """
@@ -155,7 +153,7 @@ def regressors(
     )
 
 
-def predict(table: WindowTable, solution: Solution, columns: Regressors) -> Array:
+def predict(table: WindowTable, solution: Solution, columns: Regressors) -> Floats:
     """
     Predict the window means.
 
@@ -182,7 +180,7 @@ def predict(table: WindowTable, solution: Solution, columns: Regressors) -> Arra
     )
 
 
-def warming_up(table: WindowTable, solution: Solution) -> Array:
+def warming_up(table: WindowTable, solution: Solution) -> Floats:
     """
     Evaluate what warming-up adds to the windows.
 
@@ -205,7 +203,7 @@ def warming_up(table: WindowTable, solution: Solution) -> Array:
     return np.asarray(solution.transient[table.bag] * decay[:, None])
 
 
-def correct(table: WindowTable, solution: Solution, columns: Regressors) -> Array:
+def correct(table: WindowTable, solution: Solution, columns: Regressors) -> Floats:
     """
     Correct the window means, as the compensator would; what warming-up added is taken out first.
 

@@ -14,11 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from ..typing import Floats, Ints
 
 
 class SourceBlock(Protocol):
@@ -28,42 +24,42 @@ class SourceBlock(Protocol):
     """
 
     @property
-    def accel_stamp_ns(self) -> IntArray:
+    def accel_stamp_ns(self) -> Ints:
         """
         Stamps of the samples, shape (n,).
 
         """
 
     @property
-    def accel(self) -> Array:
+    def accel(self) -> Floats:
         """
         Counts, or m/s^2, shape (n, 3).
 
         """
 
     @property
-    def board_stamp_ns(self) -> IntArray:
+    def board_stamp_ns(self) -> Ints:
         """
         Stamps of the board readings, shape (m,).
 
         """
 
     @property
-    def board(self) -> Array:
+    def board(self) -> Floats:
         """
         Board temperature, shape (m,).
 
         """
 
     @property
-    def case_stamp_ns(self) -> IntArray:
+    def case_stamp_ns(self) -> Ints:
         """
         Stamps of the case readings, shape (k,).
 
         """
 
     @property
-    def case(self) -> Array:
+    def case(self) -> Floats:
         """
         Case temperature, shape (k,).
 
@@ -88,12 +84,12 @@ class ArrayBlock:
 
     """
 
-    accel_stamp_ns: IntArray
-    accel: Array
-    board_stamp_ns: IntArray
-    board: Array
-    case_stamp_ns: IntArray
-    case: Array
+    accel_stamp_ns: Ints
+    accel: Floats
+    board_stamp_ns: Ints
+    board: Floats
+    case_stamp_ns: Ints
+    case: Floats
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from ..errors import FitError
+from ..typing import Floats
 from .model import ModelSpec
 from .solution import Solution
 from .table import WindowTable
-
-Array = npt.NDArray[np.float64]
 
 # Even a cheap sensor that drifts over 60 K stays within this of an ellipsoid; motion does not.
 _LARGEST_RMS = 0.05
@@ -41,11 +39,11 @@ class ConstantCalibration:
 
     """
 
-    bias: Array
-    scale: Array
-    misalignment: Array
+    bias: Floats
+    scale: Floats
+    misalignment: Floats
 
-    def force(self, measured: Array) -> Array:
+    def force(self, measured: Floats) -> Floats:
         """
         Specific force of measured vectors, shape (n, 3).
 
@@ -54,7 +52,7 @@ class ConstantCalibration:
 
 
 def constant_calibration(
-    means: Array, gravity: float, with_misalignment: bool
+    means: Floats, gravity: float, with_misalignment: bool
 ) -> ConstantCalibration:
     """
     Fit bias, scale and, if asked, misalignment to position means.
@@ -97,11 +95,11 @@ def constant_calibration(
 
 
 def _refine(
-    means: Array, gravity: float, bias: Array, scale: Array, with_misalignment: bool
+    means: Floats, gravity: float, bias: Floats, scale: Floats, with_misalignment: bool
 ) -> tuple[ConstantCalibration, float]:
     unit = scale * gravity
 
-    def unpack(parameters: Array) -> ConstantCalibration:
+    def unpack(parameters: Floats) -> ConstantCalibration:
         matrix = np.eye(3)
         if with_misalignment:
             matrix[1, 0], matrix[2, 0], matrix[2, 1] = parameters[6:]
@@ -109,7 +107,7 @@ def _refine(
             bias + parameters[:3] * unit, scale * np.exp(parameters[3:6]), matrix
         )
 
-    def residual(parameters: Array) -> Array:
+    def residual(parameters: Floats) -> Floats:
         return np.asarray(np.linalg.norm(unpack(parameters).force(means), axis=1) / gravity - 1.0)
 
     found = least_squares(
@@ -127,7 +125,7 @@ def starting_solution(
     spec: ModelSpec,
     gravity: float,
     constant: ConstantCalibration,
-    time_constants_s: Array,
+    time_constants_s: Floats,
     transient_s: float | None = None,
 ) -> Solution:
     """
@@ -175,7 +173,7 @@ def starting_solution(
     )
 
 
-def position_means(table: WindowTable) -> Array:
+def position_means(table: WindowTable) -> Floats:
     """
     Mean raw vector of each position, shape (n_positions, 3); a position has rows.
 

@@ -16,11 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from ..typing import Bools, Floats, Ints
 
 # A cell's variance, of n >= 32 samples, exceeds 4 times its mean by chance with probability
 # below 1e-12; vibration worth cutting out is far above.
@@ -63,16 +60,16 @@ class Cells:
     """
 
     start_ns: int
-    time: Array
-    count: IntArray
-    mean: Array
-    variance: Array
-    index: IntArray
+    time: Floats
+    count: Ints
+    mean: Floats
+    variance: Floats
+    index: Ints
     cell_s: float
     n_dropped: int
     n_saturated: int
     is_integer: bool
-    quantum: Array
+    quantum: Floats
 
 
 class CellAccumulator:
@@ -97,8 +94,8 @@ class CellAccumulator:
         self._start_ns = 0
         self._last_ns: int | None = None
         self._shift = np.zeros(3)
-        self._ids: list[IntArray] = []
-        self._sums: list[Array] = []
+        self._ids: list[Ints] = []
+        self._sums: list[Floats] = []
         self._n_dropped = 0
         self._n_saturated = 0
         self._is_integer = True
@@ -106,7 +103,7 @@ class CellAccumulator:
         self._open = np.zeros((0, 8))
         self._open_id = -1
 
-    def add(self, stamp_ns: IntArray, samples: Array) -> None:
+    def add(self, stamp_ns: Ints, samples: Floats) -> None:
         """
         Take the next samples in file order.
 
@@ -174,14 +171,14 @@ class CellAccumulator:
             quantum=self._quantum,
         )
 
-    def _begin(self, stamp_ns: IntArray, samples: Array) -> None:
+    def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
         step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
         self._cell_ns = int(max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
         self._quantum = _quantum_of(samples[:_QUANTUM_SAMPLES])
 
-    def _accumulate(self, stamp_ns: IntArray, samples: Array) -> None:
+    def _accumulate(self, stamp_ns: Ints, samples: Floats) -> None:
         since = stamp_ns - self._start_ns
         ids = since // self._cell_ns
         first = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
@@ -205,7 +202,7 @@ class CellAccumulator:
             self._sums.append(sums[:-1].copy())
 
 
-def _quantum_of(samples: Array) -> Array:
+def _quantum_of(samples: Floats) -> Floats:
     """
     Step of each axis, from the changes between samples; 0 where they are all different.
 
@@ -260,7 +257,7 @@ def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
     ]
 
 
-def _is_quiet(cells: Cells, full: BoolArray) -> BoolArray:
+def _is_quiet(cells: Cells, full: Bools) -> Bools:
     """
     Compare each cell's variance with the quietest tenth of the bag.
 
@@ -275,7 +272,7 @@ def _is_quiet(cells: Cells, full: BoolArray) -> BoolArray:
     return np.asarray((cells.variance <= limit).all(axis=1))
 
 
-def _is_joined(cells: Cells, quiet: BoolArray) -> BoolArray:
+def _is_joined(cells: Cells, quiet: Bools) -> Bools:
     """
     Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step in the mean.
 
@@ -291,5 +288,5 @@ def _is_joined(cells: Cells, quiet: BoolArray) -> BoolArray:
     limit = np.maximum(
         _STEP_SDS * np.maximum(spread, noise), np.where(is_stuck, 1.1 * cells.quantum, 0.0)
     )
-    joined: BoolArray = both & (np.abs(step) <= limit).all(axis=1)
+    joined: Bools = both & (np.abs(step) <= limit).all(axis=1)
     return joined

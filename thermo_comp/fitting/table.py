@@ -18,13 +18,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..typing import Bools, Floats, Ints
 from .history import ThermalHistory
 from .lags import BoardHistories, Memory
 from .reduction import ReducedBag
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 _NUMBERS = ('position', 'bag', 'section')
 _MEANS = ('time', 'mean', 't', 'gradient', 'rate', 'weight')
@@ -54,16 +51,16 @@ class WindowTable:
 
     """
 
-    position: IntArray
-    bag: IntArray
-    section: IntArray
-    time: Array
-    count: Array
-    mean: Array
-    t: Array
-    gradient: Array
-    rate: Array
-    weight: Array
+    position: Ints
+    bag: Ints
+    section: Ints
+    time: Floats
+    count: Floats
+    mean: Floats
+    t: Floats
+    gradient: Floats
+    rate: Floats
+    weight: Floats
     histories: tuple[ThermalHistory, ...]
 
     @property
@@ -75,7 +72,7 @@ class WindowTable:
         return int(self.position[-1]) + 1 if len(self.position) else 0
 
     @property
-    def is_dynamic(self) -> BoolArray:
+    def is_dynamic(self) -> Bools:
         """
         Whether the dynamic set prevails, shape (n,).
 
@@ -90,7 +87,7 @@ class WindowTable:
         edges = np.searchsorted(self.position, np.arange(self.n_positions + 1)).tolist()
         return [slice(start, stop) for start, stop in pairwise(edges)]
 
-    def memory(self, time_constants_s: Array) -> Memory:
+    def memory(self, time_constants_s: Floats) -> Memory:
         """
         Memory regressors at the windows.
 
@@ -119,7 +116,7 @@ class WindowTable:
             self.time - starts[self.bag],
         )
 
-    def select(self, rows: BoolArray) -> WindowTable:
+    def select(self, rows: Bools) -> WindowTable:
         """
         Keep some windows; positions keep their numbers.
 
@@ -156,7 +153,7 @@ class WindowTable:
         first = np.flatnonzero(np.concatenate(([True], (np.diff(keys, axis=0) != 0).any(axis=1))))
         total = np.add.reduceat(self.count, first)
 
-        def mean(column: Array) -> Array:
+        def mean(column: Floats) -> Floats:
             weights = self.count if column.ndim == 1 else self.count[:, None]
             shape = total if column.ndim == 1 else total[:, None]
             return np.asarray(np.add.reduceat(column * weights, first, axis=0) / shape)

@@ -15,10 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from ..errors import FitError
-from ..metrics import norm_residual
+from ..typing import Floats, Ints
+from ..unit.metrics import norm_residual
 from .assembly import parameter_covariance
 from .history import ThermalHistory
 from .model import ModelSpec, polynomial
@@ -32,8 +32,6 @@ from .verdict import (
     can_tell_misalignment,
     distinct_directions,
 )
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -62,18 +60,18 @@ class TriadFit:
 
     """
 
-    bias: Array
-    scale: Array
-    misalignment: Array
+    bias: Floats
+    scale: Floats
+    misalignment: Floats
     has_misalignment: bool
-    covariance: Array
-    up: Array
-    residual: Array
-    position: npt.NDArray[np.int64]
+    covariance: Floats
+    up: Floats
+    residual: Floats
+    position: Ints
     advice: tuple[str, ...]
 
     @property
-    def parameters(self) -> Array:
+    def parameters(self) -> Floats:
         """
         Bias, scale, M[1, 0], M[2, 0], M[2, 1], shape (9,).
 
@@ -82,14 +80,14 @@ class TriadFit:
         return np.concatenate((self.bias, self.scale, (M[1, 0], M[2, 0], M[2, 1])))
 
     @property
-    def parameter_sd(self) -> Array:
+    def parameter_sd(self) -> Floats:
         """
         Standard deviations of `parameters`, shape (9,).
 
         """
         return np.sqrt(np.diag(self.covariance))
 
-    def force(self, measured: Array) -> Array:
+    def force(self, measured: Floats) -> Floats:
         """
         Correct measured vectors, shape (n, 3), to specific force [m/s^2].
 
@@ -204,7 +202,7 @@ def _table(intervals: Sequence[StillInterval]) -> WindowTable:
     )
 
 
-def _covariance(outcome: Outcome) -> Array:
+def _covariance(outcome: Outcome) -> Floats:
     """
     Covariance of bias, scale and the elements of M, from that of the regression's parameters.
 

@@ -16,12 +16,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ..typing import Floats
 from .regression import Freedom, Outcome, regress
 from .table import WindowTable
-
-Array = npt.NDArray[np.float64]
 
 #: The paper's static set is linear; a bend must leave less than this part of its soaks' residual.
 WORTH_A_BEND = 0.9
@@ -119,5 +117,5 @@ def _has_both_directions(table: WindowTable) -> bool:
     return bool(fewest >= _FEWEST_WINDOWS)
 
 
-def _padded(parameters: Array) -> Array:
+def _padded(parameters: Floats) -> Floats:
     return np.pad(parameters, ((0, 0), (0, 1)))

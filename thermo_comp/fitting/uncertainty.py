@@ -15,11 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from ..calibration import AxisSet, Calibration
-
-Array = npt.NDArray[np.float64]
+from ..typing import Floats
+from ..unit.calibration import AxisSet, Calibration
 
 
 @dataclass(frozen=True)
@@ -40,13 +38,13 @@ class PredictedSd:
 
     """
 
-    temperature: Array
-    rate: Array
-    bias: Array
-    scale: Array
+    temperature: Floats
+    rate: Floats
+    bias: Floats
+    scale: Floats
 
 
-def predicted_sd(calibration: Calibration, temperature: Array, rate: Array) -> PredictedSd:
+def predicted_sd(calibration: Calibration, temperature: Floats, rate: Floats) -> PredictedSd:
     """
     Predict the uncertainty of bias and scale in steady ramps.
 
@@ -83,7 +81,7 @@ def predicted_sd(calibration: Calibration, temperature: Array, rate: Array) -> P
     return PredictedSd(temperature, rate, bias, scale)
 
 
-def full_covariance(axis: AxisSet) -> Array:
+def full_covariance(axis: AxisSet) -> Floats:
     """
     Unpack the lower triangle that a calibration stores.
 
@@ -107,8 +105,8 @@ def full_covariance(axis: AxisSet) -> Array:
 
 
 def _regressors(
-    axis: AxisSet, calibration: Calibration, t: Array, rate: float
-) -> tuple[Array, Array]:
+    axis: AxisSet, calibration: Calibration, t: Floats, rate: float
+) -> tuple[Floats, Floats]:
     lags = calibration.memory_time_constants_s[: len(axis.memory.bias)]
     steady = [calibration.board_lag_s * rate, rate, *(tau * rate for tau in lags)]
     one = np.ones_like(t)
@@ -119,5 +117,5 @@ def _regressors(
     return parts[0], parts[1]
 
 
-def _form(columns: Array, covariance: Array) -> Array:
+def _form(columns: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.maximum(np.einsum('ni,ij,nj->n', columns, covariance, columns), 0.0))

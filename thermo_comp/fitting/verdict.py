@@ -14,17 +14,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from ..errors import FitError
-from ..metrics import MICRO_G
+from ..typing import Floats
+from ..unit.gravity import MICRO_G
 from .evidence import ResidualRow
 from .options import FitOptions
 from .reduction import ReducedBag
 from .solution import Solution
 from .table import WindowTable
-
-Array = npt.NDArray[np.float64]
 
 SPAN_NEEDED, SPAN_ADVISED = 10.0, 25.0
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_ADVISED = 6, 9, 18
@@ -163,7 +161,7 @@ def _judge_counts(bags: Sequence[ReducedBag]) -> list[Finding]:
 
 
 def judge_table(
-    table: WindowTable, up: Array, with_misalignment: bool, has_case: bool
+    table: WindowTable, up: Floats, with_misalignment: bool, has_case: bool
 ) -> list[Finding]:
     """
     Judge what the still windows cover: temperatures, ramps, positions.
@@ -275,7 +273,7 @@ def _judge_order(table: WindowTable) -> list[Finding]:
     ]
 
 
-def _judge_positions(up: Array, with_misalignment: bool) -> list[Finding]:
+def _judge_positions(up: Floats, with_misalignment: bool) -> list[Finding]:
     distinct = distinct_directions(up)
     n = len(distinct)
     if n < POSITIONS_NEEDED:
@@ -320,7 +318,7 @@ def _judge_positions(up: Array, with_misalignment: bool) -> list[Finding]:
     return findings
 
 
-def can_tell_misalignment(up: Array) -> bool:
+def can_tell_misalignment(up: Floats) -> bool:
     """
     Whether positions are enough, and spread enough, to estimate M.
 
@@ -331,7 +329,7 @@ def can_tell_misalignment(up: Array) -> bool:
     return geometry(distinct, with_misalignment=True) <= _WORST_GEOMETRY
 
 
-def distinct_directions(up: Array) -> Array:
+def distinct_directions(up: Floats) -> Floats:
     """
     Drop directions that repeat another.
 
@@ -346,7 +344,7 @@ def distinct_directions(up: Array) -> Array:
         Those further than 5 degrees from all before.
 
     """
-    kept: list[Array] = []
+    kept: list[Floats] = []
     limit = np.cos(np.radians(_SAME_DIRECTION_DEG))
     for direction in up:
         if all(float(direction @ other) < limit for other in kept):
@@ -354,7 +352,7 @@ def distinct_directions(up: Array) -> Array:
     return np.array(kept).reshape(-1, 3)
 
 
-def geometry(up: Array, with_misalignment: bool) -> float:
+def geometry(up: Floats, with_misalignment: bool) -> float:
     """
     Worst standard deviation of bias, scale and misalignment per unit of norm noise.
 
@@ -384,7 +382,7 @@ def geometry(up: Array, with_misalignment: bool) -> float:
 
 
 def judge_result(
-    solution: Solution, rows: Sequence[ResidualRow], slow: Array, options: FitOptions
+    solution: Solution, rows: Sequence[ResidualRow], slow: Floats, options: FitOptions
 ) -> list[Finding]:
     """
     Judge what the fit left.

@@ -22,12 +22,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from ..errors import FitError
-
-Array = npt.NDArray[np.float64]
+from ..typing import Floats
 
 # Time constants are searched from two windows to this many spans: a random walk by then.
 _LONGEST_SPANS = 10.0
@@ -58,7 +56,7 @@ class Noise:
     wander_sd: float
     time_constant_s: float
 
-    def wander(self, first: Array, second: Array) -> Array:
+    def wander(self, first: Floats, second: Floats) -> Floats:
         """
         Covariance of the level at some times with itself at others, shape (n, m).
 
@@ -97,9 +95,9 @@ class Candidate:
 
     weight: float
     noise: Noise
-    parameters: Array
-    covariance: Array
-    gain: Array
+    parameters: Floats
+    covariance: Floats
+    gain: Floats
 
 
 @dataclass(frozen=True)
@@ -126,9 +124,9 @@ class WanderFit:
 
     """
 
-    parameters: Array
-    covariance: Array
-    time: Array
+    parameters: Floats
+    covariance: Floats
+    time: Floats
     candidates: tuple[Candidate, ...]
     inflation: float = 1.0
 
@@ -140,7 +138,7 @@ class WanderFit:
         """
         return self.candidates[0].noise
 
-    def prediction_sd(self, columns: Array, time: Array, count: Array) -> Array:
+    def prediction_sd(self, columns: Floats, time: Floats, count: Floats) -> Floats:
         """
         Predict the sd of ``data - columns @ parameters`` for data that were not in the fit.
 
@@ -183,7 +181,7 @@ class WanderFit:
         return float(np.sqrt(self.inflation * total))
 
 
-def fit_with_wander(columns: Array, data: Array, time: Array, count: Array) -> WanderFit:
+def fit_with_wander(columns: Floats, data: Floats, time: Floats, count: Floats) -> WanderFit:
     """
     Fit a linear model to data whose level wanders.
 
@@ -247,16 +245,16 @@ class _Solution:
 
     noise: Noise
     cost: float
-    parameters: Array
-    covariance: Array
-    gain: Array
+    parameters: Floats
+    covariance: Floats
+    gain: Floats
 
     def candidate(self, weight: float) -> Candidate:
         return Candidate(weight, self.noise, self.parameters, self.covariance, self.gain)
 
 
 def _solutions(
-    columns: Array, data: Array, time: Array, count: Array, constant: float, scale: float
+    columns: Floats, data: Floats, time: Floats, count: Floats, constant: float, scale: float
 ) -> list[_Solution]:
     """
     Solve for one time constant and all ratios of wander to white noise.

@@ -15,17 +15,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from ..metrics import MICRO_G
+from ..unit.gravity import MICRO_G
 from .ladder import model_spec
 from .regression import Freedom, Outcome
 from .selection import fit_model
 from .start import ConstantCalibration
 from .table import WindowTable
 from .verdict import Finding
-
-Array = npt.NDArray[np.float64]
 
 _REFERENCE_MODEL = 'quadratic+memory2'
 _FIRST_GUESS_S = 1800.0

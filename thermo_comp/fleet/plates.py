@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
-from ..calibration import AXES
 from ..report.figures_fleet import (
     Draw,
     Panel,
@@ -25,10 +23,10 @@ from ..report.figures_fleet import (
     draw_spreads,
 )
 from ..report.plates import DrawnPlate
+from ..typing import Floats
+from ..unit.calibration import AXES
 from .row import Row
 from .summary import QUANTITIES, Drift, Summary, spread_of
-
-Array = npt.NDArray[np.float64]
 
 _MOST_DRIFTS = 24
 _PANELS = (
@@ -99,7 +97,7 @@ def fleet_plates(fitted: Sequence[Row], summary: Summary) -> list[DrawnPlate]:
     return [draw_plate(number, *one) for number, one in enumerate(drawn, 1)]
 
 
-def _curves(fitted: Sequence[Row]) -> dict[str, Array]:
+def _curves(fitted: Sequence[Row]) -> dict[str, Floats]:
     return {
         section: np.array([v for row in fitted if isinstance(v := row[f'{section}_ug'], float)])
         for section in ('raw', 'static', 'dynamic')
@@ -140,7 +138,7 @@ def _lot_plate(fitted: Sequence[Row], summary: Summary) -> tuple[str, str, str, 
 
 
 def _drift_plate(drifts: Sequence[Drift]) -> tuple[str, str, str, Draw]:
-    panels: dict[str, tuple[Array, Array]] = {}
+    panels: dict[str, tuple[Floats, Floats]] = {}
     for words in ('bias', 'scale factor'):
         by_axis = [
             [next(c for c in one.changes if c.label == f'{words} {axis}') for axis in AXES]

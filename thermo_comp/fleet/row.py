@@ -14,9 +14,9 @@ from typing import Literal
 
 import numpy as np
 
-from ..calibration import AXES, Calibration
 from ..fitting import FitResult, predicted_sd
-from ..metrics import MICRO_G
+from ..unit.calibration import AXES, Calibration
+from ..unit.gravity import MICRO_G
 
 Cell = str | int | float | None
 Row = Mapping[str, Cell]

@@ -18,12 +18,10 @@ from datetime import datetime
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
-from ..calibration import AXES
+from ..typing import Floats
+from ..unit.calibration import AXES
 from .row import FITTED, Row
-
-Array = npt.NDArray[np.float64]
 
 _FALSE_ALARMS = 0.05
 # Fewer units have no spread to stand out of, fewer of a lot no middle.
@@ -104,10 +102,10 @@ class Spread:
 
     quantity: Quantity
     names: tuple[str, ...]
-    values: Array
+    values: Floats
     middle: float
     sd: float
-    z: Array
+    z: Floats
 
 
 @dataclass(frozen=True)

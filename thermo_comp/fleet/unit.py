@@ -19,10 +19,10 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 from .. import __version__
-from ..calibration_file import dump_calibration
 from ..errors import FitError, ThermoCompError
 from ..fitting import FitOptions, FitResult, ReducedBag, fit_bags
 from ..recording import Input, Topics
+from ..unit.calibration_file import dump_calibration
 from .bag import BagStatistics, reduce_found
 from .discovery import FoundUnit
 from .row import FAILED, REFUSED, Cell, empty_row, fitted_cells

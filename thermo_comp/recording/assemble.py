@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Block, Floats, ImuColumns, Ints, RawMessages, Role
+from ..typing import Bytes, Floats, Ints
+from .columns import Block, ImuColumns, RawMessages, Role
 from .wire import IMU_ACCELERATION, imu_columns
 
 #: A block is given out once it has so many messages, where nobody wants another number; a chunk
@@ -49,7 +50,7 @@ class Rows:
     log_ns: Ints
     numbers: Floats
     frames: list[tuple[int, str]]
-    raw: tuple[NDArray[np.uint8], Ints] | None = None
+    raw: tuple[Bytes, Ints] | None = None
 
     def cut(self, begin: int, end: int) -> Rows:
         """

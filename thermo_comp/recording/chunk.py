@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..typing import Bytes
 from . import mcap_records as mcap
 from .mcap_records import ChunkSpan, DamagedError
 from .random_access import RandomAccess
@@ -31,7 +32,6 @@ from .walk import (
     locate_run,
     walk,
 )
-from .wire import Bytes
 
 #: Chunks up to this size are taken as a whole, larger ones as a stream.
 MAX_CHUNK_BYTES = 1 << 26

@@ -15,11 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from ..typing import Bytes, Floats, Ints
 
 Input = Literal['auto', 'counts', 'imu']
 Role = Literal['accel', 'board', 'case']
@@ -129,7 +125,7 @@ class RawMessages:
     topic: str
     type: str
     log_ns: Ints
-    data: NDArray[np.uint8]
+    data: Bytes
     ends: Ints
 
 

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RecordingError
+from ..typing import Bools, Bytes, Ints
 from .assemble import Part, Rows
-from .columns import Ints, Role
+from .columns import Role
 from .encode import stamped_payloads
 from .topics import TEMPERATURE, shown
 from .walk import MESSAGE_HEAD_BYTES, Messages
-from .wire import Bytes, Encoding, Stamped, decode_stamped, frame_runs, gather, scatter
+from .wire import Encoding, Stamped, decode_stamped, frame_runs, gather, scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +112,9 @@ class Decoder:
                 )
         return part
 
-    def _is_from(self, channel: NDArray[np.uint16], role: Role) -> NDArray[np.bool_]:
+    def _is_from(self, channel: NDArray[np.uint16], role: Role) -> Bools:
         channels = self._channels[role]
-        is_own: NDArray[np.bool_] = (
+        is_own: Bools = (
             channel == channels[0] if len(channels) == 1 else np.isin(channel, channels)
         )
         return is_own
@@ -202,7 +203,7 @@ def _reencoded(stamped: Stamped, frames: list[tuple[int, str]]) -> tuple[Bytes, 
 
     """
     pieces: list[Bytes] = []
-    sizes: list[NDArray[np.int64]] = []
+    sizes: list[Ints] = []
     stops = [row for row, _ in frames[1:]] + [len(stamped.stamp_ns)]
     for (begin, text), end in zip(frames, stops, strict=True):
         payloads = stamped_payloads(stamped.stamp_ns[begin:end], text, stamped.numbers[begin:end])

@@ -17,8 +17,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .columns import Floats, Ints
-from .wire import Bytes, gather, scatter
+from ..typing import Bools, Bytes, Floats, Ints
+from .wire import gather, scatter
 
 OPCODE_MESSAGE = 5
 _NS = 1_000_000_000
@@ -179,7 +179,7 @@ class BoolRecords:
 
     _LAYOUT = layout(36, head=(RECORD_HEAD, 0), order=('u1', 32), value=('u1', 35))
 
-    def __init__(self, channel: int, log_ns: Ints, values: NDArray[np.bool_]) -> None:
+    def __init__(self, channel: int, log_ns: Ints, values: Bools) -> None:
         self.channel = channel
         self.log_ns = log_ns
         self.size = np.broadcast_to(np.int64(self._LAYOUT.itemsize), log_ns.shape)

@@ -39,10 +39,10 @@ from mcap.records import (
 )
 
 from .. import __version__
+from ..typing import Bytes
 from .definitions import Definition, offered_qos
 from .encode import Merged, Stretch
 from .rosbag2_metadata import FileSummary, TopicSummary, dump_yaml, information
-from .wire import Bytes
 
 MAGIC = b'\x89MCAP0\r\n'
 #: Name of the metadata record that holds the writer's key-value pairs.

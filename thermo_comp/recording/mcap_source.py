@@ -24,6 +24,7 @@ from typing import cast
 import numpy as np
 
 from ..errors import RecordingError
+from ..typing import Bytes
 from .assemble import Part
 from .chunk import Windows, load_chunk, load_run
 from .columns import Role
@@ -34,7 +35,7 @@ from .survey import Survey
 from .sweep import in_log_order
 from .topics import shown
 from .walk import Messages
-from .wire import Bytes, Encoding
+from .wire import Encoding
 
 _N_LOADERS = 2
 #: Pieces under way: what two threads read and decode while the caller works on one block.

@@ -16,7 +16,7 @@ import yaml
 
 from ..errors import RecordingError
 from ..files import read_bounded
-from ..plain_yaml import load_plain_yaml
+from ..plain_yaml import PlainYamlError, load_plain_yaml
 from .definitions import offered_qos
 
 _VERSION = 9
@@ -183,7 +183,7 @@ def read_metadata(directory: Path) -> Description | None:
     if not text.strip():
         return None
     try:
-        content = load_plain_yaml(text)['rosbag2_bagfile_information']
+        content = load_plain_yaml(text, node_limit=_MAX_BYTES)['rosbag2_bagfile_information']
         files = tuple(directory / PurePath(str(name)).name for name in _names(content))
         description = Description(
             storage=str(content['storage_identifier']),
@@ -191,7 +191,7 @@ def read_metadata(directory: Path) -> Description | None:
             is_compressed=str(content.get('compression_mode') or 'none').lower() != 'none',
             custom={str(k): str(v) for k, v in (content.get('custom_data') or {}).items()},
         )
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except PlainYamlError as error:
         raise RecordingError('not valid YAML', path) from error
     except (KeyError, TypeError, AttributeError) as error:
         raise RecordingError('not the metadata of a rosbag2 bag', path) from error

@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import RecordingError
+from ..typing import Bytes
 from . import mcap_records as mcap
 from .chunk import HEAD_BYTES, MAX_CHUNK_BYTES, StreamSpan, Windows, load_chunk
 from .mcap_records import Channel, ChunkSpan, DamagedError, Schema, Statistics
 from .random_access import LocalFile, OpenFile, RandomAccess
 from .walk import Messages, walk
-from .wire import Bytes
 
 #: Name of the metadata record with the key-value pairs of this package's writer.
 METADATA_NAME = 'thermo_comp'

@@ -15,8 +15,9 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from ..typing import Ints
 from .assemble import Part, Rows, join_rows
-from .columns import Ints, Role
+from .columns import Role
 from .decode import pack
 from .mcap_records import DamagedError
 

@@ -18,9 +18,9 @@ import lz4.frame
 import numpy as np
 import zstandard
 
+from ..typing import Bytes
 from .mcap_records import DamagedError
 from .random_access import RandomAccess
-from .wire import Bytes
 
 _MAX_WINDOW = 1 << 27
 _READ_BYTES = 1 << 20

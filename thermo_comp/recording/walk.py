@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Ints
+from ..typing import Bytes, Ints
 from .mcap_records import MESSAGE, MESSAGE_INDEX, PREFIX_BYTES, DamagedError
-from .wire import Bytes, field, gather
+from .wire import field, gather
 
 #: Bytes of a message record before its serialized message.
 MESSAGE_HEAD_BYTES = 31

@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RecordingError
-from .columns import Floats, ImuColumns, Ints
+from ..typing import Bytes, Floats, Ints
+from .columns import ImuColumns
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED
 
-Bytes = NDArray[np.uint8]
 Encoding = Literal['cdr', 'ros1']
 Size = TypeVar('Size', int, Ints)
 

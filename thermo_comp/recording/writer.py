@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import RecordingError
+from ..typing import Ints
 from .atomic import partial_sibling, publish, sync_directory
-from .columns import ImuColumns, Ints, RawMessages
+from .columns import ImuColumns, RawMessages
 from .definitions import Definition, known_definition
 from .encode import (
     BoolRecords,

@@ -8,12 +8,11 @@ Owns the thinning of long series to what a line of some hundred pixels can show.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ..typing import Floats
 
 
-def thin(time: Array, value: Array, n_bins: int) -> tuple[Array, Array]:
+def thin(time: Floats, value: Floats, n_bins: int) -> tuple[Floats, Floats]:
     """
     Keep, of each of `n_bins` equal stretches of time, the lowest and the highest point.
 

@@ -15,17 +15,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
-from ..calibration import Calibration
 from ..fitting.reduction import Readings
-from ..metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from ..simulation import Cyclogram
+from ..typing import Bools, Floats, Ints
+from ..unit.calibration import Calibration
+from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from .trace import ThermalTrace
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Names of the ladder's rungs, as figures and tables call them.
 RAW = 'raw'
@@ -121,13 +117,13 @@ class Windows:
 
     """
 
-    bag: IntArray
-    position: IntArray
-    time: Array
-    mean: Array
-    board: Array
-    is_dynamic: BoolArray
-    forces: dict[str, Array]
+    bag: Ints
+    position: Ints
+    time: Floats
+    mean: Floats
+    board: Floats
+    is_dynamic: Bools
+    forces: dict[str, Floats]
 
     def __len__(self) -> int:
         """
@@ -144,7 +140,7 @@ class Windows:
         """
         return next(reversed(self.forces), None)
 
-    def breaks(self, rows: BoolArray | slice = slice(None)) -> IntArray:
+    def breaks(self, rows: Bools | slice = slice(None)) -> Ints:
         """
         Rows, of those selected, at which another position begins.
 
@@ -249,7 +245,7 @@ class Evidence:
     is_fit: bool = False
 
     @cached_property
-    def residuals(self) -> dict[str, Array]:
+    def residuals(self) -> dict[str, Floats]:
         """
         ``|f| - g`` of each rung over the windows [m/s^2]; empty without gravity.
 
@@ -304,7 +300,7 @@ class Evidence:
             )
         return tuple(found)
 
-    def axis_residuals(self) -> dict[str, Array]:
+    def axis_residuals(self) -> dict[str, Floats]:
         """
         Residual of each axis over the windows, per rung [m/s^2].
 

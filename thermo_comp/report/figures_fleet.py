@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ..typing import Floats
 from .plates import DrawnPlate
 from .style import (
     AXIS_LINES,
@@ -38,7 +38,6 @@ from .style import (
 )
 from .text import label_text
 
-Array = npt.NDArray[np.float64]
 Draw = Callable[[Sheet], Figure]
 
 # More names than these would lie over each other.
@@ -66,7 +65,7 @@ class Panel:
 
     title: str
     unit: str
-    values: Sequence[Array]
+    values: Sequence[Floats]
 
 
 def draw_plate(number: int, name: str, question: str, reading: str, draw: Draw) -> DrawnPlate:
@@ -99,7 +98,7 @@ def draw_plate(number: int, name: str, question: str, reading: str, draw: Draw) 
         )
 
 
-def draw_shares(curves: Mapping[str, Array], sheet: Sheet) -> Figure:
+def draw_shares(curves: Mapping[str, Floats], sheet: Sheet) -> Figure:
     """
     Draw the share of units below each residual, by section.
 
@@ -154,7 +153,7 @@ def draw_spreads(panels: Sequence[Panel], sheet: Sheet) -> Figure:
 
 def draw_distances(
     labels: Sequence[str],
-    distances: Sequence[Array],
+    distances: Sequence[Floats],
     names: Sequence[Sequence[str]],
     limit: float,
     sheet: Sheet,
@@ -208,7 +207,7 @@ def draw_distances(
     return figure
 
 
-def draw_lots(title: str, groups: Mapping[str, Array], sheet: Sheet) -> Figure:
+def draw_lots(title: str, groups: Mapping[str, Floats], sheet: Sheet) -> Figure:
     """
     Draw one quantity lot by lot.
 
@@ -226,7 +225,7 @@ def draw_lots(title: str, groups: Mapping[str, Array], sheet: Sheet) -> Figure:
 
 
 def draw_changes(
-    labels: Sequence[str], panels: Mapping[str, tuple[Array, Array]], sheet: Sheet
+    labels: Sequence[str], panels: Mapping[str, tuple[Floats, Floats]], sheet: Sheet
 ) -> Figure:
     """
     Draw what changed between two tests of each unit, axis by axis, with two sd on either side.

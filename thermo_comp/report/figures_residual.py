@@ -8,12 +8,12 @@ Owns the figures of the residuals: the paper's Fig. 6 and Fig. 7, and the histog
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from ..metrics import MICRO_G
+from ..typing import Bools, Floats
+from ..unit.gravity import MICRO_G
 from .evidence import RAW, Evidence
 from .figures_thermal import shade_dynamic, shown_bag
 from .style import (
@@ -32,8 +32,6 @@ from .style import (
     time_unit,
 )
 from .text import number
-
-Array = npt.NDArray[np.float64]
 
 
 def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
@@ -154,9 +152,7 @@ def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
     return figure
 
 
-def _by_regime(
-    residual: Array, is_dynamic: npt.NDArray[np.bool_]
-) -> list[tuple[str, Array, Line]]:
+def _by_regime(residual: Floats, is_dynamic: Bools) -> list[tuple[str, Floats, Line]]:
     found = [
         ('static', residual[~is_dynamic], STATIC_LINE),
         ('dynamic', residual[is_dynamic], DYNAMIC_LINE),
@@ -164,7 +160,7 @@ def _by_regime(
     return [part for part in found if len(part[1])]
 
 
-def _draw_signed(axes: Axes, values: Array, line: Line) -> None:
+def _draw_signed(axes: Axes, values: Floats, line: Line) -> None:
     limit = max(float(np.quantile(np.abs(values), 0.998)) * 1.1, 1e-3)
     n_bins = int(np.clip(np.sqrt(len(values)), 9, 33))
     edges = np.linspace(-limit, limit, n_bins + 1)
@@ -184,7 +180,7 @@ def _draw_signed(axes: Axes, values: Array, line: Line) -> None:
     few_ticks(axes, 4)
 
 
-def _size_range(residuals: dict[str, Array]) -> tuple[float, float]:
+def _size_range(residuals: dict[str, Floats]) -> tuple[float, float]:
     """
     Range of sizes worth showing [micro-g]: all that is large, and the small without its tail.
 
@@ -195,12 +191,12 @@ def _size_range(residuals: dict[str, Array]) -> tuple[float, float]:
     return low, max(high, 2.0 * low)
 
 
-def _shared_limit(residuals: list[Array]) -> float:
+def _shared_limit(residuals: list[Floats]) -> float:
     largest = [float(np.quantile(np.abs(r), 0.998)) for r in residuals if r.size]
     return 1.15 * max(largest, default=0.0) / MICRO_G
 
 
-def _rms_text(residual: Array, is_dynamic: npt.NDArray[np.bool_]) -> str:
+def _rms_text(residual: Floats, is_dynamic: Bools) -> str:
     parts = []
     for label, rows in (('static', ~is_dynamic), ('dynamic', is_dynamic)):
         if rows.any():

@@ -8,12 +8,12 @@ Owns the figures of the thermal side: the paper's Fig. 3 and Fig. 4 from the use
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..metrics import MICRO_G
-from ..regime import Regime
+from ..thermal.regime import Regime
+from ..typing import Floats
+from ..unit.gravity import MICRO_G
 from .evidence import BagFacts, Evidence, ShownBag
 from .style import (
     AXIS_LINES,
@@ -28,8 +28,6 @@ from .style import (
     plot_thinned,
     time_unit,
 )
-
-Array = npt.NDArray[np.float64]
 
 _PER_MINUTE = 60.0
 _PER_MINUTE2 = 3600.0
@@ -87,7 +85,7 @@ def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
         ('T board', shown.board, BOARD_LINE),
     ):
         if len(readings.value):
-            seconds: Array = np.asarray((readings.stamp_ns - shown.start_ns) * 1e-9, np.float64)
+            seconds: Floats = np.asarray((readings.stamp_ns - shown.start_ns) * 1e-9, np.float64)
             plot_thinned(axes, seconds / unit, readings.value, sheet, label=label, **line)
     axes.set_xlim(0.0, facts.duration_s / unit)
     axes.set_xlabel(name)
@@ -150,7 +148,7 @@ def _draw_drift(
     legend_above(axes, sheet, title='a  drift of the readings since the start', alignment='left')
 
 
-def reading_drift(evidence: Evidence) -> tuple[Array, str]:
+def reading_drift(evidence: Evidence) -> tuple[Floats, str]:
     """
     Change of the raw readings within each position since it began.
 

@@ -8,13 +8,13 @@ Owns the figures of the unit itself: bias and scale functions, and where its pos
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..calibration import AXES, AxisReference, AxisSet, Calibration, RegimeSet
-from ..metrics import MICRO_G
+from ..typing import Floats
+from ..unit.calibration import AXES, AxisReference, AxisSet, Calibration, RegimeSet
+from ..unit.gravity import MICRO_G
 from .evidence import RAW, Evidence, Position
 from .style import (
     DYNAMIC_LINE,
@@ -27,8 +27,6 @@ from .style import (
     new_figure,
 )
 from .text import number
-
-Array = npt.NDArray[np.float64]
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
@@ -97,7 +95,7 @@ def _sets(calibration: Calibration) -> list[tuple[str, RegimeSet, Line, str, str
 
 
 def _draw_band(
-    axes: Axes, temperature: Array, value: Array, half: Array, line: Line, hatch: str
+    axes: Axes, temperature: Floats, value: Floats, half: Floats, line: Line, hatch: str
 ) -> None:
     axes.fill_between(
         temperature,
@@ -112,8 +110,8 @@ def _draw_band(
 
 
 def bias_curve(
-    axis_set: AxisSet, reference: AxisReference, t: Array
-) -> tuple[Array, Array | None]:
+    axis_set: AxisSet, reference: AxisReference, t: Floats
+) -> tuple[Floats, Floats | None]:
     """
     Bias of one set against the bias at the reference, at rest thermally.
 
@@ -142,7 +140,7 @@ def bias_curve(
     return value, None if sd is None else sd / per_micro_g
 
 
-def scale_curve(axis_set: AxisSet, t: Array) -> tuple[Array, Array | None]:
+def scale_curve(axis_set: AxisSet, t: Floats) -> tuple[Floats, Floats | None]:
     """
     Scale of one set against the scale at the reference, at rest thermally.
 
@@ -167,7 +165,7 @@ def scale_curve(axis_set: AxisSet, t: Array) -> tuple[Array, Array | None]:
     return value, None if sd is None else sd * 1e6
 
 
-def _sd(axis_set: AxisSet, columns: Array, first: int) -> Array | None:
+def _sd(axis_set: AxisSet, columns: Floats, first: int) -> Floats | None:
     if not axis_set.covariance:
         return None
     n = columns.shape[1]

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from ..fitting import FitResult
 from ..fitting.ladder import golovach_spec
@@ -23,6 +22,7 @@ from ..fitting.table import WindowTable
 from ..fitting.verdict import Finding
 from ..recording import inspect_recording
 from ..simulation import Cyclogram, parse_cyclogram
+from ..typing import Floats
 from .evidence import (
     CHOSEN,
     ONE_SET,
@@ -35,8 +35,6 @@ from .evidence import (
 )
 from .gather import bag_facts, best_bag, recorded_program, span_of
 from .trace import thermal_trace
-
-Array = npt.NDArray[np.float64]
 
 # The rungs below the chosen model are fitted on windows of this length first, as the fit's own
 # candidates are.
@@ -131,7 +129,7 @@ def _program(paths: Sequence[str | Path], index: int, program: str | None) -> Cy
     return None
 
 
-def _ends(result: FitResult) -> dict[str, Array]:
+def _ends(result: FitResult) -> dict[str, Floats]:
     """
     Correct with the constants alone, and with the calibration.
 
@@ -141,7 +139,7 @@ def _ends(result: FitResult) -> dict[str, Array]:
     return {RAW: np.asarray(raw), CHOSEN: _corrected(table, solution)}
 
 
-def _ladder(result: FitResult) -> dict[str, Array]:
+def _ladder(result: FitResult) -> dict[str, Floats]:
     solution, table = result.solution, result.table
     ends = _ends(result)
     forces = {RAW: ends[RAW]}
@@ -161,7 +159,7 @@ def _ladder(result: FitResult) -> dict[str, Array]:
     return forces
 
 
-def _corrected(table: WindowTable, solution: Solution) -> Array:
+def _corrected(table: WindowTable, solution: Solution) -> Floats:
     columns = regressors(table, solution.spec, solution.time_constants_s, solution.start_memory)
     return correct(table, solution, columns)
 

@@ -17,31 +17,30 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from .. import thermal
-from ..calibration import Calibration
-from ..correction import Correction
 from ..errors import RecordingError
-from ..fit_sources import digest
 from ..fitting import FitOptions, FitSource
+from ..fitting.fit_sources import digest
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sensors import learn_detector
 from ..recording import Block, Input, RecordingInfo, Topics, open_recording
 from ..replay import check_unit
-from ..settings import DetectorSettings
 from ..simulation import CYCLOGRAM_NAMES, Cyclogram, cyclogram_preset, parse_cyclogram
+from ..thermal import tracker as thermal
+from ..thermal.settings import DetectorSettings
+from ..typing import Floats, Ints
+from ..unit.calibration import Calibration
+from ..unit.correction import Correction
+from ..unit.gravity import STANDARD_GRAVITY
 from .evidence import CHOSEN, RAW, STATIC_ALONE, BagFacts, Evidence, ShownBag, Windows
 from .trace import ThermalTrace, thermal_trace
 
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 Progress = Callable[[float], None]
 
 # A recorded program is text that somebody else wrote; no real one is longer.
 _LONGEST_PROGRAM = 4096
-_STANDARD = FitOptions(gravity=9.80665)
+_STANDARD = FitOptions(gravity=STANDARD_GRAVITY)
 
 
 @dataclass(frozen=True)
@@ -322,10 +321,10 @@ def recorded_program(metadata: object) -> Cyclogram | None:
 @dataclass(frozen=True)
 class _BagWindows:
     number: int
-    position: IntArray
-    time: Array
-    mean: Array
-    states: tuple[Array, ...]
+    position: Ints
+    time: Floats
+    mean: Floats
+    states: tuple[Floats, ...]
 
 
 def _judge(
@@ -370,7 +369,7 @@ def _join(parts: Sequence[_BagWindows], calibration: Calibration | None, unit: s
     known = np.isfinite(states[thermal.BOARD])
     states = tuple(column[known] for column in states)
     mean = mean[known]
-    forces: dict[str, Array] = {}
+    forces: dict[str, Floats] = {}
     if calibration is not None:
         forces = _ladder(calibration, mean, states)
     elif unit == 'm/s^2':
@@ -389,7 +388,9 @@ def _join(parts: Sequence[_BagWindows], calibration: Calibration | None, unit: s
 _EMPTY = (np.zeros(0), np.zeros((0, 3)))
 
 
-def _ladder(calibration: Calibration, mean: Array, states: tuple[Array, ...]) -> dict[str, Array]:
+def _ladder(
+    calibration: Calibration, mean: Floats, states: tuple[Floats, ...]
+) -> dict[str, Floats]:
     """
     Specific force without temperature, with the static set alone, and as calibrated.
 
@@ -400,7 +401,7 @@ def _ladder(calibration: Calibration, mean: Array, states: tuple[Array, ...]) ->
     M = np.array(calibration.misalignment)
     correction = Correction(calibration)
 
-    def corrected(state: tuple[Array, ...]) -> Array:
+    def corrected(state: tuple[Floats, ...]) -> Floats:
         columns = [(mean[:, i] - b) / s for i, (b, s) in enumerate(correction.bias_scale(state))]
         return np.asarray(np.column_stack(columns) @ M.T)
 

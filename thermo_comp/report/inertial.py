@@ -10,14 +10,13 @@ times the Schuler oscillation bounds it, with a peak of ``2 b R / g``.
 
 from __future__ import annotations
 
-from ..metrics import MICRO_G
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 #: Times at which a navigator's user asks [s].
 TIMES_S = (60.0, 300.0, 600.0)
 _EARTH_RADIUS = 6.371e6
-_STANDARD_GRAVITY = 9.80665
 #: Peak of the Schuler oscillation for one micro-g [m]: 12.7.
-SCHULER_PEAK_PER_MICRO_G = 2.0 * MICRO_G * _EARTH_RADIUS / _STANDARD_GRAVITY
+SCHULER_PEAK_PER_MICRO_G = 2.0 * MICRO_G * _EARTH_RADIUS / STANDARD_GRAVITY
 
 
 def position_error(bias: float, time: float) -> float:

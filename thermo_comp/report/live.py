@@ -21,10 +21,10 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from ..calibration_file import load_calibration
 from ..errors import ThermoCompError
 from ..recording import Input, Topics
 from ..replay import input_for
+from ..unit.calibration_file import load_calibration
 from .evidence import Evidence
 from .gather import OpenedBag, evidence_of_bags, open_bag
 from .page import render_page

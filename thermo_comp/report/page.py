@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from html import escape
 
 from .. import __version__
-from ..calibration import AXES, Calibration
-from ..metrics import MICRO_G
+from ..unit.calibration import AXES, Calibration
+from ..unit.gravity import MICRO_G
 from .evidence import CHOSEN, SECTIONS, Evidence
 from .html import document, figure, table
 from .inertial import SCHULER_PEAK_PER_MICRO_G, TIMES_S, position_error, schuler_peak

@@ -20,16 +20,14 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
+from ..typing import Floats, Ints
 from .decimate import thin
 from .evidence import CHOSEN, ONE_SET, RAW, STATIC_ALONE, TWO_REGIMES
 
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 Line = dict[str, Any]
 
 BLACK, BLUE, RED, GREEN, GREY = '#000000', '#0072B2', '#D55E00', '#007A5A', '#8A8A8A'
@@ -210,7 +208,7 @@ def time_unit(duration_s: float) -> tuple[float, str]:
     return 1.0, 'time, s'
 
 
-def plot_thinned(axes: Axes, time: Array, value: Array, sheet: Sheet, **line: Any) -> None:
+def plot_thinned(axes: Axes, time: Floats, value: Floats, sheet: Sheet, **line: Any) -> None:
     """
     Draw a long series with no more points than the sheet has pixels.
 
@@ -218,7 +216,7 @@ def plot_thinned(axes: Axes, time: Array, value: Array, sheet: Sheet, **line: An
     axes.plot(*thin(time, value, sheet.n_bins), **line)
 
 
-def broken(time: Array, value: Array, position: IntArray) -> tuple[Array, Array]:
+def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]:
     """
     Put a gap into a series of windows wherever it changes position or pauses.
 

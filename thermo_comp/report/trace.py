@@ -10,15 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from ..fitting.reduction import Readings
-from ..regime import Regime
-from ..settings import DetectorSettings, ThermalConfig
-from ..thermal import ThermalTracker
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from ..thermal.regime import Regime
+from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..thermal.tracker import ThermalTracker
+from ..typing import Floats, Ints
 
 #: Grid points of a trace, whatever the bag's length; a line in a figure has fewer pixels.
 _N_GRID = 4000
@@ -67,10 +64,10 @@ class ThermalTrace:
 
     """
 
-    time: Array
-    board_rate: Array
-    case_rate: Array
-    case_acceleration: Array
+    time: Floats
+    board_rate: Floats
+    case_rate: Floats
+    case_acceleration: Floats
     stretches: tuple[Stretch, ...]
     is_case_leading: bool
 
@@ -83,8 +80,8 @@ def thermal_trace(
     *,
     memory_time_constants_s: tuple[float, ...] = (),
     config: ThermalConfig | None = None,
-    query_ns: IntArray | None = None,
-) -> tuple[ThermalTrace, tuple[Array, ...]]:
+    query_ns: Ints | None = None,
+) -> tuple[ThermalTrace, tuple[Floats, ...]]:
     """
     Run the thermal tracker over a bag's readings, as the node would.
 
@@ -157,7 +154,7 @@ def _row(tracker: ThermalTracker) -> tuple[float, ...]:
     )
 
 
-def _settled(value: Array, variance: Array) -> Array:
+def _settled(value: Floats, variance: Floats) -> Floats:
     """
     Leave out an estimate until it has settled: its sd has come down to thrice the usual.
 

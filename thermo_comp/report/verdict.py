@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..calibration import Calibration
-from ..metrics import MICRO_G
+from ..unit.calibration import Calibration
+from ..unit.gravity import MICRO_G
 from .evidence import CHOSEN, RAW, Evidence
 from .text import number
 

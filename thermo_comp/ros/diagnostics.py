@@ -16,9 +16,9 @@ from dataclasses import dataclass, fields, replace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from ..plausibility import Fault
-from ..regime import Regime
-from ..status import CompensatorStatus, Counters
+from ..online.status import CompensatorStatus, Counters
+from ..thermal.plausibility import Fault
+from ..thermal.regime import Regime
 from .loading import LoadedCalibration
 
 #: A sample rate further from the calibrated one than this is worth a warning.

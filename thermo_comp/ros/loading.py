@@ -11,10 +11,10 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..calibration import Calibration
-from ..calibration_file import SIZE_LIMIT, parse_calibration
 from ..errors import CalibrationError
 from ..files import read_bounded
+from ..unit.calibration import Calibration
+from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 from .parameters import NodeConfig
 
 

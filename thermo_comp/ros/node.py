@@ -29,8 +29,9 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
-from ..compensator import Compensator
 from ..errors import ThermoCompError
+from ..online.compensator import Compensator
+from ..online.snapshot import take_snapshot
 from . import parameters
 from .affinity import Affinity, AffinityError
 from .conversions import SampleConverter
@@ -213,7 +214,7 @@ class CompensationNode:
             n_case_publishers=found[2],
         )
         variances = None if last is None else (last[3], last[6], last[8])
-        return Snapshot(self._compensator.status, traffic, variances)
+        return Snapshot(take_snapshot(self._compensator), traffic, variances)
 
     def _report(self) -> None:
         """

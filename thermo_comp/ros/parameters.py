@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from ..errors import ThermoCompError
-from ..status import CompensatorConfig
+from ..online.status import CompensatorConfig
 from .affinity import ANY
 
 _DEFAULTS = CompensatorConfig()

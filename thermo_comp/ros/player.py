@@ -26,7 +26,6 @@ from typing import Any, Literal
 import numpy as np
 import rclpy
 from geometry_msgs.msg import Vector3Stamped
-from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -37,6 +36,7 @@ from sensor_msgs.msg import Imu, Temperature
 from ..errors import ThermoCompError
 from ..recording import Block, Input, RecordingReader, Role, Topics, open_recording
 from ..recording.encode import stamped_payloads
+from ..typing import Bytes
 
 NODE_NAME = 'thermo_comp_player'
 
@@ -355,5 +355,5 @@ def _raw(block: Block, topic: str | None) -> Iterator[bytes]:
                 start = end
 
 
-def _rows(payloads: NDArray[np.uint8]) -> Iterator[bytes]:
+def _rows(payloads: Bytes) -> Iterator[bytes]:
     return (row.tobytes() for row in payloads)

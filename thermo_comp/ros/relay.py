@@ -19,7 +19,7 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
 
-from ..compensator import Compensator
+from ..online.compensator import Compensator
 from .conversions import SampleConverter, read_temperature
 from .waitloop import RawPublisher, RawSubscription, RCLError
 

@@ -4,17 +4,21 @@
 Owns the known truth: a unit in a thermal chamber, simulated from the physics up.
 
 - `Cyclogram` is the chamber's program, `unit_preset` a specimen, `positions` its attitudes.
-- `simulate` runs them and returns what a recorder would have stored plus the truth;
+- `arrays` runs a whole test (`plan`) in memory, in seconds.
+- `simulate` runs one bag and returns what a recorder would have stored plus the truth;
   `simulate_blocks` gives the same bits in bounded memory.
 - The model: chamber air -> case -> board -> parts through heat capacities and conductances,
-  solved exactly; errors arise in the parts (tempcos), between them (gradients) and slowly
-  (creep); white noise; a charge-balancing converter that carries its remainder.
+  solved exactly; errors arise in the parts (tempcos, leakage), between them (gradients, heat
+  flows), slowly (creep), by the way that was gone (joints that slip) and by what is switched on;
+  white noise, a bias that walks; a charge-balancing converter that carries its remainder.
 
 Nothing here is built from a compensator's regressors, reads a file or a clock.
 
 """
 
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .attitude import Handling, positions
+from .campaign import PLAN_NAMES, Position, Record, arrays, plan
 from .converter import Converter
 from .cyclogram import (
     CYCLOGRAM_NAMES,
@@ -24,21 +28,34 @@ from .cyclogram import (
     ramps_and_soaks,
     random_cyclogram,
 )
-from .drift import CreepEffect, DifferenceEffect, DriftModel, PartEffect
+from .drift import (
+    CreepEffect,
+    DifferenceEffect,
+    DriftModel,
+    Effect,
+    FlowEffect,
+    LeakageEffect,
+    LoadEffect,
+    PartEffect,
+    PartHistory,
+    SlipEffect,
+)
 from .network import AIR, Link, ThermalNetwork, Thermostat
-from .presets import UNIT_NAMES, unit_preset
+from .presets import TRIAD_NAMES, UNIT_NAMES, unit_preset
 from .response import ThermalResponse
 from .run import START_NS, ChamberRipple, simulate, simulate_blocks
 from .thermometers import ThermometerModel
 from .truth import SimulatedRun, Truth, ideal_regime
-from .unit import MICRO_G, STANDARD_GRAVITY, UnitModel
+from .unit import SwitchedLoad, UnitModel
 
 __all__ = [
     'AIR',
     'CYCLOGRAM_NAMES',
     'MICRO_G',
+    'PLAN_NAMES',
     'STANDARD_GRAVITY',
     'START_NS',
+    'TRIAD_NAMES',
     'UNIT_NAMES',
     'ChamberRipple',
     'Converter',
@@ -46,19 +63,30 @@ __all__ = [
     'Cyclogram',
     'DifferenceEffect',
     'DriftModel',
+    'Effect',
+    'FlowEffect',
     'Handling',
+    'LeakageEffect',
     'Link',
+    'LoadEffect',
     'PartEffect',
+    'PartHistory',
+    'Position',
+    'Record',
     'SimulatedRun',
+    'SlipEffect',
+    'SwitchedLoad',
     'ThermalNetwork',
     'ThermalResponse',
     'ThermometerModel',
     'Thermostat',
     'Truth',
     'UnitModel',
+    'arrays',
     'cyclogram_preset',
     'ideal_regime',
     'parse_cyclogram',
+    'plan',
     'positions',
     'ramps_and_soaks',
     'random_cyclogram',

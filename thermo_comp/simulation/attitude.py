@@ -11,8 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..typing import Floats, Ints
 from .streams import Stream, generator
 
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
@@ -28,7 +29,7 @@ _CORNERS = [
 ]
 
 
-def positions(n: int, seed: int = 0, *, spread_deg: float = 3.0) -> NDArray[np.float64]:
+def positions(n: int, seed: int = 0, *, spread_deg: float = 3.0) -> Floats:
     """
     Return attitudes of a calibration test as the direction of the specific force.
 
@@ -73,11 +74,11 @@ def positions(n: int, seed: int = 0, *, spread_deg: float = 3.0) -> NDArray[np.f
     for row in range(n):
         push = generator(seed, Stream.POSITIONS, row).standard_normal(3)
         up[row] += math.radians(spread_deg) * np.cross(push, up[row])
-    result: NDArray[np.float64] = up / np.linalg.norm(up, axis=1, keepdims=True)
+    result: Floats = up / np.linalg.norm(up, axis=1, keepdims=True)
     return result
 
 
-def _capped_prism() -> NDArray[np.float64]:
+def _capped_prism() -> Floats:
     # Three on the equator, six 44 degrees above and below between them.
     third = np.arange(3) * 2.0 * math.pi / 3.0
     ring = np.stack([np.cos(third), np.sin(third)], axis=1)
@@ -86,13 +87,13 @@ def _capped_prism() -> NDArray[np.float64]:
     return np.concatenate([np.insert(size * ring, 2, z, axis=1) for size, z in levels])
 
 
-def _icosahedron() -> NDArray[np.float64]:
+def _icosahedron() -> Floats:
     golden = (1.0 + math.sqrt(5.0)) / 2.0
     quad = np.array([(0.0, a, b * golden) for a in (1.0, -1.0) for b in (1.0, -1.0)])
     return np.concatenate([np.roll(quad, turn, axis=1) for turn in range(3)])
 
 
-def _spiral(n: int) -> NDArray[np.float64]:
+def _spiral(n: int) -> Floats:
     k = np.arange(n)
     z = 1.0 - (2.0 * k + 1.0) / n
     turn = math.pi * (3.0 - math.sqrt(5.0)) * k
@@ -176,7 +177,7 @@ class Attitude:
         self.gravity = gravity
         self.handling = handling
 
-    def position(self, time: NDArray[np.float64]) -> NDArray[np.int64]:
+    def position(self, time: Floats) -> Ints:
         """
         Return the number of the position at rest, -1 while handled.
 
@@ -195,9 +196,7 @@ class Attitude:
         since = time - np.concatenate([[-np.inf], self.switch_s])[passed]
         return np.where(since < self.handling.duration, -1, passed).astype(np.int64)
 
-    def specific_force(
-        self, time: NDArray[np.float64], vibration: list[np.random.Generator]
-    ) -> NDArray[np.float64]:
+    def specific_force(self, time: Floats, vibration: list[np.random.Generator]) -> Floats:
         """
         Return the specific force, drawing the vibration of the handled instants.
 
@@ -234,9 +233,7 @@ class Attitude:
         return np.asarray(force)
 
 
-def _turn(
-    start: NDArray[np.float64], end: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+def _turn(start: Floats, end: Floats) -> tuple[Floats, float]:
     axis = np.cross(start, end)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:
@@ -245,9 +242,7 @@ def _turn(
     return axis / np.linalg.norm(axis), angle
 
 
-def _rotated(
-    vector: NDArray[np.float64], axis: NDArray[np.float64], angle: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _rotated(vector: Floats, axis: Floats, angle: Floats) -> Floats:
     # Rodrigues' formula with the vector across the axis.
     across = np.cross(axis, vector)
     return np.cos(angle)[:, None] * vector + np.sin(angle)[:, None] * across

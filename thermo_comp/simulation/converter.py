@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..typing import Floats, Ints
 from .streams import Stream, generator
 
 _FRACTION_BITS = 40
@@ -65,7 +66,7 @@ class Converter:
         """
         return (1 << (self.bits - 1)) - 1
 
-    def start(self, seed: int) -> NDArray[np.int64]:
+    def start(self, seed: int) -> Ints:
         """
         Return the charge on the integrators at power-on.
 
@@ -85,9 +86,7 @@ class Converter:
             dtype=np.int64,
         )
 
-    def convert(
-        self, charge: NDArray[np.float64], remainder: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    def convert(self, charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
         """
         Convert consecutive cycles.
 
@@ -123,5 +122,5 @@ class Converter:
             remainder = total[-1] - (carried[-1] << _FRACTION_BITS)
         return counts, remainder
 
-    def _clip(self, counts: NDArray[np.float64]) -> NDArray[np.int32]:
+    def _clip(self, counts: Floats) -> NDArray[np.int32]:
         return np.clip(counts, self.low, self.high).astype(np.int32)

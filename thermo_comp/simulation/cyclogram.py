@@ -13,8 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..typing import Bools, Floats
 from .streams import Stream, generator
 
 _MINUTE = 60.0
@@ -74,16 +75,16 @@ class Cyclogram:
         return self.time_s[-1]
 
     @property
-    def rates_k_min(self) -> NDArray[np.float64]:
+    def rates_k_min(self) -> Floats:
         """
         Rate of each line between points, shape (n - 1,), K/min; 0 in a soak.
 
         """
         minutes = np.diff(np.array(self.time_s)) / _MINUTE
-        rates: NDArray[np.float64] = np.diff(np.array(self.temperature_c)) / minutes
+        rates: Floats = np.diff(np.array(self.temperature_c)) / minutes
         return rates
 
-    def at(self, time: ArrayLike) -> NDArray[np.float64]:
+    def at(self, time: ArrayLike) -> Floats:
         """
         Return the programmed air temperature.
 
@@ -98,12 +99,10 @@ class Cyclogram:
             Air temperature, degC.
 
         """
-        air: NDArray[np.float64] = np.interp(
-            np.asarray(time, dtype=float), self.time_s, self.temperature_c
-        )
+        air: Floats = np.interp(np.asarray(time, dtype=float), self.time_s, self.temperature_c)
         return air
 
-    def is_ramp(self, time: ArrayLike) -> NDArray[np.bool_]:
+    def is_ramp(self, time: ArrayLike) -> Bools:
         """
         Tell where the program is changing the temperature.
 
@@ -122,7 +121,7 @@ class Cyclogram:
         line = np.searchsorted(self.time_s, time, side='right') - 1
         is_inside = (line >= 0) & (line < len(self.time_s) - 1)
         rates = self.rates_k_min[np.clip(line, 0, len(self.time_s) - 2)]
-        result: NDArray[np.bool_] = is_inside & (rates != 0.0)
+        result: Bools = is_inside & (rates != 0.0)
         return result
 
     def cut(self, duration: float) -> Cyclogram:
@@ -340,6 +339,11 @@ def _chamber() -> Cyclogram:
     return ramps_and_soaks(20.0, 20.0, [(35, 0.75, 35), (5, 0.6, 45), (20, 0.75, 35), (8, 1, 23)])
 
 
+def _three_hours() -> Cyclogram:
+    # The shortest that shows the whole range, both directions and some rest.
+    return ramps_and_soaks(20.0, 10.0, [(35, 1, 30), (5, 1.2, 45), (22, 1, 38)])
+
+
 def _held_out() -> Cyclogram:
     # Other rates, other soak temperatures and another order than 'paper': what a fit never saw.
     return ramps_and_soaks(
@@ -377,6 +381,7 @@ def _soak() -> Cyclogram:
 _PRESETS: dict[str, Callable[[], Cyclogram]] = {
     'paper': _paper,
     'chamber': _chamber,
+    'three-hours': _three_hours,
     'held-out': _held_out,
     'staircase': _staircase,
     'triangle': _triangle,

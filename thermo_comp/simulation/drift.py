@@ -4,9 +4,10 @@
 Owns the physics of the errors: bias and scale driven by the temperatures of physical parts.
 
 Each effect sits in the part where it arises: a tempco in a reference, an integrator or a magnet,
-a thermo-EMF or a thermo-elastic stress in the difference between two parts, a creep in a joint
-that relaxes. Deviations count from the still state in which the board's thermometer shows the
-reference temperature, so bias and scale there are the unit's constants.
+a thermo-EMF or a thermo-elastic stress in the difference between two parts, a creep or a slip in a
+joint, a leakage in a die, a load on a supply. Deviations count from the still state in which the
+board's thermometer shows the reference temperature, so bias and scale there are the unit's
+constants.
 
 """
 
@@ -15,80 +16,238 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from .network import ThermalNetwork
+from ..typing import Floats
 
 Triple = tuple[float, float, float]
 ZERO: Triple = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class PartEffect:
+@dataclass(frozen=True, eq=False)
+class PartHistory:
     """
-    Tempco of one part, per axis, in the deviation `d` of its temperature.
-
-    ``bias += bias * d + bias_curvature * d^2`` and likewise for the scale.
+    What the parts went through, on an even grid.
 
     Parameters
     ----------
-    part : str
-        Part of the thermal network.
-    scale, scale_curvature : tuple of float, optional
-        Relative scale change, ppm/K and ppm/K^2.
-    bias, bias_curvature : tuple of float, optional
-        Bias change, ug/K and ug/K^2.
+    nodes : tuple of str
+        Parts, the columns of the arrays.
+    deviation, rate : ndarray, shape (m, n_parts)
+        Temperatures from the reference's still state, K, and their derivatives, K/s.
+    origin : ndarray, shape (n_parts,)
+        Temperatures in that state, degC.
+    step : float
+        Step of the grid, s.
 
     """
 
-    part: str
+    nodes: tuple[str, ...]
+    deviation: Floats
+    rate: Floats
+    origin: Floats
+    step: float
+
+    def of(self, part: str) -> Floats:
+        """
+        Return the deviation of one part, shape (m,), K.
+
+        """
+        return self.deviation[:, self.nodes.index(part)]
+
+    def lagged(self, signal: Floats, time_constant: float) -> Floats:
+        """
+        Return the first-order lag of a signal that is straight on the grid, settled at its start.
+
+        """
+        kept = np.exp(-self.step / time_constant)
+        new = 1.0 - time_constant / self.step * (1.0 - kept)
+        moved = lfilter([new, 1.0 - kept - new], [1.0, -kept], signal - signal[0])
+        result: Floats = moved + signal[0]
+        return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """
+    One cause of errors; per axis ``bias * first + bias_curvature * second``, the scale likewise.
+
+    Parameters
+    ----------
+    scale, scale_curvature : tuple of float, optional
+        Relative scale change per unit of the first and the second signal, ppm.
+    bias, bias_curvature : tuple of float, optional
+        Bias change per unit of the first and the second signal, ug.
+
+    """
+
     scale: Triple = ZERO
     scale_curvature: Triple = ZERO
     bias: Triple = ZERO
     bias_curvature: Triple = ZERO
 
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats | float]:
+        # The first and the second signal, shape (m,).
+        raise NotImplementedError
+
+    def change(self, history: PartHistory) -> tuple[Floats, Floats]:
+        """
+        Return the change of the bias [ug] and of the scale [ppm], shape (m, 3).
+
+        """
+        first, second = (np.reshape(s, (-1, 1)) for s in self._signals(history))
+        bias = first * np.array(self.bias) + second * np.array(self.bias_curvature)
+        scale = first * np.array(self.scale) + second * np.array(self.scale_curvature)
+        return bias, scale
+
 
 @dataclass(frozen=True)
-class DifferenceEffect:
+class PartEffect(Effect):
     """
-    Effect of a temperature difference between two parts, per axis.
+    Tempco of one part: its deviation [K] and the square of it.
 
-    Parameters
-    ----------
-    hot, cold : str
-        The effect is proportional to the change of ``T_hot - T_cold``.
-    scale : tuple of float, optional
-        Relative scale change, ppm/K.
-    bias : tuple of float, optional
-        Bias change, ug/K.
+    """
+
+    part: str
+
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
+        d = history.of(self.part)
+        return d, d * d
+
+
+@dataclass(frozen=True)
+class DifferenceEffect(Effect):
+    """
+    Stress or voltage between two parts: the difference of their deviations [K] and of the squares.
+
+    The squares are those of expansion or Seebeck coefficients that grow with temperature.
 
     """
 
     hot: str
     cold: str
-    scale: Triple = ZERO
-    bias: Triple = ZERO
+
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
+        hot, cold = history.of(self.hot), history.of(self.cold)
+        return hot - cold, hot * hot - cold * cold
 
 
 @dataclass(frozen=True)
-class CreepEffect:
+class FlowEffect(Effect):
     """
-    Slow relaxation in a part: the effect follows a temperature change and then dies away.
+    What a heat flow does whichever way it goes: ``|T_hot - T_cold| ** exponent``, less at rest.
 
-    Parameters
-    ----------
-    part : str
-        Part that relaxes.
-    time_constant : float
-        Relaxation time, s.
-    bias : tuple of float, optional
-        Bias right after a quick change of the part's temperature, ug/K.
+    A gas that rises in a gap (1.25), the load of a heat pump (1), its losses (2). The second
+    signal is the first times the deviation of `cold`.
+
+    """
+
+    hot: str
+    cold: str
+    exponent: float = 1.25
+
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
+        at = [history.nodes.index(part) for part in (self.hot, self.cold)]
+        rest = history.origin[at[0]] - history.origin[at[1]]
+        difference = history.deviation[:, at[0]] - history.deviation[:, at[1]] + rest
+        flow = np.abs(difference) ** self.exponent - np.abs(rest) ** self.exponent
+        return flow, flow * history.of(self.cold)
+
+
+@dataclass(frozen=True)
+class LeakageEffect(Effect):
+    """
+    Leakage of a junction: ``exp(d / growth) - 1`` with the part's deviation `d`.
+
+    """
+
+    part: str
+    growth: float
+
+    def _signals(self, history: PartHistory) -> tuple[Floats, float]:
+        return np.expm1(history.of(self.part) / self.growth), 0.0
+
+
+@dataclass(frozen=True)
+class CreepEffect(Effect):
+    """
+    Slow relaxation in a part: follows a quick change of temperature [K], then dies away.
 
     """
 
     part: str
     time_constant: float
-    bias: Triple = ZERO
+
+    def _signals(self, history: PartHistory) -> tuple[Floats, float]:
+        d = history.of(self.part)
+        return d - history.lagged(d, self.time_constant), 0.0
+
+
+@dataclass(frozen=True)
+class SlipEffect(Effect):
+    """
+    A joint that is strained with a part's temperature and slips: stress [K of free strain].
+
+    The stress depends on the way, not on the time. It gives way at once at `width` (Jenkins) or
+    bit by bit towards it (Dahl, Bouc-Wen); it starts relaxed.
+
+    """
+
+    part: str
+    width: float
+    is_gradual: bool = False
+
+    def _signals(self, history: PartHistory) -> tuple[Floats, float]:
+        strain = np.diff(history.of(self.part), prepend=history.of(self.part)[:1])
+        width, now = self.width, 0.0
+        kept = np.exp(-np.abs(strain) / width).tolist()
+        stress = np.empty(len(strain))
+        for k, step in enumerate(strain.tolist()):
+            if self.is_gradual and step:
+                limit = width if step > 0.0 else -width
+                now = limit + (now - limit) * kept[k]
+            else:
+                now = min(max(now + step, -width), width)
+            stress[k] = now
+        return stress, 0.0
+
+
+@dataclass(frozen=True)
+class LoadEffect(Effect):
+    """
+    A load on the supply while a part's temperature changes, whichever way it does.
+
+    A comparator with hysteresis looks at the part's rate, the supply settles after it, and what
+    the load does changes with the temperature: ``load * d ** power``, the second signal with one
+    power more.
+
+    Parameters
+    ----------
+    part : str
+        Part whose rate is looked at.
+    on, off : float
+        Rates at which the load comes on and goes off, K/min.
+    settle : float
+        Time constant of the supply, s.
+    power : int
+        How the first signal changes with the deviation of the part.
+
+    """
+
+    part: str
+    on: float = 0.06
+    off: float = 0.03
+    settle: float = 60.0
+    power: int = 0
+
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
+        rate = np.abs(history.rate[:, history.nodes.index(self.part)]) * 60.0
+        is_on, load = False, np.empty(len(rate))
+        for k, value in enumerate(rate.tolist()):
+            is_on = value > (self.off if is_on else self.on)
+            load[k] = is_on
+        first = history.lagged(load, self.settle) * history.of(self.part) ** self.power
+        return first, first * history.of(self.part)
 
 
 @dataclass(frozen=True)
@@ -96,65 +255,18 @@ class DriftModel:
     """
     All effects of a unit.
 
-    Parameters
-    ----------
-    parts : tuple of PartEffect, optional
-        Tempcos.
-    differences : tuple of DifferenceEffect, optional
-        Effects of gradients.
-    creeps : tuple of CreepEffect, optional
-        Relaxations.
-
     """
 
-    parts: tuple[PartEffect, ...] = ()
-    differences: tuple[DifferenceEffect, ...] = ()
-    creeps: tuple[CreepEffect, ...] = ()
+    effects: tuple[Effect, ...] = ()
 
-    @property
-    def followers(self) -> tuple[tuple[str, float], ...]:
+    def evaluate(self, history: PartHistory) -> tuple[Floats, Floats]:
         """
-        What the thermal response must follow for the creeps: part and time constant.
+        Return the change of the bias [ug] and the relative change of the scale, shape (m, 3).
 
         """
-        return tuple((creep.part, creep.time_constant) for creep in self.creeps)
-
-    def evaluate(
-        self, network: ThermalNetwork, states: NDArray[np.float64], origin: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """
-        Return the change of bias and scale.
-
-        Parameters
-        ----------
-        network : ThermalNetwork
-            The parts.
-        states : ndarray, shape (m, k)
-            States of the response: the parts first, the followers of the creeps last.
-        origin : ndarray, shape (n_parts,)
-            Temperatures of the parts from which deviations count, degC.
-
-        Returns
-        -------
-        bias : ndarray, shape (m, 3)
-            Change of the bias, ug.
-        scale : ndarray, shape (m, 3)
-            Relative change of the scale.
-
-        """
-        index = {name: i for i, name in enumerate(network.nodes)}
-        deviation = states[:, : len(origin)] - origin
-        bias, ppm = np.zeros((len(states), 3)), np.zeros((len(states), 3))
-        for part in self.parts:
-            d = deviation[:, [index[part.part]]]
-            bias += d * part.bias + d * d * np.array(part.bias_curvature)
-            ppm += d * part.scale + d * d * np.array(part.scale_curvature)
-        for pair in self.differences:
-            d = deviation[:, [index[pair.hot]]] - deviation[:, [index[pair.cold]]]
-            bias += d * pair.bias
-            ppm += d * pair.scale
-        followed = states[:, states.shape[1] - len(self.creeps) :]
-        for k, creep in enumerate(self.creeps):
-            d = states[:, [index[creep.part]]] - followed[:, [k]]
-            bias += d * creep.bias
+        bias, ppm = np.zeros((2, len(history.deviation), 3))
+        for effect in self.effects:
+            more = effect.change(history)
+            bias += more[0]
+            ppm += more[1]
         return bias, ppm * 1e-6

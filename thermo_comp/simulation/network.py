@@ -15,7 +15,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..typing import Floats
 
 AIR = 'air'
 _HELD = 1e-6  # change with the air's below which a part counts as held, K/K
@@ -31,13 +32,16 @@ class Link:
     a, b : str
         The parts; `AIR` stands for the chamber's air.
     conductance : float
-        Conductance of the path, W/K.
+        Conductance of the path, W/K (at 1 K, with convection).
+    exponent : float, optional
+        The heat flows as this power of the difference: 1 by conduction, 1.25 by free convection.
 
     """
 
     a: str
     b: str
     conductance: float
+    exponent: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -130,9 +134,17 @@ class ThermalNetwork:
         """
         return tuple(self.capacity)
 
-    def system(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    @property
+    def is_convective(self) -> bool:
         """
-        Return the matrices of ``dx/dt = A x + b u + p``.
+        Whether a path's flow is no multiple of the difference.
+
+        """
+        return any(link.exponent != 1.0 for link in self.links)
+
+    def system(self) -> tuple[Floats, Floats, Floats]:
+        """
+        Return the matrices of ``dx/dt = A x + b u + p``, convection left out.
 
         Returns
         -------
@@ -150,7 +162,7 @@ class ThermalNetwork:
         index = {name: i for i, name in enumerate(self.nodes)}
         for link in self.links:
             for here, there in ((link.a, link.b), (link.b, link.a)):
-                if here == AIR:
+                if here == AIR or link.exponent != 1.0:
                     continue
                 i = index[here]
                 A[i, i] -= link.conductance
@@ -177,7 +189,66 @@ class ThermalNetwork:
         p[:n] /= rows
         return A, b, p
 
-    def equilibrium(self, air: float) -> NDArray[np.float64]:
+    def flow(self, state: Floats, air: float, drive: Floats) -> Floats:
+        """
+        Return ``dx/dt`` of one state, convection included.
+
+        Parameters
+        ----------
+        state : ndarray, shape (k,)
+            Parts, then the thermostat's integral and set point.
+        air : float
+            Air temperature, degC.
+        drive : ndarray, shape (k,)
+            Constant drive, as `system` gives it, K/s.
+
+        Returns
+        -------
+        ndarray, shape (k,)
+            Derivative, per second.
+
+        """
+        A, b, _ = self.system()
+        return np.asarray(A @ state + b * air + drive + self._convection(state, air)[0])
+
+    def _convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
+        """
+        Return the convective flows into the state and their derivatives by it.
+
+        """
+        index = {name: i for i, name in enumerate(self.nodes)}
+        flow, slope = np.zeros(len(state)), np.zeros((len(state), len(state)))
+        for link in self.links:
+            if link.exponent == 1.0:
+                continue
+            ends = [index.get(name) for name in (link.a, link.b)]
+            a, b = (air if i is None else state[i] for i in ends)
+            size = link.conductance * abs(a - b) ** (link.exponent - 1.0)
+            for sign, i, name in ((-1.0, ends[0], link.a), (1.0, ends[1], link.b)):
+                if i is None:
+                    continue
+                flow[i] += sign * size * (a - b) / self.capacity[name]
+                for other, j in ((1.0, ends[0]), (-1.0, ends[1])):
+                    if j is not None:
+                        slope[i, j] += sign * other * link.exponent * size / self.capacity[name]
+        return flow, slope
+
+    def settled(self, air: float, drive: Floats) -> Floats:
+        """
+        Return the whole state after an endless soak under a constant drive, shape (k,).
+
+        """
+        A, b, _ = self.system()
+        if not self.is_convective:
+            return np.asarray(-np.linalg.inv(A) @ (b * air + drive), dtype=np.float64)
+        # Newton's steps; the flow is convex, so some fifty reach the last digit from anywhere.
+        state = np.full(len(b), air + 1.0)
+        for _ in range(50):
+            flow, slope = self._convection(state, air)
+            state = state - np.linalg.solve(A + slope, A @ state + b * air + drive + flow)
+        return state
+
+    def equilibrium(self, air: float) -> Floats:
         """
         Return the temperatures after an endless soak.
 
@@ -193,6 +264,8 @@ class ThermalNetwork:
 
         """
         A, b, p = self.system()
+        if self.is_convective:
+            return self.settled(air, p)[: len(self.nodes)]
         return np.asarray(np.linalg.solve(A, -b * air - p)[: len(self.nodes)], dtype=np.float64)
 
     def air_for(self, node: str, temperature: float) -> float:
@@ -212,9 +285,11 @@ class ThermalNetwork:
             Air temperature, degC.
 
         """
-        i = self.nodes.index(node)
-        cold, hot = self.equilibrium(0.0)[i], self.equilibrium(1.0)[i]
-        return float((temperature - cold) / (hot - cold))
+        i, air = self.nodes.index(node), 0.0
+        for _ in range(20 if self.is_convective else 1):
+            cold, hot = self.equilibrium(air)[i], self.equilibrium(air + 1.0)[i]
+            air += float((temperature - cold) / (hot - cold))
+        return air
 
     def heater_power(self, air: float) -> float:
         """
@@ -255,9 +330,11 @@ class ThermalNetwork:
         Raises
         ------
         ValueError
-            If the thermostat holds one of the parts.
+            If the thermostat holds one of the parts, or heat flows by convection.
 
         """
+        if self.is_convective:
+            raise ValueError('a network with convection has no lag that holds for every ramp')
         A, b, _ = self.system()
         gain = np.linalg.solve(A, -b)
         shortfall = np.linalg.solve(A, -gain)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ready-made units: a thermostatted quartz triad, a bare quartz one and a MEMS one.
+Owns the ready-made units: three instruments, and triads with one kind of physics each.
 
 Every seed is another specimen: tempcos, heat paths, misalignment and constants are drawn around
 what such units show. The tables below are physics (watts, joules per kelvin, tempcos of parts);
@@ -13,15 +13,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .converter import Converter
-from .drift import CreepEffect, DifferenceEffect, DriftModel, PartEffect, Triple
+from .drift import (
+    CreepEffect,
+    DifferenceEffect,
+    DriftModel,
+    Effect,
+    FlowEffect,
+    LeakageEffect,
+    LoadEffect,
+    PartEffect,
+    SlipEffect,
+    Triple,
+)
 from .network import AIR, Link, ThermalNetwork, Thermostat
 from .streams import Stream, generator
 from .thermometers import ThermometerModel
-from .unit import MICRO_G, STANDARD_GRAVITY, UnitModel
+from .unit import SwitchedLoad, UnitModel
 
 
 class _Specimen:
@@ -37,6 +51,9 @@ class _Specimen:
 
     def near(self, value: float, spread: float = 0.05) -> float:
         return value * (1.0 + spread * self._rng.uniform(-1.0, 1.0))
+
+    def between(self, low: float, high: float) -> float:
+        return float(self._rng.uniform(low, high))
 
     def axes(self, value: float, spread: float) -> Triple:
         # Around one value, the sign kept.
@@ -60,12 +77,42 @@ class _Specimen:
     def links(self, *paths: tuple[str, str, float]) -> tuple[Link, ...]:
         return tuple(Link(a, b, self.near(conductance)) for a, b, conductance in paths)
 
-    def constants(
-        self, full_scale_g: float, bias_ug: float, spread: float = 0.01
-    ) -> tuple[Triple, Triple]:
-        K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), spread)
+    def only(self, axis: int, value: float) -> Triple:
+        x, y, z = (value * (i == axis) for i in range(3))
+        return x, y, z
+
+    def unit(
+        self,
+        network: ThermalNetwork,
+        drift: DriftModel,
+        *,
+        full_scale_g: float,
+        bias_ug: float,
+        density: float = 5.0,
+        **others: Any,
+    ) -> UnitModel:
+        """
+        Return the unit, its constants drawn; a quartz one with a charge-balancing converter.
+
+        """
+        K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), others.pop('spread', 0.01))
         bx, by, bz = self.normal(bias_ug)
-        return K, (bx * K[0] * MICRO_G, by * K[1] * MICRO_G, bz * K[2] * MICRO_G)
+        parts: dict[str, Any] = {
+            'board': ThermometerModel('board', phase=0.5),
+            'case': ThermometerModel('case'),
+            'noise_density': (density, density, density),
+            'converter': Converter(),
+        }
+        return UnitModel(
+            name=self.name,
+            serial=self.serial,
+            network=network,
+            drift=drift,
+            scale_factor=K,
+            bias_at_reference=(bx * K[0] * MICRO_G, by * K[1] * MICRO_G, bz * K[2] * MICRO_G),
+            misalignment=self.misalignment(others.pop('misalignment_sd', 1e-3)),
+            **{**parts, **others},
+        )
 
 
 def _thermostatted(seed: int) -> UnitModel:
@@ -95,7 +142,7 @@ def _thermostatted(seed: int) -> UnitModel:
         thermostat=Thermostat('oven', 55.0, 20.0, 0.08, 1800.0, 25.0),
     )
     drift = DriftModel(
-        parts=(
+        effects=(
             # The reference current sets the scale of all axes; its curvature is a bandgap's.
             PartEffect(
                 'reference', scale=draw.axes(40.0, 0.15), scale_curvature=draw.axes(0.02, 0.5)
@@ -105,27 +152,12 @@ def _thermostatted(seed: int) -> UnitModel:
             PartEffect('integrator', scale=draw.normal(3.0), bias=draw.signed(6.0, 14.0)),
             PartEffect('board', bias=draw.normal(1.0), bias_curvature=draw.normal(0.03)),
             PartEffect('head', scale=draw.axes(80.0, 0.1), bias=draw.signed(0.3, 5.0)),
-        ),
-        differences=(
             DifferenceEffect('board', 'reference', bias=draw.normal(3.0)),
             DifferenceEffect('oven', 'head', bias=draw.normal(2.0)),
+            CreepEffect('reference', 5.0 * 3600.0, bias=draw.normal(0.02)),
         ),
-        creeps=(CreepEffect('reference', 5.0 * 3600.0, bias=draw.normal(0.02)),),
     )
-    K, bias = draw.constants(11.0, 1500.0)
-    return UnitModel(
-        name=draw.name,
-        serial=draw.serial,
-        network=network,
-        drift=drift,
-        board=ThermometerModel('board', phase=0.5),
-        case=ThermometerModel('case'),
-        scale_factor=K,
-        bias_at_reference=bias,
-        misalignment=draw.misalignment(1e-3),
-        noise_density=(5.0, 5.0, 5.0),
-        converter=Converter(),
-    )
+    return draw.unit(network, drift, full_scale_g=11.0, bias_ug=1500.0)
 
 
 def _bare_quartz(seed: int) -> UnitModel:
@@ -157,14 +189,12 @@ def _bare_quartz(seed: int) -> UnitModel:
         power={'board': 0.6, 'magnet': 0.02},
     )
     drift = DriftModel(
-        parts=(
+        effects=(
             PartEffect(
                 'magnet', scale=draw.axes(48.0, 0.01), scale_curvature=draw.axes(0.31, 0.02)
             ),
             PartEffect('reference', scale=draw.axes(29.5, 0.01)),
             PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
-        ),
-        differences=(
             # The shunt that offsets the magnet's own tempco, and the coil on the pendulum, are
             # not at one temperature in a ramp: parts that balance in still air do not then.
             DifferenceEffect(
@@ -172,23 +202,10 @@ def _bare_quartz(seed: int) -> UnitModel:
             ),
             # Stress through the joint to the mounting ring, heavy and slow, bolted to the case.
             DifferenceEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
+            CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),
         ),
-        creeps=(CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),),
     )
-    K, bias = draw.constants(11.0, 2000.0)
-    return UnitModel(
-        name=draw.name,
-        serial=draw.serial,
-        network=network,
-        drift=drift,
-        board=ThermometerModel('board', phase=0.5),
-        case=ThermometerModel('case'),
-        scale_factor=K,
-        bias_at_reference=bias,
-        misalignment=draw.misalignment(1e-3),
-        noise_density=(5.0, 5.0, 5.0),
-        converter=Converter(),
-    )
+    return draw.unit(network, drift, full_scale_g=11.0, bias_ug=2000.0)
 
 
 def _mems(seed: int) -> UnitModel:
@@ -209,37 +226,168 @@ def _mems(seed: int) -> UnitModel:
         power={'board': 0.15, 'die': 0.004},
     )
     drift = DriftModel(
-        parts=(
+        effects=(
             PartEffect(
                 'die',
                 scale=draw.normal(150.0),
                 bias=draw.signed(100.0, 500.0),
                 bias_curvature=draw.normal(3.0),
             ),
+            DifferenceEffect('board', 'package', bias=draw.normal(300.0)),
+            CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),
         ),
-        differences=(DifferenceEffect('board', 'package', bias=draw.normal(300.0)),),
-        creeps=(CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),),
     )
-    K, bias = draw.constants(16.0, 20000.0, spread=0.02)
-    return UnitModel(
-        name=draw.name,
-        serial=draw.serial,
-        network=network,
-        drift=drift,
+    return draw.unit(
+        network,
+        drift,
+        full_scale_g=16.0,
+        bias_ug=20000.0,
+        spread=0.02,
+        misalignment_sd=1e-2,
         board=ThermometerModel('board', noise_sd=0.02, phase=0.5),
         case=ThermometerModel('case', noise_sd=0.02),
-        scale_factor=K,
-        bias_at_reference=bias,
-        misalignment=draw.misalignment(1e-2),
         noise_density=(120.0, 120.0, 150.0),
         converter=Converter(carries_remainder=False),
     )
 
 
+_AXES = ('x', 'y', 'z')
+
+
+def _triad(kind: str, seed: int) -> UnitModel:
+    """
+    Draw a triad of bare heads on a board whose errors have one kind of physics.
+
+    The heads' tempcos lag with the heads; each kind adds its own. The magnitudes are what such
+    errors have: some micro-g per kelvin of bias, tens of ppm per kelvin of scale.
+
+    """
+    draw = _Specimen(kind, seed)
+    heads = [f'head-{axis}' for axis in _AXES] if kind in _OWN_HEADS else ['head']
+    board_tau, taus = draw.between(400.0, 900.0), [draw.between(500.0, 1500.0) for _ in heads]
+    capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}
+    links = [*draw.links((AIR, 'case', 4.0)), Link('case', 'board', 0.4)]
+    for head, tau in zip(heads, taus, strict=True):
+        # A head takes little heat, so that the board hardly feels it.
+        to_case = draw.between(0.2, 0.8) if kind in _BETWEEN else 0.0
+        capacity[head] = 0.02 * tau
+        links.append(Link('board', head, 0.02 * (1.0 - to_case)))
+        if to_case:
+            links.append(Link('case', head, 0.02 * to_case))
+    if kind == 'convection':
+        # A gas in the gap carries what the stand-offs don't.
+        links[1] = Link('case', 'board', 0.15)
+        links.append(Link('case', 'board', draw.between(0.15, 0.35), exponent=1.25))
+    network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
+    drift = DriftModel((*_tempcos(draw, heads), *(_EXTRA[kind](draw) if kind in _EXTRA else ())))
+    others: dict[str, Any] = {}
+    if kind == 'switched-load':
+        others['loads'] = (SwitchedLoad('board', draw.between(0.3, 0.8)),)
+    if kind == 'slow-noise':
+        others['bias_walk'] = (3.0, 3.0, 3.0)
+    unit = draw.unit(
+        network, drift, full_scale_g=9.975, bias_ug=1500.0, density=_TRIAD_DENSITY, **others
+    )
+    return unit.without_drift() if kind == 'plain' else unit
+
+
+def _tempcos(draw: _Specimen, heads: list[str]) -> list[Effect]:
+    bias, bend = draw.signed(2.0, 12.0), draw.normal(0.08)
+    scale, scale_bend = draw.axes(60.0, 0.4), draw.axes(0.2, 0.6)
+    if len(heads) == 1:
+        return [PartEffect(heads[0], bias=bias, bias_curvature=bend, scale=scale,
+                           scale_curvature=scale_bend)]  # fmt: skip
+    return [
+        PartEffect(
+            head,
+            bias=draw.only(i, bias[i]),
+            bias_curvature=draw.only(i, bend[i]),
+            scale=draw.only(i, scale[i]),
+            scale_curvature=draw.only(i, scale_bend[i]),
+        )
+        for i, head in enumerate(heads)
+    ]
+
+
+def _expansion(draw: _Specimen) -> list[Effect]:
+    # Quartz against metal: the expansion coefficients differ, and the more the warmer it is.
+    return [
+        DifferenceEffect(
+            'board', 'head', bias=draw.signed(3.0, 12.0), bias_curvature=draw.signed(0.1, 0.5),
+            scale=draw.signed(10.0, 40.0), scale_curvature=draw.signed(0.3, 1.5),
+        )
+    ]  # fmt: skip
+
+
+def _slips(draw: _Specimen) -> list[Effect]:
+    # Per axis a joint that gives way at once and one that does so bit by bit.
+    effects: list[Effect] = []
+    for i in range(3):
+        for is_gradual in (False, True):
+            width = draw.between(0.5, 1.5)
+            stress = draw.signed(1.5, 4.0)[i] / width
+            effects.append(SlipEffect('head', width, is_gradual, bias=draw.only(i, stress)))
+    return effects
+
+
+def _flows(draw: _Specimen) -> list[Effect]:
+    # A heat pump between case and board: its load, its losses, and the gas it stirs.
+    return [
+        FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
+        FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
+        FlowEffect('case', 'head', 1.25, bias=draw.normal(1.0), bias_curvature=draw.normal(0.02)),
+    ]
+
+
+def _leakage(draw: _Specimen) -> list[Effect]:
+    # Doubles every 7 to 10 K; a few ug at the reference.
+    return [LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))]
+
+
+def _loads(draw: _Specimen) -> list[Effect]:
+    # The paper: while the ambient changes, other offsets and slopes, and a bend.
+    on = draw.between(0.04, 0.08)
+    off, settle = on * draw.between(0.4, 0.7), draw.between(30.0, 120.0)
+    sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 10.0), (0.03, 0.15, 0.3))
+    return [
+        LoadEffect(
+            'case', on, off, settle, power, bias=draw.signed(low, high), scale=draw.normal(ppm)
+        )
+        for power, (low, high, ppm) in enumerate(sizes)
+    ]
+
+
+# Three heads with a thermal node each, and heads that hang on the case as well.
+_OWN_HEADS = ('own-lags', 'between', 'switched-load')
+_BETWEEN = ('between', 'switched-load')
+_EXTRA: dict[str, Callable[[_Specimen], list[Effect]]] = {
+    'products': _expansion,
+    'hysteresis': _slips,
+    'even': _flows,
+    'convection': _leakage,
+    'paper': _loads,
+    'demo': _loads,
+}
+# With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
+_TRIAD_DENSITY = 3.0
+TRIAD_NAMES = (
+    'own-lags',
+    'between',
+    'products',
+    'hysteresis',
+    'even',
+    'convection',
+    'switched-load',
+    'paper',
+    'slow-noise',
+    'plain',
+    'demo',
+)
 _PRESETS: dict[str, Callable[[int], UnitModel]] = {
     'thermostatted': _thermostatted,
     'bare-quartz': _bare_quartz,
     'mems': _mems,
+    **{kind: partial(_triad, kind) for kind in TRIAD_NAMES},
 }
 UNIT_NAMES = tuple(_PRESETS)
 
@@ -251,8 +399,15 @@ def unit_preset(name: str, seed: int = 0) -> UnitModel:
     Parameters
     ----------
     name : str
-        'thermostatted' (quartz triad in an oven, the converter's board outside: the board's
-        drift dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates) or 'mems'.
+        One of `UNIT_NAMES`. 'thermostatted' (quartz triad in an oven, the converter's board
+        outside: the board's drift dominates), 'bare-quartz' (no oven: the magnet's scale tempco
+        dominates), 'mems', or a triad with one kind of physics beside tempcos that lag:
+        'own-lags' (a time constant for each head), 'between' (heads between case and board),
+        'products' (expansion coefficients that change with temperature), 'hysteresis' (joints
+        that slip), 'even' (errors even in the heat flow), 'convection' (heat that flows through
+        gas, and a leakage), 'switched-load' (electronics that heat by turns), 'paper' (a load
+        while the ambient changes), 'slow-noise' (a bias that walks), 'plain' (no thermal error
+        at all), 'demo' (the sample unit: paper and lags).
     seed : int, optional
         Another specimen for every seed, not negative.
 

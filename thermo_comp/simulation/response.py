@@ -3,17 +3,22 @@
 """
 Owns the heat flow over a program: the network solved exactly, in its modes.
 
-To the network's state come the followers, slow relaxations that take no heat. The air temperature
-is straight between knots; within such an interval the solution is a straight line plus decaying
-modes, so any instant can be evaluated without integrating up to it.
+The air temperature is straight between knots; within such an interval the solution is a straight
+line plus decaying modes, so any instant can be evaluated without integrating up to it. A network
+with convection has no modes and is integrated, interval by interval.
 
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from itertools import pairwise
+from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.integrate import solve_ivp
+
+from ..typing import Floats
 from .network import ThermalNetwork
 
 _CHUNK = 65536  # instants evaluated at once; bounds the memory of the mode table
@@ -32,8 +37,8 @@ class ThermalResponse:
         Times of the air temperature's knots, increasing, s.
     knot_air : array_like, shape (m,)
         Air temperature at the knots, degC; straight between them.
-    followers : sequence of (str, float), optional
-        Slow relaxations: for each, the part it follows and its time constant, s.
+    power : array_like, shape (m - 1, n_parts), optional
+        What the parts dissipate between the knots beside the network's constant powers, W.
     is_warm : bool, optional
         True starts in equilibrium with everything on; False has the unit switched on at the first
         knot, every part at the air's temperature.
@@ -52,7 +57,7 @@ class ThermalResponse:
         knot_time: ArrayLike,
         knot_air: ArrayLike,
         *,
-        followers: tuple[tuple[str, float], ...] = (),
+        power: ArrayLike | None = None,
         is_warm: bool = True,
     ) -> None:
         self.network = network
@@ -66,27 +71,27 @@ class ThermalResponse:
                     f'air of {air.min():g}..{air.max():g} degC needs {watts[0]:.2f}..'
                     f'{watts[1]:.2f} W of a thermostat that gives 0..{heat.max_power:g} W'
                 )
-        A, b, p = _with_followers(network, followers)
+        A, b, p = network.system()
+        drive = np.tile(p, (len(self._time) - 1, 1))
+        if power is not None:
+            drive[:, : len(network.nodes)] += np.asarray(power) / list(network.capacity.values())
+        state = self._first_state(air[0], drive[0], is_warm)
+        self._integrated: list[Any] = []
+        if network.is_convective:
+            self._integrate(air, drive, state)
+            return
         inverse = np.linalg.inv(A)
         rate, modes = np.linalg.eig(A)
         if np.linalg.cond(modes) > _MODES_CONDITION:
             raise ValueError('the network has modes that cannot be told apart; change a capacity')
         self._rate, self._modes = rate, modes
-        self._A, self._b, self._p = A, b, p
 
         length = np.diff(self._time)
         slope = np.diff(air) / length
         # Straight part of each interval: alpha + beta (t - t_knot).
         self._beta = -slope[:, None] * (inverse @ b)
-        self._alpha = (self._beta - np.outer(air[:-1], b) - p) @ inverse.T
+        self._alpha = (self._beta - np.outer(air[:-1], b) - drive) @ inverse.T
         unmix = np.linalg.inv(modes)
-        state = -inverse @ (b * air[0] + p)
-        if not is_warm:
-            n = len(network.nodes)
-            state[:] = air[0]
-            state[n : n + 2 * (heat is not None)] = 0.0
-            if heat is not None:
-                state[n + 1] = air[0]
         # Amplitude of each mode at the start of each interval.
         jump = (self._alpha[1:] - self._alpha[:-1] - self._beta[:-1] * length[:-1, None]) @ unmix.T
         amplitude = np.empty((len(length), len(rate)), dtype=complex)
@@ -96,9 +101,31 @@ class ThermalResponse:
             amplitude[k] = decayed - jump[k - 1]
         self._amplitude = amplitude
 
-    def states(self, time: ArrayLike) -> NDArray[np.float64]:
+    def _first_state(self, air: float, drive: Floats, is_warm: bool) -> Floats:
+        if is_warm:
+            return self.network.settled(air, drive)
+        state = np.zeros(len(drive))
+        state[: len(self.network.nodes)] = air
+        if self.network.thermostat is not None:
+            state[-1] = air
+        return state
+
+    def _integrate(self, air: Floats, drive: Floats, state: Floats) -> None:
+        slope = np.diff(air) / np.diff(self._time)
+        for k, (begin, end) in enumerate(pairwise(self._time)):
+
+            def flow(t: float, x: Floats, k: int = k, begin: float = begin) -> Floats:
+                return self.network.flow(x, air[k] + slope[k] * (t - begin), drive[k])
+
+            solved = solve_ivp(
+                flow, (begin, end), state, 'LSODA', dense_output=True, rtol=1e-9, atol=1e-9
+            )
+            state = solved.y[:, -1]
+            self._integrated.append(solved.sol)
+
+    def states(self, time: ArrayLike) -> Floats:
         """
-        Return the whole state, followers included.
+        Return the whole state.
 
         Parameters
         ----------
@@ -108,22 +135,40 @@ class ThermalResponse:
         Returns
         -------
         ndarray, shape (m, k)
-            Parts, then the thermostat's integral [W] and set point, then the followers.
+            Parts, then the thermostat's integral [W] and set point.
 
         """
-        time = np.atleast_1d(np.asarray(time, dtype=float))
-        result = np.empty((len(time), len(self._rate)))
-        for first in range(0, len(time), _CHUNK):
-            piece = time[first : first + _CHUNK]
-            k = np.searchsorted(self._time, piece, side='right') - 1
-            k = np.clip(k, 0, len(self._beta) - 1)
-            since = piece - self._time[k]
-            decaying = np.exp(since[:, None] * self._rate) * self._amplitude[k]
-            straight = self._alpha[k] + self._beta[k] * since[:, None]
-            result[first : first + _CHUNK] = straight + (decaying @ self._modes.T).real
-        return result
+        return self._evaluate(time)[0]
 
-    def temperatures(self, time: ArrayLike) -> NDArray[np.float64]:
+    def rates(self, time: ArrayLike) -> Floats:
+        """
+        Return the derivative of the whole state, shape (m, k), per second.
+
+        """
+        return self._evaluate(time)[1]
+
+    def _evaluate(self, time: ArrayLike) -> tuple[Floats, Floats]:
+        time = np.atleast_1d(np.asarray(time, dtype=float))
+        k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
+        size = len(self.network.system()[1])
+        states, rates = np.empty((2, len(time), size))
+        if self._integrated:
+            # The derivative of what was integrated, over half a second either side.
+            for interval in np.unique(k):
+                here, solution = k == interval, self._integrated[interval]
+                states[here] = solution(time[here]).T
+                rates[here] = (solution(time[here] + 0.5) - solution(time[here] - 0.5)).T
+            return states, rates
+        for first in range(0, len(time), _CHUNK):
+            piece = slice(first, first + _CHUNK)
+            at, since = k[piece], time[piece] - self._time[k[piece]]
+            decaying = np.exp(since[:, None] * self._rate) * self._amplitude[at]
+            straight = self._alpha[at] + self._beta[at] * since[:, None]
+            states[piece] = straight + (decaying @ self._modes.T).real
+            rates[piece] = self._beta[at] + ((decaying * self._rate) @ self._modes.T).real
+        return states, rates
+
+    def temperatures(self, time: ArrayLike) -> Floats:
         """
         Return the temperatures of the parts.
 
@@ -140,7 +185,7 @@ class ThermalResponse:
         """
         return self.states(time)[:, : len(self.network.nodes)]
 
-    def heater_power(self, time: ArrayLike) -> NDArray[np.float64]:
+    def heater_power(self, time: ArrayLike) -> Floats:
         """
         Return what the thermostat spends, 0 W without one.
 
@@ -162,39 +207,3 @@ class ThermalResponse:
         n = len(self.network.nodes)
         error = states[:, n + 1] - states[:, self.network.nodes.index(heat.node)]
         return heat.proportional * error + states[:, n]
-
-    def derivative(
-        self, states: NDArray[np.float64], air: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """
-        Return the rate of change of states.
-
-        Parameters
-        ----------
-        states : ndarray, shape (m, k)
-            States as `states` gives them.
-        air : ndarray, shape (m,)
-            Air temperature at the same instants, degC.
-
-        Returns
-        -------
-        ndarray, shape (m, k)
-            ``A x + b u + p``, per second.
-
-        """
-        result: NDArray[np.float64] = states @ self._A.T + np.outer(air, self._b) + self._p
-        return result
-
-
-def _with_followers(
-    network: ThermalNetwork, followers: tuple[tuple[str, float], ...]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    A0, b0, p0 = network.system()
-    k = len(A0)
-    size = k + len(followers)
-    A, b, p = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    A[:k, :k], b[:k], p[:k] = A0, b0, p0
-    for row, (node, time_constant) in enumerate(followers, start=k):
-        A[row, network.nodes.index(node)] = 1.0 / time_constant
-        A[row, row] = -1.0 / time_constant
-    return A, b, p

@@ -12,14 +12,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..typing import Floats, Ints
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .attitude import Attitude, Handling
 from .cyclogram import Cyclogram
+from .drift import PartHistory
 from .response import ThermalResponse
 from .streams import Stream, generator
 from .truth import SimulatedRun, Truth
-from .unit import MICRO_G, STANDARD_GRAVITY, UnitModel
+from .unit import UnitModel
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
@@ -120,19 +123,11 @@ def simulate(
         `ThermalResponse`).
 
     """
-    options = _Options(
-        rate_hz,
-        temperature_rate_hz,
-        seed,
-        start_ns,
-        gravity,
-        warm,
-        ripple,
-        switch_s,
-        handling,
+    options = RunOptions(
+        rate_hz, temperature_rate_hz, seed, start_ns, gravity, warm, ripple, switch_s, handling,
         grid_step,
-    )
-    chamber = _Chamber(unit, cyclogram, up, options)
+    )  # fmt: skip
+    chamber = Chamber(unit, cyclogram, up, options)
     return next(chamber.blocks(chamber.n_cycles))
 
 
@@ -182,33 +177,30 @@ def simulate_blocks(
     """
     if block_size < 1:
         raise ValueError(f'`block_size` must be at least 1, got {block_size}')
-    options = _Options(
-        rate_hz,
-        temperature_rate_hz,
-        seed,
-        start_ns,
-        gravity,
-        warm,
-        ripple,
-        switch_s,
-        handling,
+    options = RunOptions(
+        rate_hz, temperature_rate_hz, seed, start_ns, gravity, warm, ripple, switch_s, handling,
         grid_step,
-    )
-    return _Chamber(unit, cyclogram, up, options).blocks(block_size)
+    )  # fmt: skip
+    return Chamber(unit, cyclogram, up, options).blocks(block_size)
 
 
 @dataclass(frozen=True)
-class _Options:
-    rate_hz: float
-    temperature_rate_hz: float | None
-    seed: int
-    start_ns: int
-    gravity: float
-    warm: bool
-    ripple: ChamberRipple | None
-    switch_s: Sequence[float] | None
-    handling: Handling | None
-    grid_step: float
+class RunOptions:
+    """
+    The keywords of `simulate`.
+
+    """
+
+    rate_hz: float = 100.0
+    temperature_rate_hz: float | None = None
+    seed: int = 0
+    start_ns: int = START_NS
+    gravity: float = STANDARD_GRAVITY
+    warm: bool = True
+    ripple: ChamberRipple | None = None
+    switch_s: Sequence[float] | None = None
+    handling: Handling | None = None
+    grid_step: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ('rate_hz', 'grid_step'):
@@ -216,14 +208,53 @@ class _Options:
                 raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
 
 
-class _Chamber:
+class ThermalTruth:
+    """
+    The temperatures of a run and what they do to bias and scale, on the thermal grid.
+
+    """
+
+    def __init__(self, unit: UnitModel, cyclogram: Cyclogram, options: RunOptions) -> None:
+        knots, air = _knots(cyclogram, options)
+        power = None
+        if unit.loads:
+            knots, air, power = _switched(unit, knots, air, options.seed)
+        self.response = ThermalResponse(
+            unit.network, knots, air, power=power, is_warm=options.warm
+        )
+        n_grid = math.ceil(cyclogram.duration_s / options.grid_step) + 1
+        self.grid: Floats = np.arange(n_grid, dtype=float) * options.grid_step
+        self.air = np.interp(self.grid, knots, air)
+        n_nodes = len(unit.network.nodes)
+        self.temperatures = self.response.states(self.grid)[:, :n_nodes]
+        self.rates = self.response.rates(self.grid)[:, :n_nodes]
+        origin = unit.origin
+        bias_ug, scale = unit.drift.evaluate(
+            PartHistory(
+                unit.network.nodes,
+                self.temperatures - origin,
+                self.rates,
+                origin,
+                options.grid_step,
+            )
+        )
+        self.bias = np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g
+        self.scale = 1.0 + scale
+
+
+class Chamber:
     """
     The whole run prepared: thermal truth on its grid, thermometers read; cycles still to come.
 
     """
 
     def __init__(
-        self, unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, options: _Options
+        self,
+        unit: UnitModel,
+        cyclogram: Cyclogram,
+        up: ArrayLike,
+        options: RunOptions,
+        thermal: ThermalTruth | None = None,
     ) -> None:
         duration = cyclogram.duration_s
         self.n_cycles = math.floor(duration * options.rate_hz * (1.0 + 1e-12))
@@ -236,33 +267,24 @@ class _Chamber:
         if switch_s is None:
             switch_s = [duration * k / n_positions for k in range(1, n_positions)]
         self._attitude = Attitude(up, switch_s, options.gravity, handling)
-
-        knots, air = _knots(cyclogram, options)
-        response = ThermalResponse(
-            unit.network, knots, air, followers=unit.drift.followers, is_warm=options.warm
-        )
-        n_grid = math.ceil(duration / options.grid_step) + 1
-        self._grid: NDArray[np.float64] = np.arange(n_grid, dtype=float) * options.grid_step
-        self._air = np.interp(self._grid, knots, air)
-        states = response.states(self._grid)
-        n_nodes = len(unit.network.nodes)
-        self._temperatures = states[:, :n_nodes]
-        self._rates = response.derivative(states, self._air)[:, :n_nodes]
-        bias_ug, scale = unit.drift.evaluate(unit.network, states, unit.origin)
-        K = np.array(unit.scale_factor)
-        self._bias = np.array(unit.bias_at_reference) + bias_ug * (K * MICRO_G)
-        self._scale = 1.0 + scale
+        self.thermal = thermal or ThermalTruth(unit, cyclogram, options)
+        self.bias = self.thermal.bias + _wander(unit, self.thermal.grid, options.seed)
 
         if options.temperature_rate_hz is not None:
             unit = unit.with_thermometers(rate_hz=options.temperature_rate_hz)
-        self._board = unit.board.read(
+        response = self.thermal.response
+        self.board = unit.board.read(
             response, duration, options.seed, Stream.BOARD_NOISE, Stream.BOARD_OUTLIERS
         )
-        self._case = unit.case.read(
+        self.case = unit.case.read(
             response, duration, options.seed, Stream.CASE_NOISE, Stream.CASE_OUTLIERS
         )
 
     def blocks(self, block_size: int) -> Iterator[SimulatedRun]:
+        """
+        Return the run in stretches of so many cycles.
+
+        """
         unit, options = self._unit, self._options
         seed, rate = options.seed, options.rate_hz
         K = np.array(unit.scale_factor)
@@ -285,8 +307,8 @@ class _Chamber:
                 charge[:, i] += noise_sd[i] * noise[i].standard_normal(len(cycle))
             counts, remainder = unit.converter.convert(charge, remainder)
             until = np.iinfo(np.int64).max if last == self.n_cycles else int(stamp_ns[-1])
-            board_ns, board = _between(self._board, passed, until)
-            case_ns, case = _between(self._case, passed, until)
+            board_ns, board = _between(self.board, passed, until)
+            case_ns, case = _between(self.case, passed, until)
             passed = until
             start = options.start_ns
             yield SimulatedRun(
@@ -299,26 +321,25 @@ class _Chamber:
                 truth=truth,
             )
 
-    def _truth(self, cycle_s: NDArray[np.float64], vibration: list[np.random.Generator]) -> Truth:
+    def _truth(self, cycle_s: Floats, vibration: list[np.random.Generator]) -> Truth:
+        thermal = self.thermal
         return Truth(
             unit=self._unit,
             gravity=self._options.gravity,
             nodes=self._unit.network.nodes,
-            grid_s=self._grid,
-            air=self._air,
-            temperatures=self._temperatures,
-            rates=self._rates,
-            bias_grid=self._bias,
-            scale_grid=self._scale,
+            grid_s=thermal.grid,
+            air=thermal.air,
+            temperatures=thermal.temperatures,
+            rates=thermal.rates,
+            bias_grid=self.bias,
+            scale_grid=thermal.scale,
             cycle_s=cycle_s,
             position=self._attitude.position(cycle_s),
             specific_force=self._attitude.specific_force(cycle_s, vibration),
         )
 
 
-def _knots(
-    cyclogram: Cyclogram, options: _Options
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _knots(cyclogram: Cyclogram, options: RunOptions) -> tuple[Floats, Floats]:
     time = np.array(cyclogram.time_s)
     ripple = options.ripple
     if ripple is not None and ripple.amplitude > 0.0:
@@ -334,8 +355,44 @@ def _knots(
     return time, cyclogram.at(time)
 
 
-def _between(
-    readings: tuple[NDArray[np.int64], NDArray[np.float64]], after: int, until: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _switched(
+    unit: UnitModel, knots: Floats, air: Floats, seed: int
+) -> tuple[Floats, Floats, Floats]:
+    """
+    Return the knots with the switching of the loads among them, and the power between them.
+
+    """
+    flips = []
+    for number, load in enumerate(unit.loads):
+        spells = generator(seed, Stream.LOAD, number).uniform(
+            *load.spell, size=2 + int(knots[-1] // load.spell[0])
+        )
+        flips.append(np.cumsum(spells))
+    fine = np.unique(np.concatenate([knots, *flips]))
+    fine = fine[fine <= knots[-1]]
+    power = np.zeros((len(fine) - 1, len(unit.network.nodes)))
+    for load, at in zip(unit.loads, flips, strict=True):
+        is_on = np.searchsorted(at, fine[:-1], side='right') % 2 == 1
+        power[:, unit.network.nodes.index(load.part)] += load.power * is_on
+    return fine, np.interp(fine, knots, air), power
+
+
+def _wander(unit: UnitModel, grid: Floats, seed: int) -> Floats:
+    """
+    Return what the bias does of itself, counts/cycle: another one in each mounting, and a walk.
+
+    """
+    result = np.zeros((len(grid), 3))
+    step_h = grid[1] / 3600.0
+    for i, density in enumerate(unit.bias_walk):
+        if density:
+            steps = generator(seed, Stream.BIAS_WALK, i).standard_normal(len(grid) - 1)
+            result[1:, i] += density * math.sqrt(step_h) * np.cumsum(steps)
+    for i, sd in enumerate(unit.remounting):
+        result[:, i] += sd * generator(seed, Stream.REMOUNTING, i).standard_normal()
+    return result * unit.counts_per_micro_g
+
+
+def _between(readings: tuple[Ints, Floats], after: int, until: int) -> tuple[Ints, Floats]:
     first, last = np.searchsorted(readings[0], (after, until), side='right')
     return readings[0][first:last], readings[1][first:last]

@@ -31,6 +31,10 @@ class Stream(IntEnum):
     UNIT = 8
     POSITIONS = 9
     CYCLOGRAM = 10
+    BIAS_WALK = 11
+    REMOUNTING = 12
+    LOAD = 13
+    SIBLING = 14
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:

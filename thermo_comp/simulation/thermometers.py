@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..typing import Floats, Ints
 from .response import ThermalResponse
 from .streams import Stream, generator
 
@@ -82,7 +82,7 @@ class ThermometerModel:
         seed: int,
         noise: Stream,
         outliers: Stream,
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    ) -> tuple[Ints, Floats]:
         """
         Take the readings of a run.
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..typing import Bools, Floats, Ints
 from .network import AIR
 from .unit import UnitModel
 
@@ -49,18 +50,18 @@ class Truth:
     unit: UnitModel
     gravity: float
     nodes: tuple[str, ...]
-    grid_s: NDArray[np.float64]
-    air: NDArray[np.float64]
-    temperatures: NDArray[np.float64]
-    rates: NDArray[np.float64]
-    bias_grid: NDArray[np.float64]
-    scale_grid: NDArray[np.float64]
-    cycle_s: NDArray[np.float64]
-    position: NDArray[np.int64]
-    specific_force: NDArray[np.float64]
+    grid_s: Floats
+    air: Floats
+    temperatures: Floats
+    rates: Floats
+    bias_grid: Floats
+    scale_grid: Floats
+    cycle_s: Floats
+    position: Ints
+    specific_force: Floats
 
     @property
-    def bias(self) -> NDArray[np.float64]:
+    def bias(self) -> Floats:
         """
         Bias of each cycle, shape (n, 3), counts/cycle.
 
@@ -68,14 +69,14 @@ class Truth:
         return _on_cycles(self.bias_grid, self.grid_s, self.cycle_s)
 
     @property
-    def scale(self) -> NDArray[np.float64]:
+    def scale(self) -> Floats:
         """
         Scale of each cycle relative to the one at the reference temperature, shape (n, 3).
 
         """
         return _on_cycles(self.scale_grid, self.grid_s, self.cycle_s)
 
-    def temperature(self, node: str) -> NDArray[np.float64]:
+    def temperature(self, node: str) -> Floats:
         """
         Return the temperature of one part on the thermal grid.
 
@@ -113,16 +114,16 @@ class SimulatedRun:
 
     """
 
-    accel_stamp_ns: NDArray[np.int64]
+    accel_stamp_ns: Ints
     counts: NDArray[np.int32]
-    board_stamp_ns: NDArray[np.int64]
-    board: NDArray[np.float64]
-    case_stamp_ns: NDArray[np.int64]
-    case: NDArray[np.float64]
+    board_stamp_ns: Ints
+    board: Floats
+    case_stamp_ns: Ints
+    case: Floats
     truth: Truth
 
     @property
-    def is_saturated(self) -> NDArray[np.bool_]:
+    def is_saturated(self) -> Bools:
         """
         Cycles with an axis at its rail, shape (n,).
 
@@ -132,7 +133,7 @@ class SimulatedRun:
         return np.asarray(np.any(at_rail, axis=1))
 
 
-def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> NDArray[np.bool_]:
+def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
     """
     Tell where the board really takes up or gives off heat.
 
@@ -151,16 +152,14 @@ def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> NDArray[np
     """
     truth = run.truth
     rate = truth.rates[:, truth.nodes.index(truth.unit.board.node)]
-    result: NDArray[np.bool_] = np.abs(rate) * 60.0 > threshold_k_min
+    result: Bools = np.abs(rate) * 60.0 > threshold_k_min
     return result
 
 
-def _on_cycles(
-    grid: NDArray[np.float64], grid_s: NDArray[np.float64], cycle_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _on_cycles(grid: Floats, grid_s: Floats, cycle_s: Floats) -> Floats:
     # One arithmetic per cycle, whatever the block: not np.interp, which prepares slopes or not.
     place = cycle_s / grid_s[1]
     left = np.minimum(place.astype(np.int64), len(grid_s) - 2)
     share = (place - left)[:, None]
-    result: NDArray[np.float64] = (1.0 - share) * grid[left] + share * grid[left + 1]
+    result: Floats = (1.0 - share) * grid[left] + share * grid[left + 1]
     return result

@@ -10,15 +10,35 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..typing import Floats
+from ..unit.gravity import MICRO_G
 from .converter import Converter
-from .drift import ZERO, DriftModel, Triple
+from .drift import ZERO, DriftModel, Effect, Triple
 from .network import ThermalNetwork
+from .streams import Stream, generator
 from .thermometers import ThermometerModel
 
-STANDARD_GRAVITY = 9.80665
-MICRO_G = STANDARD_GRAVITY * 1e-6
+
+@dataclass(frozen=True)
+class SwitchedLoad:
+    """
+    Electronics that are switched on and off for random spells, off at first.
+
+    Parameters
+    ----------
+    part : str
+        Part that is heated.
+    power : float
+        What it dissipates while on, W.
+    spell : tuple of (float, float), optional
+        Shortest and longest spell, s.
+
+    """
+
+    part: str
+    power: float
+    spell: tuple[float, float] = (900.0, 3600.0)
 
 
 @dataclass(frozen=True)
@@ -54,6 +74,12 @@ class UnitModel:
         The converter.
     reference_temperature : float, optional
         Reading of the board's part at which K and bias hold in still air, degC.
+    bias_walk : tuple of float, optional
+        Random walk of the bias per axis within a run, ug per square root of an hour.
+    remounting : tuple of float, optional
+        Standard deviation of the bias per axis from one run to the next, ug.
+    loads : tuple of SwitchedLoad, optional
+        Loads beside the constant powers.
 
     """
 
@@ -69,9 +95,20 @@ class UnitModel:
     noise_density: Triple
     converter: Converter
     reference_temperature: float = 20.0
+    bias_walk: Triple = ZERO
+    remounting: Triple = ZERO
+    loads: tuple[SwitchedLoad, ...] = ()
 
     @property
-    def M(self) -> NDArray[np.float64]:
+    def counts_per_micro_g(self) -> Floats:
+        """
+        What a micro-g is per axis, shape (3,), counts/cycle.
+
+        """
+        return np.array(self.scale_factor) * MICRO_G
+
+    @property
+    def M(self) -> Floats:
         """
         Misalignment matrix, shape (3, 3).
 
@@ -79,7 +116,7 @@ class UnitModel:
         return np.array(self.misalignment)
 
     @property
-    def origin(self) -> NDArray[np.float64]:
+    def origin(self) -> Floats:
         """
         Temperatures of the parts in the still state of the reference, shape (n_parts,), degC.
 
@@ -160,6 +197,51 @@ class UnitModel:
             network = network.stretched(board / now, keep=(node,))
         return replace(self, network=network)
 
+    def sibling(self, seed: int, spread: float = 0.15) -> UnitModel:
+        """
+        Return another unit of the same type: every coefficient and time constant a bit different.
+
+        Parameters
+        ----------
+        seed : int
+            Another sibling for every seed.
+        spread : float, optional
+            Largest relative difference of a coefficient, a width or a heat capacity.
+
+        Returns
+        -------
+        UnitModel
+            The sibling, with constants and misalignment of its own.
+
+        """
+        rng = generator(seed, Stream.SIBLING)
+
+        def near(value: float) -> float:
+            return float(value * (1.0 + spread * rng.uniform(-1.0, 1.0)))
+
+        def changed(effect: Effect) -> Effect:
+            values: dict[str, float | Triple] = {}
+            for name, value in vars(effect).items():
+                if isinstance(value, tuple):
+                    values[name] = near(value[0]), near(value[1]), near(value[2])
+                elif isinstance(value, float) and name != 'exponent':
+                    values[name] = near(value)
+            return replace(effect, **values)  # type: ignore[arg-type]
+
+        capacity = {name: near(value) for name, value in self.network.capacity.items()}
+        K = np.array(self.scale_factor) * (1.0 + 0.005 * rng.standard_normal(3))
+        bias = np.array(self.bias_at_reference) + 200.0 * MICRO_G * K * rng.standard_normal(3)
+        M = self.M + 1e-3 * np.tril(rng.standard_normal((3, 3)), -1)
+        return replace(
+            self,
+            serial=f'{self.serial}-{seed:02d}',
+            network=replace(self.network, capacity=capacity),
+            drift=DriftModel(tuple(changed(effect) for effect in self.drift.effects)),
+            scale_factor=_triple(K),
+            bias_at_reference=_triple(bias),
+            misalignment=(_triple(M[0]), _triple(M[1]), _triple(M[2])),
+        )
+
     def without_noise(self) -> UnitModel:
         """
         Return the unit with no white noise on the axes and the thermometers.
@@ -173,3 +255,8 @@ class UnitModel:
 
         """
         return replace(self, drift=DriftModel())
+
+
+def _triple(values: Floats) -> Triple:
+    x, y, z = values.tolist()
+    return x, y, z

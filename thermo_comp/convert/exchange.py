@@ -20,30 +20,27 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from .calibration import (
+from ..errors import CalibrationError
+from ..typing import Floats
+from ..unit.calibration import (
+    FORMAT_VERSION,
     Axes,
     AxisReference,
     AxisSet,
     Calibration,
-    LinearTerm,
     Provenance,
     RegimeSet,
     Unit,
 )
-from .errors import CalibrationError
-from .functions import Polynomial
-
-Array = npt.NDArray[np.float64]
+from ..unit.functions import Polynomial
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 ARDUPILOT_REFERENCE_C = 35.0
 _ARDUPILOT_SCALE = 1e6
 # ArduPilot's value for a temperature of calibration that was never recorded.
 _NO_TEMPERATURE = -273.0
 _AXES = ('X', 'Y', 'Z')
-_STANDARD_GRAVITY = 9.80665
-_MICRO_G = 1e-6 * _STANDARD_GRAVITY
 _GRID = 257
 _NAME = re.compile(r'\b(TC_A\d_\w+|TC_A_ENABLE|INS_TCAL\d_\w+|INS_ACC\d_CALTEMP)\b')
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
@@ -176,10 +173,10 @@ def import_parameters(
     *,
     serial: str,
     number: int | None = None,
-    gravity: float = _STANDARD_GRAVITY,
+    gravity: float = STANDARD_GRAVITY,
     cycle_time_s: float = 0.005,
-    full_scale: float = 16.0 * _STANDARD_GRAVITY,
-    noise_density: float = 200.0 * _MICRO_G,
+    full_scale: float = 16.0 * STANDARD_GRAVITY,
+    noise_density: float = 200.0 * MICRO_G,
 ) -> Calibration:
     """
     Read PX4 or ArduPilot parameters as a calibration of a unit that speaks m/s^2.
@@ -228,12 +225,11 @@ def import_parameters(
         raise CalibrationError(f'temperature range {edges[0]:g}..{edges[1]:g} degC is empty')
     one = Polynomial((1.0,))
     axes = [
-        AxisSet(Polynomial((0.0, *(float(c) for c in bias[axis, 1:]))), one, 0.0, LinearTerm())
-        for axis in range(3)
+        AxisSet(Polynomial((0.0, *(float(c) for c in bias[axis, 1:]))), one) for axis in range(3)
     ]
     regime = RegimeSet(edges, (-60.0, 60.0), axes[0], axes[1], axes[2])
     return Calibration(
-        format_version=1,
+        format_version=FORMAT_VERSION,
         unit=Unit(serial, 'm/s^2', full_scale, cycle_time_s),
         reference_temperature_c=reference,
         gravity_m_s2=gravity,
@@ -253,7 +249,7 @@ def import_parameters(
 
 def _cubics(
     calibration: Calibration, reference: float, up: tuple[float, float, float] | None
-) -> tuple[Array, list[str]]:
+) -> tuple[Floats, list[str]]:
     """
     Cubic of each axis' offset [m/s^2] about a reference, shape (3, 4), and what it lacks.
 
@@ -287,8 +283,8 @@ def _losses(
     up: tuple[float, float, float] | None,
 ) -> list[str]:
     notes = []
-    if misfit > 0.01 * _MICRO_G:
-        notes.append(f'bias functions replaced by cubics, off by {misfit / _MICRO_G:.2g} ug')
+    if misfit > 0.01 * MICRO_G:
+        notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
     if scale_drift > 1e-8:
         rest = 'folded into the offset at one attitude' if up else 'lost'
         notes.append(f'scale over temperature is {rest}: up to {1e6 * scale_drift:.2g} ppm')
@@ -296,14 +292,11 @@ def _losses(
     worst = float(np.max(np.abs(matrix - np.eye(3))))
     if worst:
         notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
-    terms = {
-        'gradient': any(s.gradient != LinearTerm() for s in _sets(calibration)),
-        'rate': any(s.rate != LinearTerm() for s in _sets(calibration)),
-        'memory': any(any(s.memory.bias + s.memory.scale) for s in _sets(calibration)),
-    }
-    lost = [name for name, is_there in terms.items() if is_there]
+    lost = sorted({term.group for term in calibration.response if any(term.bias + term.scale)})
     if lost:
-        notes.append(f'{", ".join(lost)} terms are lost: heating and cooling read the same')
+        notes.append(
+            f'the thermal response is lost ({", ".join(lost)}): heating and cooling read the same'
+        )
     curves = [
         [(one.delta, one.bias_function, one.scale_function) for one in regime.axes()]
         for regime in calibration.regime_sets()
@@ -313,11 +306,6 @@ def _losses(
     if calibration.unit.input == 'counts':
         notes.append('offsets are counts divided by K: the driver must scale by these K')
     return notes
-
-
-def _sets(calibration: Calibration) -> list[AxisSet]:
-    static, dynamic = calibration.regime_sets()
-    return [*static.axes(), *dynamic.axes()]
 
 
 def _parse(text: str) -> dict[str, float]:
@@ -349,7 +337,7 @@ def _need(values: dict[str, float], name: str) -> float:
 
 def _read_px4(
     values: dict[str, float], number: int
-) -> tuple[Array, float, tuple[float, float], str]:
+) -> tuple[Floats, float, tuple[float, float], str]:
     prefix = f'TC_A{number}_'
     if values.get('TC_A_ENABLE', 1.0) != 1.0:
         raise CalibrationError('is 0: the set is not in use', key='TC_A_ENABLE')
@@ -362,7 +350,7 @@ def _read_px4(
 
 def _read_ardupilot(
     values: dict[str, float], number: int
-) -> tuple[Array, float, tuple[float, float], str]:
+) -> tuple[Floats, float, tuple[float, float], str]:
     prefix = f'INS_TCAL{number}_'
     if _need(values, f'{prefix}ENABLE') != 1.0:
         raise CalibrationError('is not 1: the set is not in use', key=f'{prefix}ENABLE')

@@ -14,13 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-
-#: One micro-g: a unit of accelerometer errors, from the conventional 9.80665 m/s^2.
-MICRO_G = 9.80665e-6
+from ..typing import Bools, Floats
+from .gravity import MICRO_G
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,7 @@ class ResidualStatistics:
         return self.scaled(1.0 / MICRO_G)
 
 
-def residual_statistics(residual: Array) -> ResidualStatistics:
+def residual_statistics(residual: Floats) -> ResidualStatistics:
     """
     Summarise residuals; those that are not finite are left out.
 
@@ -93,7 +89,7 @@ def residual_statistics(residual: Array) -> ResidualStatistics:
     )
 
 
-def norm_residual(specific_force: Array, gravity: float) -> Array:
+def norm_residual(specific_force: Floats, gravity: float) -> Floats:
     """
     Form ``|f| - g``, the residual that needs no attitude.
 
@@ -114,7 +110,7 @@ def norm_residual(specific_force: Array, gravity: float) -> Array:
     return np.asarray(np.sqrt(np.einsum('...i,...i->...', force, force)) - gravity)
 
 
-def statistics_by_regime(residual: Array, is_dynamic: BoolArray) -> dict[str, ResidualStatistics]:
+def statistics_by_regime(residual: Floats, is_dynamic: Bools) -> dict[str, ResidualStatistics]:
     """
     Summarise residuals over the static sections, the dynamic ones and all together.
 

@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from .regime import Regime
+from ..thermal.regime import Regime
+from .compensator import Compensator
 from .status import CompensatorStatus
-
-if TYPE_CHECKING:
-    from .compensator import Compensator
 
 #: The board temperature is called stale beyond this many of its usual intervals.
 STALE_INTERVALS = 5.0
@@ -23,7 +20,7 @@ STALE_INTERVALS = 5.0
 SHORTEST_STALE_S = 0.5
 
 
-def snapshot(compensator: Compensator) -> CompensatorStatus:
+def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     """
     Say how a compensator stands at the stamp of its last sample.
 

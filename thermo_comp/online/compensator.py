@@ -23,21 +23,22 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from .batch import SEGMENT_NS, TIME_JUMP_NS, process_block
-from .blocks import AccelBlock, CompensatedBlock
-from .calibration import Calibration
-from .correction import Correction
+from ..thermal.reading_queue import ReadingQueue
+from ..thermal.regime import Regime
+from ..thermal.settings import ThermalConfig
+from ..thermal.tracker import ThermalTracker
+from ..unit.calibration import Calibration
+from ..unit.correction import Correction
 from .health import GravityMonitor
-from .reading_queue import ReadingQueue
-from .regime import Regime
 from .sample_guard import RateWatch, StuckWatch
-from .settings import ThermalConfig
-from .snapshot import snapshot
-from .status import CompensatorConfig, CompensatorStatus, Counters
-from .thermal import ThermalTracker
+from .status import CompensatorConfig, Counters
 
 #: Samples this much faster than calibrated, relative, still have the calibrated noise.
 RATE_TOLERANCE: Final = 0.1
+#: Longest time over which bias and scale are taken as linear in time.
+SEGMENT_NS: Final = 1_000_000_000
+#: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
+TIME_JUMP_NS: Final = 1_000_000_000
 #: Earlier than any stamp.
 _EVER_NS: Final = -(1 << 62)
 
@@ -372,17 +373,6 @@ class Compensator:
         flags, self._flags = self._flags, []
         return flags
 
-    def process_block(self, block: AccelBlock) -> CompensatedBlock:
-        """
-        Correct a block, e.g. a `recording.Block`, with the bits that `process` gives one by one.
-
-        Flags wait in `take_flags`, counts in `counters`.
-
-        """
-        result = process_block(self, block)
-        self._event_ns = _EVER_NS
-        return result
-
     @property
     def is_refusing(self) -> bool:
         """
@@ -400,6 +390,7 @@ class Compensator:
         Take the readings that no sample has reached: (stamp, kind, order, degC).
 
         """
+        self._event_ns = _EVER_NS
         return self._queue.take()
 
     def flush(self, stamp_ns: int) -> None:
@@ -486,14 +477,6 @@ class Compensator:
         self._forget_samples()
         self._segment_key = None
         self.last_ns = self._event_ns = _EVER_NS
-
-    @property
-    def status(self) -> CompensatorStatus:
-        """
-        Snapshot of what is going on, at the last sample's stamp.
-
-        """
-        return snapshot(self)
 
 
 def _timeout_ns(config: CompensatorConfig) -> int:

@@ -1,59 +1,51 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the thermal state of a unit at any stamp: two thermometers, regime, memory, cross-over.
+Owns the thermal state of a unit at any stamp: its thermometers, regime, memory, cross-over.
 
 The compensator, the fit and the report all run this one class, so a regressor means the same
 when it is fitted as when it is applied. It is causal and has no clock: readings go in by stamp,
-a state comes out for a stamp.
-
-Thermal memory: the lag of the board temperature obeys ``dL/dt = (T - L) / tau``. Kept here is
-``m = T - L`` itself; with T linear between two readings (first-order hold) its exact step over
-dt is ``m' = m e + (T' - T) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
+a state comes out for a stamp. What it remembers is `memory`'s.
 
 """
 
 from __future__ import annotations
 
-import math
+from math import sqrt
 from typing import Final
 
+from .memory import BOARD_INPUT, MemorySpec, ThermalMemory, start_covariance
 from .plausibility import Fault, LeadWatch, SensorGuard
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
-from .status import ThermalState
+from .state import (
+    BOARD,
+    GRADIENT,
+    RATE,
+    VAR_BOARD,
+    VAR_GRADIENT,
+    WEIGHT,
+    Layout,
+    ThermalState,
+)
 from .thermometer import Thermometer
 
-#: A unit that starts in the middle of a ramp has a memory that nobody saw: its sd then [K].
-MEMORY_START_SD: Final = 3.0
-#: While the case sensor is lost the gradient is guessed from the board's rate, this well.
+#: While a sensor is lost its gradient is guessed from the board's rate, this well.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: A regime that no sensor has watched for this part of a thermal lag is not known any more.
 UNWATCHED_SHARE: Final = 0.25
 
-#: Layout of `ThermalTracker.sample`; the memory values follow as pairs (value, variance).
-(
-    BOARD,
-    VAR_BOARD,
-    RATE,
-    GRADIENT,
-    VAR_GRADIENT,
-    WEIGHT,
-    UNKNOWN,
-    MEMORY,
-) = range(8)
-
 
 class ThermalTracker:
     """
-    Thermal state from stamped readings of the board and the case thermometer.
+    Thermal state from stamped readings of the board and of the thermometers beside it.
 
     Parameters
     ----------
     detector : DetectorSettings
         Thermometers and detector, as the coefficient sets were fitted under.
-    memory_time_constants_s : tuple of float, optional
-        Time constants of the lags of the board temperature [s].
+    memory : MemorySpec, optional
+        The sensors by name, and what is remembered of them.
     config : ThermalConfig, optional
         Cross-over, time-out and stand-in.
 
@@ -62,18 +54,27 @@ class ThermalTracker:
     def __init__(
         self,
         detector: DetectorSettings,
-        memory_time_constants_s: tuple[float, ...] = (),
+        memory: MemorySpec | None = None,
         config: ThermalConfig | None = None,
     ) -> None:
         self.settings = detector
-        self.memory_time_constants_s = memory_time_constants_s
+        self.spec = memory or MemorySpec()
         self._configure(config or ThermalConfig())
         self.board = Thermometer(detector.board)
-        self.case = Thermometer(detector.case)
+        #: The thermometers beside the board; the first, which is the case's, leads.
+        self.sensors = [Thermometer(detector.case) for _ in self.spec.sensors]
+        self.case = self.sensors[0]
         self.detector = RegimeDetector(detector)
-        self.board_guard = SensorGuard(self.board, self.case, self.config.board_lag_s)
-        self.case_guard = SensorGuard(self.case, self.board, 0.0)
+        self._board_guard = SensorGuard(self.board, self.case, self.config.board_lag_s)
+        self._guards = [SensorGuard(sensor, self.board, 0.0) for sensor in self.sensors]
+        #: What is wrong with each thermometer, by name.
+        self.guards = {
+            BOARD_INPUT: self._board_guard,
+            **dict(zip(self.spec.sensors, self._guards, strict=True)),
+        }
         self.lead = LeadWatch(self.case, self.board, detector.relaxed_rate_k_min)
+        self.memory = ThermalMemory(self.spec)
+        self._places = {name: k for k, name in enumerate(self.spec.sensors)}
         self._clear()
 
     def _configure(self, config: ThermalConfig) -> None:
@@ -87,9 +88,6 @@ class ThermalTracker:
         self.updated_ns: int | None = None
         self._decided_ns: int | None = None
         self._is_doubted = False
-        self._memory: list[float] = []
-        self._var_memory: list[float] = []
-        self._forget_memory()
         self._weight = 0.0
         self._weight_ns = 0
         self._target = 0.0
@@ -100,11 +98,13 @@ class ThermalTracker:
 
         """
         self.board.reset()
-        self.case.reset()
+        for sensor in self.sensors:
+            sensor.reset()
+        for guard in self.guards.values():
+            guard.reset()
         self.detector.reset()
-        self.board_guard.reset()
-        self.case_guard.reset()
         self.lead.reset()
+        self.memory.forget()
         self._clear()
 
     def reconfigure(self, config: ThermalConfig, stamp_ns: int | None) -> None:
@@ -116,22 +116,24 @@ class ThermalTracker:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self._configure(config)
-        self.board_guard.lag_s = config.board_lag_s
+        self._board_guard.lag_s = config.board_lag_s
 
-    def is_case_live(self, stamp_ns: int) -> bool:
+    def is_live(self, stamp_ns: int, place: int = 0) -> bool:
         """
-        Whether the case temperature is there and fresh enough at a stamp.
+        Whether a sensor, the leading one by default, is there and fresh enough at a stamp.
 
         """
-        seen = self.case.stamp_ns
+        seen = self.sensors[place].stamp_ns
         return seen is not None and (stamp_ns - seen) * 1e-9 <= self._case_timeout_s
 
-    def board_reading(self, stamp_ns: int, celsius: float) -> bool:
+    def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
         """
-        Take one reading of the board thermometer.
+        Take one reading.
 
         Parameters
         ----------
+        name : str
+            ``'board'``, or the name of a sensor; one of the leading sensor decides the regime.
         stamp_ns : int
             Its stamp.
         celsius : float
@@ -144,7 +146,12 @@ class ThermalTracker:
             last, an outlier, or not plausible.
 
         """
-        board, guard = self.board, self.board_guard
+        if name == BOARD_INPUT:
+            return self._read_board(stamp_ns, celsius)
+        return self._read_sensor(self._places[name], stamp_ns, celsius)
+
+    def _read_board(self, stamp_ns: int, celsius: float) -> bool:
+        board, guard = self.board, self._board_guard
         before_ns, before, n_restarts = board.stamp_ns, board.temperature, board.n_restarts
         is_anew = False
         if not guard.admits(stamp_ns, celsius):
@@ -156,43 +163,39 @@ class ThermalTracker:
             board.reset()
         if not board.update(stamp_ns, celsius):
             return False
+        memory = self.memory
         if before_ns is not None:
-            dt = (stamp_ns - before_ns) * 1e-9
-            change = board.temperature - before
             has_restarted = board.n_restarts != n_restarts
-            is_gap = has_restarted and dt > self.settings.board.lag_s
+            is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > self.settings.board.lag_s
             if is_anew or is_gap:
-                self._forget_memory()
-            elif self._memory:
-                self._step_memory(dt, change)
+                memory.forget()
             if is_anew or guard.is_revived or (has_restarted and not is_gap):
+                change = board.temperature - before
                 guard.note_jump(stamp_ns, change)
-                self._var_memory = [value + change * change for value in self._var_memory]
-        self.case_guard.watch_other()
+                memory.note_jump(change)
+        if not memory.is_empty:
+            memory.board_step(stamp_ns, board.temperature)
+            self._guess_gradients(stamp_ns)
+        for other in self._guards:
+            other.watch_other()
         self._note(stamp_ns)
-        if not self.is_case_live(stamp_ns):
+        if not self.is_live(stamp_ns):
             self._decide(stamp_ns, None)
         return True
 
-    def case_reading(self, stamp_ns: int, celsius: float) -> bool:
+    def _guess_gradients(self, stamp_ns: int) -> None:
         """
-        Take one reading of the case thermometer and decide the regime.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Its stamp.
-        celsius : float
-            The reading [degC].
-
-        Returns
-        -------
-        bool
-            Whether the reading was used.
+        Let the lags of a gradient go on while its sensor is lost.
 
         """
-        case, guard = self.case, self.case_guard
-        before_ns, before, n_restarts = case.stamp_ns, case.temperature, case.n_restarts
+        for place, bank in enumerate(self.memory.neighbours):
+            if bank.taus and bank.stamp_ns is not None and not self.is_live(stamp_ns, place):
+                gradient, variance = self._lost_gradient(stamp_ns, self.board.rate)
+                bank.step(stamp_ns, gradient, sqrt(variance))
+
+    def _read_sensor(self, place: int, stamp_ns: int, celsius: float) -> bool:
+        sensor, guard = self.sensors[place], self._guards[place]
+        before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         is_anew = False
         if not guard.admits(stamp_ns, celsius):
             self._is_doubted = True
@@ -201,20 +204,26 @@ class ThermalTracker:
             is_anew = True
         is_anew = is_anew or guard.is_revived
         if is_anew:
-            case.reset()
-        if not case.update(stamp_ns, celsius):
+            sensor.reset()
+        if not sensor.update(stamp_ns, celsius):
             return False
-        if before_ns is not None and (is_anew or case.n_restarts != n_restarts):
+        bank = self.memory.neighbours[place]
+        if before_ns is not None and (is_anew or sensor.n_restarts != n_restarts):
             is_gap = (stamp_ns - before_ns) * 1e-9 > self.settings.case.lag_s
             if is_anew or not is_gap:
-                guard.note_jump(stamp_ns, case.temperature - before)
-        self.board_guard.watch_other()
+                change = sensor.temperature - before
+                guard.note_jump(stamp_ns, change)
+                bank.note_jump(change)
+        if bank.taus and self.board.stamp_ns is not None:
+            bank.step(stamp_ns, sensor.temperature - self.board.at(stamp_ns)[0])
         self._note(stamp_ns)
-        detector = self.detector
-        if guard.fault is not Fault.STILL or detector.regime is not Regime.DYNAMIC:
-            # One that stands still does not tell that a ramp has ended.
-            self._decide(stamp_ns, case)
-        self.lead.update(detector.regime is Regime.STATIC)
+        if place == 0:
+            self._board_guard.watch_other()
+            detector = self.detector
+            if guard.fault is not Fault.STILL or detector.regime is not Regime.DYNAMIC:
+                # One that stands still does not tell that a ramp has ended.
+                self._decide(stamp_ns, sensor)
+            self.lead.update(detector.regime is Regime.STATIC)
         return True
 
     @staticmethod
@@ -234,12 +243,12 @@ class ThermalTracker:
     def _note(self, stamp_ns: int) -> None:
         if self.updated_ns is None or stamp_ns > self.updated_ns:
             self.updated_ns = stamp_ns
-        self._is_doubted = (
-            self.board_guard.is_doubtful
-            or self.case_guard.is_doubtful
-            or self.lead.is_reversed
-            or self.lead.doubt > 0.0
+        is_doubted = (
+            self._board_guard.is_doubtful or self.lead.is_reversed or self.lead.doubt > 0.0
         )
+        for guard in self._guards:
+            is_doubted = is_doubted or guard.is_doubtful
+        self._is_doubted = is_doubted
 
     def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
         board = self.board if self.board.stamp_ns is not None else None
@@ -258,21 +267,6 @@ class ThermalTracker:
     def _is_unwatched(self, decided_ns: int, stamp_ns: int) -> bool:
         return (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s
 
-    def _forget_memory(self) -> None:
-        n_lags = len(self.memory_time_constants_s)
-        self._memory = [0.0] * n_lags
-        self._var_memory = [MEMORY_START_SD**2] * n_lags
-
-    def _step_memory(self, dt: float, change: float) -> None:
-        for k, tau in enumerate(self.memory_time_constants_s):
-            e = math.exp(-dt / tau)
-            self._memory[k] = self._memory[k] * e + change * (tau / dt) * (1.0 - e)
-            variance = self._var_memory[k] * e * e
-            if dt > 0.1 * tau:
-                # Nobody saw the way between two readings this far apart.
-                variance += (change * (1.0 - e)) ** 2
-            self._var_memory[k] = variance
-
     def weight_at(self, stamp_ns: int) -> float:
         """
         Weight of the dynamic set at a stamp, moving linearly over the transition time.
@@ -290,7 +284,7 @@ class ThermalTracker:
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
-        Thermal state at a stamp as a flat tuple, in the layout of `BOARD` .. `MEMORY`.
+        Thermal state at a stamp as a flat tuple, in the layout of `BOARD` .. `VAR_GRADIENT`.
 
         Parameters
         ----------
@@ -300,40 +294,49 @@ class ThermalTracker:
         Returns
         -------
         tuple of float
-            Board temperature [degC], its variance [K^2], its rate [K/s], gradient [K], variance
-            of the gradient from the case side [K^2], weight, 1.0 while the regime is unknown,
-            then (memory [K], variance [K^2]) per time constant.
+            Board temperature [degC], its variance [K^2], its rate [K/s], weight, 1.0 while the
+            regime is unknown; (gradient [K], variance from the sensor's side [K^2]) per sensor;
+            (lag [K], variance beyond that of its start [K^2]) per lag: ``T - L`` of the board, L
+            of a gradient; play less its input [K] per play.
 
         """
         board, rate, var_board = self.board.at(stamp_ns)
-        if self.is_case_live(stamp_ns):
-            case, _, var_gradient = self.case.at(stamp_ns)
-            gradient = case - board
-        else:
-            gradient, var_gradient = self._lost_gradient(stamp_ns, rate)
-        if self._is_doubted:
-            var_board += self.board_guard.doubt(stamp_ns)
-            var_gradient += self.case_guard.doubt(stamp_ns)
-            if self.lead.is_reversed:
-                # What is called the case may be the board.
-                var_board += gradient * gradient
-            else:
-                var_board += self.lead.doubt
         decided_ns = self._decided_ns
         is_known = (
             decided_ns is not None
             and self.detector.regime is not Regime.UNKNOWN
             and (stamp_ns - decided_ns) * 1e-9 <= self._unwatched_s
         )
-        unknown = 0.0 if is_known else 1.0
-        state = (board, var_board, rate, gradient, var_gradient, self.weight_at(stamp_ns), unknown)
-        if not self._memory:
-            return state
-        return state + self._memory_at(stamp_ns, board)
+        state = [board, var_board, rate, self.weight_at(stamp_ns), 0.0 if is_known else 1.0]
+        gradients = []
+        for place, sensor in enumerate(self.sensors):
+            if self.is_live(stamp_ns, place):
+                celsius, _, variance = sensor.at(stamp_ns)
+                gradient = celsius - board
+            else:
+                gradient, variance = self._lost_gradient(stamp_ns, rate)
+            gradients.append(gradient)
+            state.append(gradient)
+            state.append(variance)
+        if self._is_doubted:
+            self._add_doubt(stamp_ns, state)
+        if not self.memory.is_empty:
+            state += self.memory.at(stamp_ns, board, gradients)
+        return tuple(state)
+
+    def _add_doubt(self, stamp_ns: int, state: list[float]) -> None:
+        state[VAR_BOARD] += self._board_guard.doubt(stamp_ns)
+        for place, guard in enumerate(self._guards):
+            state[VAR_GRADIENT + 2 * place] += guard.doubt(stamp_ns)
+        if self.lead.is_reversed:
+            # What is called the case may be the board.
+            state[VAR_BOARD] += state[GRADIENT] * state[GRADIENT]
+        else:
+            state[VAR_BOARD] += self.lead.doubt
 
     def _lost_gradient(self, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
-        Guess the gradient from the board's rate, while the case sensor is lost.
+        Guess a gradient from the board's rate, while its sensor is lost.
 
         """
         lag = self.config.board_lag_s
@@ -346,19 +349,6 @@ class ThermalTracker:
             + unseen * unseen
         )
         return gradient, variance
-
-    def _memory_at(self, stamp_ns: int, board: float) -> tuple[float, ...]:
-        dt = (stamp_ns - (self.board.stamp_ns or 0)) * 1e-9
-        change = board - self.board.temperature
-        result: tuple[float, ...] = ()
-        for k, tau in enumerate(self.memory_time_constants_s):
-            value, variance = self._memory[k], self._var_memory[k]
-            if dt > 0.0:
-                e = math.exp(-dt / tau)
-                value = value * e + change * (tau / dt) * (1.0 - e)
-                variance = variance * e * e
-            result += (value, variance)
-        return result
 
     def state_at(self, stamp_ns: int) -> ThermalState:
         """
@@ -383,15 +373,26 @@ class ThermalTracker:
         if self.board.stamp_ns is None:
             raise ValueError('`state_at` needs a board temperature first')
         flat = self.sample(stamp_ns)
+        layout = Layout(self.spec)
+        lags = flat[layout.first_lag : layout.first_play : 2]
+        extra = flat[layout.first_lag + 1 : layout.first_play : 2]
+        gradients = flat[GRADIENT : layout.first_lag : 2]
+        variances = flat[VAR_GRADIENT : layout.first_lag : 2]
+        start = start_covariance(self.spec.lags).diagonal().tolist()
+        shares = self.memory.start_shares(stamp_ns)
         return ThermalState(
             board=flat[BOARD],
             var_board=flat[VAR_BOARD],
             rate=flat[RATE],
-            gradient=flat[GRADIENT],
-            var_gradient=flat[VAR_GRADIENT],
+            gradients=dict(zip(self.spec.sensors, gradients, strict=True)),
+            var_gradients=dict(zip(self.spec.sensors, variances, strict=True)),
             weight=flat[WEIGHT],
             regime=self.detector.regime,
             direction=self.detector.direction,
-            memory=flat[MEMORY::2],
-            var_memory=flat[MEMORY + 1 :: 2],
+            lags=lags,
+            var_lags=tuple(
+                variance * share * share + more
+                for variance, share, more in zip(start, shares, extra, strict=True)
+            ),
+            plays=flat[layout.first_play :],
         )

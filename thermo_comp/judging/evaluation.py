@@ -16,20 +16,18 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from .calibration import Calibration
-from .compensator import Compensator
-from .errors import RecordingError
-from .fitting.stillness import CellAccumulator, Cells, still_intervals
-from .metrics import MICRO_G, ResidualStatistics, norm_residual, statistics_by_regime
-from .recording import Block, Input, RecordingInfo, Topics, open_recording
-from .replay import check_unit, input_for
-from .status import CompensatorConfig, Counters
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from ..errors import RecordingError
+from ..fitting.stillness import CellAccumulator, Cells, still_intervals
+from ..online.batch import process_block
+from ..online.compensator import Compensator
+from ..online.status import CompensatorConfig, Counters
+from ..recording import Block, Input, RecordingInfo, Topics, open_recording
+from ..replay import check_unit, input_for
+from ..typing import Bools, Floats, Ints
+from ..unit.calibration import Calibration
+from ..unit.gravity import MICRO_G
+from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 
 #: Name of the column without thermal correction.
 RAW = 'raw'
@@ -79,11 +77,11 @@ class Evaluation:
     gravity: float
     window_s: float
     start_ns: int
-    time: Array
-    is_dynamic: BoolArray
-    board: Array
-    residuals: dict[str, Array]
-    claimed_sd: Array
+    time: Floats
+    is_dynamic: Bools
+    board: Floats
+    residuals: dict[str, Floats]
+    claimed_sd: Floats
     statistics: dict[str, dict[str, ResidualStatistics]]
     counters: dict[str, Counters]
     findings: tuple[str, ...]
@@ -164,7 +162,7 @@ def evaluate(
         cells, flags, board = _run(models, reader.blocks(), total, judged, progress)
     windows = _common_windows(models, cells, window_s, str(path))
     first = models[calibrations[0][0]]
-    time: Array = np.asarray((windows + 0.5) * window_s, dtype=np.float64)
+    time: Floats = np.asarray((windows + 0.5) * window_s, dtype=np.float64)
     is_dynamic = _regime_at(flags, first.start_ns, time)
     residuals = {
         name: norm_residual(model.mean(windows), gravity) for name, model in models.items()
@@ -258,25 +256,25 @@ class _Model:
     calibration: Calibration
     window_s: float
     start_ns: int = 0
-    _ids: list[IntArray] = field(default_factory=list)
-    _sums: list[Array] = field(default_factory=list)
+    _ids: list[Ints] = field(default_factory=list)
+    _sums: list[Floats] = field(default_factory=list)
 
     def add(self, block: Block) -> list[tuple[int, bool]]:
         if self.compensator is None:
             self._sum(block.accel_stamp_ns, self._constant(block.accel), None)
             return []
-        corrected = self.compensator.process_block(block)
+        corrected = process_block(self.compensator, block)
         self._sum(corrected.stamp_ns, corrected.specific_force, corrected.covariance)
         return self.compensator.take_flags()
 
-    def _constant(self, samples: Array) -> Array:
+    def _constant(self, samples: Floats) -> Floats:
         axes = (self.calibration.axes.x, self.calibration.axes.y, self.calibration.axes.z)
         bias = np.array([axis.bias for axis in axes])
         K = np.array([axis.scale_factor for axis in axes])
         M = np.array(self.calibration.misalignment)
         return np.asarray((samples - bias) / K @ M.T)
 
-    def _sum(self, stamp_ns: IntArray, force: Array, covariance: Array | None) -> None:
+    def _sum(self, stamp_ns: Ints, force: Floats, covariance: Floats | None) -> None:
         if not len(stamp_ns):
             return
         ids = (stamp_ns - self.start_ns) // round(self.window_s * 1e9)
@@ -297,18 +295,18 @@ class _Model:
         self._ids, self._sums = [unique], [total]
 
     @property
-    def windows(self) -> tuple[IntArray, Array]:
+    def windows(self) -> tuple[Ints, Floats]:
         return self._ids[0], self._sums[0]
 
-    def _rows(self, windows: IntArray) -> Array:
+    def _rows(self, windows: Ints) -> Floats:
         ids, sums = self.windows
         return sums[np.searchsorted(ids, windows)]
 
-    def mean(self, windows: IntArray) -> Array:
+    def mean(self, windows: Ints) -> Floats:
         rows = self._rows(windows)
         return rows[:, 1:4] / rows[:, :1]
 
-    def claimed_sd(self, windows: IntArray, calibration: Calibration) -> Array:
+    def claimed_sd(self, windows: Ints, calibration: Calibration) -> Floats:
         """
         Project the published covariance on the mean force, its white part averaged down.
 
@@ -329,10 +327,10 @@ def _run(
     total: int,
     judged: Calibration,
     progress: Callable[[float], None] | None,
-) -> tuple[Cells, list[tuple[int, bool]], list[tuple[IntArray, Array]]]:
+) -> tuple[Cells, list[tuple[int, bool]], list[tuple[Ints, Floats]]]:
     cells = CellAccumulator(_CELL_S, judged.unit.full_scale)
     flags: list[tuple[int, bool]] = []
-    board: list[tuple[IntArray, Array]] = []
+    board: list[tuple[Ints, Floats]] = []
     n_read = 0
     for block in blocks:
         if n_read == 0 and len(block):
@@ -354,14 +352,12 @@ def _run(
     return cells.finish(), flags, board
 
 
-def _common_windows(
-    models: dict[str, _Model], cells: Cells, window_s: float, path: str
-) -> IntArray:
+def _common_windows(models: dict[str, _Model], cells: Cells, window_s: float, path: str) -> Ints:
     """
     Find the windows that lie at rest as a whole and are full in every model.
 
     """
-    common: IntArray = models[RAW].windows[0]
+    common: Ints = models[RAW].windows[0]
     for model in models.values():
         ids, sums = model.windows
         full = ids[sums[:, 0] >= 0.9 * np.median(sums[:, 0])] if len(ids) else ids
@@ -380,7 +376,7 @@ def _common_windows(
     return common[at_rest]
 
 
-def _regime_at(flags: list[tuple[int, bool]], start_ns: int, time: Array) -> BoolArray:
+def _regime_at(flags: list[tuple[int, bool]], start_ns: int, time: Floats) -> Bools:
     if not flags:
         return np.zeros(len(time), dtype=np.bool_)
     stamps = (np.array([stamp for stamp, _ in flags], dtype=np.int64) - start_ns) * 1e-9
@@ -390,8 +386,8 @@ def _regime_at(flags: list[tuple[int, bool]], start_ns: int, time: Array) -> Boo
 
 
 def _nearest(
-    readings: list[tuple[IntArray, Array]], start_ns: int, time: Array, window_s: float
-) -> Array:
+    readings: list[tuple[Ints, Floats]], start_ns: int, time: Floats, window_s: float
+) -> Floats:
     stamps = np.concatenate([stamp for stamp, _ in readings])
     values = np.concatenate([value for _, value in readings])
     use = np.isfinite(values)
@@ -412,7 +408,7 @@ def _findings(
     judged: Calibration,
     statistics: dict[str, dict[str, ResidualStatistics]],
     name: str,
-    claimed_sd: Array,
+    claimed_sd: Floats,
 ) -> tuple[str, ...]:
     findings = []
     noise = float(np.sqrt(np.mean(claimed_sd**2)))
@@ -435,7 +431,7 @@ def _findings(
     return tuple(findings)
 
 
-def _notes(judged: Calibration, board: Array) -> tuple[str, ...]:
+def _notes(judged: Calibration, board: Floats) -> tuple[str, ...]:
     notes = []
     ranges = (judged.static.temperature_range_c, judged.dynamic.temperature_range_c)
     lower, upper = min(low for low, _ in ranges), max(high for _, high in ranges)

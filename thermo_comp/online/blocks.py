@@ -8,13 +8,9 @@ Owns the shape of a batch: columns in file order in, columns of published sample
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
-Floats: TypeAlias = npt.NDArray[np.float64]
-Stamps: TypeAlias = npt.NDArray[np.int64]
+from ..typing import Floats, Ints, Stamps
 
 
 class AccelBlock(Protocol):
@@ -90,7 +86,7 @@ class CompensatedBlock:
     """
 
     #: Which samples of the block these are, shape (n,).
-    index: npt.NDArray[np.int64]
+    index: Ints
     stamp_ns: Stamps
     #: [m/s^2], shape (n, 3).
     specific_force: Floats

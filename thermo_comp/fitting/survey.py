@@ -12,13 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from .fitting.stillness import CellAccumulator, still_intervals
-from .recording import RecordingInfo, Topics, open_recording
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from ..recording import RecordingInfo, Topics, open_recording
+from ..typing import Floats, Ints
+from .stillness import CellAccumulator, still_intervals
 
 # What a fit asks of one unit's bags together; below the first it refuses.
 HARD_SPAN_K, ADVISED_SPAN_K = 10.0, 25.0
@@ -248,7 +245,7 @@ class _Stamps:
         self._first_ns: int | None = None
         self._last_ns = 0
 
-    def add(self, stamp_ns: IntArray) -> None:
+    def add(self, stamp_ns: Ints) -> None:
         if not len(stamp_ns):
             return
         if self._first_ns is None:
@@ -280,10 +277,10 @@ class _Readings:
     """
 
     def __init__(self) -> None:
-        self._stamp_ns: list[IntArray] = []
-        self._celsius: list[Array] = []
+        self._stamp_ns: list[Ints] = []
+        self._celsius: list[Floats] = []
 
-    def add(self, stamp_ns: IntArray, celsius: Array) -> None:
+    def add(self, stamp_ns: Ints, celsius: Floats) -> None:
         self._stamp_ns.append(stamp_ns)
         self._celsius.append(celsius)
 

@@ -21,11 +21,11 @@ from functools import cached_property
 from typing import Literal, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ..typing import Floats
+
 #: One float, or an array of them: what every evaluation here maps onto itself.
-Number = TypeVar('Number', float, Array)
+Number = TypeVar('Number', float, Floats)
 
 
 def hold(value: Number, lower: float, upper: float) -> Number:

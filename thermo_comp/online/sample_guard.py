@@ -13,12 +13,11 @@ come at another rate are of another scale, whatever else they are.
 from __future__ import annotations
 
 from math import nan
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-Mask: TypeAlias = npt.NDArray[np.bool_]
+from ..typing import Bools, Floats, Ints
 
 #: Fewer equal samples in a row than this are chance, however far they lie apart.
 STUCK_SAMPLES: Final = 50
@@ -77,7 +76,7 @@ class StuckWatch:
         self.n_same += 1
         return self.n_same >= STUCK_SAMPLES and stamp_ns - self.run[3] > self.limit_ns
 
-    def find(self, stamps: npt.NDArray[np.int64], samples: npt.NDArray[np.float64]) -> Mask | None:
+    def find(self, stamps: Ints, samples: Floats) -> Bools | None:
         """
         Find the samples of a batch that the stream would call stuck.
 
@@ -107,16 +106,14 @@ class StuckWatch:
         found[:STUCK_SAMPLES] = head
         return found
 
-    def _find(
-        self, stamps: npt.NDArray[np.int64], samples: npt.NDArray[np.float64]
-    ) -> Mask | None:
+    def _find(self, stamps: Ints, samples: Floats) -> Bools | None:
         x, y, z = samples.T
         same = np.empty(len(stamps), dtype=bool)
         same[0] = (x[0], y[0], z[0]) == self.run[:3]
         np.equal(x[1:], x[:-1], out=same[1:])
         same[1:] &= y[1:] == y[:-1]
         same[1:] &= z[1:] == z[:-1]
-        found: Mask | None = None
+        found: Bools | None = None
         row = np.arange(len(stamps))
         changed = np.flatnonzero(~same)
         if (
@@ -139,7 +136,7 @@ class StuckWatch:
         return found
 
 
-def _may_stand_still(samples: npt.NDArray[np.float64]) -> bool:
+def _may_stand_still(samples: Floats) -> bool:
     """
     Look at a few samples whether `STUCK_SAMPLES` in a row may be equal anywhere.
 

@@ -11,9 +11,9 @@ import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from .errors import FitError
-from .fitting import FitSource
-from .recording import Block, Input, Topics, open_recording
+from ..errors import FitError
+from ..recording import Block, Input, Topics, open_recording
+from . import FitSource
 
 
 def fit_sources(

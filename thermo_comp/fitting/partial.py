@@ -16,8 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import FitError
-from .fitting.one_pose import (
+from ..errors import FitError
+from ..recording import Block, Input, Topics, open_recording
+from ..recording.columns import Role
+from .one_pose import (
     BranchFit,
     Pose,
     PoseOptions,
@@ -25,12 +27,10 @@ from .fitting.one_pose import (
     fit_whole,
     read_pose,
 )
-from .fitting.reduction import ReducedBag, reduce_source
-from .fitting.rests import ONE_ATTITUDE_DEG, attitudes_apart
-from .fitting.sources import FitSource
-from .fitting.triad import TriadFit, fit_triad
-from .recording import Block, Input, Topics, open_recording
-from .recording.columns import Role
+from .reduction import ReducedBag, reduce_source
+from .rests import ONE_ATTITUDE_DEG, attitudes_apart
+from .sources import FitSource
+from .triad import TriadFit, fit_triad
 
 # A hand holds still for seconds only.
 _WINDOW_S, _CELL_S, _MIN_STILL_S = 1.0, 0.5, 2.0

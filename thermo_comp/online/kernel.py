@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .blocks import Floats, Stamps
+from ..typing import Floats, Ints, Stamps
 
 try:
-    from ._kernel import correct as _correct_in_c
+    from .._kernel import correct as _correct_in_c
 except ImportError:
     _correct_in_c = None  # type: ignore[assignment]
 
-Ints = npt.NDArray[np.int64]
 
 #: Samples corrected at a time.
 PIECE = 12288

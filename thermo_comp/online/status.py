@@ -8,11 +8,10 @@ Owns what surrounds the compensator's arithmetic: its settings, its counters, it
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
-from .plausibility import Fault
-from .regime import Regime
-from .settings import ThermalConfig, refuse_outside
+from ..thermal.plausibility import Fault
+from ..thermal.settings import ThermalConfig, refuse_outside
+from ..thermal.state import ThermalState
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,6 @@ class CompensatorConfig:
         ThermalConfig(self.transition_time_s, self.case_timeout_s)
 
 
-#: A memory is called settled when its start-up uncertainty is below this [K].
-MEMORY_SETTLED_SD: Final = 0.05
 #: The counters of samples that came in and did not go out.
 DROPPED = (
     'n_not_finite',
@@ -126,38 +123,6 @@ class Counters:
 
         """
         return self.n_out + self.n_dropped
-
-
-@dataclass(frozen=True, slots=True)
-class ThermalState:
-    """
-    The thermal state at one stamp.
-
-    """
-
-    #: Board temperature [degC], its variance [K^2] and its rate [K/s].
-    board: float
-    var_board: float
-    rate: float
-    #: T_case - T_board [K] and the part of its variance that does not come from the board.
-    gradient: float
-    var_gradient: float
-    #: Weight of the dynamic set, 0..1.
-    weight: float
-    regime: Regime
-    #: -1 cooling, +1 heating, 0 neither.
-    direction: int
-    #: T_board minus its lags [K], and the variance that start-up left in them [K^2].
-    memory: tuple[float, ...]
-    var_memory: tuple[float, ...]
-
-    @property
-    def is_settled(self) -> bool:
-        """
-        Whether the memory has forgotten that its start was not seen.
-
-        """
-        return all(variance < MEMORY_SETTLED_SD**2 for variance in self.var_memory)
 
 
 @dataclass(frozen=True, slots=True)

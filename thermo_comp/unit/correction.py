@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from . import thermal
+from ..thermal import tracker as thermal
 from .axis_correction import AxisCorrection, BiasScale, Excess, Regressors, Variance
 from .calibration import Calibration, RegimeSet
 from .functions import Number, hold

@@ -12,22 +12,14 @@ the operations of `Compensator.process` in their order.
 from __future__ import annotations
 
 from array import array
-from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import numpy.typing as npt
 
-from .blocks import AccelBlock, CompensatedBlock, Floats, Stamps
+from ..typing import Bools, Floats, Ints, Stamps
+from .blocks import AccelBlock, CompensatedBlock
+from .compensator import SEGMENT_NS, TIME_JUMP_NS, Compensator
 from .kernel import Lines, correct
-from .sample_guard import Mask
 
-if TYPE_CHECKING:
-    from .compensator import Compensator
-
-#: Longest time over which bias and scale are taken as linear in time.
-SEGMENT_NS: Final = 1_000_000_000
-#: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
-TIME_JUMP_NS: Final = 1_000_000_000
 #: Where xx, xy, xz, yy, yz, zz stand in a row of the covariance.
 _UNIQUE = [0, 1, 2, 4, 5, 8]
 
@@ -78,7 +70,9 @@ class _Segments:
 
 def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
     """
-    Correct a block of samples; see `Compensator.process_block`.
+    Correct a block, e.g. a `recording.Block`, with the bits that `Compensator.process` gives.
+
+    Flags wait in `Compensator.take_flags`, counts in its `counters`.
 
     """
     counters = compensator.counters
@@ -251,7 +245,7 @@ def _add_segments(
 def _apply(
     compensator: Compensator,
     segments: _Segments,
-    index: npt.NDArray[np.int64],
+    index: Ints,
     stamps: Stamps,
     samples: Floats,
 ) -> CompensatedBlock:
@@ -276,7 +270,7 @@ def _apply(
     force, covariance, lowest, highest = correct(lines, correction.misalignment, stamps, samples)
     full_scale = compensator.calibration.unit.full_scale
     # The extremes settle the usual case; a NaN fails both comparisons.
-    keep: Mask
+    keep: Bools
     if (lowest > -full_scale).all() and (highest < full_scale).all():
         keep = np.ones(len(samples), dtype=bool)
     else:
@@ -291,9 +285,7 @@ def _apply(
     return CompensatedBlock(index, stamps, force, covariance)
 
 
-def _covered(
-    first: npt.NDArray[np.int64], counts: npt.NDArray[np.int64], n_samples: int
-) -> npt.NDArray[np.int64] | None:
+def _covered(first: Ints, counts: Ints, n_samples: int) -> Ints | None:
     """
     Find the samples that lie in a segment; None when all do.
 
@@ -306,13 +298,13 @@ def _covered(
 def _judge(
     compensator: Compensator,
     segments: _Segments,
-    counts: npt.NDArray[np.int64],
+    counts: Ints,
     stamps: Stamps,
     samples: Floats,
     force: Floats,
     covariance: Floats,
-    keep: Mask,
-    is_stuck: Mask | None,
+    keep: Bools,
+    is_stuck: Bools | None,
 ) -> None:
     """
     Leave out what the stream would not publish, and count why.
@@ -355,11 +347,11 @@ def _judge(
 def _refuted(
     compensator: Compensator,
     segments: _Segments,
-    begins: npt.NDArray[np.int64],
+    begins: Ints,
     stamps: Stamps,
     force: Floats,
     covariance: Floats,
-    keep: Mask,
+    keep: Bools,
 ) -> list[bool]:
     """
     Let the first sample of each segment tell of gravity; say which segments are held back for it.
@@ -388,7 +380,7 @@ def _refuted(
 
 def _stuck(
     compensator: Compensator, stamps: Stamps, samples: Floats, may_be_zero: bool
-) -> Mask | None:
+) -> Bools | None:
     """
     Find the samples that are not believed: too long the same, or three exact zeros.
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic
 
-from . import thermal
+from ..thermal import tracker as thermal
 from .calibration import AxisReference, AxisSet
 from .functions import Number, hold
 

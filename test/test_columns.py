@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The table of columns: the bank, what it needs remembered, and each value by hand.
+
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from builders import SECOND_NS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.thermal.settings import DetectorSettings
+from thermo_comp.thermal.state import Layout
+from thermo_comp.thermal.tracker import ThermalTracker
+from thermo_comp.unit.columns import (
+    BANK_TAUS,
+    UNBOUNDED,
+    Column,
+    bank,
+    memory_of,
+    values,
+)
+
+WIDE = {'range': UNBOUNDED}
+
+
+def by_group(columns):
+    groups = {}
+    for column in columns:
+        groups.setdefault(column.group, []).append(column)
+    return {name: len(group) for name, group in groups.items()}
+
+
+def test_the_bank():
+    assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
+    assert by_group(bank()) == {
+        'now': 1, 'board': 8, 'neighbour': 8, 'product': 17, 'even': 9, 'play': 8
+    }  # fmt: skip
+    assert by_group(bank(('case', 'tip'))) == {
+        'now': 2, 'board': 8, 'neighbour': 16, 'product': 26, 'even': 18, 'play': 8
+    }  # fmt: skip
+    assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
+
+
+def test_what_the_bank_needs_remembered():
+    spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
+    assert spec.inputs == ('board', 'case', 'tip')
+    # A lag of its own for the plays that follow one.
+    assert spec.taus('board') == (*BANK_TAUS[:4], 900.0, *BANK_TAUS[4:])
+    assert spec.taus('case') == spec.taus('tip') == BANK_TAUS
+    assert len(spec.plays) == 8
+    assert memory_of(()) == MemorySpec()
+    with pytest.raises(ValueError, match="one of \\('case',\\), got tip"):
+        memory_of(bank(('tip',)))
+
+
+def test_each_value_by_hand():
+    columns = [
+        Column('now', 'now', 'tip', **WIDE),
+        Column('rate', 'rate', **WIDE),
+        Column('board', 'board', tau_s=60.0, **WIDE),
+        Column('neighbour', 'neighbour', 'tip', 120.0, **WIDE),
+        Column('product', 'neighbour', 'tip', 120.0, power=1, **WIDE),
+        Column('even', 'even', 'case', width_k=1.5, power=2, **WIDE),
+        Column('play', 'play', tau_s=60.0, width_k=0.4, **WIDE),
+        Column('board', 'board', tau_s=60.0, range=(-0.25, 0.25)),
+        Column('board', 'board', tau_s=60.0, during='static', **WIDE),
+        Column('board', 'board', tau_s=60.0, during='dynamic', power=3, **WIDE),
+    ]
+    spec = memory_of(columns, ('case', 'tip'))
+    layout = Layout(spec)
+    # board, var, rate, weight, unknown; case, tip; two lags; a play.
+    state = (23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1)
+    assert layout.width == len(state)
+    found = values(columns, state, 20.0, spec)
+    expected = [
+        -0.7, 0.01, 0.5, -0.3, -0.9, math.tanh(0.64) * 9.0, 0.1, 0.25, 0.375, 0.125 * 27.0
+    ]  # fmt: skip
+    assert found == pytest.approx(expected)
+    # t is held at the edge of the calibrated temperatures, the lag itself is not.
+    at_edge = values(columns, state, 20.0, spec, (-10.0, 22.0))
+    assert at_edge[4] == pytest.approx(-0.6)
+    assert at_edge[2] == 0.5
+
+
+@given(st.lists(st.floats(-60.0, 60.0), min_size=5, max_size=5))
+@settings(max_examples=50, deadline=None)
+def test_one_state_has_the_bits_of_many(boards):
+    columns = bank(('case', 'tip'))
+    tracker = ThermalTracker(DetectorSettings(), memory_of(columns, ('case', 'tip')))
+    rows = []
+    for second, celsius in enumerate(boards):
+        for name, ahead in (('board', 0.0), ('case', 1.0), ('tip', -3.0)):
+            tracker.read(name, second * SECOND_NS, celsius + ahead * second)
+        rows.append(tracker.sample(second * SECOND_NS + 300_000_000))
+    spec = tracker.spec
+    many = values(columns, tuple(np.array(rows).T.copy()), 20.0, spec, (-20.0, 30.0))
+    for k, row in enumerate(rows):
+        one = values(columns, row, 20.0, spec, (-20.0, 30.0))
+        assert one == [column[k] for column in many]
+
+
+def test_lags_of_a_neighbour_in_a_ramp():
+    # The gradient of a sensor that runs away from the board at r K/s: L = r (t - tau (1 - e)).
+    rate, n = 0.002, 3000
+    columns = [Column('neighbour', 'neighbour', 'tip', tau, **WIDE) for tau in BANK_TAUS]
+    spec = memory_of(columns, ('case', 'tip'))
+    tracker = ThermalTracker(DetectorSettings(), spec)
+    for second in range(n + 1):
+        tracker.read('board', second * SECOND_NS, 20.0)
+        tracker.read('case', second * SECOND_NS, 20.0)
+        tracker.read('tip', second * SECOND_NS, 20.0 + rate * second)
+    found = values(columns, tracker.sample(n * SECOND_NS), 20.0, spec)
+    expected = [rate * (n - tau * -math.expm1(-n / tau)) for tau in BANK_TAUS]
+    # The thermometer needs some readings to bend into the ramp: a few mK.
+    assert found == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ('keys', 'message'),
+    [
+        ({'range': (1.0, 1.0)}, '`range` must be .* got .1.0, 1.0.'),
+        ({'kind': 'board', **WIDE}, '`tau_s` must be greater than 0 for board'),
+        ({'kind': 'play', **WIDE}, '`width_k` must be greater than 0 for play'),
+    ],
+)
+def test_refusals(keys, message):
+    with pytest.raises(ValueError, match=message):
+        Column(**{'group': 'now', 'kind': 'now', **keys})

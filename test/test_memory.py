@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The thermal memory against closed forms: lags of ramps and steps, loops of plays, unknown starts.
+
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from builders import SECOND_NS
+
+from thermo_comp.thermal.memory import (
+    LagBank,
+    MemorySpec,
+    Plays,
+    ThermalMemory,
+    start_covariance,
+)
+
+TAUS = (60.0, 900.0, 7680.0)
+
+
+@pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
+def test_a_lag_of_a_ramp(step_s):
+    # u = r t from rest: u - L = r tau (1 - exp(-t / tau)), however it is read (first-order hold).
+    rate, n = 0.01, 200
+    bank = LagBank(TAUS)
+    for k in range(n + 1):
+        bank.step(round(k * step_s * 1e9), rate * k * step_s)
+    end = (n + 0.3) * step_s
+    found, extra = bank.at(round(end * 1e9), rate * end)
+    expected = [rate * tau * -math.expm1(-end / tau) for tau in TAUS]
+    assert found == pytest.approx(expected, rel=1e-9)
+    assert (max(extra) > 0.0) == (step_s > 6.0)
+
+
+def test_a_lag_of_a_step():
+    # Within one reading interval of 1 ms from 0 to 5 K, then constant: u - L = 5 exp(-t / tau).
+    bank = LagBank(TAUS)
+    bank.step(0, 0.0)
+    bank.step(1_000_000, 5.0)
+    for second in range(1, 601):
+        bank.step(second * SECOND_NS, 5.0)
+    found, extra = bank.at(600 * SECOND_NS, 5.0)
+    assert found == pytest.approx([5.0 * math.exp(-600.0 / tau) for tau in TAUS], rel=2e-5)
+    assert extra == [0.0] * len(TAUS)
+
+
+def test_a_value_at_the_same_stamp_replaces_the_last_one():
+    bank = LagBank((100.0,))
+    bank.step(0, 1.0)
+    bank.step(0, 3.0)
+    assert bank.at(0, 3.0)[0] == [2.0]
+
+
+def test_what_is_not_known_of_a_lag():
+    bank = LagBank((100.0, 1000.0))
+    bank.step(0, 0.0)
+    # 50 s without a reading are more than a tenth of 100 s, not of 1000 s.
+    bank.step(50 * SECOND_NS, 2.0)
+    lost = 2.0 * (1.0 - math.exp(-0.5))
+    assert bank.extra == pytest.approx([lost**2, 0.0])
+    # It fades as the lag forgets.
+    found = bank.at(150 * SECOND_NS, 2.0)[1]
+    assert found == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
+    bank.note_jump(3.0)
+    assert bank.extra == pytest.approx([lost**2 + 9.0, 9.0])
+
+
+def test_a_guess_that_stays_wrong_adds_up_to_its_own_error():
+    bank = LagBank((100.0,))
+    for second in range(2000):
+        bank.step(second * SECOND_NS, 0.0, 0.5 if second else 0.0)
+    assert bank.extra == pytest.approx([0.25], rel=1e-6)
+
+
+def test_the_loop_of_a_play():
+    # Half-width 1 on 0 -> 5 -> 0 -> 5: up at v - 1, stands still over 2, down at v + 1.
+    plays = Plays((1.0,))
+    way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
+    P = []
+    for v in way.tolist():
+        plays.step(v)
+        P.append(plays.at(v)[0] + v)
+    up, down, again = P[:51], P[51:102], P[102:]
+    assert up == pytest.approx([max(v - 1.0, 0.0) for v in way[:51]])
+    assert down == pytest.approx([min(4.0, v + 1.0) for v in way[51:102]])
+    assert again == pytest.approx([max(1.0, v - 1.0) for v in way[102:]])
+    assert plays.at(9.0) == [-1.0]
+    assert plays.at(-9.0) == [1.0]
+
+
+def test_a_play_does_not_depend_on_how_fast_it_goes():
+    slow, fast = Plays((0.4, 1.6)), Plays((0.4, 1.6))
+    for v in np.linspace(0.0, 3.0, 1000):
+        slow.step(float(v))
+    for v in (0.0, 3.0):
+        fast.step(v)
+    assert slow.at(3.0) == pytest.approx(fast.at(3.0))
+
+
+def test_a_play_on_a_lag_follows_the_lag():
+    spec = MemorySpec(lags=(('board', 900.0),), plays=((900.0, 0.4),))
+    memory = ThermalMemory(spec)
+    for second in range(1801):
+        memory.board_step(second * SECOND_NS, 20.0 + 0.002 * second)
+    lagged = 23.6 - 0.002 * 900.0 * -math.expm1(-2.0)
+    found = memory.at(1800 * SECOND_NS, 23.6, [0.0])
+    assert 23.6 - found[0] == pytest.approx(lagged)
+    # It has been pushed from 20 up to 0.4 K below the lagged temperature.
+    assert lagged - 20.0 > 0.4
+    assert found[2] == pytest.approx(-0.4)
+
+
+def test_start_prior():
+    lags = (('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0))
+    P = start_covariance(lags)
+    assert math.sqrt(P[1, 1]) == pytest.approx(3.0)
+    assert math.sqrt(P[0, 0]) == pytest.approx(0.39, abs=0.005)
+    assert math.sqrt(P[2, 2]) == pytest.approx(1.0)
+    assert P[0, 1] == pytest.approx(0.005 * 60.0 * 3600.0 / 3660.0)
+    assert not P[:2, 2:].any()
+    assert P[2, 3] == 0.0
+    assert np.linalg.eigvalsh(P).min() > 0.0
+    assert start_covariance(()).shape == (0, 0)
+
+
+def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
+    # A board that has wandered for long: its lags at the first reading scatter by P.
+    D = 0.005
+    tau = np.array([60.0, 240.0, 960.0])
+    n, step = 4000, 6.0
+    m = np.zeros((n, 3))
+    for _ in range(900):
+        walk = math.sqrt(D * step) * rng.standard_normal((n, 1))
+        e = np.exp(-step / tau)
+        m = m * e + walk * (tau / step) * (1.0 - e)
+    P = start_covariance([('board', t) for t in tau])
+    # n draws: relative sd sqrt(2 / n) = 2.2 %; the walk's steps are a tenth of 60 s.
+    np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
+
+
+def test_the_start_fades_with_each_time_constant():
+    memory = ThermalMemory(MemorySpec(lags=(('board', 60.0), ('board', 600.0), ('case', 600.0))))
+    assert memory.start_shares(5) == [1.0, 1.0, 1.0]
+    memory.board_step(0, 20.0)
+    memory.neighbours[0].step(300 * SECOND_NS, 2.0)
+    found = memory.start_shares(600 * SECOND_NS)
+    assert found == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])
+
+
+@pytest.mark.parametrize(
+    ('keys', 'message'),
+    [
+        ({'sensors': ()}, 'at least one thermometer'),
+        ({'sensors': ('case', 'case')}, 'each once'),
+        ({'sensors': ('board',)}, 'each once'),
+        ({'lags': (('lid', 60.0),)}, 'must be of board, case'),
+        ({'lags': (('board', 0.0),)}, 'time constant above 0'),
+        ({'lags': (('case', 60.0), ('board', 60.0))}, 'in the order of'),
+        ({'lags': (('board', 60.0), ('board', 60.0))}, 'each once'),
+        ({'plays': ((60.0, 1.0),)}, 'one of its lags'),
+        ({'plays': ((0.0, 0.0),)}, 'half-width above 0'),
+    ],
+)
+def test_refusals(keys, message):
+    with pytest.raises(ValueError, match=message):
+        MemorySpec(**keys)

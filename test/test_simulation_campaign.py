@@ -1,0 +1,209 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A whole test in memory: the run of the bags, the units of every kind, the physics of their errors.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermo_comp.simulation import (
+    MICRO_G,
+    PLAN_NAMES,
+    STANDARD_GRAVITY,
+    TRIAD_NAMES,
+    FlowEffect,
+    LoadEffect,
+    PartHistory,
+    Position,
+    SlipEffect,
+    SwitchedLoad,
+    UnitModel,
+    arrays,
+    parse_cyclogram,
+    plan,
+    simulate,
+    unit_preset,
+)
+from thermo_comp.typing import Floats
+
+PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
+STATION = Position('one', PROGRAM, np.array([0.48, -0.6, 0.64]))
+
+
+def _history(temperature: Floats, step: float = 1.0) -> PartHistory:
+    deviation = np.reshape(temperature, (len(temperature), -1))
+    nodes = ('a', 'b')[: deviation.shape[1]]
+    rate = np.gradient(deviation, step, axis=0)
+    return PartHistory(nodes, deviation, rate, np.zeros(len(nodes)), step)
+
+
+@pytest.mark.parametrize('kind', ['own-lags', 'switched-load', 'slow-noise', 'convection'])
+def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
+    unit = unit_preset(kind, 1)
+    _, record = arrays(unit, [STATION, STATION], 3)
+    run = simulate(unit, PROGRAM, STATION.up, rate_hz=4.0, seed=3001, start_ns=0)
+    np.testing.assert_array_equal(record.counts, run.counts)
+    np.testing.assert_array_equal(record.board, run.board)
+    np.testing.assert_array_equal(record.case, run.case)
+    np.testing.assert_allclose(record.time_s, run.accel_stamp_ns * 1e-9)
+    np.testing.assert_allclose(record.case_time_s, run.case_stamp_ns * 1e-9)
+    np.testing.assert_array_equal(record.specific_force, run.truth.specific_force[0])
+    np.testing.assert_array_equal(record.scale, run.truth.scale_grid)
+
+
+def test_means_are_those_of_the_cycles_without_noise() -> None:
+    unit = unit_preset('own-lags', 1).without_noise()
+    (cycles,), (means,) = (arrays(unit, [STATION], window_s=w) for w in (None, 60.0))
+    # Two converters that carry, the sum of each within a count of the input's; and the run reads
+    # the truth at the middle of a cycle, along straight lines of a second.
+    np.testing.assert_allclose(means.counts, cycles.means(), atol=1.0 / 240.0 + 1e-4)
+    np.testing.assert_array_equal(means.board, cycles.board)
+
+
+@pytest.mark.parametrize('kind', ['own-lags', 'mems'])
+def test_means_scatter_as_those_of_the_cycles(kind: str) -> None:
+    unit = unit_preset(kind, 1)
+    still = replace(unit.without_drift(), misalignment=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    soak = Position('soak', parse_cyclogram('20 10h'), STATION.up)
+    (cycles,), (means,) = (arrays(still, [soak], window_s=w) for w in (None, 60.0))
+    ratio = means.counts.std(axis=0) / cycles.means().std(axis=0)
+    # 600 means each: the ratio of two deviations scatters by 4 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.16)
+
+
+@pytest.mark.parametrize('kind', TRIAD_NAMES)
+def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
+    """
+    The floor that every table is held against: 0.65 ug of |g| over 60 s, 1.12 of the vector.
+
+    """
+    unit = unit_preset(kind, 2)
+    errors, norms = [], []
+    for record in arrays(unit, plan('held-out', 2), 7, window_s=60.0):
+        found = record.corrected_by_truth(unit) / MICRO_G
+        errors.append(np.sum((found - record.specific_force / MICRO_G) ** 2, axis=1))
+        norms.append(np.linalg.norm(found, axis=1) - STANDARD_GRAVITY / MICRO_G)
+    vector = np.sqrt(np.mean(np.concatenate(errors)))
+    if kind == 'slow-noise':
+        # The walk's mean square over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter widely.
+        assert 4.0 < vector < 20.0
+    else:
+        # 1311 means: 2 % and 1.2 %, five of each.
+        assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
+        assert vector == pytest.approx(1.12, abs=0.07)
+
+
+@pytest.mark.parametrize('kind', TRIAD_NAMES)
+def test_units_of_a_kind_differ(kind: str) -> None:
+    one, other = (unit_preset(kind, seed) for seed in (1, 2))
+    assert one == unit_preset(kind, 1)
+    assert one.network.capacity != other.network.capacity
+    assert one.scale_factor != other.scale_factor
+    assert all(abs(K / 335.0 - 1.0) < 0.02 for K in one.scale_factor)
+
+
+def test_siblings_are_near_and_not_the_same() -> None:
+    unit = unit_preset('between', 1)
+    first, again, second = (unit.sibling(seed) for seed in (1, 1, 2))
+    assert first == again
+    assert first.serial != second.serial
+    for other in (first, second):
+        for name, value in unit.network.capacity.items():
+            assert 0.0 < abs(other.network.capacity[name] / value - 1.0) <= 0.15
+        for was, now in zip(unit.drift.effects, other.drift.effects, strict=True):
+            moved = np.array(now.bias)[np.array(was.bias) != 0.0]
+            base = np.array(was.bias)[np.array(was.bias) != 0.0]
+            assert np.all(np.abs(moved / base - 1.0) <= 0.15)
+            assert np.all(moved != base)
+
+
+def test_plans_are_what_their_names_say() -> None:
+    hours = {
+        name: sum(p.program.duration_s for p in plan(name, 1)) / 3600.0 for name in PLAN_NAMES
+    }
+    assert hours == pytest.approx(
+        {
+            'chamber-18': 171.0,
+            'chamber-9': 27.0,
+            'tumble': 6.0,
+            'tumble-3': 15.0,
+            'tumble-1': 9.0,
+            'held-out': 3 * 26220 / 3600,
+        },
+        rel=1e-2,
+    )
+    for name in PLAN_NAMES:
+        ups = np.array([p.up for p in plan(name, 1)])
+        np.testing.assert_allclose(np.linalg.norm(ups, axis=1), 1.0)
+        assert np.any(ups != np.array([p.up for p in plan(name, 2)]))
+    # No axis of a bench tumble's chamber positions sees one gravity only.
+    assert np.ptp(np.array([p.up for p in plan('tumble-3', 1)][18:]), axis=0).min() > 0.5
+    fitted = np.array([p.up for p in plan('chamber-18', 1)])
+    held_out = np.array([p.up for p in plan('held-out', 1)])
+    assert (held_out @ fitted.T).max() < 0.999
+    with pytest.raises(ValueError, match=r"`name` must be one of chamber-18, .*, got 'oven'"):
+        plan('oven')
+
+
+def test_a_joint_that_slips_goes_round_a_loop() -> None:
+    """
+    Rate-independent: the way back differs from the way there, and time does not matter.
+
+    """
+    there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
+    for is_gradual in (False, True):
+        effect = SlipEffect('a', 1.0, is_gradual, bias=(2.0, 0.0, 0.0))
+        quick, _ = effect.change(_history(there_and_back))
+        slow, _ = effect.change(_history(np.repeat(there_and_back, 7), 60.0))
+        np.testing.assert_array_equal(slow[::7], quick)
+        # It gives way at its width, each way.
+        assert quick[199, 0] == pytest.approx(2.0, rel=0.01)
+        assert quick[-1, 0] == pytest.approx(-2.0, rel=0.02)
+        # Once round once more closes the loop.
+        twice, _ = effect.change(_history(np.concatenate([there_and_back] * 2)))
+        assert twice[-1, 0] == pytest.approx(quick[-1, 0], rel=0.02)
+
+
+def test_a_flow_is_even_and_zero_at_rest() -> None:
+    up = np.stack([np.linspace(0, 3, 50), np.zeros(50)], axis=1)
+    effect = FlowEffect('a', 'b', 1.25, bias=(1.0, 0.0, 0.0))
+    warm, cold = (effect.change(_history(sign * up))[0] for sign in (1.0, -1.0))
+    np.testing.assert_allclose(warm, cold)
+    assert warm[-1, 0] == pytest.approx(3.0**1.25)
+    assert warm[0, 0] == 0.0
+
+
+def test_a_load_is_on_while_the_part_changes() -> None:
+    minute = np.concatenate([np.zeros(600), np.linspace(0, 10, 1200), np.full(1800, 10.0)])
+    effect = LoadEffect('a', settle=1.0, power=1, bias=(1.0, 0.0, 0.0))
+    for sign in (1.0, -1.0):
+        bias, _ = effect.change(_history(sign * minute))
+        assert bias[1500, 0] == pytest.approx(sign * minute[1500], rel=0.01)
+        assert np.abs(bias[1900:]).max() < 1e-9
+
+
+def test_a_switched_load_heats_its_part() -> None:
+    """
+    By what the heat balance of an endless spell says, and not before it is on.
+
+    """
+    unit = unit_preset('own-lags', 1)
+    spell = 200_000.0
+    load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
+    loaded: UnitModel = replace(unit, loads=(load,))
+    program = parse_cyclogram('20 111h')
+    on, off = (
+        simulate(one, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
+        for one in (loaded, unit)
+    )
+    warmer = on.temperature('board') - off.temperature('board')
+    np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)
+    # 0.5 W through 0.4 W/K to the case and about 4 W/K to the air.
+    to_air = next(link.conductance for link in unit.network.links if link.a == 'air')
+    assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)

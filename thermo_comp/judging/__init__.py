@@ -1,0 +1,6 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the judgement of a calibration against recordings.
+
+"""

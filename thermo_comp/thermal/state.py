@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the thermal state of a unit at one stamp: by name, and as the flat tuple of a sample.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from .memory import MemorySpec
+from .regime import Regime
+
+#: A memory is called settled when its start-up uncertainty is below this [K].
+MEMORY_SETTLED_SD: Final = 0.05
+
+#: Layout of `ThermalTracker.sample`: from `GRADIENT` on (gradient, variance) per sensor, then
+#: (lag, extra variance) per lag, then each play less its input (`Layout` says where).
+(
+    BOARD,
+    VAR_BOARD,
+    RATE,
+    WEIGHT,
+    UNKNOWN,
+    GRADIENT,
+    VAR_GRADIENT,
+) = range(7)
+
+
+class Layout:
+    """
+    Where in a sample what stands.
+
+    Parameters
+    ----------
+    spec : MemorySpec
+        Of the tracker that gives the samples.
+
+    Attributes
+    ----------
+    gradients : dict of str to int
+        Place of each sensor's gradient; its variance comes behind it.
+    lags : dict of (str, float) to int
+        Place of each lag; its extra variance comes behind it.
+    plays : dict of (float, float) to int
+        Place of each play.
+    first_lag, first_play, width : int
+        Where they begin, and the length of a sample.
+
+    """
+
+    def __init__(self, spec: MemorySpec) -> None:
+        self.gradients = {name: GRADIENT + 2 * k for k, name in enumerate(spec.sensors)}
+        self.first_lag = GRADIENT + 2 * len(spec.sensors)
+        self.lags = {lag: self.first_lag + 2 * k for k, lag in enumerate(spec.lags)}
+        self.first_play = self.first_lag + 2 * len(spec.lags)
+        self.plays = {play: self.first_play + k for k, play in enumerate(spec.plays)}
+        self.width = self.first_play + len(spec.plays)
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalState:
+    """
+    The thermal state at one stamp.
+
+    """
+
+    #: Board temperature [degC], its variance [K^2] and its rate [K/s].
+    board: float
+    var_board: float
+    rate: float
+    #: T_sensor - T_board [K] of each sensor, and the part of its variance that does not come from
+    #: the board.
+    gradients: dict[str, float]
+    var_gradients: dict[str, float]
+    #: Weight of the dynamic set, 0..1.
+    weight: float
+    regime: Regime
+    #: -1 cooling, +1 heating, 0 neither.
+    direction: int
+    #: T_board minus its lags and the lags of the gradients [K], what is not known of them [K^2],
+    #: and the plays less their inputs [K], in the order of the tracker's spec.
+    lags: tuple[float, ...]
+    var_lags: tuple[float, ...]
+    plays: tuple[float, ...]
+
+    @property
+    def gradient(self) -> float:
+        """
+        Gradient of the leading sensor [K].
+
+        """
+        return next(iter(self.gradients.values()))
+
+    @property
+    def is_settled(self) -> bool:
+        """
+        Whether the memory has forgotten that its start was not seen.
+
+        """
+        return all(variance < MEMORY_SETTLED_SD**2 for variance in self.var_lags)

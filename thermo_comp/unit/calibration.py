@@ -1,0 +1,375 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the Calibration value: everything that is known about one unit, validated as a whole.
+
+The dataclasses mirror the calibration file key by key. One object is one unit; it is immutable,
+so a running node swaps it by one reference.
+
+Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
+(0..1), and phi_j the columns of the response (`columns`), common to both sets (eqs 6-9, and
+beyond the paper the response)::
+
+    bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
+    scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
+    x_i   = (N_i - bias) / scale
+    f     = M x
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from ..thermal.settings import DetectorSettings
+from .columns import Column
+from .extremes import smallest_value
+from .functions import TemperatureFunction
+from .posterior import Block, ParameterLayout, Posterior
+from .schema import Bounds, NotNegative, Positive
+
+#: The version of the file's layout that this code writes.
+FORMAT_VERSION = 2
+AXES = ('x', 'y', 'z')
+#: A scale function, with every term at its worst, must stay above this fraction of the reference.
+SMALLEST_RELATIVE_SCALE = 0.1
+#: How exactly a function must meet its value at the reference.
+NORMALISATION_TOLERANCE = 1e-9
+
+Range = tuple[float, float]
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """
+    What is calibrated, and in which unit it speaks.
+
+    """
+
+    serial: Annotated[str, Bounds(shortest=1), 'Serial number of the unit.']
+    input: Annotated[
+        Literal['counts', 'm/s^2'],
+        'Unit of the raw samples: counts per conversion cycle, or m/s^2.',
+    ]
+    full_scale: Annotated[
+        Positive, 'A sample at or beyond this magnitude is saturated, in input units.'
+    ]
+    cycle_time_s: Annotated[Positive, 'Length of a conversion cycle = sample interval [s].']
+
+
+@dataclass(frozen=True)
+class AxisReference:
+    """
+    One axis at the reference temperature.
+
+    """
+
+    scale_factor: Annotated[float, 'K: input units per m/s^2 at the reference temperature.']
+    bias: Annotated[float, 'dNs(0): zero offset at the reference, in input units.']
+
+    def __post_init__(self) -> None:
+        if not self.scale_factor:
+            raise ValueError('`scale_factor` must not be 0, got 0.0')
+
+
+@dataclass(frozen=True)
+class Axes:
+    """
+    The three axes at the reference temperature.
+
+    """
+
+    x: AxisReference
+    y: AxisReference
+    z: AxisReference
+
+
+@dataclass(frozen=True)
+class AxisSet:
+    """
+    The curves of one axis in one regime (method section 3: items 2 to 4).
+
+    """
+
+    bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
+    scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
+    delta: Annotated[float, 'Bias of this regime relative to axes.bias, input units.'] = 0.0
+    residual_sd_m_s2: Annotated[
+        NotNegative, 'What this set leaves unexplained, as a slow error.'
+    ] = 0.0
+
+    def __post_init__(self) -> None:
+        for name, function, expected in (
+            ('bias_function', self.bias_function, 0.0),
+            ('scale_function', self.scale_function, 1.0),
+        ):
+            value = function.value(0.0)
+            if not abs(value - expected) <= NORMALISATION_TOLERANCE:
+                raise ValueError(f'`{name}` must be {expected:g} at the reference, got {value:g}')
+
+
+@dataclass(frozen=True)
+class RegimeSet:
+    """
+    The coefficient set of one regime, with the ranges over which it was fitted.
+
+    Outside a range the regressor is held at the range's edge and the covariance grows.
+
+    """
+
+    temperature_range_c: Annotated[Range, 'Board temperature [degC].']
+    rate_range_k_min: Annotated[Range, 'dT_board/dt [K/min].']
+    x: AxisSet
+    y: AxisSet
+    z: AxisSet
+
+    def __post_init__(self) -> None:
+        for name in ('temperature_range_c', 'rate_range_k_min'):
+            lower, upper = getattr(self, name)
+            if not lower < upper:
+                raise ValueError(f'`{name}` must be [lower, upper] with lower < upper')
+
+    def axes(self) -> tuple[AxisSet, AxisSet, AxisSet]:
+        """
+        Return the three axes in order.
+
+        """
+        return self.x, self.y, self.z
+
+
+@dataclass(frozen=True)
+class ResponseTerm(Column):
+    """
+    A column of the thermal response with its weights on the three axes.
+
+    """
+
+    bias: Annotated[Vector, 'Input units per unit of the column.'] = field(kw_only=True)
+    scale: Annotated[Vector, 'Relative, per unit of the column.'] = field(kw_only=True)
+
+
+@dataclass(frozen=True)
+class GroupEvidence:
+    """
+    What one group of columns is worth to the data it was fitted on.
+
+    """
+
+    group: Annotated[str, 'The group, as in `response`.']
+    part: Annotated[Literal['bias', 'scale'], 'Which of the two it corrects.']
+    explains_m_s2: Annotated[NotNegative, 'RMS of what it explains.']
+    effective_parameters: Annotated[NotNegative, 'How many of its weights the data determine.']
+    log_evidence_change: Annotated[float, 'By how much the log evidence falls without it.']
+    prior_sd: Annotated[
+        tuple[NotNegative, ...], 'Standard deviation of its weights before the data were seen.'
+    ]
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    One bag that the calibration was fitted on.
+
+    """
+
+    name: str
+    sha256: str = ''
+    n_samples: int = 0
+
+
+@dataclass(frozen=True)
+class ResidualSummary:
+    """
+    |g| error of one section of the fitted data, before and after.
+
+    """
+
+    section: str
+    n_windows: int
+    raw_rms_m_s2: NotNegative
+    rms_m_s2: NotNegative
+    max_m_s2: NotNegative
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """
+    Where the numbers come from.
+
+    """
+
+    created: str = ''
+    tool_version: str = ''
+    model: str = ''
+    sources: tuple[Source, ...] = ()
+    residuals: tuple[ResidualSummary, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """
+    One unit's calibration.
+
+    Raises
+    ------
+    ValueError
+        If parts contradict each other: naming the key, the rule and the value.
+
+    """
+
+    format_version: Annotated[int, f'Version of this layout: {FORMAT_VERSION}.']
+    unit: Unit
+    reference_temperature_c: Annotated[float, 'T_ref; the paper uses 20.']
+    gravity_m_s2: Annotated[float, Bounds(above=9.0, below=10.5), 'Local gravity used by the fit.']
+    axes: Axes
+    static: Annotated[RegimeSet, 'The set of the static regime, S = 0.']
+    dynamic: Annotated[RegimeSet, 'The set of the dynamic regime, S = 1.']
+    noise_density_m_s2_sqrt_hz: Annotated[
+        tuple[Positive, Positive, Positive],
+        'White noise of each axis; variance of a sample = density^2 / cycle, and rounding.',
+    ]
+    slow_noise_m_s2_sqrt_h: Annotated[
+        tuple[NotNegative, NotNegative, NotNegative],
+        'Random walk of the bias of each axis, per root hour.',
+    ] = (0.0, 0.0, 0.0)
+    misalignment: Annotated[
+        tuple[Vector, Vector, Vector],
+        'M: lower triangular, unit diagonal; sensitivity axes to frame.',
+    ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    misalignment_sd: Annotated[
+        tuple[NotNegative, NotNegative, NotNegative],
+        'Standard deviations of M[1][0], M[2][0], M[2][1], where there is no `posterior`.',
+    ] = (0.0, 0.0, 0.0)
+    sensors: Annotated[
+        tuple[str, ...], 'Thermometers beside the board; the first one leads in a ramp.'
+    ] = ('case',)
+    response: Annotated[
+        tuple[ResponseTerm, ...], 'The thermal response, common to both sets.'
+    ] = ()
+    board_lag_s: Annotated[
+        Positive,
+        'Time constant of T_board behind T_case: stands in for the gradient (lag times rate) '
+        'while the case sensor is lost.',
+    ] = 900.0
+    detector: Annotated[DetectorSettings, 'The thermometers and the regime detector.'] = field(
+        default_factory=DetectorSettings
+    )
+    provenance: Provenance = Provenance()
+    evidence: Annotated[
+        tuple[GroupEvidence, ...], 'What each group of columns is worth, by part.'
+    ] = ()
+    posterior: Annotated[
+        Posterior | None, 'Covariance of all parameters; null where it is unknown.'
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.format_version != FORMAT_VERSION:
+            raise ValueError(
+                f'`format_version` must be {FORMAT_VERSION}, got {self.format_version}'
+            )
+        self._check_misalignment()
+        self._check_sensors()
+        for regime, regime_set in (('static', self.static), ('dynamic', self.dynamic)):
+            for axis, name in enumerate(AXES):
+                smallest = self._smallest_scale(regime, regime_set, axis)
+                if not smallest > SMALLEST_RELATIVE_SCALE:
+                    raise ValueError(
+                        f'`{regime}.{name}.scale_function` must stay above '
+                        f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {smallest:.4g}'
+                    )
+        expected = parameter_layout(self).n_parameters
+        if self.posterior is not None and self.posterior.n_parameters != expected:
+            raise ValueError(
+                f'`posterior.rest` must have one number per parameter ({expected}), '
+                f'got {self.posterior.n_parameters}'
+            )
+
+    def _check_misalignment(self) -> None:
+        for row in range(3):
+            for column in range(3):
+                value = self.misalignment[row][column]
+                key = f'`misalignment[{row}][{column}]`'
+                if column == row and value != 1.0:
+                    raise ValueError(f'{key} must be 1, got {value:g}')
+                if column > row and value:
+                    raise ValueError(f'{key} must be 0 (M is lower triangular), got {value:g}')
+                if column < row and not abs(value) < 0.5:
+                    raise ValueError(f'{key} must be below 0.5 in magnitude, got {value:g}')
+
+    def _check_sensors(self) -> None:
+        names = self.sensors
+        if not names or len(set(names)) != len(names) or not all(names) or 'board' in names:
+            raise ValueError(
+                '`sensors` must be different names, at least one, none of them board, '
+                f'got {list(names)}'
+            )
+        for k, term in enumerate(self.response):
+            if term.kind in ('now', 'neighbour', 'even') and term.sensor not in names:
+                raise ValueError(
+                    f'`response[{k}].sensor` must be one of sensors {list(names)}, '
+                    f'got {term.sensor!r}'
+                )
+
+    def _smallest_scale(self, regime: str, regime_set: RegimeSet, axis: int) -> float:
+        """
+        Lower bound of the relative scale over a set's ranges, every term at its worst.
+
+        """
+        reference = self.reference_temperature_c
+        lower, upper = (edge - reference for edge in regime_set.temperature_range_c)
+        result = smallest_value(regime_set.axes()[axis].scale_function, lower, upper)
+        farthest = max(
+            abs(edge - reference) for one in self.regime_sets() for edge in one.temperature_range_c
+        )
+        for term in self.response:
+            if term.during in ('always', regime) and term.scale[axis]:
+                largest = max(abs(edge) for edge in term.range)
+                try:
+                    result -= largest * farthest**term.power * abs(term.scale[axis])
+                except OverflowError:
+                    result = -math.inf
+        return result if math.isfinite(result) else -math.inf
+
+    def regime_sets(self) -> tuple[RegimeSet, RegimeSet]:
+        """
+        Return the static and the dynamic set.
+
+        """
+        return self.static, self.dynamic
+
+
+def parameter_layout(calibration: Calibration) -> ParameterLayout:
+    """
+    Say where each parameter of a calibration stands in its posterior.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The unit; only the sizes of its functions and of its response count.
+
+    Returns
+    -------
+    ParameterLayout
+        The offsets.
+
+    """
+    blocks = []
+    at = 0
+    for static, dynamic in zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True):
+        pairs: tuple[tuple[TemperatureFunction, TemperatureFunction], ...] = (
+            (static.bias_function, dynamic.bias_function),
+            (static.scale_function, dynamic.scale_function),
+        )
+        for of_static, of_dynamic in pairs:
+            middle = at + 1 + of_static.n_free
+            response = middle + 1 + of_dynamic.n_free
+            end = response + len(calibration.response)
+            blocks.append(Block(at, middle, response, end))
+            at = end
+    return ParameterLayout(
+        (blocks[0], blocks[2], blocks[4]), (blocks[1], blocks[3], blocks[5]), at, at + 3
+    )

@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the calibration file: YAML to a validated Calibration and back, and its JSON Schema.
+
+The reader takes any bytes at all and answers with a Calibration or a CalibrationError that names
+the file and the key: size, nesting and the YAML features it accepts are bounded before anything
+is built (no aliases, so no alias bombs; no tags, so no objects; no duplicate keys).
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..errors import CalibrationError
+from ..files import read_bounded, write_atomically
+from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
+from .calibration import FORMAT_VERSION, Calibration
+from .schema import SchemaError, build, json_schema, plain
+from .version_1 import read_version_1
+
+#: A calibration with the whole bank of columns takes some 600 kB, most of it the posterior.
+SIZE_LIMIT = 1 << 20
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """
+    Read and validate a calibration file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The YAML file.
+
+    Returns
+    -------
+    Calibration
+        The one object it holds.
+
+    Raises
+    ------
+    CalibrationError
+        If the file cannot be read, is not YAML of the accepted kind, or holds a value that is
+        not acceptable; names the file, the key, the value and what was expected.
+
+    """
+    try:
+        content = read_bounded(path, SIZE_LIMIT)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, 'strerror', None) or str(error)
+        raise CalibrationError(f'cannot be read: {reason}', path) from error
+    return parse_calibration(content, path)
+
+
+def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibration:
+    """
+    Build a Calibration from the bytes of a calibration file.
+
+    Parameters
+    ----------
+    content : bytes
+        YAML text in UTF-8.
+    path : str or Path or None, optional
+        Named in errors.
+
+    Returns
+    -------
+    Calibration
+        The one object it holds.
+
+    Raises
+    ------
+    CalibrationError
+        As `load_calibration`.
+
+    """
+    try:
+        data = load_plain_yaml(content.decode('utf-8'))
+    except UnicodeDecodeError as error:
+        raise CalibrationError(f'not UTF-8 text (byte {error.start})', path) from error
+    except PlainYamlError as error:
+        raise CalibrationError(str(error), path) from error
+    if not isinstance(data, dict):
+        raise CalibrationError('expected a mapping of keys at the top level', path)
+    version = data.get('format_version')
+    if type(version) is int and version > FORMAT_VERSION:
+        raise CalibrationError(
+            f'this file is of version {version}, newer than the {FORMAT_VERSION} that this '
+            'release reads; update thermo_comp',
+            path,
+            'format_version',
+        )
+    try:
+        if type(version) is int and version == 1:
+            return read_version_1(data)
+        return build(Calibration, data)
+    except SchemaError as error:
+        raise CalibrationError(error.message, path, error.key or None) from error
+
+
+def dump_calibration(calibration: Calibration) -> str:
+    """
+    Write a Calibration as YAML text with all digits.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The value.
+
+    Returns
+    -------
+    str
+        A text that `parse_calibration` turns into an equal value.
+
+    Raises
+    ------
+    CalibrationError
+        If the value would not be accepted when read back.
+
+    """
+    text: str = yaml.dump(
+        plain(calibration),
+        Dumper=_Dumper,
+        sort_keys=False,
+        default_flow_style=None,
+        width=98,
+        allow_unicode=True,
+    )
+    if parse_calibration(text.encode()) != calibration:
+        raise CalibrationError('the calibration does not survive being written')
+    return text
+
+
+def save_calibration(calibration: Calibration, path: str | Path) -> None:
+    """
+    Write a calibration file atomically.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The value.
+    path : str or Path
+        The file; an existing one is replaced as a whole.
+
+    Raises
+    ------
+    CalibrationError
+        If the file cannot be written (an old one is then untouched) or the value is not valid.
+
+    """
+    text = dump_calibration(calibration)
+    try:
+        write_atomically(path, text.encode())
+    except OSError as error:
+        raise CalibrationError(f'cannot be written: {error.strerror}', path) from error
+
+
+def calibration_schema() -> dict[str, Any]:
+    """
+    Return the JSON Schema of the calibration file.
+
+    """
+    return {
+        '$schema': 'https://json-schema.org/draft/2020-12/schema',
+        **json_schema(Calibration),
+    }
+
+
+class _Dumper(yaml.SafeDumper):
+    """
+    Writes every number so that this reader and any YAML 1.1 reader see the same float.
+
+    """
+
+    def ignore_aliases(self, _data: Any) -> bool:
+        return True
+
+
+def _represent_str(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
+    # A text that one of the two YAML versions would take for a number is quoted: '1e5', 'no'.
+    style = None if is_plain_text(value) else "'"
+    return dumper.represent_scalar('tag:yaml.org,2002:str', value, style=style)
+
+
+_Dumper.add_representer(str, _represent_str)

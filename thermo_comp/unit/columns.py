@@ -1,0 +1,329 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the columns of the thermal response: what there is to regress bias and scale on.
+
+With ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, ``L_tau(u)`` the first-order
+lag of u, ``P_r(v)`` the play of half-width r on v, and w the weight of the dynamic regime:
+
+=========  ==========================  ====================================================
+kind       value u                     carries
+=========  ==========================  ====================================================
+now        g_s                         heat that flows now
+rate       dT_board/dt [K/s]           the same, as seen by one thermometer
+board      T_board - L_tau(T_board)    parts that lag the board
+neighbour  L_tau(g_s)                  parts between the thermometers
+even       tanh((g_s / width)^2)       heat load whichever way the heat flows
+play       P_r(v) - v, v = t or        rate-independent hysteresis
+           v = L_tau(t)
+=========  ==========================  ====================================================
+
+A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
+and t at those of the calibrated temperatures. The groups of the bank are its kinds, and
+*product*: a kind of power 1, coefficients that change with temperature.
+
+This is the one table of columns: tracker, fit, correction, covariance and file take theirs from
+here, so that another regressor is an entry of `bank` and, if it is of a new kind, of `_value`.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Final, Literal
+
+import numpy as np
+
+from ..thermal.memory import BOARD_INPUT, MemorySpec
+from ..thermal.state import BOARD, RATE, WEIGHT, Layout
+from .functions import Number, hold
+from .schema import Bounds, NotNegative
+
+#: A range that holds nothing back, of any value.
+UNBOUNDED: Final = (-1000.0, 1000.0)
+#: Time constants of the bank: from a few readings to the longest memory that bags can show [s].
+BANK_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 8).round(9).tolist())
+#: Widths of the even columns [K], half-widths of the plays [K], and the lag that some follow [s].
+EVEN_WIDTHS: Final = (0.75, 1.5, 3.0)
+PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2)
+PLAY_TAU: Final = 900.0
+
+
+@dataclass(frozen=True)
+class Column:
+    """
+    One regressor of the thermal response; its keys are the calibration file's.
+
+    Raises
+    ------
+    ValueError
+        If the keys contradict each other: naming the key, the rule and the value.
+
+    """
+
+    group: Annotated[
+        Literal['now', 'rate', 'board', 'neighbour', 'product', 'even', 'play'],
+        'What evidence judges together.',
+    ]
+    kind: Annotated[
+        Literal['now', 'rate', 'board', 'neighbour', 'even', 'play'],
+        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; tanh((g_s / width)^2); '
+        'play of t minus t, where g_s = T_s - T_board.',
+    ]
+    sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
+    tau_s: Annotated[
+        NotNegative, 'Time constant of the lag (board, neighbour; play: 0 = none).'
+    ] = 0.0
+    width_k: Annotated[NotNegative, 'Width of even, half-width of play.'] = 0.0
+    power: Annotated[int, Bounds(at_least=0), 'The value is multiplied by t to this power.'] = 0
+    during: Annotated[
+        Literal['always', 'static', 'dynamic'],
+        'always, or multiplied by 1 - w (static) or by w (dynamic), w = weight of the regime.',
+    ] = 'always'
+    range: Annotated[
+        tuple[float, float],
+        'Range of the value before t and w multiply it; held at its edges outside.',
+    ] = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        lower, upper = self.range
+        if not lower < upper:
+            raise ValueError(
+                f'`range` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
+            )
+        for key, kinds in (('tau_s', ('board', 'neighbour')), ('width_k', ('even', 'play'))):
+            if self.kind in kinds and not getattr(self, key) > 0.0:
+                raise ValueError(
+                    f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
+                )
+
+    @property
+    def lag(self) -> tuple[str, float] | None:
+        """
+        Which lag of the memory the value is, or follows: input and time constant [s].
+
+        """
+        if self.kind == 'neighbour':
+            return self.sensor, self.tau_s
+        return (BOARD_INPUT, self.tau_s) if self.tau_s and self.kind != 'even' else None
+
+
+def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
+    """
+    Return all columns that a response may have, none held to a range yet.
+
+    Parameters
+    ----------
+    sensors : sequence of str, optional
+        Names of the thermometers beside the board.
+
+    Returns
+    -------
+    tuple of Column
+        Group by group.
+
+    """
+    now = [Column('now', 'now', sensor, range=UNBOUNDED) for sensor in sensors]
+    board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in BANK_TAUS]
+    neighbour = [
+        Column('neighbour', 'neighbour', sensor, tau, range=UNBOUNDED)
+        for sensor in sensors
+        for tau in BANK_TAUS
+    ]
+    product = [replace(column, group='product', power=1) for column in (*now, *board, *neighbour)]
+    even = [
+        Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
+        for sensor in sensors
+        for power in (0, 1, 2)
+        for width in EVEN_WIDTHS
+    ]
+    play = [
+        Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
+        for tau in (0.0, PLAY_TAU)
+        for width in PLAY_WIDTHS
+    ]
+    return (*now, *board, *neighbour, *product, *even, *play)
+
+
+def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
+    """
+    Find what a tracker must remember for some columns.
+
+    Parameters
+    ----------
+    columns : iterable of Column
+        The columns.
+    sensors : sequence of str, optional
+        Names of the thermometers beside the board; the first leads.
+
+    Returns
+    -------
+    MemorySpec
+        Lags by rising time constant; a play on a lag needs that lag.
+
+    Raises
+    ------
+    ValueError
+        If a column is of a sensor that is not among them.
+
+    """
+    lags: set[tuple[str, float]] = set()
+    plays: set[tuple[float, float]] = set()
+    for column in columns:
+        if column.kind in ('now', 'neighbour', 'even') and column.sensor not in sensors:
+            raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
+        if column.lag:
+            lags.add(column.lag)
+        if column.kind == 'play':
+            plays.add((column.tau_s, column.width_k))
+    order = (BOARD_INPUT, *sensors)
+    return MemorySpec(
+        tuple(sensors),
+        tuple(sorted(lags, key=lambda lag: (order.index(lag[0]), lag[1]))),
+        tuple(sorted(plays)),
+    )
+
+
+def values(
+    columns: Sequence[Column],
+    state: Sequence[Number],
+    reference_temperature: float,
+    memory: MemorySpec,
+    temperature_range_c: tuple[float, float] = UNBOUNDED,
+) -> list[Number]:
+    """
+    Evaluate columns.
+
+    Parameters
+    ----------
+    columns : sequence of Column
+        The columns.
+    state : sequence of float or of ndarray
+        As `ThermalTracker.sample` gives it, or many of them as columns.
+    reference_temperature : float
+        T_ref [degC].
+    memory : MemorySpec
+        That of the tracker; it may remember more than these columns need.
+    temperature_range_c : tuple of float, optional
+        At the edges of which t is held [degC].
+
+    Returns
+    -------
+    list of float or of ndarray
+        phi of each column.
+
+    """
+    table = ColumnTable(columns, memory, reference_temperature, temperature_range_c)
+    return table.values(state)
+
+
+class ColumnTable:
+    """
+    Columns, ready to be evaluated; the same bits for one state and for many.
+
+    Parameters
+    ----------
+    columns, memory, reference_temperature, temperature_range_c
+        See `values`.
+
+    """
+
+    def __init__(
+        self,
+        columns: Sequence[Column],
+        memory: MemorySpec,
+        reference_temperature: float,
+        temperature_range_c: tuple[float, float] = UNBOUNDED,
+    ) -> None:
+        layout = Layout(memory)
+        self.columns = tuple(columns)
+        self._reference = reference_temperature
+        lower, upper = temperature_range_c
+        self._t_range = lower - reference_temperature, upper - reference_temperature
+        self._n_powers = max((column.power for column in columns), default=0)
+        # What differs only in power, range or regime is evaluated once.
+        sources: dict[tuple[str, int, float], int] = {}
+        self._plan: list[tuple[int, float, float, int, str]] = []
+        for column in columns:
+            width = column.width_k if column.kind == 'even' else 0.0
+            key = ('even' if width else '', _place(column, layout), width)
+            source = sources.setdefault(key, len(sources))
+            self._plan.append((source, *column.range, column.power, column.during))
+        self._sources = [(place, width) for _, place, width in sources]
+
+    def raw(self, state: Sequence[Number]) -> list[Number]:
+        """
+        Evaluate u of each column, not held.
+
+        """
+        found = [_value(state[place], width) for place, width in self._sources]
+        return [found[source] for source, _, _, _, _ in self._plan]
+
+    def held(self, raw: Sequence[Number]) -> list[Number]:
+        """
+        Hold what `raw` gives at the edges of the columns' ranges.
+
+        """
+        return [
+            hold(u, lower, upper)
+            for u, (_, lower, upper, _, _) in zip(raw, self._plan, strict=True)
+        ]
+
+    def values(self, state: Sequence[Number]) -> list[Number]:
+        """
+        Evaluate phi of each column.
+
+        """
+        return self.weighted(self.held(self.raw(state)), state)
+
+    def weighted(self, held: Sequence[Number], state: Sequence[Number]) -> list[Number]:
+        """
+        Multiply a number per column by that column's power of t and weight of its regime.
+
+        """
+        t = hold(state[BOARD] - self._reference, *self._t_range)
+        powers = [t, t]
+        for _ in range(1, self._n_powers):
+            powers.append(powers[-1] * t)
+        weight = state[WEIGHT]
+        rest = 1.0 - weight
+        result = []
+        for u, (_, _, _, power, during) in zip(held, self._plan, strict=True):
+            phi = u * powers[power] if power else u
+            if during != 'always':
+                phi = phi * (rest if during == 'static' else weight)
+            result.append(phi)
+        return result
+
+
+def _place(column: Column, layout: Layout) -> int:
+    """
+    Find the number of a sample that a column is made of.
+
+    """
+    if column.kind == 'rate':
+        return RATE
+    if column.kind == 'play':
+        return layout.plays[column.tau_s, column.width_k]
+    if column.lag:
+        return layout.lags[column.lag]
+    return layout.gradients[column.sensor]
+
+
+def _value(u: Number, even_width: float) -> Number:
+    if not even_width:
+        return u
+    x = u / even_width
+    return _tanh(x * x)
+
+
+def _tanh(x: Number) -> Number:
+    """
+    Hyperbolic tangent with the same bits for a float and for an array of them.
+
+    """
+    if isinstance(x, np.ndarray):
+        return np.array([math.tanh(v) for v in x.ravel().tolist()]).reshape(x.shape)
+    return math.tanh(x)

@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the covariance of all parameters of a calibration, as a factor that fits into its file.
+
+``covariance = factor @ factor.T + diag(rest)``, single precision in base64.
+
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated
+
+import numpy as np
+
+from ..typing import Floats
+from .schema import Bounds
+
+#: What single precision cannot tell from nothing, relative to a variance.
+_NEGLIGIBLE = 1e-7
+#: An eigenvalue of a correlation matrix below this is no rounding.
+_MOST_NEGATIVE = -1e-6
+_FLOAT32 = np.dtype('<f4')
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """
+    What is uncertain about the parameters, all at once: factor @ factor.T + diag(rest).
+
+    The order of the parameters is that of `ParameterLayout`.
+
+    Raises
+    ------
+    ValueError
+        If a text is not base64 of float32 numbers, the sizes differ, a number is not finite, or a
+        variance is negative.
+
+    """
+
+    rank: Annotated[int, Bounds(at_least=0), 'Number of columns of the factor.']
+    factor: Annotated[
+        str, 'base64 of little-endian float32: one row of `rank` numbers per parameter.'
+    ]
+    rest: Annotated[
+        str, 'base64 of little-endian float32: one variance per parameter, beside the factor.'
+    ]
+
+    def __post_init__(self) -> None:
+        n, size = len(self.variances), self._factor.size
+        if size != n * self.rank:
+            raise ValueError(
+                f'`factor` must hold {n} x {self.rank} numbers (`rest` x `rank`), got {size}'
+            )
+        if (self.variances < 0.0).any():
+            raise ValueError('`rest` must not have a negative variance')
+
+    @classmethod
+    def of(cls, matrix: Floats, variances: Floats) -> Posterior:
+        """
+        Encode a factor, shape (n_parameters, rank), and the variances beside it.
+
+        """
+        return cls(matrix.shape[1], _encoded(matrix), _encoded(variances))
+
+    @property
+    def n_parameters(self) -> int:
+        """
+        Number of parameters.
+
+        """
+        return len(self.variances)
+
+    @property
+    def matrix(self) -> Floats:
+        """
+        The factor, shape (n_parameters, rank).
+
+        """
+        return self._factor.reshape(-1, self.rank)
+
+    @cached_property
+    def variances(self) -> Floats:
+        """
+        The variances that stand on the diagonal beside the factor, shape (n_parameters,).
+
+        """
+        return _decoded('rest', self.rest)
+
+    @cached_property
+    def _factor(self) -> Floats:
+        return _decoded('factor', self.factor)
+
+    def covariance(self) -> Floats:
+        """
+        Return the covariance matrix, shape (n_parameters, n_parameters).
+
+        """
+        result: Floats = self.matrix @ self.matrix.T + np.diag(self.variances)
+        return result
+
+
+@dataclass(frozen=True)
+class Block:
+    """
+    Where the parameters of the bias, or of the scale, of one axis stand among all.
+
+    Each index is that of the first: the level of a set is followed by its function's free
+    coefficients, the weights of the response stand from `response` to before `end`.
+
+    """
+
+    static: int
+    dynamic: int
+    response: int
+    end: int
+
+
+@dataclass(frozen=True)
+class ParameterLayout:
+    """
+    The order of a calibration's parameters in its posterior.
+
+    For each axis the bias [input units], then the scale [relative]; then M[1][0], M[2][0],
+    M[2][1] from `misalignment` on.
+
+    """
+
+    bias: tuple[Block, Block, Block]
+    scale: tuple[Block, Block, Block]
+    misalignment: int
+    n_parameters: int
+
+
+def posterior_of(covariance: Floats, tolerance: float = 0.0) -> Posterior:
+    """
+    Find the smallest factor that holds a covariance matrix.
+
+    Parameters
+    ----------
+    covariance : ndarray
+        Covariance of the parameters, shape (n, n); only its symmetric part counts.
+    tolerance : float, optional
+        The largest share of a parameter's variance that the factor may leave to the diagonal;
+        what single precision cannot resolve is left there in any case.
+
+    Returns
+    -------
+    Posterior
+        With each parameter's variance as given.
+
+    Raises
+    ------
+    ValueError
+        If `covariance` has a negative variance or is not positive semidefinite.
+
+    """
+    diagonal = np.diag(covariance).copy()
+    if not np.all(diagonal >= 0.0):
+        raise ValueError('`covariance` must not have a negative variance')
+    # Scaled to correlations first: entries in counts^2 and in relative^2 differ by 10 decades.
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    with np.errstate(over='ignore'):
+        correlation = (covariance + covariance.T) / 2.0 / scale / scale[:, np.newaxis]
+    # Eigenvalues exist of what is finite; beyond 1 there is no correlation anyway.
+    is_bounded = np.abs(correlation).max(initial=0.0) < 2.0
+    eigenvalues, vectors = np.linalg.eigh(correlation if is_bounded else -np.eye(1))
+    if not eigenvalues[0] > _MOST_NEGATIVE:
+        raise ValueError('`covariance` must be positive semidefinite')
+    columns = vectors[:, ::-1] * np.sqrt(np.maximum(eigenvalues[::-1], 0.0))
+    share = np.where(diagonal > 0.0, 1.0, 0.0)
+    left_out = share[:, np.newaxis] - np.cumsum(columns**2, axis=1)
+    enough = np.all(left_out <= max(tolerance, _NEGLIGIBLE), axis=0)
+    rank = int(np.argmax(enough)) + 1 if diagonal.any() else 0
+    factor = (columns[:, :rank] * scale[:, np.newaxis]).astype(_FLOAT32)
+    held = np.sum(factor.astype(np.float64) ** 2, axis=1)
+    return Posterior.of(factor, np.maximum(diagonal - held, 0.0))
+
+
+def _encoded(numbers: Floats) -> str:
+    with np.errstate(over='ignore'):
+        return base64.b64encode(numbers.astype(_FLOAT32).tobytes()).decode('ascii')
+
+
+def _decoded(key: str, text: str) -> Floats:
+    try:
+        numbers = np.frombuffer(base64.b64decode(text, validate=True), _FLOAT32)
+    except ValueError as error:
+        raise ValueError(f'`{key}` must be base64 of float32 numbers: {error}') from error
+    if not np.isfinite(numbers).all():
+        raise ValueError(f'`{key}` must hold finite numbers')
+    result = numbers.astype(np.float64)
+    result.flags.writeable = False
+    return result
