@@ -15,7 +15,7 @@ from typing import Annotated
 
 import typer
 
-from .. import __version__, is_compiled
+from .. import __version__
 from ..errors import ThermoCompError
 from . import (
     convert,
@@ -49,7 +49,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f'thermo_comp {__version__}' + ' (compiled core)' * is_compiled())
+        typer.echo(f'thermo_comp {__version__}')
         raise typer.Exit
 
 

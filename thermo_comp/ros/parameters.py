@@ -21,7 +21,6 @@ from rclpy.parameter import Parameter
 
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
-from .affinity import ANY
 
 _DEFAULTS = CompensatorConfig()
 
@@ -54,7 +53,6 @@ class NodeConfig:
         Seconds.
     local_gravity, gravity_tolerance : float
         Metres per second squared.
-    cpu_affinity : int
 
     """
 
@@ -106,12 +104,6 @@ class NodeConfig:
         (0.0, 100.0),
     )
     diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
-    cpu_affinity: int = _parameter(
-        ANY,
-        'Core that all threads of the process keep to, for less CPU time and latency; -1 leaves '
-        'it to the system.',
-        (ANY, 4095),
-    )
 
     def compensator_config(self) -> CompensatorConfig:
         """
