@@ -1,14 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way from a solution to the Calibration that the compensator applies.
+Owns the way from a posterior to the Calibration that the compensator applies, and its covariance.
 
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 
 import numpy as np
@@ -17,33 +18,39 @@ from .. import __version__
 from ..thermal.settings import DetectorSettings
 from ..typing import Floats
 from ..unit.calibration import (
+    FORMAT_VERSION,
     Axes,
     AxisReference,
+    AxisSet,
     Calibration,
+    GroupEvidence,
     Provenance,
     RegimeSet,
     ResidualSummary,
+    ResponseTerm,
     Source,
     Unit,
 )
-from .evidence import ResidualRow, inflation
-from .model import RegimeName
+from ..unit.columns import Column
+from ..unit.functions import CubicSpline, Polynomial, TemperatureFunction
+from ..unit.posterior import posterior_of
+from .evidence import ResidualRow
+from .learning import Learnt
+from .posterior import Regression, inverse_misalignment
 from .reduction import ReducedBag
-from .regression import Outcome
-from .solution import regressors
-from .table import WindowTable
 from .verdict import Finding
+from .windows import Sets, ThermalWindows
 
 # Edges are widened by this part of the span, so that the run that was fitted is inside them.
 _EDGE_MARGIN = 0.02
-# A regime that the bags do not show has no range of its own: it takes all of them.
-_FEWEST_WINDOWS = 5
 # The response of a unit to heat flowing through it is linear: a ramp twice as fast as the
 # chamber's has twice the terms. A curve over temperature has no such law: it ends where the data
 # end.
 _LINEAR_REACH = 2.0
-# Orthogonality of a triad whose misalignment was not measured [rad].
-UNKNOWN_SKEW = 5e-3
+# Bags without any temperature say nothing of a range: the curve is flat, its prior wide.
+_UNSEEN_RANGE_C = 0.5
+# Of each parameter's variance, what may leave its correlations for the diagonal.
+_LEFT_ON_DIAGONAL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -55,73 +62,68 @@ class UnitFacts:
     ----------
     unit : Unit
         Serial, input, full scale, cycle.
-    noise_density : ndarray, shape (3,)
-        White noise [m/s^2/sqrt(Hz)].
+    detector : DetectorSettings
+        Settings under which the regimes were told apart.
     board_lag : float
         Time constant of the board behind the case [s].
-    slow_error : ndarray, shape (2, 3)
-        What each regime's set leaves unexplained on each axis [m/s^2].
+    reference_temperature : float
+        T_ref [degC].
+    model : str
+        Name of the model, for the provenance.
 
     """
 
     unit: Unit
-    noise_density: Floats
+    detector: DetectorSettings
     board_lag: float
-    slow_error: Floats
+    reference_temperature: float
+    model: str
 
 
-def parameter_covariance(outcome: Outcome) -> Floats:
+@dataclass(frozen=True)
+class _Weights:
     """
-    Covariance of all free parameters, as far as the data tell them apart.
-
-    Parameters
-    ----------
-    outcome : Outcome
-        A regression that has ended.
-
-    Returns
-    -------
-    ndarray, shape (m, m)
-        Inverse of the normal matrix; a combination that nothing determines gets no variance
-        of its own, because nothing moves it either.
+    Physical weights, shape (3, m): input units, and relative, per unit of the column.
 
     """
-    normal = outcome.information
-    diagonal = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal / np.outer(diagonal, diagonal)
-    values, vectors = np.linalg.eigh(scaled)
-    keep = values > 1e-13 * values[-1]
-    inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T
-    return np.asarray(inverse / np.outer(diagonal, diagonal))
+
+    bias: Floats
+    scale: Floats
 
 
 def build_calibration(
-    outcome: Outcome,
-    table: WindowTable,
+    windows: ThermalWindows,
+    regression: Regression,
+    learnt: Learnt,
+    columns: Sequence[Column],
+    sets: Sets,
+    nominal: Floats,
     bags: Sequence[ReducedBag],
-    detector: DetectorSettings,
     facts: UnitFacts,
-    reference_temperature: float,
     residuals: Sequence[ResidualRow] = (),
     findings: Sequence[Finding] = (),
 ) -> Calibration:
     """
-    Write a solution as a calibration.
+    Write a posterior as a calibration.
 
     Parameters
     ----------
-    outcome : Outcome
-        The regression.
-    table : WindowTable
+    windows : ThermalWindows
         What it was fitted on.
+    regression : Regression
+        The regression on them.
+    learnt : Learnt
+        Its end.
+    columns : sequence of Column
+        The bank, in the order of the windows' columns behind those of the sets.
+    sets : Sets
+        The curves.
+    nominal : ndarray, shape (3,)
+        K0 [input units per m/s^2].
     bags : sequence of ReducedBag
         For the provenance.
-    detector : DetectorSettings
-        Settings under which the regimes were told apart.
     facts : UnitFacts
         The unit.
-    reference_temperature : float
-        T_ref.
     residuals : sequence of ResidualRow, optional
         For the provenance.
     findings : sequence of Finding, optional
@@ -133,55 +135,66 @@ def build_calibration(
         The calibration.
 
     """
-    solution = outcome.solution
-    covariance = parameter_covariance(outcome)
-    n_bias = solution.bias.shape[1]
-    sets = {}
-    inflated = inflation(table, outcome)
-    names: tuple[RegimeName, RegimeName] = ('static', 'dynamic')
-    for regime, name in enumerate(names):
-        axes = []
-        for axis in range(3):
-            where = outcome.layout.axis[axis]
-            block = inflated[axis] * covariance[np.ix_(where, where)]
-            # Scale parameters become relative to K.
-            unit = np.ones(len(where))
-            unit[n_bias:] = 1.0 / solution.scale[axis, 0]
-            axes.append(
-                solution.spec.axis_set(
-                    name,
-                    solution.bias[axis],
-                    solution.scale[axis],
-                    block * np.outer(unit, unit),
-                    float(facts.slow_error[regime, axis]),
-                )
-            )
-        ranges = _ranges(table, outcome, regime, reference_temperature)
-        sets[name] = RegimeSet(x=axes[0], y=axes[1], z=axes[2], **ranges)
-    matrix = solution.misalignment
+    state, prior = learnt.posterior.state, learnt.prior
+    weights = _Weights(
+        state.on_bias / regression.rms * nominal[:, None], state.on_scale / regression.rms
+    )
+    n_sets = len(sets.levels())
+    used = [
+        k
+        for k, column in enumerate(columns)
+        if ('bias', column.group) in prior.groups or ('scale', column.group) in prior.groups
+    ]
+    terms = tuple(
+        ResponseTerm(
+            **{field.name: getattr(columns[k], field.name) for field in fields(Column)}
+            | {'range': _column_range(columns[k], windows.raw[:, k])},
+            bias=_triple(weights.bias[:, n_sets + k]),
+            scale=_triple(weights.scale[:, n_sets + k]),
+        )
+        for k in used
+    )
+    slow = _slow_error(windows, learnt)
+    regimes = {
+        name: RegimeSet(
+            **_ranges(windows),
+            **{
+                axis: _axis_set(sets, weights, number, is_dynamic, float(slow[number]))
+                for number, axis in enumerate('xyz')
+            },
+        )
+        for name, is_dynamic in (('static', False), ('dynamic', True))
+    }
+    matrix = np.linalg.inv(inverse_misalignment(state.skew))
+    K = state.kappa * nominal
+    to_file = _to_file(regression, learnt, sets, nominal, n_sets, used)
+    covariance = to_file @ learnt.posterior.covariance @ to_file.T
+    window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
+    walk = prior.sigma * np.sqrt(prior.rho * 3600.0)
     return Calibration(
-        format_version=1,
+        format_version=FORMAT_VERSION,
         unit=facts.unit,
-        reference_temperature_c=reference_temperature,
-        gravity_m_s2=solution.gravity,
+        reference_temperature_c=facts.reference_temperature,
+        gravity_m_s2=regression.gravity,
         axes=Axes(
             *(
-                AxisReference(float(solution.scale[axis, 0]), float(solution.bias[axis, 0]))
+                AxisReference(float(K[axis]), float(state.bias[axis] * nominal[axis]))
                 for axis in range(3)
             )
         ),
-        static=sets['static'],
-        dynamic=sets['dynamic'],
-        noise_density_m_s2_sqrt_hz=_triple(facts.noise_density),
+        static=regimes['static'],
+        dynamic=regimes['dynamic'],
+        noise_density_m_s2_sqrt_hz=_triple(np.maximum(prior.sigma * np.sqrt(window_s), 1e-9)),
+        slow_noise_m_s2_sqrt_h=_triple(walk),
         misalignment=(_triple(matrix[0]), _triple(matrix[1]), _triple(matrix[2])),
-        misalignment_sd=_misalignment_sd(outcome, float(inflated.mean()) * covariance),
-        memory_time_constants_s=tuple(solution.time_constants_s.tolist()),
+        misalignment_sd=_triple(np.sqrt(np.diag(covariance)[-3:])),
+        response=terms,
         board_lag_s=facts.board_lag,
-        detector=detector,
+        detector=facts.detector,
         provenance=Provenance(
             created=datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ'),
             tool_version=__version__,
-            model=solution.spec.name,
+            model=facts.model,
             sources=tuple(
                 Source(bag.source.name, bag.source.sha256 or '', bag.n_samples) for bag in bags
             ),
@@ -198,52 +211,158 @@ def build_calibration(
                 if finding.level != 'good'
             ),
         ),
+        evidence=tuple(
+            GroupEvidence(
+                group=worth.group,
+                part='bias' if worth.part == 'bias' else 'scale',
+                explains_m_s2=worth.explains,
+                effective_parameters=max(worth.effective, 0.0),
+                log_evidence_change=worth.evidence,
+                prior_sd=(worth.sd,),
+            )
+            for worth in learnt.worth
+        ),
+        posterior=posterior_of(covariance, _LEFT_ON_DIAGONAL),
     )
 
 
+def _axis_set(
+    sets: Sets, weights: _Weights, axis: int, is_dynamic: bool, slow: float
+) -> AxisSet:
+    """
+    The curves of one axis in one regime.
+
+    """
+    n = sets.static.n_free
+    bias, scale = weights.bias[axis], weights.scale[axis]
+    family = sets.dynamic if is_dynamic else sets.static
+    delta = 0.0
+    of_bias, of_scale = bias[:n], scale[:n]
+    if is_dynamic:
+        delta = float(bias[n])
+        m = sets.dynamic.n_free
+        of_bias, of_scale = bias[n + 1 : n + 1 + m], scale[n + 1 : n + 1 + m]
+        if sets.is_shared:
+            # A difference is of lower order: what it lacks is the static curve's own.
+            family = sets.static
+            of_bias = bias[:n] + np.pad(of_bias, (0, n - m))
+            of_scale = scale[:n] + np.pad(of_scale, (0, n - m))
+    return AxisSet(
+        bias_function=_shaped(family, 0.0, _numbers(of_bias)),
+        scale_function=_shaped(family, 1.0, _numbers(of_scale)),
+        delta=delta,
+        residual_sd_m_s2=slow,
+    )
+
+
+def _shaped(
+    family: TemperatureFunction, reference: float, values: tuple[float, ...]
+) -> TemperatureFunction:
+    """
+    A function of a family with its value at the reference, and its free coefficients.
+
+    """
+    if isinstance(family, Polynomial):
+        return Polynomial((reference, *values))
+    if isinstance(family, CubicSpline):
+        anchored = tuple(reference if knot == 0.0 else 0.0 for knot in family.knots_k)
+        return CubicSpline(family.knots_k, anchored).with_free(values)
+    return replace(family, constant=reference - math.fsum(values), amplitudes=values)
+
+
+def _to_file(
+    regression: Regression,
+    learnt: Learnt,
+    sets: Sets,
+    nominal: Floats,
+    n_sets: int,
+    used: Sequence[int],
+) -> Floats:
+    """
+    Derivative of the file's parameters, in its order, by the regression's.
+
+    """
+    layout, state = learnt.posterior.layout, learnt.posterior.state
+    n, m = sets.static.n_free, sets.dynamic.n_free
+    rows: list[Floats] = []
+
+    def row(*terms: tuple[int, float]) -> None:
+        made = np.zeros(layout.n_unit)
+        for place, value in terms:
+            if place >= 0:
+                made[place] += value
+        rows.append(made)
+
+    for axis in range(3):
+        for places, level, unit in (
+            (layout.on_bias[axis], (int(layout.bias[axis]), nominal[axis]), nominal[axis]),
+            (layout.on_scale[axis], (int(layout.kappa[axis]), 1.0 / state.kappa[axis]), 1.0),
+        ):
+            each = [(int(p), unit / r) for p, r in zip(places, regression.rms, strict=True)]
+            row(level)
+            for k in range(n):
+                row(each[k])
+            row(level, each[n])
+            if sets.is_shared:
+                for k in range(n):
+                    row(each[k], *([each[n + 1 + k]] if k < m else []))
+            else:
+                for k in range(m):
+                    row(each[n + 1 + k])
+            for k in used:
+                row(each[n_sets + k])
+    a, _, c = state.skew
+    # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the skew (a, b, c) of its inverse.
+    s = [int(place) for place in layout.skew]
+    row((s[0], -1.0))
+    row((s[0], c), (s[1], -1.0), (s[2], a))
+    row((s[2], -1.0))
+    return np.array(rows)
+
+
+def _slow_error(windows: ThermalWindows, learnt: Learnt) -> Floats:
+    """
+    What the bias does of itself: another one in each mounting, and a walk since the start [m/s^2].
+
+    The walk's mean square over a run as long as the bags is half of what it has at the end.
+
+    """
+    prior = learnt.prior
+    data = windows.data
+    length = [float(np.ptp(data.time[data.bag == bag])) for bag in np.unique(data.bag)]
+    walked = prior.sigma**2 * prior.rho * float(np.median(length)) / 2.0
+    return np.sqrt(prior.offset_sd**2 + walked)
+
+
+def _numbers(values: Floats) -> tuple[float, ...]:
+    return tuple(float(v) + 0.0 for v in values)  # no -0.0
+
+
 def _triple(values: Floats) -> tuple[float, float, float]:
-    a, b, c = (float(v) + 0.0 for v in values)  # no -0.0
+    a, b, c = _numbers(values)
     return a, b, c
 
 
-def _misalignment_sd(outcome: Outcome, covariance: Floats) -> tuple[float, float, float]:
-    where = outcome.layout.skew
-    if where[0] < 0:
-        return (UNKNOWN_SKEW,) * 3
-    a, _, c = outcome.solution.skew
-    # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the skew (a, b, c) of its inverse.
-    jacobian = np.array([[-1.0, 0.0, 0.0], [c, -1.0, a], [0.0, 0.0, -1.0]])
-    block = jacobian @ covariance[np.ix_(where, where)] @ jacobian.T
-    return _triple(np.sqrt(np.maximum(np.diag(block), 0.0)))
-
-
-def _ranges(
-    table: WindowTable, outcome: Outcome, regime: int, reference_temperature: float
-) -> dict[str, tuple[float, float]]:
+def _ranges(windows: ThermalWindows) -> dict[str, tuple[float, float]]:
     """
-    Ranges of the regressors over a regime's windows.
-
-    A set that shares its curve with the other regime was fitted on all the windows.
+    Ranges of temperature and rate; what both sets share was fitted on all the windows.
 
     """
-    solution = outcome.solution
-    rows = table.is_dynamic if regime else ~table.is_dynamic
-    if solution.spec.dynamic is None or rows.sum() < _FEWEST_WINDOWS:
-        rows = np.ones(len(table.t), dtype=bool)
-    lags = regressors(table, solution.spec, solution.time_constants_s, solution.start_memory)
-    memory = lags.bias[rows][:, list(solution.spec.memory_columns('bias'))]
-    spec = solution.spec
-    reach = _LINEAR_REACH if spec.gradient or spec.rate or spec.n_lags else 1.0
     return {
-        'temperature_range_c': _range(table.t[rows] + reference_temperature, 0.01),
-        'rate_range_k_min': _widened(table.rate[rows] * 60.0, reach),
-        'gradient_range_k': _widened(table.gradient[rows], reach),
-        'memory_range_k': _widened(memory.ravel(), reach) if memory.size else (-50.0, 50.0),
+        'temperature_range_c': _range(windows.temperature, _UNSEEN_RANGE_C),
+        'rate_range_k_min': _widened(windows.rate * 60.0, _LINEAR_REACH, 0.01),
     }
 
 
-def _widened(values: Floats, reach: float) -> tuple[float, float]:
-    lower, upper = _range(values, 0.01)
+def _column_range(column: Column, values: Floats) -> tuple[float, float]:
+    if column.kind == 'even':
+        return column.range
+    reach = _LINEAR_REACH**2 if column.kind == 'square' else _LINEAR_REACH
+    return _widened(values, reach, 0.01)
+
+
+def _widened(values: Floats, reach: float, margin: float) -> tuple[float, float]:
+    lower, upper = _range(values, margin)
     return min(lower, reach * lower), max(upper, reach * upper)
 
 
@@ -251,3 +370,4 @@ def _range(values: Floats, smallest_margin: float) -> tuple[float, float]:
     lower, upper = float(np.min(values)), float(np.max(values))
     margin = max(_EDGE_MARGIN * (upper - lower), smallest_margin)
     return lower - margin, upper + margin
+

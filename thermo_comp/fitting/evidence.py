@@ -1,27 +1,26 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a fit shows for itself: positions, residuals before and after, what is left unexplained.
+Owns what a fit shows for itself: residuals of each step of the model, and of each position.
+
+A position is judged twice: as fitted, and by the unit's parameters without that position, which
+is what a new attitude will see.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..typing import Bools, Floats
+from ..typing import Floats
 from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
-from .reduction import ReducedBag, StillInterval
-from .regression import Outcome
-from .solution import Solution, correct, regressors, warming_up
-from .table import WindowTable
-
-# Slow errors are told from white noise by what averaging over so many windows takes away.
-_BLOCK = 6
-_LONG_BLOCK_S = 900.0
+from .learning import Learnt
+from .posterior import Regression, State
+from .reduction import ReducedBag
+from .windows import CURVE, SET, ThermalWindows
 
 
 @dataclass(frozen=True)
@@ -36,11 +35,13 @@ class PositionReport:
     start_ns : int
         Stamp of its start.
     duration_s : float
-        Length.
+        Length [s].
     up : tuple of float
         Estimated direction of the specific force, in the output frame.
     residual_rms : float
-        RMS of ``|f| - g`` over its windows.
+        RMS of ``|f| - g`` over its windows [m/s^2].
+    left_out_rms : float
+        The same, with what the other positions alone say of the unit [m/s^2].
 
     """
 
@@ -49,12 +50,13 @@ class PositionReport:
     duration_s: float
     up: tuple[float, float, float]
     residual_rms: float
+    left_out_rms: float
 
 
 @dataclass(frozen=True)
 class ResidualRow:
     """
-    ``|f| - g`` of one section, uncorrected and corrected.
+    ``|f| - g`` of one section, by step of the model.
 
     Parameters
     ----------
@@ -62,104 +64,116 @@ class ResidualRow:
         ``static``, ``dynamic`` or ``all``.
     raw : ResidualStatistics
         With the constants at the reference temperature.
-    one_set : ResidualStatistics
-        With one quadratic set, blind to the regime.
+    one_set, two_sets : ResidualStatistics
+        With one curve, blind to the regime; with a curve for each regime.
     fitted : ResidualStatistics
-        With the calibration.
+        With the calibration, on the data that it was fitted to.
+    left_out : ResidualStatistics
+        Each position with what the others say of the unit: what a new attitude will see.
 
     """
 
     section: str
     raw: ResidualStatistics
     one_set: ResidualStatistics
+    two_sets: ResidualStatistics
     fitted: ResidualStatistics
+    left_out: ResidualStatistics
 
 
 def residual_rows(
-    table: WindowTable, fitted: Solution, one_set: Solution
-) -> tuple[ResidualRow, ...]:
+    windows: ThermalWindows, regression: Regression, learnt: Learnt
+) -> tuple[tuple[ResidualRow, ...], Floats]:
     """
-    Compare raw, one set and the fitted sets on the same windows.
+    Compare the steps of the model on the same windows.
 
     Parameters
     ----------
-    table : WindowTable
+    windows : ThermalWindows
         The windows.
-    fitted, one_set : Solution
-        The chosen model, and one quadratic set.
+    regression : Regression
+        The regression on them.
+    learnt : Learnt
+        Its end.
 
     Returns
     -------
     tuple of ResidualRow
         Static, dynamic, all.
+    ndarray, shape (n,)
+        ``|f| - g`` of each window by the other positions [m/s^2].
 
     """
-    bias, scale = reference_constants(table, fitted)
-    raw = (table.mean - warming_up(table, fitted) - bias) / scale @ fitted.misalignment.T
-    by_model = [statistics_by_regime(norm_residual(raw, fitted.gravity), table.is_dynamic)]
-    for solution in (one_set, fitted):
-        residual = norm_residual(corrected(table, solution), fitted.gravity)
-        by_model.append(statistics_by_regime(residual, table.is_dynamic))
-    return tuple(
-        ResidualRow(section, *(model[section] for model in by_model))
+    state = learnt.posterior.state
+    nothing = np.zeros_like(state.on_bias)
+    steps = [regression.force(replace(state, on_bias=nothing, on_scale=nothing))]
+    for groups in ((CURVE,), (CURVE, SET)):
+        steps.append(regression.force(_with_only(regression, learnt, groups)))
+    steps.append(regression.force(state))
+    residuals = [norm_residual(force, regression.gravity) for force in steps]
+    left_out = left_out_residual(regression, learnt)
+    is_dynamic = windows.weight > 0.5
+    tables = [statistics_by_regime(r, is_dynamic) for r in (*residuals, left_out)]
+    rows = tuple(
+        ResidualRow(section, *(table[section] for table in tables))
         for section in ('static', 'dynamic', 'all')
     )
+    return rows, left_out
 
 
-def corrected(table: WindowTable, solution: Solution) -> Floats:
+def _with_only(regression: Regression, learnt: Learnt, groups: tuple[str, ...]) -> State:
     """
-    Correct a table's windows with a solution, shape (n, 3).
-
-    """
-    columns = regressors(table, solution.spec, solution.time_constants_s, solution.start_memory)
-    return correct(table, solution, columns)
-
-
-def reference_constants(table: WindowTable, solution: Solution) -> tuple[Floats, Floats]:
-    """
-    Bias and scale at the reference temperature in still air.
-
-    A unit that heats itself has a gradient in still air, too; the level of a model with a
-    gradient term alone is no state that the unit is ever in.
-
-    Parameters
-    ----------
-    table : WindowTable
-        Gives the gradient in still air.
-    solution : Solution
-        The estimates.
-
-    Returns
-    -------
-    bias, scale : ndarray, shape (3,)
-        Input units; input units per m/s^2.
+    Fit again with some groups only, as wide as they like to be.
 
     """
-    spec = solution.spec
-    bias, scale = solution.bias[:, 0].copy(), solution.scale[:, 0].copy()
-    if spec.gradient and spec.live == 'both':
-        calm = np.abs(table.rate) <= np.quantile(np.abs(table.rate), 0.1)
-        gradient = float(np.median(table.gradient[calm]))
-        behind = spec.rate + spec.n_lags + 1
-        bias += gradient * solution.bias[:, -behind]
-        scale += gradient * solution.scale[:, -behind]
-    return bias, scale
+    wide = {'bias': 0.05, 'scale': 0.005}
+    kept = {
+        (part, group): sd
+        for part, sd in wide.items()
+        for group in groups
+        if group in regression.windows.groups
+    }
+    # What such a model leaves is no noise of the windows; it counts for all of them alike.
+    prior = replace(learnt.prior, groups=kept, offset_sd=1e-7, rho=np.zeros(3))
+    return regression.solve(learnt.posterior.state, prior).state
+
+
+def left_out_residual(regression: Regression, learnt: Learnt) -> Floats:
+    """
+    ``|f| - g`` of each position's windows by the other positions, shape (n,) [m/s^2].
+
+    """
+    position = regression.windows.position
+    result = np.empty(len(position))
+    for p in range(regression.windows.n_positions):
+        state = regression.without(learnt.posterior, learnt.prior, p)
+        rows = position == p
+        result[rows] = norm_residual(regression.force(state), regression.gravity)[rows]
+    return result
 
 
 def position_reports(
-    table: WindowTable, bags: Sequence[ReducedBag], solution: Solution
+    windows: ThermalWindows,
+    bags: Sequence[ReducedBag],
+    regression: Regression,
+    learnt: Learnt,
+    left_out: Floats,
 ) -> tuple[PositionReport, ...]:
     """
-    List the positions of a table with what the fit left on each.
+    List the positions with what the fit left on each.
 
     Parameters
     ----------
-    table : WindowTable
+    windows : ThermalWindows
         The windows.
     bags : sequence of ReducedBag
         Where they come from.
-    solution : Solution
-        The estimates.
+    regression : Regression
+        The regression on them.
+    learnt : Learnt
+        Its end.
+    left_out : ndarray, shape (n,)
+        As `left_out_residual` gives it.
 
     Returns
     -------
@@ -167,12 +181,16 @@ def position_reports(
         In order.
 
     """
-    residual = norm_residual(corrected(table, solution), solution.gravity)
+    data, state = windows.data, learnt.posterior.state
+    residual = norm_residual(regression.force(state), regression.gravity)
     result = []
-    for number, rows in enumerate(table.position_slices()):
-        bag = bags[int(table.bag[rows.start])]
-        interval = _interval_at(bag, float(table.time[rows.start]))
-        x, y, z = (float(v) for v in solution.up[number])
+    for number in range(data.n_positions):
+        rows = data.position == number
+        bag = bags[int(data.bag[rows][0])]
+        starts = [interval.time[0] for interval in bag.intervals]
+        at = np.searchsorted(starts, data.time[rows][0], side='right')
+        interval = bag.intervals[max(0, int(at) - 1)]
+        x, y, z = (float(v) for v in state.up[number])
         result.append(
             PositionReport(
                 source=bag.source.name,
@@ -180,144 +198,7 @@ def position_reports(
                 duration_s=(interval.end_ns - interval.start_ns) * 1e-9,
                 up=(x, y, z),
                 residual_rms=float(np.sqrt(np.mean(residual[rows] ** 2))),
+                left_out_rms=float(np.sqrt(np.mean(left_out[rows] ** 2))),
             )
         )
     return tuple(result)
-
-
-def _interval_at(bag: ReducedBag, time: float) -> StillInterval:
-    starts = [interval.time[0] for interval in bag.intervals]
-    return bag.intervals[max(0, int(np.searchsorted(starts, time, side='right')) - 1)]
-
-
-def slow_error(table: WindowTable, outcome: Outcome) -> Floats:
-    """
-    Split what is left into white noise and a slow part, and return the slow part.
-
-    Averaging over m windows divides the variance of white noise by m and leaves a slow error as
-    it is: ``v(1) = s^2 + w^2`` and ``v(m) = s^2 + w^2 / m``.
-
-    Parameters
-    ----------
-    table : WindowTable
-        The windows.
-    outcome : Outcome
-        The regression.
-
-    Returns
-    -------
-    ndarray, shape (2, 3)
-        Standard deviation of the slow error per regime and axis [m/s^2].
-
-    """
-    scale = np.abs(outcome.solution.scale[:, 0])
-    residual = outcome.residual / scale
-    result = np.zeros((2, 3))
-    dynamic = table.is_dynamic
-    for regime, wanted in enumerate((~dynamic, dynamic)):
-        single, block = _variances(table, residual, wanted, _BLOCK)
-        if block is None:
-            single, block = _variances(table, residual, np.ones_like(wanted), _BLOCK)
-        if block is not None:
-            square = (_BLOCK * block - single) / (_BLOCK - 1)
-            result[regime] = np.sqrt(np.maximum(square, 0.0))
-    return result
-
-
-def noise_density(table: WindowTable, bags: Sequence[ReducedBag], outcome: Outcome) -> Floats:
-    """
-    White noise of the specific force as a density, from the scatter of the window means.
-
-    This is the noise that an integrating filter meets. A converter that carries its remainder
-    scatters more from sample to sample, but that part cancels in a sum.
-
-    Parameters
-    ----------
-    table : WindowTable
-        The windows.
-    bags : sequence of ReducedBag
-        Their cycle, and the samples' scatter where the windows are too few.
-    outcome : Outcome
-        The regression.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        [m/s^2/sqrt(Hz)].
-
-    """
-    scale = np.abs(outcome.solution.scale[:, 0])
-    cycle = float(np.median([bag.cycle_s for bag in bags]))
-    everything = np.ones(len(table.time), dtype=bool)
-    single, block = _variances(table, outcome.residual / scale, everything, 2)
-    if block is None:
-        samples = [interval.sample_sd for bag in bags for interval in bag.intervals]
-        density = np.median(samples, axis=0) / scale * np.sqrt(cycle)
-    else:
-        # Pairs: v(1) - v(2) = w^2 / 2.
-        white = 2.0 * np.maximum(single - block, 0.0)
-        density = np.sqrt(white * float(np.median(table.count)) * cycle)
-    return np.asarray(np.maximum(density, 1e-9))
-
-
-def inflation(table: WindowTable, outcome: Outcome) -> Floats:
-    """
-    Tell by how much correlated residuals make the covariance of white ones too small.
-
-    Means over long blocks of white residuals have the variance of one divided by their number;
-    what they have more is what the parameters' variance lacks.
-
-    Parameters
-    ----------
-    table : WindowTable
-        The windows.
-    outcome : Outcome
-        The regression.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Factor of each axis' covariance, at least 1.
-
-    """
-    steps = np.diff(table.time)
-    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else _LONG_BLOCK_S
-    size = max(2, round(_LONG_BLOCK_S / usual))
-    # The regression took the means of each position and more out: as many blocks are not free.
-    residual = outcome.residual
-    while size >= 2:
-        single, block = _variances(table, residual, np.ones(len(residual), bool), size)
-        if block is not None:
-            return np.maximum(1.0, size * block / np.maximum(single, 1e-300))
-        size //= 2
-    return np.ones(3)
-
-
-def _variances(
-    table: WindowTable, residual: Floats, wanted: Bools, size: int
-) -> tuple[Floats, Floats | None]:
-    """
-    Mean squares of single windows and of block means; None when there are too few blocks.
-
-    """
-    singles, means = [], []
-    for rows in table.position_slices():
-        part = residual[rows][wanted[rows]]
-        n = len(part) // size
-        if n:
-            part = part[: n * size]
-            singles.append(part)
-            means.append(part.reshape(n, size, 3).mean(axis=1))
-    if sum(map(len, means)) < 10:
-        return np.mean(residual**2, axis=0), None
-    single, block = np.concatenate(singles), np.concatenate(means)
-    return _trimmed_square(single), _trimmed_square(block)
-
-
-def _trimmed_square(values: Floats) -> Floats:
-    """
-    Mean square with outliers pulled in to 4 robust sd.
-
-    """
-    limit = 4.0 * 1.4826 * np.median(np.abs(values), axis=0)
-    return np.asarray(np.mean(np.clip(values, -limit, limit) ** 2, axis=0))

@@ -8,47 +8,37 @@ Owns the fit as a whole: sources in, calibration with its evidence out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import FitError
 from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..typing import Floats
 from ..unit.calibration import Calibration, Unit
+from ..unit.columns import Column, bank
 from ..unit.gravity import STANDARD_GRAVITY
-from .assembly import UNKNOWN_SKEW, UnitFacts, build_calibration
-from .evidence import (
-    PositionReport,
-    ResidualRow,
-    noise_density,
-    position_reports,
-    residual_rows,
-    slow_error,
-)
-from .history import ThermalHistory, thermal_history
-from .ladder import model_spec
-from .options import COUNTS_FULL_SCALE, FitOptions
+from .assembly import UnitFacts, build_calibration
+from .curves import sets_of
+from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
+from .learning import Key, Learnt, learn
+from .options import COUNTS_FULL_SCALE, GROUPS, FitOptions
+from .posterior import Prior, Regression, initial_state
 from .reduction import ReducedBag, reduce_source
-from .regression import Freedom, Outcome, regress
 from .rests import judge_rests
-from .selection import Candidate, Selector
 from .sensors import learn_detector
-from .solution import Solution
 from .sources import FitSource
 from .start import ConstantCalibration, constant_calibration, position_means
-from .table import WindowTable, window_table
-from .two_sets import even_handed
 from .verdict import (
-    POSITIONS_FOR_MISALIGNMENT,
     POSITIONS_NEEDED,
     Finding,
-    can_tell_misalignment,
+    distinct_directions,
     enforce,
     judge_bags,
     judge_result,
-    judge_table,
+    judge_windows,
 )
-from .warm_up import find_warm_up
+from .windows import CURVE, SET, ThermalWindows, thermal_windows
 
 Progress = Callable[[str, float], None]
 
@@ -56,6 +46,12 @@ Progress = Callable[[str, float], None]
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 # Stands in where the bags do not tell how far the board lags behind the case.
 _USUAL_BOARD_LAG_S = 900.0
+# Built-in prior, wide for any triad: bias [m/s^2], relative scale, elements of M [rad].
+_BIAS_SD, _SCALE_SD, _SKEW_SD = 1.0, 0.05, 1e-3
+# Widths that the groups begin with and silent ones keep: what a cheap sensor does over a chamber.
+_GROUP_BIAS_SD, _GROUP_SCALE_SD = 1e-3, 1e-4
+# A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
+_OFFSET_SD, _SIGMA = 1e-6, 1e-5
 
 
 @dataclass(frozen=True)
@@ -67,33 +63,27 @@ class FitResult:
     ----------
     calibration : Calibration
         The result.
-    solution : Solution
-        The estimates behind it, with the attitudes.
-    outcome : Outcome
-        The regression's end.
-    candidates : tuple of Candidate
-        The models that were tried, smallest first.
+    learnt : Learnt
+        Posterior, prior and what each group is worth.
     residuals : tuple of ResidualRow
         Over the windows of the fit.
     positions : tuple of PositionReport
         The still intervals.
     findings : tuple of Finding
         What the data lacked, or not.
-    table : WindowTable
-        The windows.
+    windows : ThermalWindows
+        The windows of the regression.
     bags : tuple of ReducedBag
         The reduced bags.
 
     """
 
     calibration: Calibration
-    solution: Solution
-    outcome: Outcome
-    candidates: tuple[Candidate, ...]
+    learnt: Learnt
     residuals: tuple[ResidualRow, ...]
     positions: tuple[PositionReport, ...]
     findings: tuple[Finding, ...]
-    table: WindowTable
+    windows: ThermalWindows
     bags: tuple[ReducedBag, ...]
 
 
@@ -120,48 +110,12 @@ def fit(
     Raises
     ------
     FitError
-        If the data cannot carry the fit.
+        If the data contradict themselves, or there is no still interval.
 
     """
     tell = progress or _no_progress
     check_serial(sources, options)
     return fit_bags(reduce_sources(sources, options, tell), options, tell)
-
-
-def fit_bags(
-    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress | None = None
-) -> FitResult:
-    """
-    Fit a calibration to bags that have been reduced, by whomever.
-
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        One per bag; each interval's number of the bag is its place here.
-    options : FitOptions
-        What the user said; the lengths are those of the reduction.
-    progress : callable, optional
-        Told a stage's name and how far the whole is, 0..1.
-
-    Returns
-    -------
-    FitResult
-        Calibration and evidence.
-
-    Raises
-    ------
-    FitError
-        If the data cannot carry the fit.
-
-    """
-    tell = progress or _no_progress
-    detector = options.detector or learn_detector(bags)
-    histories = []
-    for number, bag in enumerate(bags):
-        tell('temperatures', 0.6 + 0.1 * number / len(bags))
-        histories.append(history_of(bag, detector, options))
-    table = window_table(bags, histories, options.reference_temperature)
-    return _fit_table(table, bags, detector, options, tell)
 
 
 def reduce_sources(
@@ -170,31 +124,17 @@ def reduce_sources(
     """
     Stream all sources into their sufficient statistics.
 
-    Parameters
-    ----------
-    sources : sequence of FitSource
-        The bags.
-    options : FitOptions
-        Lengths and full scale.
-    progress : callable
-        Told how far it is.
-
-    Returns
-    -------
-    list of ReducedBag
-        One per source.
-
     Raises
     ------
     FitError
-        If there is no source, or one has no samples, no still interval or no board temperature.
+        If there is no source, or one has no samples or no still interval.
 
     """
     if not sources:
         raise FitError('no bag was given')
     bags = []
     for number, source in enumerate(sources):
-        progress('reading', 0.6 * number / len(sources))
+        progress('reading', 0.5 * number / len(sources))
         bags.append(reduce_bag(source, number, options))
     return bags
 
@@ -220,7 +160,7 @@ def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBa
     Raises
     ------
     FitError
-        If it has no samples, no still interval or no board temperature.
+        If it has no samples or no still interval.
 
     """
     full_scale = options.full_scale
@@ -236,8 +176,6 @@ def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBa
     )
     if not bag.n_samples:
         raise FitError(f'{source.name}: no accelerometer samples')
-    if not len(bag.board.value):
-        raise FitError(f'{source.name}: no board temperature; a thermal fit needs it')
     if not bag.intervals:
         raise FitError(
             f'{source.name}: no still interval of {options.min_still_s:g} s; the unit must '
@@ -246,177 +184,189 @@ def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBa
     return bag
 
 
-def history_of(bag: ReducedBag, detector: DetectorSettings, options: FitOptions) -> ThermalHistory:
-    """
-    Run the thermal tracker over one bag, as the node would with these options.
-
-    """
-    config = ThermalConfig(transition_time_s=options.transition_time_s)
-    return thermal_history(bag, detector, options.window_s / 5.0, config)
-
-
-def _fit_table(
-    table: WindowTable,
-    bags: Sequence[ReducedBag],
-    detector: DetectorSettings,
-    options: FitOptions,
-    tell: Progress,
+def fit_bags(
+    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress | None = None
 ) -> FitResult:
-    findings = list(enforce(judge_bags(bags, options), options))
-    findings += enforce(judge_rests(bags, options), options)
-    constant, table_findings = first_guess(table, bags, options)
-    findings += enforce(table_findings, options)
-    tells_misalignment = bool(np.any(constant.misalignment != np.eye(3)))
-    longest = max(len(history.board) * history.step_s for history in table.histories)
-    freedom = Freedom(
-        misalignment=options.misalignment is not False,
-        skew_sd=np.inf if tells_misalignment else UNKNOWN_SKEW,
-        time_constant_range_s=(2.0 * options.window_s, max(longest / 2.0, 4.0 * options.window_s)),
-    )
-    coarse = table.coarsened(_selection_window(table, options))
-    tell('models', 0.7)
-    warm_up = find_warm_up(coarse, options.gravity, constant, freedom)
-    if warm_up is not None:
-        findings.append(warm_up.finding())
-        table = table.select(table.time >= warm_up.cut_s).renumbered()
-        coarse = table.coarsened(_selection_window(table, options))
-    n_tried = 0
-
-    def trying(_name: str) -> None:
-        nonlocal n_tried
-        n_tried += 1
-        tell('models', min(0.7 + 0.01 * n_tried, 0.95))
-
-    transient_s = warm_up.time_constant_s if warm_up is not None else None
-    selector = Selector(coarse, options.gravity, constant, freedom, trying, transient_s)
-    if options.model == 'auto':
-        name = selector.choose()
-    else:
-        name = selector.try_model(model_spec(options.model, coarse)).spec.name
-    tell('regression', 0.95)
-    chosen = _refined(table, selector, name, freedom)
-    one_set = _refined(table, selector, 'quadratic', freedom)
-    slow = slow_error(table, chosen)
-    if not tells_misalignment:
-        chosen, one_set = without_misalignment(chosen), without_misalignment(one_set)
-    residuals = residual_rows(table, chosen.solution, one_set.solution)
-    findings += judge_result(chosen.solution, residuals, slow, options)
-    facts = UnitFacts(
-        _unit(bags, options), noise_density(table, bags, chosen), board_lag(table), slow
-    )
-    calibration = build_calibration(
-        chosen, table, bags, detector, facts, options.reference_temperature, residuals, findings
-    )
-    return FitResult(
-        calibration=calibration,
-        solution=chosen.solution,
-        outcome=chosen,
-        candidates=selector.table_of(name),
-        residuals=residuals,
-        positions=position_reports(table, bags, chosen.solution),
-        findings=tuple(findings),
-        table=table,
-        bags=tuple(bags),
-    )
-
-
-def _selection_window(table: WindowTable, options: FitOptions) -> float:
     """
-    Length of the windows that candidates are compared on: some twenty of them per position.
-
-    """
-    spans = [float(np.ptp(table.time[rows])) for rows in table.position_slices()]
-    wanted = min(options.selection_window_s, float(np.median(spans)) / 20.0)
-    return max(wanted, options.window_s)
-
-
-def first_guess(
-    table: WindowTable, bags: Sequence[ReducedBag], options: FitOptions
-) -> tuple[ConstantCalibration, list[Finding]]:
-    """
-    Fit the triad without temperature, and judge what the windows cover.
+    Fit a calibration to bags that have been reduced, by whomever.
 
     Parameters
     ----------
-    table : WindowTable
-        The windows.
     bags : sequence of ReducedBag
-        Where they come from.
+        One per bag; each interval's number of the bag is its place here.
     options : FitOptions
-        Whether M is wanted.
+        What the user said; the lengths are those of the reduction.
+    progress : callable, optional
+        Told a stage's name and how far the whole is, 0..1.
 
     Returns
     -------
-    ConstantCalibration
-        First guess; M is the identity when it is not to be estimated.
-    list of Finding
-        Findings.
+    FitResult
+        Calibration and evidence.
 
     Raises
     ------
     FitError
-        If there are fewer positions than anything can be fitted to.
+        If the data contradict themselves.
 
     """
-    n = table.n_positions
-    if n < POSITIONS_NEEDED:
-        raise FitError(
-            f'{n} still positions, need {POSITIONS_NEEDED} for bias and scale and '
-            f'{POSITIONS_FOR_MISALIGNMENT} for the misalignment'
-        )
-    means = position_means(table)
-    box = constant_calibration(means, options.gravity, with_misalignment=False)
-    force = box.force(means)
-    up = force / np.linalg.norm(force, axis=1, keepdims=True)
-    wanted = can_tell_misalignment(up) if options.misalignment is None else options.misalignment
+    tell = progress or _no_progress
+    _check_temperatures(bags)
+    findings = list(enforce(judge_bags(bags, options), options))
+    findings += enforce(judge_rests(bags, options), options)
+    detector = options.detector or learn_detector(bags)
+    tell('temperatures', 0.55)
+    sets = sets_of(options, bags)
+    columns = () if options.model == 'golovach' else bank()
+    windows = thermal_windows(
+        bags,
+        columns,
+        sets,
+        detector,
+        ThermalConfig(transition_time_s=options.transition_time_s),
+        options.reference_temperature,
+        options.regression_window_s,
+    )
+    start = first_guess(windows, options)
+    up = start.force(position_means(windows.data))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
     has_case = all(len(bag.case.value) for bag in bags)
-    findings = judge_table(table, up, wanted, has_case)
-    if not wanted and options.misalignment is None:
-        findings.append(
-            Finding(
-                'misalignment',
-                'advice',
-                'these positions identify bias and scale only, M stays the identity; it needs '
-                f'{POSITIONS_FOR_MISALIGNMENT} well spread ones',
-            )
-        )
-    if not wanted:
-        return box, findings
-    return constant_calibration(means, options.gravity, with_misalignment=True), findings
-
-
-def without_misalignment(outcome: Outcome) -> Outcome:
-    """
-    Publish the identity for an M that the positions cannot tell.
-
-    It was free within what a triad's M may be, lest it be taken for drift: the covariance of the
-    other parameters keeps that doubt.
-
-    """
-    return replace(
-        outcome,
-        solution=replace(outcome.solution, skew=np.zeros(3)),
-        layout=replace(outcome.layout, skew=np.full(3, -1)),
+    findings += enforce(judge_windows(windows, up, has_case), options)
+    tell('regression', 0.7)
+    nominal = start.scale
+    regression = Regression(windows.data, options.gravity, nominal)
+    inverse = np.linalg.inv(start.misalignment)
+    state = initial_state(
+        windows.data,
+        regression.n_bags,
+        start.bias / nominal,
+        np.ones(3),
+        np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
+        up,
+    )
+    prior = _wide_prior(windows, start, up, columns, options)
+    forced = {(part, group) for group in options.forced for part in ('bias', 'scale')}
+    if options.model == 'golovach':
+        forced = set(prior.groups)
+    learnt = learn(
+        regression,
+        state,
+        prior,
+        frozenset(forced),
+        lambda part: tell('regression', 0.7 + 0.25 * part),
+    )
+    residuals, left_out = residual_rows(windows, regression, learnt)
+    findings += judge_result(
+        learnt.posterior.state.kappa * nominal, residuals, learnt.prior.offset_sd, options
+    )
+    facts = UnitFacts(
+        _unit(bags, options),
+        detector,
+        board_lag(windows),
+        options.reference_temperature,
+        options.model,
+    )
+    calibration = build_calibration(
+        windows, regression, learnt, columns, sets, nominal, bags, facts, residuals, findings
+    )
+    return FitResult(
+        calibration=calibration,
+        learnt=learnt,
+        residuals=residuals,
+        positions=position_reports(windows, bags, regression, learnt, left_out),
+        findings=tuple(findings),
+        windows=windows,
+        bags=tuple(bags),
     )
 
 
-def _refined(table: WindowTable, selector: Selector, name: str, freedom: Freedom) -> Outcome:
-    """
-    Repeat a candidate's fit on the fine windows, from where the coarse ones left it.
-
-    """
-    trial = selector.try_model(model_spec(name, table))
-    return even_handed(table, regress(table, trial.outcome.solution, freedom), freedom)
+def _check_temperatures(bags: Sequence[ReducedBag]) -> None:
+    seen = [bool(len(bag.board.value)) for bag in bags]
+    if any(seen) and not all(seen):
+        name = bags[seen.index(False)].source.name
+        raise FitError(f'{name}: no board temperature, which the other bags have')
 
 
-def board_lag(table: WindowTable) -> float:
+def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
     """
-    Time constant of the board behind the case: slope of the gradient over the board's rate.
+    Guess the triad without temperature: by its ellipsoid, or by the norm where that is not seen.
+
+    Parameters
+    ----------
+    windows : ThermalWindows
+        The windows.
+    options : FitOptions
+        Local gravity, unit of the samples.
+
+    Returns
+    -------
+    ConstantCalibration
+        M is the identity.
+
+    Raises
+    ------
+    FitError
+        If the norms are no gravity.
 
     """
-    rate = table.rate - np.mean(table.rate)
+    means = position_means(windows.data)
+    gravity = options.gravity
+    norms = np.linalg.norm(means, axis=1)
+    if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
+        return constant_calibration(means, gravity, with_misalignment=False)
+    scale = float(np.median(norms)) / gravity
+    if options.input == 'm/s^2':
+        if abs(scale - 1.0) > 0.2:
+            raise FitError(
+                f'the samples at rest have norm {scale * gravity:.3g}, expected {gravity:.3g} '
+                'm/s^2: is the unit right?'
+            )
+        scale = 1.0
+    return ConstantCalibration(np.zeros(3), np.full(3, scale), np.eye(3))
+
+
+def _wide_prior(
+    windows: ThermalWindows,
+    start: ConstantCalibration,
+    up: Floats,
+    columns: Sequence[Column],
+    options: FitOptions,
+) -> Prior:
+    """
+    What is known of any unit before its data are seen.
+
+    """
+    names = [CURVE, SET, *dict.fromkeys(column.group for column in columns)]
+    if options.groups is not None:
+        names = [name for name in names if name in options.groups]
+    if not windows.has_temperature:
+        names = []
+    groups: dict[Key, float] = {('bias', name): _GROUP_BIAS_SD for name in names}
+    if len(distinct_directions(up)) >= POSITIONS_NEEDED:
+        groups |= {('scale', name): _GROUP_SCALE_SD for name in names if name != GROUPS[-1]}
+    elif CURVE in names:
+        # Too few attitudes to tell it from the bias: it stays where it is.
+        groups['scale', CURVE] = _GROUP_SCALE_SD
+    return Prior(
+        bias_mean=start.bias / start.scale,
+        bias_sd=np.full(3, _BIAS_SD),
+        scale_sd=_SCALE_SD,
+        skew_sd=_SKEW_SD,
+        groups=groups,
+        offset_sd=_OFFSET_SD,
+        sigma=np.full(3, _SIGMA),
+        rho=np.zeros(3),
+    )
+
+
+def board_lag(windows: ThermalWindows) -> float:
+    """
+    Time constant of the board behind the case: slope of the gradient over the board's rate [s].
+
+    """
+    rate = windows.rate - np.mean(windows.rate)
     power = float(rate @ rate)
-    lag = float(rate @ table.gradient) / power if power > 0.0 else np.nan
+    lag = float(rate @ windows.gradient) / power if power > 0.0 else np.nan
     return lag if 1.0 <= lag <= 1e5 else _USUAL_BOARD_LAG_S
 
 

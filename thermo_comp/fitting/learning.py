@@ -21,11 +21,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ..typing import Floats, Ints
 from .posterior import Posterior, Prior, Regression, State
 
-Floats = npt.NDArray[np.float64]
 Key = tuple[str, str]
 
 # A group whose effective parameters are below this, under a wide prior, is not seen by the data.
@@ -151,7 +150,7 @@ def _silent(posterior: Posterior, regression: Regression, prior: Prior) -> froze
 
 def _places(
     posterior: Posterior, regression: Regression, prior: Prior
-) -> dict[Key, npt.NDArray[np.int64]]:
+) -> dict[Key, Ints]:
     layout = posterior.layout
     names = np.array(regression.windows.groups)
     return {

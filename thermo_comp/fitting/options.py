@@ -15,6 +15,10 @@ from ..thermal.settings import DetectorSettings
 
 #: The converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
+#: Families of the curve over temperature.
+CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
+#: What evidence judges: curve and set of the two sets, then the groups of the response.
+GROUPS = ('curve', 'set', 'now', 'board', 'neighbour', 'product', 'even', 'play')
 
 
 @dataclass(frozen=True)
@@ -26,9 +30,16 @@ class FitOptions:
     ----------
     gravity : float
         Local gravity; see `gravity.resolve_gravity`.
-    model : str, optional
-        ``auto``, ``golovach`` (the paper: static linear, quadratic where the soaks bend;
-        dynamic quadratic), or a candidate's name such as ``quadratic+gradient+memory2``.
+    model : {'response', 'golovach'}, optional
+        The whole bank, thinned by evidence; or the paper: a linear static and a quadratic dynamic
+        set, without a response.
+    static_curve, dynamic_curve : str or None, optional
+        ``linear``, ``quadratic``, ``cubic``, ``spline`` or ``exponential``; None takes the
+        model's own.
+    groups : tuple of str or None, optional
+        Groups of columns that may take part; None takes all.
+    forced : tuple of str, optional
+        Groups that stay whatever they earn.
     serial : str or None, optional
         Unit serial; None takes the sources'.
     input : {'counts', 'm/s^2'}, optional
@@ -38,16 +49,14 @@ class FitOptions:
         usual range that holds the data.
     reference_temperature : float, optional
         T_ref; the paper uses 20.
-    misalignment : bool or None, optional
-        Whether M is estimated; None decides by the positions.
     detector : DetectorSettings or None, optional
         Thermometer and detector settings; None learns them from the bags.
     transition_time_s : float, optional
         Cross-over time of the sets, as the node will use.
     window_s, cell_s, min_still_s : float, optional
         Lengths of a window, of a cell and of the shortest still interval.
-    selection_window_s : float, optional
-        Length of the windows on which candidates are compared.
+    regression_window_s : float, optional
+        Length up to which neighbouring windows of a position are merged for the regression.
     allow : tuple of str, optional
         Names of refusals that the user overrides, see `verdict`.
 
@@ -59,22 +68,25 @@ class FitOptions:
     """
 
     gravity: float
-    model: str = 'auto'
+    model: Literal['response', 'golovach'] = 'response'
+    static_curve: str | None = None
+    dynamic_curve: str | None = None
+    groups: tuple[str, ...] | None = None
+    forced: tuple[str, ...] = ()
     serial: str | None = None
     input: Literal['counts', 'm/s^2'] = 'counts'
     full_scale: float | None = None
     reference_temperature: float = 20.0
-    misalignment: bool | None = None
     detector: DetectorSettings | None = None
     transition_time_s: float = 30.0
     window_s: float = 10.0
     cell_s: float = 0.5
     min_still_s: float = 3.0
-    selection_window_s: float = 60.0
+    regression_window_s: float = 60.0
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ('gravity', 'window_s', 'cell_s', 'min_still_s', 'selection_window_s'):
+        for name in ('gravity', 'window_s', 'cell_s', 'min_still_s', 'regression_window_s'):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {value}')
@@ -82,6 +94,15 @@ class FitOptions:
             raise ValueError(f'`full_scale` must be positive, got {self.full_scale}')
         if self.input not in ('counts', 'm/s^2'):
             raise ValueError(f"`input` must be 'counts' or 'm/s^2', got {self.input!r}")
+        if self.model not in ('response', 'golovach'):
+            raise ValueError(f"`model` must be 'response' or 'golovach', got {self.model!r}")
+        for name in ('static_curve', 'dynamic_curve'):
+            value = getattr(self, name)
+            if value is not None and value not in CURVES:
+                raise ValueError(f'`{name}` must be one of {", ".join(CURVES)}, got {value!r}')
+        for group in (*(self.groups or ()), *self.forced):
+            if group not in GROUPS:
+                raise ValueError(f'`groups` must be of {", ".join(GROUPS)}, got {group!r}')
         if not self.cell_s <= self.window_s:
             raise ValueError(
                 f'`cell_s` must not exceed `window_s` ({self.window_s}), got {self.cell_s}'

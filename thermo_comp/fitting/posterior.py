@@ -23,13 +23,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
+from ..typing import Bools, Floats, Ints
 from .whitening import Whitener
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 # Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
 _JITTER = 1e-13
@@ -61,6 +58,8 @@ class Windows:
         Derivative of each column by that state.
     start_covariance : ndarray, shape (n_lags, n_lags)
         Prior of the start states [K^2].
+    in_scale : ndarray of bool, shape (m,)
+        Which columns the scale may have as well as the bias.
 
     """
 
@@ -74,6 +73,7 @@ class Windows:
     lag: Ints
     start: Floats
     start_covariance: Floats
+    in_scale: Bools
 
     @property
     def n_positions(self) -> int:
@@ -315,6 +315,7 @@ class Regression:
             part: np.array([(part, group) in prior.groups for group in groups])
             for part in ('bias', 'scale')
         }
+        uses['scale'] &= self.windows.in_scale
         n_axis = 2 + sum(int(used.sum()) for used in uses.values())
         axis = take(3, n_axis)
         n_bias = int(uses['bias'].sum())
@@ -426,64 +427,24 @@ class Regression:
         Hessian and gradient of minus the log likelihood, and the residuals.
 
         """
-        n_columns = len(self.windows.groups)
-        moved, lag = self.moved, self.windows.lag
-        A = inverse_misalignment(state.skew)
-        force = self.gravity * state.up @ A.T
-        tangent = tangent_basis(state.up)
-        hessian = np.zeros((layout.n, layout.n))
-        gradient = np.zeros(layout.n)
         residual = self.residual(state)
         white = np.empty_like(residual)
+        filtered = np.empty_like(residual)
         size = 0.0
-        used_b = np.flatnonzero(layout.on_bias[0] >= 0)
-        used_s = np.flatnonzero(layout.on_scale[0] >= 0)
-        has_start = layout.start.shape[1] > 0
-        width = layout.axis.shape[1]
-        behind = n_columns + 1 + np.arange(len(moved))
         for axis in range(3):
             found = self._whitened(axis, float(prior.rho[axis]))
-            sigma = float(prior.sigma[axis])
-            kappa = float(state.kappa[axis])
             w = self._whitener.filter(residual[:, axis : axis + 1], found.gains)[:, 0]
-            white[:, axis] = w / sigma
-            size += float(w @ w) / sigma**2 + found.determinant + 2.0 * len(w) * np.log(sigma)
+            filtered[:, axis] = w
+            white[:, axis] = w / prior.sigma[axis]
+            size += float(white[:, axis] @ white[:, axis]) + found.determinant
+            size += 2.0 * len(w) * float(np.log(prior.sigma[axis]))
+        hessian = np.zeros((layout.n, layout.n))
+        gradient = np.zeros(layout.n)
+        width = layout.axis.shape[1]
+        for axis in range(3):
             own = slice(layout.axis[axis, 0], layout.axis[axis, -1] + 1)
-            for p, rows in enumerate(self._rows):
-                a = float(force[p, axis])
-                m0 = state.start[self._bags[p]]
-                # How each unknown acts on the base: T; a weight takes its column along with what
-                # the start states add to it.
-                T = np.zeros((self._base.shape[1], width + 3 + 3 + layout.start.shape[1]))
-                scaled = T[:, 0]
-                scaled[0] = 1.0
-                scaled[1 : n_columns + 1] = state.on_scale[axis]
-                T[0, 1] = 1.0
-                at = np.arange(2, 2 + len(used_b))
-                T[1 + used_b, at] = 1.0
-                at_scale = np.arange(2 + len(used_b), width)
-                T[1 + used_s, at_scale] = kappa * a
-                if has_start:
-                    scaled[behind] = state.on_scale[axis, moved] * m0[lag[moved]]
-                    column = np.zeros((len(moved), n_columns))
-                    column[np.arange(len(moved)), moved] = m0[lag[moved]]
-                    T[n_columns + 1 :, at] = column[:, used_b]
-                    T[n_columns + 1 :, at_scale] = kappa * a * column[:, used_s]
-                    weight = state.on_bias[axis] + kappa * a * state.on_scale[axis]
-                    T[behind, width + 6 + lag[moved]] = weight[moved]
-                turned = kappa * self.gravity * scaled
-                for k, (row, source) in enumerate(_SKEW_ROWS):
-                    if row == axis:
-                        T[:, width + k] = state.up[p, source] * turned
-                T[:, width + 3 : width + 5] = np.outer(turned, A[axis] @ tangent[p])
-                T[0, width + 5] = 1.0
-                scaled *= a
-                G = T.T @ (found.grams[p] @ T) / sigma**2
-                g = T.T @ (found.base[rows].T @ w[rows]) / sigma**2
-                other = np.concatenate(
-                    (layout.skew, layout.up[p], layout.offset[p, axis : axis + 1],
-                     layout.start[self._bags[p]])
-                )
+            for p in range(len(self._rows)):
+                other, G, g = self._block(state, prior, layout, p, axis, filtered)
                 hessian[own, own] += G[:width, :width]
                 hessian[own, other] += G[:width, width:]
                 hessian[np.ix_(other, other)] += G[width:, width:]
@@ -494,6 +455,120 @@ class Regression:
                 own, layout.skew
             ].T
         return _Equations(hessian, gradient, residual, white, size)
+
+    def _block(
+        self, state: State, prior: Prior, layout: Layout, p: int, axis: int, filtered: Floats
+    ) -> tuple[Ints, Floats, Floats]:
+        """
+        What one axis in one position says: places behind the axis' own, Hessian, gradient.
+
+        """
+        n_columns = len(self.windows.groups)
+        moved, lag = self.moved, self.windows.lag
+        found = self._whitened(axis, float(prior.rho[axis]))
+        A = inverse_misalignment(state.skew)
+        a = self.gravity * float(A[axis] @ state.up[p])
+        kappa = float(state.kappa[axis])
+        used_b = np.flatnonzero(layout.on_bias[0] >= 0)
+        used_s = np.flatnonzero(layout.on_scale[0] >= 0)
+        width = layout.axis.shape[1]
+        m0 = state.start[self._bags[p]]
+        # How each unknown acts on the base: T; a weight takes its column along with what the
+        # start states add to it.
+        T = np.zeros((self._base.shape[1], width + 6 + layout.start.shape[1]))
+        scaled = np.zeros(len(T))
+        scaled[0] = 1.0
+        scaled[1 : n_columns + 1] = state.on_scale[axis]
+        T[0, 1] = 1.0
+        at = np.arange(2, 2 + len(used_b))
+        T[1 + used_b, at] = 1.0
+        at_scale = np.arange(2 + len(used_b), width)
+        T[1 + used_s, at_scale] = kappa * a
+        if layout.start.shape[1]:
+            scaled[n_columns + 1 :] = state.on_scale[axis, moved] * m0[lag[moved]]
+            column = np.zeros((len(moved), n_columns))
+            column[np.arange(len(moved)), moved] = m0[lag[moved]]
+            T[n_columns + 1 :, at] = column[:, used_b]
+            T[n_columns + 1 :, at_scale] = kappa * a * column[:, used_s]
+            weight = state.on_bias[axis] + kappa * a * state.on_scale[axis]
+            behind = n_columns + 1 + np.arange(len(moved))
+            T[behind, width + 6 + lag[moved]] = weight[moved]
+        T[:, 0] = a * scaled
+        turned = kappa * self.gravity * scaled
+        for k, (row, source) in enumerate(_SKEW_ROWS):
+            if row == axis:
+                T[:, width + k] = state.up[p, source] * turned
+        T[:, width + 3 : width + 5] = np.outer(turned, A[axis] @ tangent_basis(state.up[[p]])[0])
+        T[0, width + 5] = 1.0
+        rows, variance = self._rows[p], float(prior.sigma[axis]) ** 2
+        G = T.T @ (found.grams[p] @ T) / variance
+        g = T.T @ (found.base[rows].T @ filtered[rows, axis]) / variance
+        other = np.concatenate(
+            (
+                layout.skew,
+                layout.up[p],
+                layout.offset[p, axis : axis + 1],
+                layout.start[self._bags[p]],
+            )
+        )
+        return other, G, g
+
+    def without(self, posterior: Posterior, prior: Prior, p: int) -> State:
+        """
+        The mode that the other positions alone would give, to first order.
+
+        Parameters
+        ----------
+        posterior : Posterior
+            The mode of all.
+        prior : Prior
+            Its prior.
+        p : int
+            The position left out.
+
+        Returns
+        -------
+        State
+            What belongs to the unit has moved; the rest is as it was.
+
+        """
+        layout, n = posterior.layout, posterior.layout.n_unit
+        filtered = posterior.whitened * prior.sigma
+        own = [layout.up[p], layout.offset[p], layout.start[self._bags[p]]]
+        local = np.concatenate(own)
+        place = np.full(layout.n, -1)
+        place[:n] = np.arange(n)
+        place[local] = n + np.arange(len(local))
+        size = n + len(local)
+        hessian, gradient = np.zeros((size, size)), np.zeros(size)
+        for axis in range(3):
+            other, G, g = self._block(posterior.state, prior, layout, p, axis, filtered)
+            where = place[np.concatenate((layout.axis[axis], other))]
+            hessian[np.ix_(where, where)] += G
+            gradient[where] += g
+        away = self.vector(posterior.state, layout)
+        known = np.diag(posterior.precision[local])
+        if len(own[2]):
+            known[-len(own[2]) :, -len(own[2]) :] += self._start_information
+        gradient[n:] -= known @ away[local]
+        inner = np.linalg.solve(
+            hessian[n:, n:] + known, np.column_stack((hessian[n:, :n], gradient[n:]))
+        )
+        told = hessian[:n, :n] - hessian[:n, n:] @ inner[:, :n]
+        pull = gradient[:n] - hessian[:n, n:] @ inner[:, n]
+        C = posterior.covariance
+        step = np.zeros(layout.n)
+        step[:n] = -np.linalg.solve(np.eye(n) - C @ told, C @ pull)
+        return self._moved(posterior.state, step, layout)
+
+    def force(self, state: State) -> Floats:
+        """
+        Correct the windows as the compensator would: offsets and start states unknown, (n, 3).
+
+        """
+        along = self.measured - state.bias - self._columns @ state.on_bias.T
+        along /= state.kappa * (1.0 + self._columns @ state.on_scale.T)
+        return np.asarray(along @ np.linalg.inv(inverse_misalignment(state.skew)).T)
 
     def solve(
         self, state: State, prior: Prior, n_steps: int = 6, tolerance: float = 1e-3

@@ -17,9 +17,7 @@ from scipy.optimize import least_squares
 
 from ..errors import FitError
 from ..typing import Floats
-from .model import ModelSpec
-from .solution import Solution
-from .table import WindowTable
+from .posterior import Windows
 
 # Even a cheap sensor that drifts over 60 K stays within this of an ellipsoid; motion does not.
 _LARGEST_RMS = 0.05
@@ -120,65 +118,12 @@ def _refine(
     return unpack(found.x), gravity * float(np.sqrt(np.mean(residual(found.x) ** 2)))
 
 
-def starting_solution(
-    table: WindowTable,
-    spec: ModelSpec,
-    gravity: float,
-    constant: ConstantCalibration,
-    time_constants_s: Floats,
-    transient_s: float | None = None,
-) -> Solution:
+def position_means(windows: Windows) -> Floats:
     """
-    Turn the constant calibration into a start of the full regression.
-
-    Parameters
-    ----------
-    table : WindowTable
-        The windows.
-    spec : ModelSpec
-        The model.
-    gravity : float
-        Local gravity.
-    constant : ConstantCalibration
-        The first guess.
-    time_constants_s : ndarray, shape (n_lags,)
-        First guess of the lags [s].
-    transient_s : float or None, optional
-        Time constant of warming-up [s], where it is modelled.
-
-    Returns
-    -------
-    Solution
-        All temperature coefficients zero.
+    Mean raw vector of each position, shape (n_positions, 3).
 
     """
-    bias = np.zeros((3, spec.n_columns('bias')))
-    scale = np.zeros((3, spec.n_columns('scale')))
-    bias[:, 0] = constant.bias
-    scale[:, 0] = constant.scale
-    force = constant.force(position_means(table))
-    inverse = np.linalg.inv(constant.misalignment)
-    return Solution(
-        spec=spec,
-        gravity=gravity,
-        bias=bias,
-        scale=scale,
-        skew=np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
-        up=force / np.linalg.norm(force, axis=1, keepdims=True),
-        time_constants_s=np.asarray(time_constants_s, dtype=np.float64),
-        start_memory=np.zeros((len(table.histories), spec.n_lags)),
-        noise_sd=np.tile(1e-4 * gravity * constant.scale, (2, 1)),
-        transient=np.zeros((0 if transient_s is None else len(table.histories), 3)),
-        transient_s=transient_s or 1.0,
-    )
-
-
-def position_means(table: WindowTable) -> Floats:
-    """
-    Mean raw vector of each position, shape (n_positions, 3); a position has rows.
-
-    """
-    first = np.searchsorted(table.position, np.arange(table.n_positions))
-    total = np.add.reduceat(table.count, first)
-    weighted = np.add.reduceat(table.mean * table.count[:, None], first, axis=0)
+    first = np.searchsorted(windows.position, np.arange(windows.n_positions))
+    total = np.add.reduceat(windows.weight, first)
+    weighted = np.add.reduceat(windows.mean * windows.weight[:, None], first, axis=0)
     return np.asarray(weighted / total[:, None])

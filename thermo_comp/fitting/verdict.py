@@ -3,7 +3,7 @@
 """
 Owns the verdict: whether the bags can carry a calibration, with numbers and advice.
 
-A refusal stops the fit unless the user allows it by name; advice goes into the result.
+Only contradictions are refused. A refusal stops the fit unless the user allows it by name; advice goes into the result.
 
 """
 
@@ -11,20 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from ..errors import FitError
 from ..typing import Floats
 from ..unit.gravity import MICRO_G
-from .evidence import ResidualRow
 from .options import FitOptions
 from .reduction import ReducedBag
-from .solution import Solution
-from .table import WindowTable
+from .windows import ThermalWindows
 
-SPAN_NEEDED, SPAN_ADVISED = 10.0, 25.0
+if TYPE_CHECKING:
+    from .evidence import ResidualRow
+
+SPAN_ADVISED = 25.0
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_ADVISED = 6, 9, 18
 # Directions closer than this are one position measured twice.
 _SAME_DIRECTION_DEG = 5.0
@@ -160,20 +161,19 @@ def _judge_counts(bags: Sequence[ReducedBag]) -> list[Finding]:
     return []
 
 
-def judge_table(
-    table: WindowTable, up: Floats, with_misalignment: bool, has_case: bool
-) -> list[Finding]:
+def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> list[Finding]:
     """
     Judge what the still windows cover: temperatures, ramps, positions.
 
+    Nothing that is missing is refused: the posterior says what it costs. Refused is what
+    contradicts itself.
+
     Parameters
     ----------
-    table : WindowTable
+    windows : ThermalWindows
         The windows.
     up : ndarray, shape (n_positions, 3)
         Directions, to first order.
-    with_misalignment : bool
-        Whether M is to be estimated.
     has_case : bool
         Whether there are case temperatures.
 
@@ -183,84 +183,69 @@ def judge_table(
         Findings.
 
     """
-    findings = _judge_span(table) + _judge_ramps(table)
-    findings += _judge_positions(up, with_misalignment)
+    findings = _judge_positions(up)
+    if not windows.has_temperature:
+        text = 'no temperature was recorded: the calibration holds at the temperature of the test'
+        return [*findings, Finding('temperature', 'advice', text)]
+    findings += _judge_span(windows) + _judge_ramps(windows)
     if has_case:
-        findings += _judge_order(table)
-    else:
-        findings.append(
-            Finding(
-                'case',
-                'advice',
-                'no case temperature: the regime is told from the board alone, later and less '
-                'surely',
-            )
-        )
-    return findings
+        return findings + _judge_order(windows)
+    text = 'no case temperature: the regime is told from the board alone, later and less surely'
+    return [*findings, Finding('case', 'advice', text)]
 
 
-def _judge_span(table: WindowTable) -> list[Finding]:
-    lower, upper = float(np.min(table.t)), float(np.max(table.t))
+def _judge_span(windows: ThermalWindows) -> list[Finding]:
+    lower, upper = float(np.min(windows.temperature)), float(np.max(windows.temperature))
     span = upper - lower
     if span >= SPAN_ADVISED:
         return [Finding('span', 'good', f'temperature span {span:.1f} degC')]
-    level: Literal['refusal', 'advice'] = 'refusal' if span < SPAN_NEEDED else 'advice'
     return [
         Finding(
             'span',
-            level,
-            f'temperature span {span:.1f} degC, need {SPAN_NEEDED:g} ({SPAN_ADVISED:g} advised): '
-            'run the chamber over the whole range of use',
+            'advice',
+            f'temperature span {span:.1f} degC ({SPAN_ADVISED:g} advised): run the chamber over '
+            'the whole range of use',
         )
     ]
 
 
-def _judge_ramps(table: WindowTable) -> list[Finding]:
-    rate = table.rate * 60.0
+def _judge_ramps(windows: ThermalWindows) -> list[Finding]:
+    rate = windows.rate * 60.0
     heating, cooling = float(np.mean(rate > _RAMP_K_MIN)), float(np.mean(rate < -_RAMP_K_MIN))
     findings = []
     if heating + cooling < 0.02:
-        findings.append(
-            Finding(
-                'ramps',
-                'refusal',
-                f'no ramp: the board never changes by {_RAMP_K_MIN:g} K/min for long, so there '
-                'is no dynamic set; record ramps between the soaks',
-            )
+        text = (
+            f'no ramp: the board never changes by {_RAMP_K_MIN:g} K/min for long, so what a ramp '
+            'does is not known; record ramps between the soaks'
         )
+        findings.append(Finding('ramps', 'advice', text))
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
         seen, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
-        findings.append(
-            Finding(
-                'directions',
-                'advice',
-                f'only {seen} was seen; errors in a ramp change sign with its direction, so '
-                f'record {missing}, too',
-            )
+        text = (
+            f'only {seen} was seen; errors in a ramp change sign with its direction, so '
+            f'record {missing}, too'
         )
-    calm = float(np.mean(~table.is_dynamic))
+        findings.append(Finding('directions', 'advice', text))
+    calm = float(np.mean(windows.weight <= 0.5))
     if calm < 0.05:
-        findings.append(
-            Finding(
-                'soak',
-                'advice',
-                f'only {100.0 * calm:.0f} % of the windows are static: the soaks end before the '
-                'unit has settled; let some last several hours',
-            )
+        text = (
+            f'only {100.0 * calm:.0f} % of the windows are static: the soaks end before the '
+            'unit has settled; let some last several hours'
         )
+        findings.append(Finding('soak', 'advice', text))
     return findings
 
 
-def _judge_order(table: WindowTable) -> list[Finding]:
+def _judge_order(windows: ThermalWindows) -> list[Finding]:
     """
     Check that the case leads: the gradient has the sign of the board's rate.
 
     """
-    moving = np.abs(table.rate) * 60.0 > _RAMP_K_MIN
+    moving = np.abs(windows.rate) * 60.0 > _RAMP_K_MIN
     if moving.sum() < 30:
         return []
-    gradient = table.gradient - np.median(table.gradient)
-    correlation = float(np.corrcoef(gradient[moving], table.rate[moving])[0, 1])
+    gradient = windows.gradient - np.median(windows.gradient)
+    correlation = float(np.corrcoef(gradient[moving], windows.rate[moving])[0, 1])
     if correlation > -0.3:
         return []
     return [
@@ -273,49 +258,24 @@ def _judge_order(table: WindowTable) -> list[Finding]:
     ]
 
 
-def _judge_positions(up: Floats, with_misalignment: bool) -> list[Finding]:
-    distinct = distinct_directions(up)
-    n = len(distinct)
+def _judge_positions(up: Floats) -> list[Finding]:
+    n = len(distinct_directions(up))
     if n < POSITIONS_NEEDED:
-        return [
-            Finding(
-                'positions',
-                'refusal',
-                f'{n} distinct positions, need {POSITIONS_NEEDED} for bias and scale and '
-                f'{POSITIONS_FOR_MISALIGNMENT} for the misalignment '
-                f'({POSITIONS_ADVISED} advised)',
-            )
-        ]
-    findings = []
-    if with_misalignment and n < POSITIONS_FOR_MISALIGNMENT:
-        findings.append(
-            Finding(
-                'misalignment',
-                'refusal',
-                f'{n} distinct positions cannot tell the misalignment, need '
-                f'{POSITIONS_FOR_MISALIGNMENT}: add positions between the faces',
-            )
+        text = (
+            f'{n} distinct position{"s" * (n != 1)}: what tells bias from scale stays at its '
+            f'prior (that takes {POSITIONS_NEEDED}, the misalignment {POSITIONS_FOR_MISALIGNMENT})'
         )
-    worst = geometry(distinct, with_misalignment)
-    if not worst <= _WORST_GEOMETRY:
-        findings.append(
-            Finding(
-                'geometry',
-                'refusal',
-                f'the positions are badly spread: the worst parameter is known to {worst:.1f} '
-                f'times the noise, need {_WORST_GEOMETRY:g}; point each axis up, down and '
-                'between, or leave the misalignment out',
-            )
+        return [Finding('positions', 'advice', text)]
+    if not can_tell_misalignment(up):
+        text = (
+            f'{n} distinct positions tell bias and scale, the misalignment stays at its prior: '
+            f'it takes {POSITIONS_FOR_MISALIGNMENT} well spread ones'
         )
-    elif n < POSITIONS_ADVISED:
-        findings.append(
-            Finding('positions', 'advice', f'{n} positions; {POSITIONS_ADVISED} give more')
-        )
-    else:
-        findings.append(
-            Finding('positions', 'good', f'{n} positions, worst parameter {worst:.1f} x noise')
-        )
-    return findings
+        return [Finding('misalignment', 'advice', text)]
+    if n < POSITIONS_ADVISED:
+        text = f'{n} positions; {POSITIONS_ADVISED} give more'
+        return [Finding('positions', 'advice', text)]
+    return [Finding('positions', 'good', f'{n} positions')]
 
 
 def can_tell_misalignment(up: Floats) -> bool:
@@ -382,19 +342,19 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 
 def judge_result(
-    solution: Solution, rows: Sequence[ResidualRow], slow: Floats, options: FitOptions
+    K: Floats, rows: Sequence[ResidualRow], slow: float, options: FitOptions
 ) -> list[Finding]:
     """
     Judge what the fit left.
 
     Parameters
     ----------
-    solution : Solution
-        The estimates.
+    K : ndarray, shape (3,)
+        Scale factors.
     rows : sequence of ResidualRow
         Residuals before and after.
-    slow : ndarray, shape (2, 3)
-        Slow error per regime and axis.
+    slow : float
+        RMS over the axes of what no temperature explains [m/s^2].
     options : FitOptions
         The unit of the samples.
 
@@ -407,46 +367,23 @@ def judge_result(
     findings = []
     overall = rows[-1]
     raw, fitted = overall.raw.micro_g.rms, overall.fitted.micro_g.rms
-    left = float(np.sqrt(np.mean(slow**2))) / MICRO_G
-    text = f'|g| error {raw:.1f} ug RMS raw, {fitted:.1f} ug fitted, {left:.1f} ug of it slow'
-    if left > 0.3 * raw and left > 0.5 * fitted:
-        findings.append(
-            Finding(
-                'misfit',
-                'advice',
-                f'{text}: temperature does not explain the drift (jumps, mounting, a loose '
-                'thermometer?)',
-            )
-        )
+    left_out = overall.left_out.micro_g.rms
+    text = (
+        f'|g| error {raw:.1f} ug RMS raw, {left_out:.1f} ug on positions left out, '
+        f'{fitted:.1f} ug in sample'
+    )
+    if slow / MICRO_G > max(0.3 * raw, 0.5 * fitted):
+        why = ': temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
+        findings.append(Finding('misfit', 'advice', text + why))
     elif raw < 1.2 * fitted:
-        findings.append(
-            Finding(
-                'compensated',
-                'advice',
-                f'{text}: no temperature drift above the noise; already compensated?',
-            )
-        )
+        why = ': no temperature drift above the noise; already compensated?'
+        findings.append(Finding('compensated', 'advice', text + why))
     else:
         findings.append(Finding('residual', 'good', text))
-    relative = np.abs(solution.scale[:, 0])
-    if options.input == 'm/s^2' and np.abs(relative - 1.0).max() > 0.1:
-        findings.append(
-            Finding(
-                'units',
-                'advice',
-                f'the scale factors are {relative.min():.3g}..{relative.max():.3g}, expected near '
-                '1 for m/s^2: is the unit, or --gravity, right?',
-            )
+    if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
+        text = (
+            f'the scale factors are {K.min():.3g}..{K.max():.3g}, expected near 1 for m/s^2: is '
+            'the unit, or --gravity, right?'
         )
-    longest = float(np.max(solution.time_constants_s, initial=0.0))
-    if longest:
-        findings.append(
-            Finding(
-                'memory',
-                'good',
-                'thermal memory of '
-                + ' and '.join(f'{tau:.0f} s' for tau in solution.time_constants_s)
-                + f'; soaks should last {5.0 * longest / 3600.0:.1f} h to see it die',
-            )
-        )
+        findings.append(Finding('units', 'advice', text))
     return findings

@@ -19,9 +19,8 @@ References
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from ..typing import Floats, Ints
 
 
 class Whitener:
@@ -37,7 +36,7 @@ class Whitener:
 
     """
 
-    def __init__(self, position: npt.NDArray[np.int64], time: Floats) -> None:
+    def __init__(self, position: Ints, time: Floats) -> None:
         starts = np.flatnonzero(np.r_[True, position[1:] != position[:-1]])
         lengths = np.diff(np.r_[starts, len(position)])
         n_steps = int(lengths.max())

@@ -13,6 +13,7 @@ now        g_s                         heat that flows now
 rate       dT_board/dt [K/s]           the same, as seen by one thermometer
 board      T_board - L_tau(T_board)    parts that lag the board
 neighbour  L_tau(g_s)                  parts between the thermometers
+square     (T_board - L_tau)^2         curves of parts that lag the board
 even       tanh((g_s / width)^2)       heat load whichever way the heat flows
 play       P_r(v) - v, v = t or        rate-independent hysteresis
            v = L_tau(t)
@@ -68,13 +69,13 @@ class Column:
         'What evidence judges together.',
     ]
     kind: Annotated[
-        Literal['now', 'rate', 'board', 'neighbour', 'even', 'play'],
-        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; tanh((g_s / width)^2); '
+        Literal['now', 'rate', 'board', 'neighbour', 'square', 'even', 'play'],
+        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2; tanh((g_s / width)^2); '
         'play of t minus t, where g_s = T_s - T_board.',
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
     tau_s: Annotated[
-        NotNegative, 'Time constant of the lag (board, neighbour; play: 0 = none).'
+        NotNegative, 'Time constant of the lag (board, neighbour, square; play: 0 = none).'
     ] = 0.0
     width_k: Annotated[NotNegative, 'Width of even, half-width of play.'] = 0.0
     power: Annotated[int, Bounds(at_least=0), 'The value is multiplied by t to this power.'] = 0
@@ -93,7 +94,7 @@ class Column:
             raise ValueError(
                 f'`range` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
             )
-        for key, kinds in (('tau_s', ('board', 'neighbour')), ('width_k', ('even', 'play'))):
+        for key, kinds in (('tau_s', ('board', 'neighbour', 'square')), ('width_k', ('even', 'play'))):
             if self.kind in kinds and not getattr(self, key) > 0.0:
                 raise ValueError(
                     f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
@@ -133,6 +134,8 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
         for tau in BANK_TAUS
     ]
     product = [replace(column, group='product', power=1) for column in (*now, *board, *neighbour)]
+    # A part's own curve bends over its own temperature: (t - m)^2 = t^2 - 2 t m + m^2.
+    product += [replace(column, group='product', kind='square') for column in board]
     even = [
         Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
         for sensor in sensors
@@ -248,17 +251,18 @@ class ColumnTable:
         self._plan: list[tuple[int, float, float, int, str]] = []
         for column in columns:
             width = column.width_k if column.kind == 'even' else 0.0
-            key = ('even' if width else '', _place(column, layout), width)
+            bend = column.kind if column.kind in ('even', 'square') else ''
+            key = (bend, _place(column, layout), width)
             source = sources.setdefault(key, len(sources))
             self._plan.append((source, *column.range, column.power, column.during))
-        self._sources = [(place, width) for _, place, width in sources]
+        self._sources = list(sources)
 
     def raw(self, state: Sequence[Number]) -> list[Number]:
         """
         Evaluate u of each column, not held.
 
         """
-        found = [_value(state[place], width) for place, width in self._sources]
+        found = [_value(bend, state[place], width) for bend, place, width in self._sources]
         return [found[source] for source, _, _, _, _ in self._plan]
 
     def held(self, raw: Sequence[Number]) -> list[Number]:
@@ -312,10 +316,12 @@ def _place(column: Column, layout: Layout) -> int:
     return layout.gradients[column.sensor]
 
 
-def _value(u: Number, even_width: float) -> Number:
-    if not even_width:
+def _value(bend: str, u: Number, width: float) -> Number:
+    if not bend:
         return u
-    x = u / even_width
+    if bend == 'square':
+        return u * u
+    x = u / width
     return _tanh(x * x)
 
 

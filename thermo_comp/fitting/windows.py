@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the windows: reduced bags in, the regression's table of samples and columns out.
+
+The thermal tracker that the compensator runs is run here over the bags' readings, and the columns
+are those of `unit.columns`, so a regressor means in the fit what it means online.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..thermal.memory import MemorySpec, start_covariance
+from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Layout
+from ..thermal.tracker import ThermalTracker
+from ..typing import Floats, Ints
+from ..unit.columns import Column, ColumnTable, memory_of
+from ..unit.functions import TemperatureFunction
+from .history import thermal_states
+from .posterior import Windows
+from .reduction import ReducedBag
+
+#: Groups of the sets themselves, beside those of the response.
+CURVE, SET = 'curve', 'set'
+
+
+@dataclass(frozen=True)
+class Sets:
+    """
+    How the curves of the two sets are made.
+
+    Parameters
+    ----------
+    static, dynamic : TemperatureFunction
+        The families and their shapes; only `basis` counts.
+    is_shared : bool
+        Whether the dynamic curve is the static one plus a difference: else each has its own.
+
+    """
+
+    static: TemperatureFunction
+    dynamic: TemperatureFunction
+    is_shared: bool = True
+
+    def columns(self, t: Floats, weight: Floats) -> tuple[list[Floats], list[str]]:
+        """
+        Evaluate the columns of the sets, and name their groups.
+
+        """
+        static, dynamic = self.static.basis(t), self.dynamic.basis(t)
+        if not self.is_shared:
+            static = [(1.0 - weight) * value for value in static]
+        switched = [weight, *(weight * value for value in dynamic)]
+        return [*static, *switched], [group for group, _ in self.levels()]
+
+    def levels(self) -> list[tuple[str, bool]]:
+        """
+        Group of each column, and whether it is a level.
+
+        """
+        curve = [(CURVE, False)] * self.static.n_free
+        return [*curve, (SET, True), *[(SET, False)] * self.dynamic.n_free]
+
+
+@dataclass(frozen=True)
+class ThermalWindows:
+    """
+    The regression's windows, and what the calibration says of the states they were taken in.
+
+    Parameters
+    ----------
+    data : Windows
+        Samples and columns, for the regression.
+    names : tuple of str
+        Source of each bag.
+    temperature, rate, weight : ndarray, shape (n,)
+        Board temperature, its rate, weight of the dynamic set.
+    gradient : ndarray, shape (n,)
+        T - T_board of the sensor that leads.
+    raw : ndarray, shape (n, k)
+        The response's columns before powers of t and ranges.
+    typical_count : float
+        Samples in a typical window.
+
+    """
+
+    data: Windows
+    names: tuple[str, ...]
+    temperature: Floats
+    rate: Floats
+    weight: Floats
+    gradient: Floats
+    raw: Floats
+    typical_count: float
+
+    @property
+    def has_temperature(self) -> bool:
+        """
+        Whether any temperature was recorded.
+
+        """
+        return bool(np.ptp(self.temperature) > 0.0)
+
+
+def thermal_windows(
+    bags: Sequence[ReducedBag],
+    columns: Sequence[Column],
+    sets: Sets,
+    detector: DetectorSettings,
+    config: ThermalConfig,
+    reference_temperature: float,
+    window_s: float,
+    sensors: Sequence[str] = ('case',),
+) -> ThermalWindows:
+    """
+    Join the windows of all bags with the columns of their thermal state.
+
+    Windows before the board's first reading, or while its estimate is still settling, are left
+    out. A bag without any temperature stands at the reference, where no column says anything.
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        The bags.
+    columns : sequence of Column
+        The response.
+    sets : Sets
+        The curves.
+    detector, config : DetectorSettings, ThermalConfig
+        Of the tracker.
+    reference_temperature : float
+        T_ref [degC].
+    window_s : float
+        Neighbouring windows of a position are merged up to this length [s].
+    sensors : sequence of str, optional
+        Thermometers beside the board.
+
+    Returns
+    -------
+    ThermalWindows
+        The table; a position none of whose windows is usable is left out.
+
+    """
+    spec = memory_of(columns, sensors)
+    table = ColumnTable(columns, spec, reference_temperature)
+    parts: list[tuple[Floats, ...]] = []
+    numbers: list[tuple[Ints, Ints]] = []
+    groups: list[str] = []
+    n_positions = 0
+    for bag, reduced in enumerate(bags):
+        begin, grid, states, shares = _states(
+            reduced, spec, detector, config, reference_temperature
+        )
+        raw = table.raw(tuple(states.T))
+        curves, groups = sets.columns(states[:, BOARD] - reference_temperature, states[:, WEIGHT])
+        values = [*curves, *table.weighted(raw, tuple(states.T))]
+        moved = _moved(columns, spec, raw, states, shares, reference_temperature)
+        whole = np.column_stack(
+            (states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved)
+        )
+        for interval in reduced.intervals:
+            use = interval.time >= begin
+            if not use.any():
+                continue
+            time, count = interval.time[use], interval.count[use]
+            rows = np.column_stack(
+                [np.interp(time, grid, column) for column in whole.T]
+            )
+            merged = _merged(time, count, interval.mean[use], rows, window_s)
+            n = len(merged[0])
+            parts.append(merged)
+            numbers.append((np.full(n, n_positions), np.full(n, bag)))
+            n_positions += 1
+    time, count, mean, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
+    position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
+    k, m = len(columns), len(groups) + len(columns)
+    lag = [-1] * len(groups)
+    lag += [
+        spec.lags.index(column.lag)
+        if column.lag and column.kind in ('board', 'neighbour', 'square')
+        else -1
+        for column in columns
+    ]
+    data = Windows(
+        position=position,
+        bag=bag_of,
+        time=time,
+        weight=count / float(np.median(count)),
+        mean=mean,
+        columns=rows[:, 4 + k : 4 + k + m],
+        groups=(*groups, *(column.group for column in columns)),
+        lag=np.array(lag, dtype=np.int64),
+        start=np.hstack((np.zeros((len(time), len(groups))), rows[:, 4 + k + m :])),
+        start_covariance=start_covariance(spec.lags),
+        # Fc is 1 at the reference in either regime, so the scale has no level of its own there;
+        # a play in the scale has never been seen.
+        in_scale=np.array(
+            [not (group == SET and is_level) for group, is_level in sets.levels()]
+            + [column.kind != 'play' for column in columns]
+        ),
+    )
+    return ThermalWindows(
+        data,
+        tuple(bag.source.name for bag in bags),
+        *rows[:, :4].T,
+        rows[:, 4 : 4 + k],
+        float(np.median(count)),
+    )
+
+
+def _states(
+    bag: ReducedBag,
+    spec: MemorySpec,
+    detector: DetectorSettings,
+    config: ThermalConfig,
+    reference_temperature: float,
+) -> tuple[float, Floats, Floats, Floats]:
+    """
+    Run the tracker: where its estimate has settled, grid, states, shares of the start states.
+
+    """
+    if not len(bag.board.value):
+        # Nothing is known: a unit that stays at the reference.
+        width = Layout(spec).width
+        still = np.zeros((2, width))
+        still[:, BOARD] = reference_temperature
+        ends = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
+        return -1.0, ends, still, np.zeros((2, len(spec.lags)))
+    tracker = ThermalTracker(detector, spec, config)
+    shortest = min((float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1),
+                   default=1.0)
+    step_s = max(shortest / 5.0, 0.1)
+    start_s, states = thermal_states(bag, tracker, step_s)
+    grid = start_s + step_s * np.arange(len(states))
+    age = grid - start_s
+    shares = np.exp(-age[:, None] / np.array([tau for _, tau in spec.lags]))
+    settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
+    return float(grid[int(np.argmax(settled))]), grid, states, shares
+
+
+def _moved(
+    columns: Sequence[Column],
+    spec: MemorySpec,
+    raw: Sequence[Floats],
+    states: Floats,
+    shares: Floats,
+    reference_temperature: float,
+) -> Floats:
+    """
+    Derivative of each column by the start state of its lag, shape (n, k).
+
+    """
+    t = states[:, BOARD] - reference_temperature
+    result = np.zeros((len(states), len(columns)))
+    by_lag = {
+        column.lag: raw[k] for k, column in enumerate(columns) if column.kind == 'board'
+    }
+    for k, column in enumerate(columns):
+        if column.lag is None or column.kind == 'play':
+            continue
+        share = shares[:, spec.lags.index(column.lag)]
+        if column.kind == 'square':
+            share = 2.0 * by_lag[column.lag] * share
+        result[:, k] = share * t**column.power
+    return result
+
+
+def _merged(
+    time: Floats, count: Floats, mean: Floats, rows: Floats, window_s: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """
+    Count-weighted means of neighbouring windows up to a length.
+
+    """
+    slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))
+    first = np.flatnonzero(np.r_[True, np.diff(slot) != 0])
+    total = np.add.reduceat(count, first)
+
+    def averaged(values: Floats) -> Floats:
+        summed = np.add.reduceat(values * count[:, None], first, axis=0)
+        return np.asarray(summed / total[:, None])
+
+    return averaged(time[:, None])[:, 0], total, averaged(mean), averaged(rows)
