@@ -23,8 +23,9 @@ from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, json_schema, plain
 from .version_1 import read_version_1
 
-#: A calibration with the whole bank of columns takes some 600 kB, most of it the posterior.
-SIZE_LIMIT = 1 << 20
+#: With the whole bank of columns and one thermometer beside the board a calibration takes some
+#: 600 kB, nearly all of it the posterior; this is enough for two of them.
+SIZE_LIMIT = 1 << 21
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -130,7 +131,12 @@ def dump_calibration(calibration: Calibration) -> str:
         width=98,
         allow_unicode=True,
     )
-    if parse_calibration(text.encode()) != calibration:
+    content = text.encode()
+    if len(content) > SIZE_LIMIT:
+        raise CalibrationError(
+            f'the calibration takes {len(content)} bytes, at most {SIZE_LIMIT} are accepted'
+        )
+    if parse_calibration(content) != calibration:
         raise CalibrationError('the calibration does not survive being written')
     return text
 
