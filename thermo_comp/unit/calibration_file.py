@@ -176,7 +176,10 @@ def calibration_schema() -> dict[str, Any]:
     }
 
 
-class _Dumper(yaml.SafeDumper):
+_BASE: type[yaml.SafeDumper] = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+
+class _Dumper(_BASE):  # type: ignore[valid-type, misc]
     """
     Writes every number so that this reader and any YAML 1.1 reader see the same float.
 
