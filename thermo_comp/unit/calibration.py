@@ -26,6 +26,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings
 from ..typing import Floats
 from .functions import CubicSpline, Exponential, Polynomial
@@ -55,7 +56,14 @@ class Unit:
 
     __pydantic_config__ = _STRICT
 
-    serial: Annotated[str, Field(min_length=1, description='Serial number of the unit.')]
+    serial: Annotated[
+        str,
+        Field(
+            min_length=1,
+            max_length=LONGEST_SERIAL,
+            description='Serial number of the unit, one printable line.',
+        ),
+    ]
     input: Annotated[
         Literal['counts', 'm/s^2'],
         Field(description='Unit of the raw samples: counts per conversion cycle, or m/s^2.'),
@@ -67,6 +75,9 @@ class Unit:
     cycle_time_s: Annotated[
         Positive, Field(description='Length of a conversion cycle = sample interval [s].')
     ]
+
+    def __post_init__(self) -> None:
+        valid_serial(self.serial)
 
 
 @dataclass(frozen=True)

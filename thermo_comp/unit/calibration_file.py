@@ -21,7 +21,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from ..errors import CalibrationError
-from ..files import read_bounded, write_atomically
+from ..files import CALIBRATION, read_bounded, write_atomically
 from .calibration import FORMAT_VERSION, Calibration
 
 #: A calibration of the largest model takes some 60 kB.
@@ -207,7 +207,9 @@ def dump_calibration(calibration: Calibration) -> str:
     return text
 
 
-def save_calibration(calibration: Calibration, path: str | Path) -> None:
+def save_calibration(
+    calibration: Calibration, path: str | Path, *, overwrite: bool = True
+) -> None:
     """
     Write a calibration file atomically.
 
@@ -216,19 +218,20 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     calibration : Calibration
         The value.
     path : str or Path
-        The file; an existing one is replaced as a whole.
+        The file.
+    overwrite : bool, optional
+        Replace a calibration that is there.
 
     Raises
     ------
     CalibrationError
-        If the file cannot be written (an old one is then untouched) or the value is not valid.
+        If the value is not valid.
+    OutputError
+        If the file may not or cannot be written; an old one is then untouched.
 
     """
     text = dump_calibration(calibration)
-    try:
-        write_atomically(path, text.encode())
-    except OSError as error:
-        raise CalibrationError(f'cannot be written: {error.strerror}', path) from error
+    write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)
 
 
 def calibration_schema() -> dict[str, Any]:
