@@ -242,7 +242,7 @@ def test_write_replaces_as_a_whole_or_not_at_all(tmp_path):
     save_calibration(rich_calibration(), path)
     assert load_calibration(path) == rich_calibration()
     assert [p.name for p in tmp_path.iterdir()] == ['unit.yaml']
-    with pytest.raises(OutputError, match='cannot be written: .* is no directory'):
+    with pytest.raises(OutputError, match=r'cannot be written: .* is no directory'):
         save_calibration(calibration(), path / 'unit.yaml')
 
 
