@@ -21,7 +21,6 @@ import pytest
 from builders import rich_calibration
 from conftest import Cli
 from test_cli_errors import bag
-from thermo_comp.calibration_file import save_calibration
 
 from thermo_comp.errors import OutputError
 from thermo_comp.files import (
@@ -38,6 +37,7 @@ from thermo_comp.files import (
     check_output,
     write_atomically,
 )
+from thermo_comp.unit.calibration_file import save_calibration
 
 FILES = (CALIBRATION, PAGE, PARAMETERS, PARQUET, MCAP, PICTURE, CSV)
 
