@@ -51,7 +51,7 @@ nightly: $(VENV)/.installed-test
 fuzz: $(VENV)/.installed-fuzz
 	$(BIN)/python fuzz/run.py all --seconds $(FUZZ_SECONDS)
 
-# Not in place: what is measured is what a user installs, compiled where there is a C compiler.
+# Not in place: what is measured is what a user installs.
 bench: | $(BIN)/python
 	$(BIN)/python -m venv $(VENV)-bench
 	$(VENV)-bench/bin/python -m pip install -qq --disable-pip-version-check '.[ros,test]'

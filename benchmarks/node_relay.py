@@ -12,10 +12,9 @@ callback. The CPU time is that of the whole relay process, all its threads, from
 to the last; the latency runs from the source's publish call to the arrival in the sink's
 middleware, before any Python of the sink. Only ratios travel. The node brings its own profile for
 Fast DDS; source, sink and naive relay run without one. At the last rate the node is measured once
-more while its `calibration_file` is set twice a second. `--core` keeps each relay to that core,
-the node by its `cpu_affinity`. `--floor` measures a third relay, too: one wait set, one
-subscription, bytes copied, nothing computed, the node's profile. What is measured is the package
-that Python finds: the installed one, compiled or not, or the source of an editable install.
+more while its `calibration_file` is set twice a second. `--core` keeps each relay to that
+core. `--floor` measures a third relay, too: one wait set, one
+subscription, bytes copied, nothing computed, the node's profile.
 
 The source keeps `--depth` samples to repeat them. With a reliable relay Fast DDS has it throw away
 at once what has arrived, every 859 of them; with 2000 kept, that holds the source itself up for 1
@@ -307,9 +306,7 @@ def _machine() -> str:
     if info.is_file():
         lines = info.read_text(encoding='utf-8').splitlines()
         model = next((line.split(':')[1].strip() for line in lines if 'model name' in line), model)
-    core = 'compiled' if thermo_comp.is_compiled() else 'interpreted'
-    python = platform.python_version()
-    return f'{model}, {os.cpu_count()} cores, Python {python}, {core} core'
+    return f'{model}, {os.cpu_count()} cores, Python {platform.python_version()}'
 
 
 if __name__ == '__main__':

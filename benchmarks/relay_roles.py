@@ -210,7 +210,6 @@ def _node(arguments: argparse.Namespace) -> None:
 
     overrides = [
         f'calibration_file:={arguments.calibration}',
-        f'cpu_affinity:={arguments.core}',
         f'qos_overrides./accel/counts.subscription.reliability:={arguments.reliability}',
     ]
     command = [argument for override in overrides for argument in ('-p', override)]
@@ -267,7 +266,7 @@ def main() -> None:
     parser.add_argument('--depth', type=int, required=True)
     parser.add_argument('--calibration', required=True)
     arguments = parser.parse_args()
-    if arguments.role in ('naive', 'floor') and arguments.core >= 0:
+    if arguments.role in ('naive', 'floor', 'node') and arguments.core >= 0:
         os.sched_setaffinity(0, {arguments.core})
     ROLES[arguments.role](arguments)
 

@@ -29,7 +29,6 @@ from pathlib import Path
 
 import numpy as np
 
-from thermo_comp import is_compiled
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter, open_recording
@@ -281,10 +280,9 @@ def main() -> None:
     parser.add_argument('--gigabytes', type=float, default=0.0, help='of the large bag')
     parser.add_argument('--repeats', type=int, default=2)
     options = parser.parse_args()
-    core = 'compiled' if is_compiled() else 'interpreted'
     print(
         f'{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, '
-        f'numpy {np.__version__}, {core} core'
+        f'numpy {np.__version__}'
     )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -66,17 +66,6 @@ the middleware some four times, a quarter of the node's CPU time. A sample lost 
 20 ms later than by default. A profile of yours (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
 `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) takes its place; repeat the setting there.
 
-A message wakes a thread of the middleware, and that one the node's. With best effort it does so while it holds
-a lock that the node's thread needs next. So that thread runs under Linux' policy `SCHED_BATCH` then: it takes
-the core from nobody, and runs when the middleware's is done. Where others keep the cores busy it would be late;
-once more than a quarter of the wake-ups are, by more than 0.5 ms, it gets the usual policy back for a minute. A
-policy of yours (`chrt -f`, say) is left alone, before and while the node runs; niceness stays as it is.
-
-The system spreads those threads over idle cores, with cold caches. With `cpu_affinity` all threads keep to one
-core: a fifth less CPU time up to 2 kHz with a reliable subscription, up to a tenth less with best effort
-([measured](benchmarks.md#the-node)). Name a core that nothing of a higher priority holds for long. A core that
-the process was not started with (`taskset`, cpusets, `isolcpus`) is refused.
-
 `linear_acceleration_covariance` is a full 3x3: noise of the sample plus what is uncertain about the
 calibration at this thermal state. Without angular rate or orientation in the input, the first element
 of their covariance is -1 (REP 145).

@@ -49,7 +49,6 @@ def unit(tmp_path: Path) -> Path:
         (['calibration_file:={unit}', 'input:=imu'], "unit.input: must be 'm/s^2'"),
         (['calibration_file:={unit}', 'input:=gyro'], '`input` must be one of counts, imu'),
         (['calibration_file:={unit}', 'transition_time:=-1'], '`transition_time` must be between'),
-        (['calibration_file:={unit}', 'cpu_affinity:=4095'], 'core 4095 is not among those'),
         (
             [
                 'calibration_file:={unit}',

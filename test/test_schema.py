@@ -37,7 +37,7 @@ class Square:
 class Drawing:
     """Something of everything."""
 
-    name: Annotated[str, Bounds(shortest=2)]
+    name: Annotated[str, Bounds(shortest=2, longest=20)]
     shapes: tuple[Circle | Square, ...] = ()
     corner: tuple[float, float] = (0.0, 0.0)
     layer: int | str = 0
@@ -82,8 +82,9 @@ def test_nothing_is_converted_but_integers_to_floats() -> None:
         ({}, 'name', 'this key is missing'),
         ({'nmae': 'ab'}, 'nmae', 'unknown key'),
         ({'name': 'a'}, 'name', "must have at least 2 characters, got 'a'"),
+        ({'name': 'x' * 21}, 'name', 'must have at most 20 characters'),
         ({'name': 3}, 'name', 'must be a valid text, got 3'),
-        ({'name': 'x' * 99, 'layer': None}, 'layer', 'must be a valid integer or text, got None'),
+        ({'name': 'ab', 'layer': None}, 'layer', 'must be a valid integer or text, got None'),
         ({'name': 'ab', 'layer': True}, 'layer', 'must be a valid integer or text, got True'),
         ({'name': 'ab', 'is_hidden': 1}, 'is_hidden', 'must be a valid true or false, got 1'),
         ({'name': 'ab', 'colour': 'pink'}, 'colour', "'red', 'green' or 'blue', got 'pink'"),
@@ -125,7 +126,7 @@ def test_json_schema_says_the_same() -> None:
     assert schema['required'] == ['name']
     assert schema['additionalProperties'] is False
     assert schema['description'] == 'Something of everything.'
-    assert schema['properties']['name'] == {'type': 'string', 'minLength': 2}
+    assert schema['properties']['name'] == {'type': 'string', 'minLength': 2, 'maxLength': 20}
     assert schema['properties']['shapes'] == {
         'type': 'array',
         'items': {'anyOf': [{'$ref': '#/$defs/Circle'}, {'$ref': '#/$defs/Square'}]},

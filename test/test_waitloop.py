@@ -7,7 +7,6 @@ The one file that leaves rclpy's documented API: these tests fail loudly when rc
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Iterator
@@ -20,7 +19,6 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 import rclpy
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.context import Context
-from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -29,7 +27,6 @@ from ros_helpers import DEEP, TIMEOUT, Peer
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from thermo_comp.ros.scheduling import LATE_NS, LIMIT
 from thermo_comp.ros.waitloop import (
     OTHERS_PERIOD_NS,
     RawPublisher,
@@ -409,69 +406,3 @@ def test_only_best_effort_messages_that_crowd_gather(
     loop.close()
     assert bool(rests) == is_resting
     assert all(0.0 < rest <= rest_s for rest in rests)
-
-
-@pytest.mark.skipif(not hasattr(os, 'SCHED_BATCH'), reason='only Linux has SCHED_BATCH')
-@pytest.mark.parametrize(
-    ('qos', 'delay_ns', 'is_courteous'),
-    [
-        pytest.param(BEST_EFFORT, 0, True, id='best effort'),
-        pytest.param(BEST_EFFORT, 10 * LATE_NS, False, id='best effort, but late'),
-        pytest.param(RELIABLE, 0, False, id='reliable'),
-    ],
-)
-def test_only_a_best_effort_loop_that_is_in_time_takes_the_core_from_nobody(
-    node: Node, peer: Peer, qos: QoSProfile, delay_ns: int, is_courteous: bool
-) -> None:
-    loop = WaitLoop(node)
-    raw = loop.subscribe(Vector3Stamped, 'samples', qos)
-    policies: list[int] = []
-    news = threading.Condition()
-
-    def take() -> None:
-        messages, _ = raw.drain(is_paced=True)
-        if messages:
-            raw.delay_ns = delay_ns
-            with news:
-                policies.append(os.sched_getscheduler(0))
-                news.notify_all()
-
-    after: list[int] = []
-
-    def run() -> None:
-        loop.run(take)
-        after.append(os.sched_getscheduler(0))
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    publisher = peer.publisher(Vector3Stamped, 'samples')
-    peer.poll(raw.subscription.get_publisher_count, 'the publisher')
-    for n_sent in range(1, 3 * LIMIT):
-        publisher.publish(Vector3Stamped())
-        with news:
-            assert news.wait_for(lambda n=n_sent: len(policies) >= n, TIMEOUT)
-    loop.stop()
-    thread.join(TIMEOUT)
-    assert not thread.is_alive()
-    loop.close()
-    assert policies[-1] == (os.SCHED_BATCH if is_courteous else os.SCHED_OTHER)
-    assert after == [os.SCHED_OTHER]
-
-
-def test_a_drain_tells_how_long_its_first_message_waited(
-    node: Node, peer: Peer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loop = WaitLoop(node)
-    raw = loop.subscribe(Vector3Stamped, 'samples', RELIABLE)
-    publisher = peer.publisher(Vector3Stamped, 'samples')
-    for _ in range(2):
-        publisher.publish(Vector3Stamped())
-        assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
-    now_ns = time.time_ns()
-    monkeypatch.setattr('thermo_comp.ros.waitloop.time.time_ns', lambda: now_ns)
-    _, received_ns = raw.drain()
-    assert received_ns[0] < received_ns[1] <= now_ns
-    assert raw.delay_ns == now_ns - received_ns[0]
-    raw.drain()
-    assert raw.delay_ns == 0
-    loop.close()

@@ -38,13 +38,3 @@ References
 """
 
 __version__ = '0.1.0'
-
-
-def is_compiled() -> bool:
-    """
-    Say whether the core runs as C extensions; what it computes is the same to the bit.
-
-    """
-    from importlib.util import find_spec
-
-    return find_spec(f'{__name__}._core__mypyc') is not None

@@ -69,6 +69,7 @@ def simulate(
 
     """
     from .. import simulation
+    from ..files import bag_kind, check_output
 
     out = Output(as_json, quiet)
     try:
@@ -80,11 +81,12 @@ def simulate(
         specimen = simulation.unit_preset(unit, unit_seed)
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
-    options.refuse_existing(output, force)
     ups = simulation.positions(positions, position_seed)
     names = (
         [output] if positions == 1 else [output / f'{i:02d}.mcap' for i in range(1, positions + 1)]
     )
+    for name in names:
+        check_output(name, bag_kind(name), overwrite=force)
     written: list[dict[str, Any]] = []
     with out.progress('simulating', total=positions) as done:
         for i, (name, up) in enumerate(zip(names, ups, strict=True)):

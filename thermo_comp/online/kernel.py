@@ -5,7 +5,6 @@ Owns the arithmetic of many samples: that of `Compensator.process`, in its order
 
 What a sample costs here is memory traffic, so the samples go through in pieces whose columns stay
 in the cache, and a segment's coefficients are spread over its samples just before they are used.
-Where the core is compiled, C does the same operations in the same order in one pass.
 
 """
 
@@ -17,12 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..typing import Floats, Ints, Stamps
-
-try:
-    from .._kernel import correct as _correct_in_c
-except ImportError:
-    _correct_in_c = None  # type: ignore[assignment]
-
 
 #: Samples corrected at a time.
 PIECE = 12288
@@ -51,13 +44,6 @@ class Lines:
         self._begins = self._ends - counts
         self._rows = slice(0, 0)
         self._counts: Ints = counts
-
-    def tables(self) -> tuple[Ints, Ints, Floats]:
-        """
-        Give where the segments begin, how many samples each has, and a row per coefficient.
-
-        """
-        return self._start_ns, self._ends - self._begins, np.array(self._columns)
 
     def select(self, begin: int, end: int) -> None:
         """
@@ -147,10 +133,6 @@ def correct(
 
     """
     n = len(stamps)
-    if _correct_in_c is not None:
-        out = np.empty((12, n))
-        extremes = np.array(_correct_in_c(*lines.tables(), stamps, samples, out, misalignment))
-        return out[:3].T, out[3:].T, extremes[0], extremes[1]
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
     raw = np.empty((3, min(n, PIECE)))
     # The columns stand one after the other in memory: each is written in one run.

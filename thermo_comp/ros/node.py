@@ -33,7 +33,6 @@ from ..errors import ThermoCompError
 from ..online.compensator import Compensator
 from ..online.snapshot import take_snapshot
 from . import parameters
-from .affinity import Affinity, AffinityError
 from .conversions import SampleConverter
 from .diagnostics import Snapshot, Traffic, build
 from .loading import check, load
@@ -110,8 +109,6 @@ class CompensationNode:
         """
         self._config = parameters.declare(self.node)
         self._loaded = load(self._config)
-        self._affinity = Affinity()
-        self._affinity.check(self._config.cpu_affinity)
         self._compensator = Compensator(
             self._loaded.calibration, self._config.compensator_config()
         )
@@ -130,7 +127,6 @@ class CompensationNode:
         self.node.add_post_set_parameters_callback(self._post_set)
         self._loop.call_every(self._config.diagnostics_period, self._report)
         self._log = self.node.get_logger()
-        self._keep_to_core()
         inputs = tuple(
             f'qos_overrides.{self.node.resolve_topic_name(topic)}.'
             for _, topic in _INPUTS.values()
@@ -265,7 +261,6 @@ class CompensationNode:
             else:
                 loaded = self._loaded
                 check(loaded, config)
-            self._affinity.check(config.cpu_affinity)
         except ThermoCompError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self._prepared = (config, loaded)
@@ -295,17 +290,6 @@ class CompensationNode:
             relay.samples = self._open_samples(config)
         if config.diagnostics_period != before.diagnostics_period:
             self._loop.call_every(config.diagnostics_period, self._report)
-        self._keep_to_core()
-
-    def _keep_to_core(self) -> None:
-        """
-        Go where the parameter says; what the system refuses after the check is no end.
-
-        """
-        try:
-            self._affinity.keep_to(self._config.cpu_affinity)
-        except AffinityError as error:
-            self._log.error(str(error))
 
     def _say_calibration(self) -> None:
         loaded = self._loaded

@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter
 
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
-from .affinity import ANY
+from ..text import valid_serial
 
 _DEFAULTS = CompensatorConfig()
 
@@ -54,7 +54,6 @@ class NodeConfig:
         Seconds.
     local_gravity, gravity_tolerance : float
         Metres per second squared.
-    cpu_affinity : int
 
     """
 
@@ -106,12 +105,6 @@ class NodeConfig:
         (0.0, 100.0),
     )
     diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
-    cpu_affinity: int = _parameter(
-        ANY,
-        'Core that all threads of the process keep to, for less CPU time and latency; -1 leaves '
-        'it to the system.',
-        (ANY, 4095),
-    )
 
     def compensator_config(self) -> CompensatorConfig:
         """
@@ -309,6 +302,11 @@ def _checked(name: str, value: Any) -> Any:
             raise ParameterError(
                 f'parameter `{name}` must be one of {", ".join(choices)}, got {value!r}'
             )
+        if name == 'serial' and value:
+            try:
+                valid_serial(value)
+            except ValueError as mistake:
+                raise ParameterError(f'parameter {mistake}') from mistake
         return value
     is_whole = isinstance(entry.default, int)
     if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float):

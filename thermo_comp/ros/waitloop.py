@@ -40,8 +40,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerGuardCondition
 from rclpy.subscription import Subscription
 
-from .scheduling import Courtesy
-
 #: The most messages taken in one go, so that a flood cannot keep the rest of the node waiting.
 DRAIN_LIMIT = 4096
 
@@ -77,8 +75,6 @@ class RawSubscription:
         self.n_lost = 0
         #: What lay between the last two messages, on average over one drain [ns].
         self.interval_ns = 0
-        #: How long the first message of the last drain had waited for it [ns].
-        self.delay_ns = 0
 
     def drain(self, *, is_paced: bool = False) -> tuple[list[bytes], list[int]]:
         """
@@ -103,9 +99,7 @@ class RawSubscription:
         take, message_type = self._take, self._message_type
         taken = take(message_type, True)
         if taken is None:
-            self.delay_ns = 0
             return messages, received_ns
-        taken_ns = time.time_ns()
         before_ns = newest_ns = self._newest_ns
         while taken is not None:
             message, info = taken
@@ -119,7 +113,6 @@ class RawSubscription:
             taken = take(message_type, True)
         self._newest_ns = newest_ns
         self.interval_ns = (newest_ns - before_ns) // len(messages)
-        self.delay_ns = taken_ns - received_ns[0] if received_ns[0] else 0
         self._count_lost(info['publication_sequence_number'], len(messages))
         return messages, received_ns
 
@@ -219,7 +212,6 @@ class WaitLoop:
         self._reserved.can_execute = _is_no_subscription
         self._raw: list[RawSubscription] = []
         self._hot: list[RawSubscription] = []
-        self._courtesy = Courtesy()
         self._is_stopping = False
         self._is_stale = True
         self._period_ns = _NEVER_NS
@@ -326,7 +318,6 @@ class WaitLoop:
                     rest_ns = 0
                     # Only there a wake-up costs more than to sleep a little.
                     if all(one.is_best_effort for one in self._hot):
-                        in_use.enter_context(self._courtesy)
                         rest_ns = int(self._rest_s * 1e9)
                     self._serve(on_data, wait_sets, rest_ns)
         except (RCLError, ExternalShutdownException):
@@ -421,7 +412,6 @@ class WaitLoop:
             is_flowing = any(is_ready('subscription', index) for index in range(n_hot))
             on_data()
             first = self._hot[0]
-            self._courtesy.note(first.delay_ns, woken_ns)
             if woken_ns >= others_due_ns:
                 others_due_ns = woken_ns + OTHERS_PERIOD_NS
                 # With one condition met beforehand the middleware does not prepare to wait.

@@ -3,7 +3,7 @@
 """
 Owns the settings of thermometers, detector and tracker: what is known of a unit beforehand.
 
-They travel in calibrations and to a fleet's workers, so they stand apart from what is compiled.
+They travel in calibrations and to a fleet's workers.
 
 """
 

@@ -23,6 +23,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings
 from .columns import Column
 from .extremes import smallest_value
@@ -49,7 +50,11 @@ class Unit:
 
     """
 
-    serial: Annotated[str, Bounds(shortest=1), 'Serial number of the unit.']
+    serial: Annotated[
+        str,
+        Bounds(shortest=1, longest=LONGEST_SERIAL),
+        'Serial number of the unit, one printable line.',
+    ]
     input: Annotated[
         Literal['counts', 'm/s^2'],
         'Unit of the raw samples: counts per conversion cycle, or m/s^2.',
@@ -58,6 +63,9 @@ class Unit:
         Positive, 'A sample at or beyond this magnitude is saturated, in input units.'
     ]
     cycle_time_s: Annotated[Positive, 'Length of a conversion cycle = sample interval [s].']
+
+    def __post_init__(self) -> None:
+        valid_serial(self.serial)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from ..errors import CalibrationError
-from ..files import read_bounded, write_atomically
+from ..files import CALIBRATION, read_bounded, write_atomically
 from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
 from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, json_schema, plain
@@ -141,7 +141,9 @@ def dump_calibration(calibration: Calibration) -> str:
     return text
 
 
-def save_calibration(calibration: Calibration, path: str | Path) -> None:
+def save_calibration(
+    calibration: Calibration, path: str | Path, *, overwrite: bool = True
+) -> None:
     """
     Write a calibration file atomically.
 
@@ -150,19 +152,20 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     calibration : Calibration
         The value.
     path : str or Path
-        The file; an existing one is replaced as a whole.
+        The file.
+    overwrite : bool, optional
+        Replace a calibration that is there.
 
     Raises
     ------
     CalibrationError
-        If the file cannot be written (an old one is then untouched) or the value is not valid.
+        If the value is not valid.
+    OutputError
+        If the file may not or cannot be written; an old one is then untouched.
 
     """
     text = dump_calibration(calibration)
-    try:
-        write_atomically(path, text.encode())
-    except OSError as error:
-        raise CalibrationError(f'cannot be written: {error.strerror}', path) from error
+    write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)
 
 
 def calibration_schema() -> dict[str, Any]:
