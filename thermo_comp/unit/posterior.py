@@ -12,7 +12,7 @@ from __future__ import annotations
 import base64
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -60,7 +60,7 @@ class Posterior:
             raise ValueError('`rest` must not have a negative variance')
 
     @classmethod
-    def of(cls, matrix: Floats, variances: Floats) -> Posterior:
+    def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
         """
         Encode a factor, shape (n_parameters, rank), and the variances beside it.
 
@@ -183,11 +183,11 @@ def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
     return Posterior.of(factor, np.maximum(diagonal - held, 0.0))
 
 
-def _encoded(numbers: Floats) -> str:
+def _encoded(numbers: npt.NDArray[np.floating[Any]]) -> str:
     return base64.b64encode(_single(numbers).tobytes()).decode('ascii')
 
 
-def _single(numbers: Floats) -> npt.NDArray[np.float32]:
+def _single(numbers: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
     # What overflows is refused as not finite.
     with np.errstate(over='ignore'):
         return numbers.astype(_FLOAT32)
