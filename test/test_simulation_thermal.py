@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from thermo_comp.simulation import (
@@ -115,7 +114,7 @@ def test_creep_relaxes_towards_its_part() -> None:
     """
     step = np.full((7201, 1), 10.0)
     step[0] = 0.0
-    history = PartHistory(('case',), step, np.zeros_like(step), np.zeros(1), 1.0)
+    history = PartHistory(('case',), step, np.zeros(1), 1.0)
     bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
     # The step itself takes 1 s, 1.4e-4 of the time constant.
     np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)

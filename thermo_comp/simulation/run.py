@@ -207,7 +207,6 @@ class ThermalTruth:
             PartHistory(
                 unit.network.nodes,
                 self.temperatures - origin,
-                self.rates,
                 origin,
                 options.grid_step,
             )
