@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..typing import Floats
+
 _MINUTE = 60.0
 _HOUR = 3600.0
 _STEP = re.compile(

@@ -43,8 +43,8 @@ class PartHistory:
     """
 
     nodes: tuple[str, ...]
-    deviation: NDArray[np.float64]
-    origin: NDArray[np.float64]
+    deviation: Floats
+    origin: Floats
     step: float
 
     def of(self, part: str) -> Floats:

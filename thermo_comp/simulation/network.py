@@ -188,9 +188,7 @@ class ThermalNetwork:
         p[:n] /= rows
         return A, b, p
 
-    def convection(
-        self, state: NDArray[np.float64], air: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
         """
         Return what convection adds to ``dx/dt`` of one state, and its derivatives by the state.
 

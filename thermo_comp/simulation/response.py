@@ -110,13 +110,11 @@ class ThermalResponse:
             state[-1] = air
         return state
 
-    def _integrate(
-        self, air: NDArray[np.float64], drive: NDArray[np.float64], state: NDArray[np.float64]
-    ) -> None:
+    def _integrate(self, air: Floats, drive: Floats, state: Floats) -> None:
         A, b, _ = self.network.system()
         for k, (begin, end) in enumerate(pairwise(self._time)):
 
-            def flow(t: float, x: NDArray[np.float64], k: int = k) -> NDArray[np.float64]:
+            def flow(t: float, x: Floats, k: int = k) -> Floats:
                 now = float(np.interp(t, self._time, air))
                 return np.asarray(A @ x + b * now + drive[k] + self.network.convection(x, now)[0])
 
