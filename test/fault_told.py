@@ -24,6 +24,7 @@ class Told:
     test: str
 
 
+_OUTPUTS, _TEXT = 'test_files.py', 'test_text.py'
 _PROCESS, _FILES = 'test_fault_process.py', 'test_fault_files.py'
 _BAD_FILE = (
     'the calibration that was read runs on; setting it again is refused with path and reason'
@@ -58,7 +59,7 @@ TOLD = [
             ('truncated', 'the first key or line that fails'),
             ('deleted', 'No such file or directory'),
             ('made unreadable', 'cannot be read'),
-            ('1 GB', 'at most 1 MiB; not read'),
+            ('1 GB', 'at most 2 MiB; not read'),
             ('a YAML alias bomb', 'aliases are not accepted; not built'),
             ('a directory', 'not a regular file'),
             ('a FIFO', 'not a regular file; never waited for'),
@@ -101,6 +102,76 @@ TOLD = [
         'the old output is whole; the new one lies beside it under a hidden name and can be read',
         '',
         f'{_FILES}::test_a_killed_command_leaves_the_old_file',
+    ),
+    Told(
+        'an output is an input',
+        '`-o` names what is read: another spelling, a link, a folder around it; with `--force`',
+        'exit code 1, nothing is touched',
+        'one line: the output and the input that it is',
+        f'{_OUTPUTS}::test_an_output_is_never_an_input',
+    ),
+    Told(
+        'an output is something else',
+        '`--force` onto a file of another kind, a device, a folder with other files in it',
+        'exit code 1, nothing is touched',
+        'one line: the output and what it is not',
+        f'{_OUTPUTS}::test_only_the_same_kind_is_replaced',
+    ),
+    Told(
+        'two commands write one output',
+        'at the same time, without `--force`',
+        'the first has it, whole; the other ends with exit code 1',
+        'one line: exists already',
+        f'{_OUTPUTS}::test_of_two_writers_one_wins',
+    ),
+    Told(
+        'the output is a link',
+        '`-o` names a symbolic link',
+        'what it points at is written; the link stays',
+        '',
+        f'{_OUTPUTS}::test_a_link_is_written_through',
+    ),
+    Told(
+        'the bags of a fleet cannot be read any more',
+        '`fleet fit` again after a bad mount',
+        'exit code 1; calibrations and certificates of the earlier run stay',
+        'the row of the unit: the reason, and what stays',
+        'test_fleet_run.py::test_bags_that_cannot_be_read_any_more_take_no_result_away',
+    ),
+    Told(
+        'a serial is no serial',
+        'line breaks, escape sequences, 65 characters: file, option, parameter, metadata',
+        'refused',
+        'one line: one printable line of 1 to 64 characters',
+        f'{_TEXT}::test_what_is_no_serial',
+    ),
+    Told(
+        'a recording forges lines',
+        'escape sequences and line breaks in its serial, metadata and topics',
+        'they are shown as a literal of Python would be',
+        '',
+        f'{_TEXT}::test_a_recording_forges_no_line',
+    ),
+    Told(
+        'a terminal cannot show a name',
+        'a Cyrillic serial on latin-1, a file name that is not UTF-8',
+        'what cannot be shown is shown escaped',
+        '',
+        f'{_TEXT}::test_any_terminal_can_show_it',
+    ),
+    Told(
+        'a command fails unforeseen',
+        'an exception that nobody expected',
+        'exit code 70, the traceback in a file',
+        'one line: the exception and the file',
+        f'{_TEXT}::test_what_nobody_has_foreseen',
+    ),
+    Told(
+        'clients of `view` say nothing',
+        '300 connections without a request',
+        '16 are waited for, 2 s each; no more threads; the page is served afterwards',
+        '',
+        'test_report_live.py::test_clients_that_say_nothing_grow_no_threads',
     ),
     Told(
         'a recording is torn',

@@ -16,7 +16,7 @@ from builders import axis_set, calibration, regime_set, rich_calibration, term
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.errors import CalibrationError
+from thermo_comp.errors import CalibrationError, OutputError
 from thermo_comp.unit.calibration import GroupEvidence, parameter_layout
 from thermo_comp.unit.calibration_file import (
     SIZE_LIMIT,
@@ -253,6 +253,43 @@ def test_files_that_are_no_files(tmp_path):
         assert caught.value.path == str(path)
 
 
+@pytest.mark.parametrize(
+    ('old', 'new', 'key', 'message'),
+    [
+        (
+            '[4.0, 37.0]',
+            '[4.0, 999.0]',
+            'static.y.bias_function',
+            'must be finite over its range',
+        ),
+        ('[4.0, 37.0]', '[4.0, 1e5]', 'static.temperature_range_c[1]', 'less than 1000'),
+        ('[4.0, 37.0]', '[-300, 37.0]', 'static.temperature_range_c[0]', 'at least -273.15'),
+        ('c: 20.0', 'c: 1e308', 'reference_temperature_c', 'less than 1000'),
+        (
+            '[-15.0, 0.0',
+            '[-1e-320, 0.0',
+            'static.z.scale_function.knots_k',
+            'rise strictly, by 0.001',
+        ),
+        ('0.0, 15.0]', '0.0, 1e308]', 'static.z.scale_function.knots_k', 'within 2000 K'),
+        ('[0.99893, 1.0', '[1e308, 1.0', 'static.z.scale_function', 'must stay above 0.1'),
+        (
+            '[0.0, 0.0031]',
+            '[0.0, 1e308]',
+            'static.x.bias_function',
+            'must be finite over its range',
+        ),
+    ],
+)
+def test_functions_that_overflow_are_refused(old, new, key, message):
+    text = (REPOSITORY / 'config' / 'calibration.example.yaml').read_text()
+    text = text.replace('e_fold_k: [18.0]', 'e_fold_k: [1.0]')
+    assert old in text
+    with pytest.raises(CalibrationError, match=message) as caught:
+        parse_calibration(text.replace(old, new, 1).encode())
+    assert caught.value.key == key
+
+
 def test_write_replaces_as_a_whole_or_not_at_all(tmp_path):
     path = tmp_path / 'unit.yaml'
     save_calibration(calibration(), path)
@@ -260,8 +297,8 @@ def test_write_replaces_as_a_whole_or_not_at_all(tmp_path):
     save_calibration(rich_calibration(), path)
     assert load_calibration(path) == rich_calibration()
     assert [p.name for p in tmp_path.iterdir()] == ['unit.yaml']
-    with pytest.raises(CalibrationError, match='cannot be written: No such file'):
-        save_calibration(calibration(), tmp_path / 'absent' / 'unit.yaml')
+    with pytest.raises(OutputError, match=r'cannot be written: .* is no directory'):
+        save_calibration(calibration(), path / 'unit.yaml')
 
 
 def test_value_that_the_reader_would_refuse_is_not_written():

@@ -87,6 +87,7 @@ class TestUsage:
             (('evaluate', 'a', '-c', 'b', '--window', '0'), r'--window must be positive'),
             (('evaluate', 'a', '-c', 'b', '--height', '3'), r'--latitude and --height'),
             (('simulate', '-o', 'a', '--unit', 'gold'), r'must be one of thermostatted'),
+            (('simulate', '-o', 'a', '--plan', 'oven'), r'must be one of chamber-18'),
             (('simulate', '-o', 'a', '--profile', '20, up'), r"step 2 'up'"),
             (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
             (('convert', 'a', '-o', 'b'), r'--columns'),

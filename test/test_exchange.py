@@ -8,7 +8,9 @@ Exchange with autopilots: their formulas written out again here, round trips, lo
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from builders import term
@@ -53,6 +55,20 @@ def cubic() -> Calibration:
             Polynomial((0.0, 5e-4, -1e-5)),
         ]
     )
+
+
+@pytest.mark.parametrize('to', [export_px4, export_ardupilot])
+def test_foreign_text_makes_no_live_line(cubic: Calibration, to: Callable[..., Any]) -> None:
+    # WHY: a serial with a line break set a parameter of the vehicle.
+    clean = to(cubic).text
+    unit = replace(cubic.unit)
+    forged = '7\nINS_TCAL1_ENABLE,0\r1\t1\tTC_A_ENABLE\t0\t6\x1b[2J\u2028x,1'
+    object.__setattr__(unit, 'serial', forged)
+    text = to(replace(cubic, unit=unit)).text
+    assert [line for line in text.splitlines() if not line.startswith('#')] == [
+        line for line in clean.splitlines() if not line.startswith('#')
+    ]
+    assert len(text.splitlines()) == len(clean.splitlines())
 
 
 def numbers(text: str, separator: str) -> dict[str, float]:

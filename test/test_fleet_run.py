@@ -124,6 +124,37 @@ def test_the_rest_finishes_and_a_second_run_does_nothing(
     assert {name for name, known in found.items() if known} == {'A/good'}
 
 
+def test_bags_that_cannot_be_read_any_more_take_no_result_away(
+    client: Any, tmp_path: Path
+) -> None:
+    # WHY: after a bad mount a second run deleted calibrations and certificates that were good.
+    bags = write_unit(tmp_path / 'bags' / 'unit', 1)
+    options = replace(OPTIONS, certificates=True)
+    first = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, client=client)
+    before = contents(tmp_path / 'out' / 'units')
+    assert {Path(name).name for name in before} == {
+        'calibration.yaml',
+        'certificate.html',
+        'result.json',
+    }
+    kept = [(path, path.stat().st_mtime_ns, path.read_bytes()) for path in bags]
+    for path in bags:
+        path.write_bytes(b'')
+    for changed in (options, replace(options, input='counts')):
+        second = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', changed, client=client)
+        (row,) = second.rows
+        assert row['verdict'] == 'failed'
+        assert 'calibration.yaml of an earlier run stays' in str(row['problem'])
+        assert not second.is_whole
+        assert contents(tmp_path / 'out' / 'units') == before
+    for path, stamp_ns, content in kept:
+        path.write_bytes(content)
+        os.utime(path, ns=(stamp_ns, stamp_ns))
+    third = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, client=client)
+    assert third.n_done == 0
+    assert third.rows == first.rows
+
+
 def test_fewer_units_than_threads_are_cut_into_bags_with_the_same_result(
     client: Any, fleet: Path
 ) -> None:

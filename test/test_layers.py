@@ -28,6 +28,7 @@ LAYERS = {
     'thermal': 1,
     'unit': 1,
     'online': 2,
+    'text': 0,
     'simulation': 2,
     'recording': 2,
     'fitting': 3,

@@ -101,6 +101,7 @@ def test_a_bad_override_is_refused_with_its_name_rule_and_value(override: str, t
         ('diagnostics_period', 0.0, 'must be between 0.01 and 60, got 0'),
         ('frame_id', 3, 'must be a string, got 3'),
         ('input', 'gyro', 'must be one of counts, imu'),
+        ('serial', 'two\nlines', '`serial` must be one printable line'),
     ],
 )
 def test_an_update_is_refused_as_a_whole(name: str, value: Any, text: str) -> None:

@@ -27,7 +27,7 @@ from thermo_comp.errors import CalibrationError
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.online.status import CompensatorConfig
-from thermo_comp.unit.calibration import AxisSet, Calibration, RegimeSet
+from thermo_comp.unit.calibration import Calibration, RegimeSet
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.functions import Polynomial
 
@@ -112,30 +112,28 @@ configs = st.builds(
 )
 
 
-def largest(axis: AxisSet, regime: RegimeSet, of: Calibration) -> tuple[float, float]:
+def largest(axis: int, regime: RegimeSet, of: Calibration) -> tuple[float, float]:
     """Bound an axis' |bias| without the reference's, and the distance of its scale from 1."""
-    t = max(abs(edge - of.reference_temperature_c) for edge in regime.temperature_range_c)
-    gradient = max(map(abs, regime.gradient_range_k))
-    rate = max(map(abs, regime.rate_range_k_min)) / 60.0
-    memory = max(map(abs, regime.memory_range_k))
+    edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
+    t = max(abs(edge - of.reference_temperature_c) for edge in edges)
+    curves = regime.axes()[axis]
 
     def terms(name: str) -> float:
-        function = getattr(axis, f'{name}_function').coefficients[1:]
-        return (
-            sum(abs(c) * t**power for power, c in enumerate(function, 1))
-            + abs(getattr(axis.gradient, name)) * gradient
-            + abs(getattr(axis.rate, name)) * rate
-            + sum(map(abs, getattr(axis.memory, name))) * memory
+        function = getattr(curves, f'{name}_function').coefficients[1:]
+        response = (
+            abs(getattr(term, name)[axis]) * max(map(abs, term.range)) * t**term.power
+            for term in of.response
         )
+        return sum(abs(c) * t**power for power, c in enumerate(function, 1)) + sum(response)
 
-    return abs(axis.delta) + terms('bias'), terms('scale')
+    return abs(curves.delta) + terms('bias'), terms('scale')
 
 
 def bound(of: Calibration) -> float:
     """Bound the specific force that a unit can give, from its calibration alone [m/s^2]."""
     worst = 0.0
     for regime in (of.static, of.dynamic):
-        for axis, reference in zip(regime.axes(), (of.axes.x, of.axes.y, of.axes.z), strict=True):
+        for axis, reference in enumerate((of.axes.x, of.axes.y, of.axes.z)):
             bias, scale = largest(axis, regime, of)
             assert scale < 0.5
             span = of.unit.full_scale + abs(reference.bias) + bias

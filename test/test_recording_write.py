@@ -29,14 +29,13 @@ from recording_helpers import START_NS, read_with_rosbags, typestore
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as Reader2
 
-from thermo_comp.errors import RecordingError
+from thermo_comp.errors import OutputError, RecordingError
 from thermo_comp.recording import (
     BagWriter,
     ImuColumns,
     open_recording,
     read_recording,
 )
-from thermo_comp.recording.atomic import publish
 
 STEP_NS = 2_500_000
 REQUIRED: tuple[()] = ()
@@ -258,7 +257,7 @@ def test_inputs_can_be_copied_beside_the_outputs(tmp_path: Path) -> None:
 def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     small(path, 1.0)
-    with pytest.raises(RecordingError, match='exists already'):
+    with pytest.raises(OutputError, match='exists already'):
         small(path, 2.0)
 
     def value() -> float:
@@ -283,26 +282,31 @@ def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path: Path, nam
 def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path: Path) -> None:
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.tex').write_text('ten years of work')
-    with pytest.raises(RecordingError, match=r'is not replaced: it holds thesis\.tex'):
+    with pytest.raises(OutputError, match=r'is not replaced: it holds thesis\.tex'):
         BagWriter(tmp_path / 'home', overwrite=True)
     (tmp_path / 'file').write_text('')
-    with pytest.raises(RecordingError, match='is a file and is not replaced'):
+    with pytest.raises(OutputError, match='is not replaced: it is a file'):
         BagWriter(tmp_path / 'file', overwrite=True)
     (tmp_path / 'folder.mcap').mkdir()
-    with pytest.raises(RecordingError, match='is a directory and is not replaced'):
+    with pytest.raises(OutputError, match='is not replaced: it is a folder'):
         BagWriter(tmp_path / 'folder.mcap', overwrite=True)
+
+
+def test_a_folder_of_bags_is_no_bag(tmp_path: Path) -> None:
+    small(tmp_path / 'fit' / '01.mcap', 1.0)
+    with pytest.raises(OutputError, match=r'is not replaced: it has no metadata\.yaml'):
+        BagWriter(tmp_path / 'fit', overwrite=True)
 
 
 def test_directories_are_exchanged_without_the_system_call_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ('old', 'new'):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / name).touch()
-    monkeypatch.setattr('thermo_comp.recording.atomic._exchange', lambda *_: False)
-    publish(tmp_path / 'new', tmp_path / 'old')
-    assert [p.name for p in tmp_path.iterdir()] == ['old']
-    assert [p.name for p in (tmp_path / 'old').iterdir()] == ['new']
+    small(tmp_path / 'bag', 1.0)
+    monkeypatch.setattr('thermo_comp.files._exchange', lambda *_: False)
+    small(tmp_path / 'bag', 2.0, overwrite=True)
+    assert [p.name for p in tmp_path.iterdir()] == ['bag']
+    columns = read_recording(tmp_path / 'bag', require=()).columns
+    assert float(columns.accel[0, 0]) == 2.0
 
 
 @contextmanager
@@ -329,7 +333,7 @@ def test_a_full_disk_is_one_clear_error(tmp_path: Path, name: str) -> None:
     rng = np.random.default_rng(1)
     stamps = START_NS + STEP_NS * np.arange(50_000)
     bag.write_counts('accel/counts', stamps, rng.normal(size=(50_000, 3)))
-    with limited_file_size(100_000), pytest.raises(RecordingError, match=r'bag.*: cannot be wri'):
+    with limited_file_size(100_000), pytest.raises(OutputError, match=r'bag.*: cannot be wri'):
         bag.close()
     assert [p.name for p in tmp_path.iterdir()] == [name]
     assert len(read_recording(path, require=()).columns) == 5
@@ -347,14 +351,14 @@ def test_an_output_may_be_a_link(tmp_path: Path) -> None:
 
 def test_a_target_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / 'file').write_text('')
-    with pytest.raises(RecordingError, match=r'cannot be written: .*file is no directory'):
+    with pytest.raises(OutputError, match=r'cannot be written: .*file is no directory'):
         BagWriter(tmp_path / 'file' / 'bag.mcap')
     if os.geteuid() == 0:
-        with pytest.raises(RecordingError, match='cannot be written'):
+        with pytest.raises(OutputError, match='cannot be written'):
             BagWriter('/proc/bag.mcap')
     else:
         (tmp_path / 'locked').mkdir(mode=0o500)
-        with pytest.raises(RecordingError, match='cannot be written: Permission denied'):
+        with pytest.raises(OutputError, match='cannot be written: Permission denied'):
             BagWriter(tmp_path / 'locked' / 'bag.mcap')
 
 

@@ -16,7 +16,7 @@ import pytest
 from builders import rich_calibration
 from rosbags.highlevel import AnyReader
 
-from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter, Block, ImuColumns, Topics, read_recording
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, ReplayResult, replay, switches
@@ -225,7 +225,7 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path: Path) -> None:
 def test_an_output_is_not_overwritten_unasked(tmp_path: Path) -> None:
     bag = thermal_test(tmp_path / 'bag', minutes=1.0)
     replay(bag, rich_calibration(), tmp_path / 'out')
-    with pytest.raises(RecordingError, match='exists already'):
+    with pytest.raises(OutputError, match='exists already'):
         replay(bag, rich_calibration(), tmp_path / 'out')
     replay(bag, rich_calibration(), tmp_path / 'out', overwrite=True)
 

@@ -18,7 +18,7 @@ import pytest
 from report_helpers import PROGRAM, RATE_HZ, certificate, evidence, fitted, run, write_bag
 
 from thermo_comp import __version__
-from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.fitting.reduction import Readings
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter
@@ -294,14 +294,12 @@ def test_figures_as_png(tmp_path):
 
 def test_page_is_written_atomically(tmp_path):
     target = tmp_path / 'page.html'
-    target.write_text('old')
-    with pytest.raises(OSError, match='missing'):
-        write_report(bare(), tmp_path / 'missing' / 'page.html')
+    target.write_text('<!doctype html>old')
     folder = tmp_path / 'figures'
     folder.write_text('in the way')
-    with pytest.raises(OSError, match='figures'):
+    with pytest.raises(OutputError, match='figures is no directory'):
         write_report(bare(), target, figures=folder)
-    assert target.read_text() == 'old'
+    assert target.read_text() == '<!doctype html>old'
     assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']
 
 

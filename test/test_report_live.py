@@ -11,12 +11,14 @@ import http.client
 import os
 import shutil
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +26,7 @@ import pytest
 from conftest import ROOT
 from report_helpers import certificate, fitted, write_bag
 
-from thermo_comp.report.live import LiveReport, LiveServer
+from thermo_comp.report.live import HOST, MOST_CLIENTS, LiveReport, LiveServer
 from thermo_comp.unit.calibration_file import save_calibration
 
 TIMEOUT_S = 60.0
@@ -76,6 +78,35 @@ def test_page_follows_the_file_and_outlives_a_bad_one(unit):
     assert 'second note' in page
     unit.write_text(good)
     assert 'older' not in report.page()
+
+
+def test_clients_that_say_nothing_grow_no_threads(unit):
+    # WHY: each of 900 half-open connections had a thread of its own, for half a minute.
+    with served(LiveReport(unit)) as server:
+        before = threading.active_count()
+        silent = [socket.create_connection((HOST, server.server_port)) for _ in range(300)]
+        for number, client in enumerate(silent):
+            client.settimeout(TIMEOUT_S)
+            if number % 2:
+                client.sendall(b'GET / HT')
+        most = 0
+        for client in silent:
+            most = max(most, threading.active_count() - before)
+            with suppress(ConnectionError):
+                assert client.recv(1) == b''
+            client.close()
+        assert 0 < most <= MOST_CLIENTS
+        assert 'first note' in get(server.url)
+
+
+def test_a_client_that_goes_away_is_no_news(unit, capfd):
+    with served(LiveReport(unit)) as server:
+        client = socket.create_connection((HOST, server.server_port))
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
+        client.sendall(b'GET / HT')
+        client.close()  # with a reset
+        assert 'first note' in get(server.url)
+    assert capfd.readouterr().err == ''
 
 
 def test_first_bad_file_makes_a_page_that_goes_on_asking(tmp_path):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The chamber's program: presets, the user's own list, random programs.
+The chamber's program: presets and the user's own list.
 
 """
 
@@ -16,7 +16,6 @@ from thermo_comp.simulation import (
     cyclogram_preset,
     parse_cyclogram,
     ramps_and_soaks,
-    random_cyclogram,
 )
 
 
@@ -74,9 +73,6 @@ def test_a_typed_program_that_cannot_be_read_is_refused(text: str, message: str)
 def test_air_is_straight_between_points_and_rests_outside() -> None:
     program = Cyclogram((0.0, 600.0, 1200.0), (20.0, 25.0, 25.0))
     np.testing.assert_allclose(program.at([-1.0, 300.0, 900.0, 5000.0]), [20.0, 22.5, 25.0, 25.0])
-    np.testing.assert_array_equal(
-        program.is_ramp([-1.0, 0.0, 599.0, 600.0, 1300.0]), [False, True, True, False, False]
-    )
 
 
 def test_cut_shortens_in_mid_ramp_and_draws_out_by_resting() -> None:
@@ -84,17 +80,6 @@ def test_cut_shortens_in_mid_ramp_and_draws_out_by_resting() -> None:
     assert program.cut(300.0) == Cyclogram((0.0, 300.0), (20.0, 25.0))
     assert program.cut(900.0) == Cyclogram((0.0, 600.0, 900.0), (20.0, 30.0, 30.0))
     assert program.cut(600.0) == program
-
-
-@pytest.mark.parametrize('seed', range(20))
-def test_random_programs_keep_their_limits(seed: int) -> None:
-    program = random_cyclogram(seed, 6 * 3600.0, rates=(0.2, 2.0))
-    assert program.duration_s == 6 * 3600.0
-    assert program == random_cyclogram(seed, 6 * 3600.0, rates=(0.2, 2.0))
-    assert program != random_cyclogram(seed + 1, 6 * 3600.0, rates=(0.2, 2.0))
-    ramps = np.abs(program.rates_k_min[program.rates_k_min != 0.0])
-    assert np.all((ramps > 0.2 - 1e-9) & (ramps < 2.0 + 1e-9))
-    assert 5.0 <= min(program.temperature_c) < max(program.temperature_c) <= 35.0
 
 
 def test_program_refuses_what_is_not_one() -> None:
@@ -112,9 +97,3 @@ def test_program_refuses_what_is_not_one() -> None:
         cyclogram_preset('oven')
     with pytest.raises(ValueError, match='`duration` must be positive, got 0'):
         cyclogram_preset('paper').cut(0.0)
-    with pytest.raises(ValueError, match='`duration` must be positive, got -5'):
-        random_cyclogram(0, -5.0)
-    with pytest.raises(ValueError, match='`rates` must be an increasing pair, got'):
-        random_cyclogram(0, rates=(0.0, 1.0))
-    with pytest.raises(ValueError, match='`span` must be an increasing pair, got'):
-        random_cyclogram(0, span=(30.0, 10.0))

@@ -42,9 +42,7 @@ def _static(unit: UnitModel, board: Floats) -> tuple[Floats, ...]:
     for temperature in board:
         parts = unit.network.equilibrium(unit.network.air_for('board', float(temperature)))
         deviation = (parts - unit.origin)[None]
-        history = PartHistory(
-            unit.network.nodes, deviation, np.zeros_like(deviation), unit.origin, 1.0
-        )
+        history = PartHistory(unit.network.nodes, deviation, unit.origin, 1.0)
         still.append(unit.drift.evaluate(history))
     bias, scale = zip(*still, strict=True)
     return np.concatenate(bias), np.concatenate(scale)

@@ -69,6 +69,25 @@ class RecordingError(ThermoCompError):
         super().__init__(': '.join(part for part in (self.path, topic, message) if part))
 
 
+class OutputError(ThermoCompError):
+    """
+    An output that may not or cannot be written, with its name.
+
+    Parameters
+    ----------
+    message : str
+        Why not.
+    path : str or Path
+        The output.
+
+    """
+
+    def __init__(self, message: str, path: str | Path) -> None:
+        self.message = message
+        self.path = str(path)
+        super().__init__(f'{path}: {message}')
+
+
 class FleetError(ThermoCompError):
     """
     A fleet that cannot be fitted as a whole: no bags, no scheduler, a missing library.

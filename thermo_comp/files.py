@@ -1,16 +1,114 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the two file operations that must not go wrong: a bounded read and an atomic write.
+Owns how a file is read within bounds and how an output comes to be, for all that write one.
+
+An output never replaces what the command reads; without `overwrite` it never replaces anything,
+whoever else writes at the same time; with it, only what is of the same kind. It takes its name
+when it is whole. A link is written through: it goes on pointing where it did.
 
 """
 
 from __future__ import annotations
 
+import errno
 import os
+import re
+import secrets
+import shutil
 import stat
-import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+
+from .errors import OutputError
+
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+_HEAD_BYTES = 4096
+_INDEX = 'metadata.yaml'
+
+
+@dataclass(frozen=True)
+class Kind:
+    """
+    What an output is, and how a file of that kind is known.
+
+    Parameters
+    ----------
+    name : str
+        What a message calls it.
+    mark : bytes
+        Pattern found in the first 4 KiB; an empty file is of any kind.
+    is_folder : bool, optional
+        The mark is found in the name of each file in it, then, and its index is there.
+
+    """
+
+    name: str
+    mark: bytes
+    is_folder: bool = False
+
+    def refusal(self, path: Path) -> str:
+        """
+        Say why what stands under a name is not of this kind; nothing where it is.
+
+        """
+        if path.is_dir() != self.is_folder:
+            return f'it is a {"folder" if path.is_dir() else "file"}'
+        if self.is_folder:
+            entries = sorted(path.iterdir())
+            for entry in entries:
+                if not (entry.is_file() and re.search(self.mark, os.fsencode(entry.name))):
+                    return f'it holds {entry.name}, which belongs to no bag'
+            is_whole = not entries or (path / _INDEX).is_file()
+            return '' if is_whole else f'it has no {_INDEX}'
+        head = b''
+        if path.is_file():
+            with path.open('rb') as file:
+                head = file.read(_HEAD_BYTES)
+            if not head or re.search(self.mark, head):
+                return ''
+        return f'it is no {self.name}'
+
+
+CALIBRATION = Kind('calibration', rb'(?m)^(format_version|unit)\s*:')
+PAGE = Kind('HTML page', rb'(?i)\A\s*<!doctype html')
+PICTURE = Kind('PNG picture', rb'\A\x89PNG\r\n')
+PARAMETERS = Kind('parameter file of ours', rb'\A# Thermal calibration of unit ')
+RECORD = Kind('JSON record', rb'\A\{')
+PARQUET = Kind('Parquet file', rb'\APAR1')
+CSV = Kind('CSV table of ours', rb'\A(stamp_ns|name|section),')
+MCAP = Kind('MCAP file', rb'\A\x89MCAP')
+BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z', is_folder=True)
+
+
+def bag_kind(path: str | Path, others: str = '') -> Kind:
+    """
+    Tell by the suffix what a bag is to be.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``*.mcap`` makes a bare file, a name without a suffix a rosbag2 directory.
+    others : str, optional
+        What else may be written there, for the message.
+
+    Raises
+    ------
+    OutputError
+        If it has the suffix of anything else.
+
+    """
+    suffix = Path(path).suffix
+    if suffix == '.mcap':
+        return MCAP
+    if suffix[1:2].isalpha():
+        raise OutputError(
+            f'cannot be written: {suffix} is none of *.mcap{others} and a folder', path
+        )
+    return BAG
 
 
 def read_bounded(path: str | Path, limit: int) -> bytes:
@@ -52,42 +150,260 @@ def read_bounded(path: str | Path, limit: int) -> bytes:
     return content
 
 
-def write_atomically(path: str | Path, content: bytes) -> None:
+def check_output(
+    path: str | Path,
+    kind: Kind,
+    *,
+    overwrite: bool = False,
+    others: Iterable[str | Path] = (),
+) -> None:
     """
-    Write a file so that its readers see the old content or the new one, never a part.
+    Refuse an output before any work is done for it.
 
     Parameters
     ----------
     path : str or Path
-        The file; its folder must exist.
-    content : bytes
-        The whole content.
+        The file or folder to be written.
+    kind : Kind
+        What it will be.
+    overwrite : bool, optional
+        Replace one of that kind.
+    others : iterable of str or Path, optional
+        What the command reads, and what else it writes: never replaced, however it is spelt.
 
     Raises
     ------
-    OSError
-        If it cannot be written, with `path` as its file; the old file is then untouched.
+    OutputError
+        If it may not be written.
 
     """
-    target = Path(path)
-    try:
-        _replace(target, content)
-    except OSError as error:
-        # Not the temporary file, which nobody knows of.
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    target = Path(os.path.realpath(path))
+    for other in others:
+        if _overlaps(target, Path(os.path.realpath(other))):
+            raise OutputError(f'is {other} or a part of it, which the command needs', path)
+    if target.exists():
+        if not overwrite:
+            raise OutputError('exists already; --force overwrites it', path)
+        with _told(path):
+            refusal = kind.refusal(target)
+        if refusal:
+            raise OutputError(f'is not replaced: {refusal}', path)
+        return
+    folder = next(above for above in target.parents if above.exists())
+    if not folder.is_dir():
+        raise OutputError(f'cannot be written: {folder} is no directory', path)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f'cannot be written: {folder} is closed to you', path)
 
 
-def _replace(target: Path, content: bytes) -> None:
-    descriptor, name = tempfile.mkstemp(prefix=f'.{target.name}.', dir=target.parent)
-    temporary = Path(name)
+class Draft:
+    """
+    An output in the making: it stands under a hidden name until it is whole.
+
+    Parameters
+    ----------
+    path : str or Path
+        Its name-to-be; folders above it are made.
+    kind : Kind
+        What it is.
+    overwrite : bool, optional
+        Replace one of that kind.
+
+    Attributes
+    ----------
+    partial : Path
+        Where it is to be written; it has the suffix of `path`, so that tools open it.
+
+    Raises
+    ------
+    OutputError
+        If it may not or cannot be written.
+
+    """
+
+    def __init__(self, path: str | Path, kind: Kind, *, overwrite: bool = False) -> None:
+        check_output(path, kind, overwrite=overwrite)
+        self._path = path
+        self._is_replacing = overwrite
+        self._target = Path(os.path.realpath(path))
+        self.partial = _hidden_sibling(self._target)
+        with _told(path):
+            self._target.parent.mkdir(parents=True, exist_ok=True)
+            if kind.is_folder:
+                self.partial.mkdir()
+
+    def publish(self) -> None:
+        """
+        Give the finished output its name.
+
+        Raises
+        ------
+        OutputError
+            If that fails, or somebody else was first; what bears the name then stays.
+
+        """
+        with _told(self._path):
+            if self.partial.is_dir():
+                sync_directory(self.partial)
+                self._publish_folder()
+            else:
+                self._publish_file()
+            sync_directory(self._target.parent)
+
+    def drop(self) -> None:
+        """
+        Remove what was written so far.
+
+        """
+        with suppress(OSError):
+            if self.partial.is_dir():
+                shutil.rmtree(self.partial)
+            else:
+                self.partial.unlink(missing_ok=True)
+
+    def _publish_file(self) -> None:
+        if self._is_replacing:
+            with suppress(FileNotFoundError):
+                self.partial.chmod(stat.S_IMODE(self._target.stat().st_mode))
+        else:
+            try:
+                os.link(self.partial, self._target)
+            except FileExistsError:
+                raise
+            except OSError:
+                # No hard links here, as on FAT: whoever makes the name has it.
+                os.close(os.open(self._target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+            else:
+                self.partial.unlink()
+                return
+        self.partial.replace(self._target)
+
+    def _publish_folder(self) -> None:
+        if not (self._is_replacing and self._target.exists()):
+            try:
+                # Of folders the system replaces none but an empty one.
+                self.partial.rename(self._target)
+            except OSError as error:
+                if error.errno in (errno.ENOTEMPTY, errno.ENOTDIR):
+                    raise FileExistsError(error.errno, error.strerror) from error
+                raise
+        elif _exchange(self.partial, self._target):
+            shutil.rmtree(self.partial)
+        else:
+            old = _hidden_sibling(self._target)
+            self._target.rename(old)
+            try:
+                self.partial.rename(self._target)
+            except OSError:
+                old.rename(self._target)
+                raise
+            shutil.rmtree(old)
+
+
+@contextmanager
+def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
+    """
+    Give a place to write to; what the block leaves there becomes the output, if it succeeds.
+
+    Raises
+    ------
+    OutputError
+        As `Draft`, and for an `OSError` of the block.
+
+    """
+    draft = Draft(path, kind, overwrite=overwrite)
     try:
-        with os.fdopen(descriptor, 'wb') as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        # mkstemp gives 0600; a calibration is read by other users of the machine.
-        temporary.chmod(0o644)
-        temporary.replace(target)
+        with _told(path):
+            yield draft.partial
+            with draft.partial.open('rb') as file:
+                os.fsync(file.fileno())
+        draft.publish()
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        draft.drop()
         raise
+
+
+def write_atomically(
+    path: str | Path, content: bytes, kind: Kind, *, overwrite: bool = True
+) -> None:
+    """
+    Write a file so that its readers see the old content or the new one, never a part.
+
+    Raises
+    ------
+    OutputError
+        As `Draft`; what bears the name then stays.
+
+    """
+    with drafted(path, kind, overwrite=overwrite) as partial:
+        partial.write_bytes(content)
+
+
+def sync_directory(path: Path) -> None:
+    """
+    Flush a directory's entries to disk.
+
+    """
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _told(path: str | Path) -> Iterator[None]:
+    """
+    Say which output failed, and not the hidden name, which nobody knows of.
+
+    """
+    try:
+        yield
+    except FileExistsError as error:
+        raise OutputError('exists already; --force overwrites it', path) from error
+    except OSError as error:
+        raise OutputError(f'cannot be written: {error.strerror or error}', path) from error
+
+
+def _hidden_sibling(path: Path) -> Path:
+    stem = path.stem[:40]
+    return path.with_name(f'.{stem}.{os.getpid()}-{secrets.token_hex(3)}.partial{path.suffix}')
+
+
+def _overlaps(target: Path, other: Path) -> bool:
+    """
+    Say whether a target is, holds or lies in another file, by whatever names and links.
+
+    """
+    if target == other or other in target.parents or target in other.parents:
+        return True
+    return not _identities(target).isdisjoint(_identities(other))
+
+
+def _identities(path: Path) -> set[tuple[int, int]]:
+    """
+    Identify a file, or a folder with the files in it.
+
+    """
+    found = set()
+    for one in (path, *(path.iterdir() if path.is_dir() else ())):
+        with suppress(OSError):
+            status = one.stat()
+            found.add((status.st_dev, status.st_ino))
+    return found
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """
+    Let two folders swap names in one step, where the system can.
+
+    """
+    import ctypes
+
+    rename = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
+    if rename is None:
+        return False
+    done: int = rename(
+        _AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE
+    )
+    return done == 0

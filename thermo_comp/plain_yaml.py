@@ -86,15 +86,15 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
     for n, event in enumerate(yaml.parse(text, Loader=_LOADER)):
         if n > node_limit:
             raise PlainYamlError(f'more than {node_limit} keys and values')
-        kind = type(event)
-        if kind is yaml.ScalarEvent or kind in (yaml.SequenceStartEvent, yaml.MappingStartEvent):
+        if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
             if event.tag not in (None, '!'):
                 raise PlainYamlError(f'YAML tags are not accepted ({_line(event)})')
             holder = open_ones[-1]
-            if kind is yaml.ScalarEvent:
+            value: Any = {}
+            if isinstance(event, yaml.ScalarEvent):
                 value = _scalar(event) if event.implicit[0] else event.value
-            else:
-                value = [] if kind is yaml.SequenceStartEvent else {}
+            elif isinstance(event, yaml.SequenceStartEvent):
+                value = []
             if type(holder) is list:
                 holder.append(value)
             elif keys[-1] is None:
@@ -110,17 +110,17 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
             else:
                 holder[keys[-1]] = value
                 keys[-1] = None
-            if kind is not yaml.ScalarEvent:
+            if isinstance(event, yaml.CollectionStartEvent):
                 if len(open_ones) > depth_limit:
                     raise PlainYamlError(f'nested deeper than {depth_limit} ({_line(event)})')
                 open_ones.append(value)
                 keys.append(None)
-        elif kind in (yaml.SequenceEndEvent, yaml.MappingEndEvent):
+        elif isinstance(event, yaml.CollectionEndEvent):
             open_ones.pop()
             keys.pop()
-        elif kind is yaml.AliasEvent:
+        elif isinstance(event, yaml.AliasEvent):
             raise PlainYamlError(f'YAML aliases are not accepted ({_line(event)})')
-        elif kind is yaml.DocumentStartEvent:
+        elif isinstance(event, yaml.DocumentStartEvent):
             if has_document:
                 raise PlainYamlError('expected one YAML document, found more')
             has_document = True

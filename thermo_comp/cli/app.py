@@ -37,6 +37,9 @@ from . import (
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
 
+#: EX_SOFTWARE of sysexits.h.
+_SOFTWARE = 70
+
 app = typer.Typer(
     name='thermo_comp',
     help='Thermal-drift compensation of a three-axis accelerometer.',
@@ -88,8 +91,8 @@ def main(arguments: list[str] | None = None) -> None:
     """
     Run one command and leave the process with its exit code.
 
-    0: done. 1: the data or the result is bad. 2: the command line is wrong. A user's mistake is
-    one line on stderr, never a traceback.
+    0: done. 1: the data or the result is bad. 2: the command line is wrong. 70: a mistake of this
+    program's; its traceback goes into a file. Whatever it is, it is one line on stderr.
 
     Parameters
     ----------
@@ -112,7 +115,8 @@ def run(arguments: list[str]) -> int:
     Returns
     -------
     int
-        0 done, 1 the data or the result is bad, 2 the command line is wrong.
+        0 done, 1 the data or the result is bad, 2 the command line is wrong, 70 the command
+        itself has failed.
 
     """
     arguments, ros_arguments = split_ros_arguments(arguments)
@@ -138,6 +142,8 @@ def run(arguments: list[str]) -> int:
         where = f'{failure.filename}: ' if failure.filename else ''
         output.error(f'{where}{failure.strerror or failure}')
         return 1
+    except Exception as failure:  # noqa: BLE001 - the last line of defence
+        return _unexpected(failure)
     return code if isinstance(code, int) else 0
 
 
@@ -167,6 +173,28 @@ def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
         else:
             target.append(argument)
     return own, ros
+
+
+def _unexpected(failure: Exception) -> int:
+    """
+    Keep the traceback of what nobody has foreseen, say where, return its exit code.
+
+    """
+    import tempfile
+    import traceback
+
+    lines = [f'thermo_comp {__version__}, {sys.version}\n', *traceback.format_exception(failure)]
+    try:
+        descriptor, name = tempfile.mkstemp(prefix='thermo_comp-', suffix='.log')
+        with os.fdopen(descriptor, 'w', encoding='utf-8', errors='backslashreplace') as log:
+            log.writelines(lines)
+    except OSError as error:
+        name = f'not written ({error.strerror})'
+    reason = f'{type(failure).__name__}: {failure}'
+    output.error(
+        f'unexpected {reason:.300}; this is a mistake of the program, its traceback is {name}'
+    )
+    return _SOFTWARE
 
 
 def _usage(mistake: Exception) -> int:

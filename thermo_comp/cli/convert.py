@@ -86,9 +86,11 @@ def convert(
 
     """
     from ..convert import write_log
+    from ..files import bag_kind, check_output
 
     out = Output(as_json, quiet)
-    options.refuse_existing(output, force)
+    read_too = [] if columns is None else [columns]
+    check_output(output, bag_kind(output), overwrite=force, others=[log, *read_too])
     is_bag = log.is_dir() or log.suffix.lower() in _BAGS
     if is_bag:
         _refuse_for_bags(columns, imu, baro, allow_compensated)

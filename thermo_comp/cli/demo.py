@@ -98,7 +98,8 @@ def demo(
     _say(out, result, calibrations['node'].provenance.model)
     with out.progress('drawing'):
         page, figure = _draw(held_out, calibrations['node'], output)
-    out.line(f'\nfigure {figure}, certificate {page}')
+    out.line()
+    out.line(f'figure {figure}, certificate {page}')
     out.json(
         {
             'messages_in': played.n_in,

@@ -67,13 +67,13 @@ def export(
 
     """
     from ..convert.exchange import export_ardupilot, export_px4
-    from ..files import write_atomically
+    from ..files import PARAMETERS, check_output, write_atomically
     from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
     if device_id and to is not Autopilot.px4:
         raise options.usage('--device-id is for PX4')
-    options.refuse_existing(output, force)
+    check_output(output, PARAMETERS, overwrite=force, others=[path])
     calibration = load_calibration(path)
     try:
         if to is Autopilot.px4:
@@ -83,7 +83,7 @@ def export(
             result = export_ardupilot(calibration, imu=1 if number is None else number, up=up)
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
-    write_atomically(output, result.text.encode())
+    write_atomically(output, result.text.encode(), PARAMETERS, overwrite=force)
     out.line(f'{output}: parameters of {to.value} for unit {calibration.unit.serial}')
     for note in result.notes:
         out.line(f'- {note}')
@@ -106,7 +106,9 @@ def import_(
         ),
     ],
     output: Annotated[Path, typer.Option('--output', '-o', help='Calibration to write (YAML).')],
-    serial: Annotated[str, typer.Option(help='Serial to give the unit.')],
+    serial: Annotated[
+        str, typer.Option(help='Serial to give the unit.', callback=options.check_serial)
+    ],
     number: Annotated[
         int | None, typer.Option(help='Which set, where there are several (TC_A0, INS_TCAL1).')
     ] = None,
@@ -132,12 +134,12 @@ def import_(
 
     """
     from ..convert.exchange import import_parameters
-    from ..files import read_bounded
+    from ..files import CALIBRATION, check_output, read_bounded
     from ..unit.calibration_file import save_calibration
     from ..unit.gravity import MICRO_G
 
     out = Output(as_json, quiet)
-    options.refuse_existing(output, force)
+    check_output(output, CALIBRATION, overwrite=force, others=[path])
     try:
         calibration = import_parameters(
             read_bounded(path, _LIMIT).decode('utf-8', errors='replace'),
@@ -150,7 +152,7 @@ def import_(
         )
     except (CalibrationError, ValueError) as failure:
         raise CalibrationError(str(failure), path=path) from failure
-    save_calibration(calibration, output)
+    save_calibration(calibration, output, overwrite=force)
     lower, upper = calibration.static.temperature_range_c
     source = calibration.provenance.model
     out.line(f'{output}: unit {serial}, {source}, {lower:g} .. {upper:g} degC')

@@ -35,7 +35,7 @@ def fit(
     report: Annotated[
         Path | None, typer.Option(help='Certificate to write (HTML).', metavar='HTML')
     ] = None,
-    serial: Annotated[str | None, typer.Option(help="Serial, instead of the bags'.")] = None,
+    serial: options.NewSerial = None,
     full_scale: Annotated[
         float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
     ] = None,
@@ -69,6 +69,7 @@ def fit(
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
 
     """
+    from ..files import CALIBRATION, PAGE, check_output
     from ..fitting import FitOptions, resolve_gravity
     from ..fitting import fit as run
     from ..fitting.fit_sources import fit_sources
@@ -78,9 +79,9 @@ def fit(
     gravity = options.place(gravity, latitude, height)
     if gravity is None:
         raise options.usage('give --gravity, or --latitude and --height')
-    for path in (output, report):
-        if path is not None:
-            options.refuse_existing(path, force)
+    check_output(output, CALIBRATION, overwrite=force, others=bags)
+    if report is not None:
+        check_output(report, PAGE, overwrite=force, others=[*bags, output])
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
     sources, kind = fit_sources(bags, topics, input_.value, serial)
     torn = [source for source in sources if source.truncated]
@@ -101,11 +102,11 @@ def fit(
         raise options.usage(str(mistake)) from mistake
     with out.progress('fitting', total=1.0) as done:
         result = run(sources, settings, lambda _stage, part: done(part))
-    save_calibration(result.calibration, output)
+    save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
         from ..report import write_report
 
-        write_report(result, report, paths=bags)
+        write_report(result, report, paths=bags, overwrite=force)
     _say(out, result, output, verbose)
     if report is not None:
         out.line(f'{report}: certificate')

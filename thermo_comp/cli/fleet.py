@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..text import one_line
 from . import options
 from .output import Output, micro_g
 
@@ -196,5 +197,5 @@ def _short(name: str, limit: int = 22) -> str:
     Keep the end of a long name, which tells units apart, so that the table fits 80 columns.
 
     """
-    clean = ''.join(c if c.isprintable() else ' ' for c in name)
+    clean = one_line(name)
     return clean if len(clean) <= limit else f'~{clean[1 - limit :]}'

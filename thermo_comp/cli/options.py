@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import ThermoCompError
+from ..text import valid_serial
 
 if TYPE_CHECKING:
     from ..recording import Topics
@@ -30,9 +30,22 @@ class InputChoice(str, Enum):
     imu = 'imu'
 
 
+def check_serial(serial: str | None) -> str | None:
+    """
+    Refuse what can be no serial; an empty one is for the command to judge.
+
+    """
+    if serial:
+        try:
+            valid_serial(serial)
+        except ValueError as mistake:
+            raise usage(str(mistake)) from mistake
+    return serial
+
+
 Json = Annotated[bool, typer.Option('--json', help='Print the result as one JSON object.')]
 Quiet = Annotated[bool, typer.Option('--quiet', '-q', help='Print nothing but errors.')]
-Force = Annotated[bool, typer.Option('--force', '-f', help='Overwrite the output.')]
+Force = Annotated[bool, typer.Option('--force', '-f', help='Overwrite one of the same kind.')]
 CalibrationFile = Annotated[
     Path, typer.Option('--calibration', '-c', help='Calibration of the unit (YAML).')
 ]
@@ -54,8 +67,14 @@ Height = Annotated[float | None, typer.Option('--height', help='Height above the
 Serial = Annotated[
     str | None,
     typer.Option(
-        '--serial', help="Serial of the unit, instead of the bag's; '' accepts any calibration."
+        '--serial',
+        help="Serial of the unit, instead of the bag's; '' accepts any calibration.",
+        callback=check_serial,
     ),
+]
+NewSerial = Annotated[
+    str | None,
+    typer.Option('--serial', help="Serial, instead of the bags'.", callback=check_serial),
 ]
 
 
@@ -101,27 +120,6 @@ def place(gravity: float | None, latitude: float | None, height: float | None) -
         return normal_gravity(latitude, height)
     except ValueError as mistake:
         raise usage(str(mistake)) from mistake
-
-
-def refuse_existing(output: Path, force: bool) -> None:
-    """
-    Refuse to overwrite an output before any work is done.
-
-    Parameters
-    ----------
-    output : Path
-        The file or directory to be written.
-    force : bool
-        The user's word.
-
-    Raises
-    ------
-    ThermoCompError
-        If it exists and `force` is not given.
-
-    """
-    if output.exists() and not force:
-        raise ThermoCompError(f'{output}: exists already; --force overwrites it')
 
 
 def usage(message: str, **context: Any) -> typer.BadParameter:

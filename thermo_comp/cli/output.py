@@ -4,7 +4,8 @@
 Owns how the command line speaks: tables, JSON, progress, and one line per error.
 
 Results go to stdout, everything about the run (progress, notes, errors) to stderr, so that a pipe
-carries results only.
+carries results only. Everything goes through `_print`: what somebody else chose (serials, topics,
+metadata, file names) can neither forge a line nor move the cursor, and any terminal can show it.
 
 """
 
@@ -18,9 +19,11 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
+
+from ..text import one_line
 
 if TYPE_CHECKING:
     from ..recording import RecordingInfo
@@ -51,7 +54,7 @@ class Output:
 
         """
         if not (self.as_json or self.quiet):
-            print(text)
+            _print(text)
 
     def note(self, text: str) -> None:
         """
@@ -59,7 +62,7 @@ class Output:
 
         """
         if not self.quiet:
-            print(f'thermo_comp: {text}', file=sys.stderr)
+            _print(f'thermo_comp: {text}', sys.stderr)
 
     def torn(self, infos: Iterable[RecordingInfo]) -> bool:
         """
@@ -82,11 +85,11 @@ class Output:
 
     def json(self, data: Mapping[str, Any]) -> None:
         """
-        Print the result for machines; numbers that JSON does not know become null.
+        Print the result for machines, in ASCII; numbers that JSON does not know become null.
 
         """
         if self.as_json:
-            print(json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False))
+            print(json.dumps(plain(data), indent=2, allow_nan=False))
 
     def table(
         self, columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = ''
@@ -106,7 +109,7 @@ class Output:
         """
         if self.as_json or self.quiet:
             return
-        cells = [[text(cell) for cell in row] for row in rows]
+        cells = [[_shown(text(cell), sys.stdout) for cell in row] for row in rows]
         right = [all(_is_number(row[i]) for row in cells) for i in range(len(columns))]
         if sys.stdout.isatty():
             from rich import box
@@ -123,7 +126,7 @@ class Output:
             Console(highlight=False, markup=False).print(table)
             return
         for text_line in aligned(columns, cells, right, title):
-            print(text_line)
+            _print(text_line)
 
     @contextmanager
     def progress(self, what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
@@ -157,7 +160,7 @@ class Output:
         )
 
         with Progress(
-            TextColumn('{task.description}'),
+            TextColumn('{task.description}', markup=False),
             BarColumn(),
             TaskProgressColumn(show_speed=True),
             TimeElapsedColumn(),
@@ -165,7 +168,7 @@ class Output:
             console=Console(stderr=True),
             transient=True,
         ) as bar:
-            task = bar.add_task(what, total=total)
+            task = bar.add_task(_shown(what, sys.stderr), total=total)
             yield lambda done: bar.update(task, completed=done)
 
 
@@ -179,7 +182,25 @@ def error(message: str) -> None:
 
     """
     line = ' '.join(message.split())
-    print(f'thermo_comp: error: {line}', file=sys.stderr)
+    _print(f'thermo_comp: error: {line}', sys.stderr)
+
+
+def _print(text: str, file: TextIO | None = None) -> None:
+    """
+    Print one line.
+
+    """
+    stream = sys.stdout if file is None else file
+    print(_shown(text, stream), file=stream)
+
+
+def _shown(text: str, file: TextIO) -> str:
+    """
+    Return a line as the stream can carry it.
+
+    """
+    encoding = file.encoding or 'utf-8'
+    return one_line(text).encode(encoding, 'backslashreplace').decode(encoding)
 
 
 def text(cell: Cell) -> str:

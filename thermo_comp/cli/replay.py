@@ -61,6 +61,7 @@ def replay(
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
 
     """
+    from ..files import bag_kind, check_output
     from ..online.status import CompensatorConfig
     from ..replay import replay as run
     from ..unit.calibration_file import load_calibration
@@ -75,7 +76,8 @@ def replay(
         config = CompensatorConfig(**{k: v for k, v in given.items() if v is not None})
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
-    options.refuse_existing(output, force)
+    kind = bag_kind(output)
+    check_output(output, kind, overwrite=force, others=[bag, calibration])
     with out.progress('replaying', total=1.0) as done:
         result = run(
             bag,

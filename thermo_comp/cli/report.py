@@ -56,6 +56,7 @@ def report(
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
 
     """
+    from ..files import PAGE, check_output
     from ..replay import input_for
     from ..report import evidence_of_bags, open_bag, write_report
     from ..unit.calibration_file import load_calibration
@@ -64,7 +65,8 @@ def report(
     if not bags and calibration is None:
         raise options.usage('give bags, a calibration, or both')
     gravity = options.place(gravity, latitude, height)
-    options.refuse_existing(output, force)
+    read = [*(bags or []), *([calibration] if calibration is not None else [])]
+    check_output(output, PAGE, overwrite=force, others=read)
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
     paths = bags or []
     loaded = None if calibration is None else load_calibration(calibration)
@@ -84,7 +86,7 @@ def report(
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
     is_torn = out.torn(bag.info for bag in opened)
-    verdict = write_report(evidence, output, figures=figures)
+    verdict = write_report(evidence, output, figures=figures, overwrite=force)
     out.line(f'{output}: {verdict.headline}')
     for reservation in verdict.reservations:
         out.line(f'- {reservation}')

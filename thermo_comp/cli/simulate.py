@@ -32,9 +32,24 @@ def simulate(
         ),
     ],
     unit: Annotated[
-        str, typer.Option(help='Kind of unit: thermostatted, bare-quartz or mems.')
+        str,
+        typer.Option(
+            help='Kind of unit: thermostatted, bare-quartz, mems; or with one kind of physics: '
+            'own-lags, between, products, hysteresis, even, convection, switched-load, paper, '
+            'slow-noise, plain, demo.'
+        ),
     ] = 'thermostatted',
     unit_seed: Annotated[int, typer.Option(help='Which specimen of that kind.', min=0)] = 1,
+    sibling: Annotated[
+        int | None, typer.Option(help='Another unit of its type, +-15 % in everything.', min=0)
+    ] = None,
+    plan: Annotated[
+        str | None,
+        typer.Option(
+            help='A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
+            'tumble, tumble-3, tumble-1 or held-out.'
+        ),
+    ] = None,
     profile: Annotated[
         str,
         typer.Option(help="Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'."),
@@ -69,41 +84,45 @@ def simulate(
 
     """
     from .. import simulation
+    from ..files import bag_kind, check_output
 
     out = Output(as_json, quiet)
     try:
-        cyclogram = (
-            simulation.cyclogram_preset(profile)
-            if profile in simulation.CYCLOGRAM_NAMES
-            else simulation.parse_cyclogram(profile)
-        )
         specimen = simulation.unit_preset(unit, unit_seed)
+        if plan is None:
+            program = simulation.parse_cyclogram(profile)
+            ups = simulation.positions(positions, position_seed)
+            stations = tuple(simulation.Position(profile, program, up) for up in ups)
+        else:
+            stations = simulation.plan(plan, position_seed)
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
-    options.refuse_existing(output, force)
-    ups = simulation.positions(positions, position_seed)
-    names = (
-        [output] if positions == 1 else [output / f'{i:02d}.mcap' for i in range(1, positions + 1)]
-    )
+    if sibling is not None:
+        specimen = specimen.sibling(sibling)
+    n = len(stations)
+    names = [output] if n == 1 else [output / f'{i:02d}.mcap' for i in range(1, n + 1)]
+    for name in names:
+        check_output(name, bag_kind(name), overwrite=force)
     written: list[dict[str, Any]] = []
-    with out.progress('simulating', total=positions) as done:
-        for i, (name, up) in enumerate(zip(names, ups, strict=True)):
+    with out.progress('simulating', total=n) as done:
+        for i, (name, station) in enumerate(zip(names, stations, strict=True)):
+            cyclogram = station.program
             facts = {
                 'unit': unit,
                 'unit_seed': unit_seed,
-                'profile': profile,
+                'profile': profile if plan is None else plan,
                 'position': i + 1,
-                'positions': positions,
+                'positions': n,
                 'position_seed': position_seed,
                 'seed': seed + i,
                 'rate_hz': rate_hz,
                 'gravity': gravity,
-                'up': up.tolist(),
+                'up': station.up.tolist(),
             }
             runs = simulation.simulate_blocks(
                 specimen,
                 cyclogram,
-                up,
+                station.up,
                 block_size=_BLOCK,
                 rate_hz=rate_hz,
                 temperature_rate_hz=temperature_rate_hz,
@@ -119,7 +138,8 @@ def simulate(
         ('bag', 'counts', 'board', 'case'),
         [(row['bag'], row['counts'], row['board'], row['case']) for row in written],
     )
-    out.json({'serial': specimen.serial, 'duration_s': cyclogram.duration_s, 'bags': written})
+    seconds = max(station.program.duration_s for station in stations)
+    out.json({'serial': specimen.serial, 'duration_s': seconds, 'bags': written})
 
 
 def _part(

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import CalibrationError
+from ..text import one_line
 from ..typing import Floats
 from ..unit.calibration import (
     FORMAT_VERSION,
@@ -109,9 +110,7 @@ def export_px4(
     values += [(f'{prefix}TREF', reference), (f'{prefix}TMIN', lower), (f'{prefix}TMAX', upper)]
     if not device_id:
         notes.append(f'{prefix}ID is 0: set it to the device id of the sensor, PX4 matches by it')
-    lines = [f'# Thermal calibration of unit {calibration.unit.serial}, by thermo_comp']
-    lines += [f'# {note}' for note in notes]
-    lines += ['# Vehicle-Id Component-Id Name Value Type']
+    lines = _comments(calibration, [*notes, 'Vehicle-Id Component-Id Name Value Type'])
     lines += [
         f'1\t1\t{name}\t{value}\t6' if isinstance(value, int) else f'1\t1\t{name}\t{value:.9g}\t9'
         for name, value in values
@@ -157,8 +156,7 @@ def export_ardupilot(
         'the offset itself is not written: calibrate the accelerometer as usual afterwards '
         f'(ArduPilot keeps its temperature in INS_ACC{imu}_CALTEMP)'
     )
-    lines = [f'# Thermal calibration of unit {calibration.unit.serial}, by thermo_comp']
-    lines += [f'# {note}' for note in notes]
+    lines = _comments(calibration, notes)
     lines += [f'{prefix}ENABLE,1', f'{prefix}TMIN,{lower:.9g}', f'{prefix}TMAX,{upper:.9g}']
     for power in (1, 2, 3):
         lines += [
@@ -245,6 +243,15 @@ def import_parameters(
             ),
         ),
     )
+
+
+def _comments(calibration: Calibration, notes: list[str]) -> list[str]:
+    """
+    Head a parameter file; whatever a note holds, it ends with its line.
+
+    """
+    title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
+    return [f'# {one_line(said)}' for said in (title, *notes)]
 
 
 def _cubics(

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..recording import BagWriter, ImuColumns, Topics
+from ..text import valid_serial
 from ..typing import Bools, Floats, Ints
 from .table import NO_STAMP
 from .units import Stillness, believed_unit, contradiction, find_stillness
@@ -238,9 +239,16 @@ def write_log(
     Raises
     ------
     RecordingError
-        If no row is usable, a stated unit contradicts the readings, or the bag cannot be written.
+        If no row is usable, a stated unit contradicts the readings, or the serial is none.
+    OutputError
+        If the bag may not or cannot be written.
 
     """
+    if log.serial:
+        try:
+            valid_serial(log.serial)
+        except ValueError as mistake:
+            raise RecordingError(str(mistake), path=log.path) from mistake
     usable = _usable(log)
     stamp_ns, accel, line = log.stamp_ns[usable], log.accel[usable], log.line[usable]
     if not len(stamp_ns):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import FitError
+from ..text import valid_serial
 from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..typing import Floats
 from ..unit.calibration import Calibration, Unit
@@ -389,13 +390,16 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     Raises
     ------
     FitError
-        If the bags name different units and the user none.
+        If the bags name different units and the user none, or the serial is none.
 
     """
     serials = {source.serial for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         raise FitError(f'the bags are of different units: {", ".join(sorted(serials))}')
-    return options.serial or (serials.pop() if serials else 'unknown')
+    try:
+        return valid_serial(options.serial or (serials.pop() if serials else 'unknown'))
+    except ValueError as mistake:
+        raise FitError(str(mistake)) from mistake
 
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:

@@ -20,7 +20,8 @@ from typing import Any
 from urllib.parse import quote
 
 from ..errors import FleetError
-from ..files import write_atomically
+from ..files import CALIBRATION as CALIBRATION_FILE
+from ..files import PAGE, RECORD, write_atomically
 from .discovery import FoundUnit
 from .row import FITTED, Cell, empty_row
 from .unit import FleetOptions, UnitOutcome
@@ -138,7 +139,8 @@ class Ledger:
         options : FleetOptions
             The options.
         outcome : UnitOutcome or None
-            None keeps what is there, for bags that were only touched.
+            None keeps what is there, for bags that were only touched. One without a calibration,
+            or from a file system that failed, takes no earlier calibration away.
 
         Returns
         -------
@@ -147,29 +149,39 @@ class Ledger:
 
         Raises
         ------
-        FleetError
+        OutputError
             If it cannot be written.
 
         """
         folder = self.folder_of(unit.name)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if outcome is None:
-                said = json.loads((folder / RESULT).read_bytes())
-                said['files'] = _files(unit)
-            else:
-                # Between this line and the last the unit counts as not done.
-                for name in (RESULT, CERTIFICATE, CALIBRATION):
-                    (folder / name).unlink(missing_ok=True)
-                if outcome.calibration:
-                    write_atomically(folder / CALIBRATION, outcome.calibration)
+        if outcome is None:
+            said = json.loads((folder / RESULT).read_bytes())
+            said['files'] = _files(unit)
+        else:
+            said = _record(unit, options, outcome)
+            if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):
+                return _kept(said['row'], folder)
+            if outcome.calibration:
+                # Until the record is written its hash is not the file's: the unit is not done.
+                write_atomically(folder / CALIBRATION, outcome.calibration, CALIBRATION_FILE)
                 if outcome.certificate:
-                    write_atomically(folder / CERTIFICATE, zlib.decompress(outcome.certificate))
-                said = _record(unit, options, outcome)
-            write_atomically(folder / RESULT, (json.dumps(said, indent=1) + '\n').encode())
-        except OSError as error:
-            raise FleetError(f'{folder}: cannot be written: {error.strerror}') from error
+                    page = zlib.decompress(outcome.certificate)
+                    write_atomically(folder / CERTIFICATE, page, PAGE)
+                else:
+                    (folder / CERTIFICATE).unlink(missing_ok=True)
+        content = (json.dumps(said, indent=1) + '\n').encode()
+        write_atomically(folder / RESULT, content, RECORD)
         return empty_row(**said['row'])
+
+
+def _kept(row: dict[str, Cell], folder: Path) -> dict[str, Cell]:
+    """
+    Return the row of a run that leaves an earlier calibration, and its record, as they are.
+
+    """
+    kept = f'{folder / CALIBRATION} of an earlier run stays'
+    said = '; '.join(str(part) for part in (row['problem'], kept) if part)
+    return empty_row(**{**row, 'problem': said})
 
 
 def _record(unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FleetError
+from ..files import PAGE as PAGE_FILE
 from ..files import write_atomically
 from .discovery import FoundUnit, find_units
 from .engine import Job, connected, n_tasks, require_libraries, run
@@ -112,7 +113,9 @@ def fit_fleet(
     Raises
     ------
     FleetError
-        If a library is missing, there is no bag or no scheduler, or results cannot be written.
+        If a library is missing, there is no bag or no scheduler.
+    OutputError
+        If results cannot be written.
 
     """
     require_libraries()
@@ -163,8 +166,5 @@ def _written(rows: tuple[Row, ...], summary: Summary, n_done: int, ledger: Ledge
     parquet, csv = write_tables(rows, ledger.folder)
     page = ledger.folder / PAGE
     content = render_fleet(rows, summary, ledger.certificate_of)
-    try:
-        write_atomically(page, content.encode())
-    except OSError as error:
-        raise FleetError(f'{page}: cannot be written: {error.strerror}') from error
+    write_atomically(page, content.encode(), PAGE_FILE)
     return FleetResult(rows, summary, n_done, parquet, csv, page)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import FleetError
-from ..files import write_atomically
+from ..files import CSV, PARQUET, write_atomically
 from .row import COLUMNS, Row, empty_row
 
 
@@ -35,16 +35,13 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
     Raises
     ------
-    FleetError
+    OutputError
         If one cannot be written.
 
     """
     parquet, text = folder / 'fleet.parquet', folder / 'fleet.csv'
-    try:
-        write_atomically(parquet, to_parquet(rows))
-        write_atomically(text, to_csv(rows).encode())
-    except OSError as error:
-        raise FleetError(f'{folder}: cannot be written: {error.strerror}') from error
+    write_atomically(parquet, to_parquet(rows), PARQUET)
+    write_atomically(text, to_csv(rows).encode(), CSV)
     return parquet, text
 
 

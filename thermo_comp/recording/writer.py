@@ -11,7 +11,6 @@ there before stays if writing fails.
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,9 +20,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import RecordingError
+from ..errors import OutputError, RecordingError
+from ..files import Draft, bag_kind
 from ..typing import Ints
-from .atomic import partial_sibling, publish, sync_directory
 from .columns import ImuColumns, RawMessages
 from .definitions import Definition, known_definition
 from .encode import (
@@ -45,7 +44,6 @@ Compression = Literal['none', 'lz4', 'zstd']
 
 _AUTO_FLUSH_BYTES = 1 << 26
 _LAST_SECOND = 2**31
-_BAG_FILES = {'.mcap', '.db3', '.yaml', '.zstd'}
 
 
 class BagWriter:
@@ -68,7 +66,7 @@ class BagWriter:
 
     Raises
     ------
-    RecordingError
+    OutputError
         The output exists, is no bag that may be replaced, or cannot be created.
     ValueError
         An unknown compression.
@@ -96,21 +94,17 @@ class BagWriter:
         if compression not in {'zstd', 'lz4', 'none'}:
             raise ValueError(f'`compression` must be zstd, lz4 or none, got {compression!r}')
         self._path = Path(path)
-        self._is_file = self._path.suffix == '.mcap'
         self._metadata = dict(metadata or {})
         self._batches: list[Records] = []
         self._n_buffered_bytes = 0
         self._file: McapFile | None = None
-        self._target = self._path.resolve()
-        _check_target(self._path, self._is_file, overwrite)
-        self._partial = partial_sibling(self._target)
+        kind = bag_kind(path)
+        self._is_file = not kind.is_folder
+        self._draft = Draft(path, kind, overwrite=overwrite)
         with self._translated():
-            self._target.parent.mkdir(parents=True, exist_ok=True)
-            if not self._is_file:
-                self._partial.mkdir()
             name = self._path.name if self._is_file else f'{self._path.name}_0.mcap'
             self._file = McapFile(
-                self._partial if self._is_file else self._partial / name,
+                self._draft.partial if self._is_file else self._draft.partial / name,
                 compression,
                 level,
                 chunk_bytes,
@@ -146,7 +140,7 @@ class BagWriter:
         ------
         ValueError
             Shapes that do not fit, times that no ROS stamp can hold.
-        RecordingError
+        OutputError
             The disk is full or the like.
 
         """
@@ -185,7 +179,7 @@ class BagWriter:
         ------
         ValueError
             As for `write_counts`.
-        RecordingError
+        OutputError
             As for `write_counts`.
 
         """
@@ -231,7 +225,7 @@ class BagWriter:
         ------
         ValueError
             As for `write_counts`.
-        RecordingError
+        OutputError
             As for `write_counts`.
 
         """
@@ -280,7 +274,7 @@ class BagWriter:
         ------
         ValueError
             As for `write_counts`.
-        RecordingError
+        OutputError
             As for `write_counts`.
 
         """
@@ -320,7 +314,9 @@ class BagWriter:
         ValueError
             Lengths that do not fit.
         RecordingError
-            A type whose definition is not known; the disk is full or the like.
+            A type whose definition is not known.
+        OutputError
+            As for `write_counts`.
 
         """
         if isinstance(messages, RawMessages):
@@ -338,7 +334,7 @@ class BagWriter:
 
         Raises
         ------
-        RecordingError
+        OutputError
             The disk is full or the like.
 
         """
@@ -353,8 +349,9 @@ class BagWriter:
 
         Raises
         ------
-        RecordingError
-            The disk is full or the like; nothing of this output is left then.
+        OutputError
+            The disk is full or the like, or somebody else was first; nothing of this output is
+            left then.
 
         """
         if self._file is None:
@@ -365,9 +362,8 @@ class BagWriter:
                 summary = self._file.finish(self._metadata)
                 if not self._is_file:
                     text = dump_metadata(summary, self._metadata)
-                    _write_text(self._partial / 'metadata.yaml', text)
-                    sync_directory(self._partial)
-                publish(self._partial, self._target)
+                    _write_text(self._draft.partial / 'metadata.yaml', text)
+            self._draft.publish()
         except BaseException:
             self.abort()
             raise
@@ -382,11 +378,7 @@ class BagWriter:
         if file is not None:
             with suppress(OSError):
                 file.close()
-        with suppress(OSError):
-            if self._partial.is_dir():
-                shutil.rmtree(self._partial)
-            else:
-                self._partial.unlink(missing_ok=True)
+        self._draft.drop()
 
     def __enter__(self) -> BagWriter:
         """
@@ -458,7 +450,7 @@ class BagWriter:
             yield
         except OSError as error:
             self.abort()
-            raise RecordingError(
+            raise OutputError(
                 f'cannot be written: {error.strerror or error}', self._path
             ) from error
 
@@ -468,26 +460,6 @@ def _as_stamps(stamp_ns: ArrayLike) -> Ints:
     if len(stamps) and int(np.max(stamps)) >= _LAST_SECOND * 1_000_000_000:
         raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))}')
     return stamps
-
-
-def _check_target(path: Path, is_file: bool, overwrite: bool) -> None:
-    if not path.exists():
-        folder = next((above for above in path.parents if above.exists()), path)
-        if not folder.is_dir():
-            raise RecordingError(f'cannot be written: {folder} is no directory', path)
-        return
-    if not overwrite:
-        raise RecordingError('exists already; say so if it is to be overwritten', path)
-    if is_file == path.is_dir():
-        raise RecordingError(
-            f'is a {"directory" if path.is_dir() else "file"} and is not replaced', path
-        )
-    if path.is_dir():
-        strange = [entry.name for entry in path.iterdir() if entry.suffix not in _BAG_FILES]
-        if strange:
-            raise RecordingError(
-                f'is not replaced: it holds {sorted(strange)[0]}, which belongs to no bag', path
-            )
 
 
 def _write_text(path: Path, text: str) -> None:

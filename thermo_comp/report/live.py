@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import hashlib
 import secrets
+import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 from ..errors import ThermoCompError
 from ..recording import Input, Topics
@@ -35,7 +37,9 @@ HOST = '127.0.0.1'
 _NAMES = ('127.0.0.1', 'localhost')
 _POLL_MS = 1000
 # A client that keeps a connection open without a word is let go after this [s].
-_CLIENT_TIMEOUT_S = 30.0
+_CLIENT_TIMEOUT_S = 2.0
+#: So many are answered at once; who finds no place is let go, and a page asks again by itself.
+MOST_CLIENTS = 16
 _SCRIPT = """
 const shown = "%s", title = document.title;
 setInterval(async () => {
@@ -190,7 +194,33 @@ class LiveServer(ThreadingHTTPServer):
 
     def __init__(self, report: LiveReport, port: int = 0) -> None:
         self.report = report
+        self._places = threading.BoundedSemaphore(MOST_CLIENTS)
         super().__init__((HOST, port), _Handler)
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:  # noqa: ARG002
+        """
+        Take a client if there is a place for it.
+
+        """
+        return self._places.acquire(blocking=False)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """
+        Answer a client, and give its place to another.
+
+        """
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """
+        Say nothing of a client that went away.
+
+        """
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
 
     @property
     def url(self) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..files import write_atomically
+from ..files import PAGE, PICTURE, write_atomically
 from ..fitting import FitResult
 from .evidence import Evidence
 from .fitted import evidence_of_fit
@@ -47,6 +47,7 @@ def write_report(
     figures: str | Path | None = None,
     paths: Sequence[str | Path] = (),
     program: str | None = None,
+    overwrite: bool = True,
 ) -> Verdict:
     """
     Write a certificate as one self-contained HTML page.
@@ -56,13 +57,15 @@ def write_report(
     subject : FitResult or Evidence
         A fit, or what `evidence_of_bags` gathered.
     path : str or Path
-        The page; written atomically.
+        The page.
     figures : str or Path or None, optional
         Folder that gets the figures as PNG files, made if it is not there.
     paths : sequence of str or Path, optional
         The bags of a fit, in its order, to look up what simulated ones say of their chamber.
     program : str or None, optional
         The chamber's program of a fit, as `simulation.parse_cyclogram` reads it.
+    overwrite : bool, optional
+        Replace a page and pictures that are there.
 
     Returns
     -------
@@ -71,8 +74,8 @@ def write_report(
 
     Raises
     ------
-    OSError
-        If a file cannot be written.
+    OutputError
+        If a file may not or cannot be written.
     RecordingError
         If one of `paths` cannot be opened.
     ValueError
@@ -84,9 +87,7 @@ def write_report(
         evidence = evidence_of_fit(evidence, paths=paths, program=program)
     page, verdict = render_report(evidence)
     if figures is not None:
-        folder = Path(figures)
-        folder.mkdir(parents=True, exist_ok=True)
         for name, content in png_files(evidence).items():
-            write_atomically(folder / name, content)
-    write_atomically(path, page.encode())
+            write_atomically(Path(figures) / name, content, PICTURE, overwrite=overwrite)
+    write_atomically(path, page.encode(), PAGE, overwrite=overwrite)
     return verdict

@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
+from ..text import valid_serial
 
 _DEFAULTS = CompensatorConfig()
 
@@ -301,6 +302,11 @@ def _checked(name: str, value: Any) -> Any:
             raise ParameterError(
                 f'parameter `{name}` must be one of {", ".join(choices)}, got {value!r}'
             )
+        if name == 'serial' and value:
+            try:
+                valid_serial(value)
+            except ValueError as mistake:
+                raise ParameterError(f'parameter {mistake}') from mistake
         return value
     is_whole = isinstance(entry.default, int)
     if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float):

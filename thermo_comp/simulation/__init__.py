@@ -26,7 +26,6 @@ from .cyclogram import (
     cyclogram_preset,
     parse_cyclogram,
     ramps_and_soaks,
-    random_cyclogram,
 )
 from .drift import (
     CreepEffect,
@@ -35,7 +34,6 @@ from .drift import (
     Effect,
     FlowEffect,
     LeakageEffect,
-    LoadEffect,
     PartEffect,
     PartHistory,
     SlipEffect,
@@ -43,7 +41,7 @@ from .drift import (
 from .network import AIR, Link, ThermalNetwork, Thermostat
 from .presets import TRIAD_NAMES, UNIT_NAMES, unit_preset
 from .response import ThermalResponse
-from .run import START_NS, ChamberRipple, simulate, simulate_blocks
+from .run import START_NS, ChamberRipple, RunOptions, simulate, simulate_blocks
 from .thermometers import ThermometerModel
 from .truth import SimulatedRun, Truth, ideal_regime
 from .unit import SwitchedLoad, UnitModel
@@ -68,11 +66,11 @@ __all__ = [
     'Handling',
     'LeakageEffect',
     'Link',
-    'LoadEffect',
     'PartEffect',
     'PartHistory',
     'Position',
     'Record',
+    'RunOptions',
     'SimulatedRun',
     'SlipEffect',
     'SwitchedLoad',
@@ -89,7 +87,6 @@ __all__ = [
     'plan',
     'positions',
     'ramps_and_soaks',
-    'random_cyclogram',
     'simulate',
     'simulate_blocks',
     'unit_preset',

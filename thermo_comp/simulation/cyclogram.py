@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..typing import Bools, Floats
-from .streams import Stream, generator
+from ..typing import Floats
 
 _MINUTE = 60.0
 _HOUR = 3600.0
@@ -101,28 +100,6 @@ class Cyclogram:
         """
         air: Floats = np.interp(np.asarray(time, dtype=float), self.time_s, self.temperature_c)
         return air
-
-    def is_ramp(self, time: ArrayLike) -> Bools:
-        """
-        Tell where the program is changing the temperature.
-
-        Parameters
-        ----------
-        time : array_like, shape (m,)
-            Seconds from the start of the program.
-
-        Returns
-        -------
-        ndarray of bool, shape (m,)
-            True from the first instant of a ramp up to, not including, its last.
-
-        """
-        time = np.asarray(time, dtype=float)
-        line = np.searchsorted(self.time_s, time, side='right') - 1
-        is_inside = (line >= 0) & (line < len(self.time_s) - 1)
-        rates = self.rates_k_min[np.clip(line, 0, len(self.time_s) - 2)]
-        result: Bools = is_inside & (rates != 0.0)
-        return result
 
     def cut(self, duration: float) -> Cyclogram:
         """
@@ -267,64 +244,6 @@ def cyclogram_preset(name: str) -> Cyclogram:
     if name not in _PRESETS:
         raise ValueError(f'`name` must be one of {", ".join(CYCLOGRAM_NAMES)}, got {name!r}')
     return _PRESETS[name]()
-
-
-def random_cyclogram(
-    seed: int,
-    duration: float = 8 * _HOUR,
-    *,
-    span: tuple[float, float] = (5.0, 35.0),
-    rates: tuple[float, float] = (0.1, 3.0),
-    soaks: tuple[float, float] = (20.0, 90.0),
-) -> Cyclogram:
-    """
-    Draw a program: ramps between random temperatures at random rates, and random soaks.
-
-    Successive ramps mostly alternate in direction and cover at least a fifth of the span.
-
-    Parameters
-    ----------
-    seed : int
-        Same seed, same program.
-    duration : float, optional
-        Length, s; the last ramp or soak is cut there.
-    span : tuple of float, optional
-        Coldest and hottest air, degC.
-    rates : tuple of float, optional
-        Slowest and fastest ramp, K/min, drawn evenly in the logarithm.
-    soaks : tuple of float, optional
-        Shortest and longest soak, minutes.
-
-    Returns
-    -------
-    Cyclogram
-        The program.
-
-    Raises
-    ------
-    ValueError
-        If `duration` or a rate is not positive, or a pair is not in order.
-
-    """
-    if not duration > 0.0:
-        raise ValueError(f'`duration` must be positive, got {duration}')
-    for label, (low, high) in (('span', span), ('rates', rates), ('soaks', soaks)):
-        if not low < high or (label == 'rates' and low <= 0.0):
-            raise ValueError(f'`{label}` must be an increasing pair, got {(low, high)}')
-    rng = generator(seed, Stream.CYCLOGRAM)
-    start = air = rng.uniform(*span)
-    first_soak = minutes = rng.uniform(*soaks)
-    steps = []
-    while minutes < duration / _MINUTE:
-        target = air
-        while abs(target - air) < 0.2 * (span[1] - span[0]):
-            target = rng.uniform(*span)
-        rate = math.exp(rng.uniform(math.log(rates[0]), math.log(rates[1])))
-        rest = rng.uniform(*soaks)
-        steps.append((target, rate, rest))
-        minutes += abs(target - air) / rate + rest
-        air = target
-    return ramps_and_soaks(start, first_soak, steps).cut(duration)
 
 
 def _paper() -> Cyclogram:

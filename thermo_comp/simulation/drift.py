@@ -33,8 +33,8 @@ class PartHistory:
     ----------
     nodes : tuple of str
         Parts, the columns of the arrays.
-    deviation, rate : ndarray, shape (m, n_parts)
-        Temperatures from the reference's still state, K, and their derivatives, K/s.
+    deviation : ndarray, shape (m, n_parts)
+        Temperatures from the reference's still state, K.
     origin : ndarray, shape (n_parts,)
         Temperatures in that state, degC.
     step : float
@@ -44,7 +44,6 @@ class PartHistory:
 
     nodes: tuple[str, ...]
     deviation: Floats
-    rate: Floats
     origin: Floats
     step: float
 
@@ -135,23 +134,44 @@ class DifferenceEffect(Effect):
 @dataclass(frozen=True)
 class FlowEffect(Effect):
     """
-    What a heat flow does whichever way it goes: ``|T_hot - T_cold| ** exponent``, less at rest.
+    What a heat flow does whichever way it goes, less what it does at rest.
 
-    A gas that rises in a gap (1.25), the load of a heat pump (1), its losses (2). The second
-    signal is the first times the deviation of `cold`.
+    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent``: a gas that rises in
+    a gap (1.25), the load of a heat pump (1), its losses (2). Where the supply of the pump limits
+    it, the signal levels off at 1, ``x^e / (1 + x^e)``: then it is a matter of on and off. The
+    second signal is the first times the deviation of `cold`.
+
+    Parameters
+    ----------
+    hot, cold : str
+        The parts.
+    exponent : float, optional
+        Growth with the difference.
+    knee : float, optional
+        Difference at which the signal is 1, or half of where it levels off, K.
+    is_limited : bool, optional
+        Whether it levels off.
+    power : int, optional
+        How the first signal changes with the deviation of `cold`.
 
     """
 
     hot: str
     cold: str
     exponent: float = 1.25
+    knee: float = 1.0
+    is_limited: bool = False
+    power: int = 0
 
     def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
         at = [history.nodes.index(part) for part in (self.hot, self.cold)]
-        rest = history.origin[at[0]] - history.origin[at[1]]
+        rest = history.origin[at[:1]] - history.origin[at[1:]]
         difference = history.deviation[:, at[0]] - history.deviation[:, at[1]] + rest
-        flow = np.abs(difference) ** self.exponent - np.abs(rest) ** self.exponent
-        return flow, flow * history.of(self.cold)
+        flow, least = ((np.abs(d) / self.knee) ** self.exponent for d in (difference, rest))
+        if self.is_limited:
+            flow, least = flow / (1.0 + flow), least / (1.0 + least)
+        first = (flow - least) * history.of(self.cold) ** self.power
+        return first, first * history.of(self.cold)
 
 
 @dataclass(frozen=True)
@@ -210,44 +230,6 @@ class SlipEffect(Effect):
                 now = min(max(now + step, -width), width)
             stress[k] = now
         return stress, 0.0
-
-
-@dataclass(frozen=True)
-class LoadEffect(Effect):
-    """
-    A load on the supply while a part's temperature changes, whichever way it does.
-
-    A comparator with hysteresis looks at the part's rate, the supply settles after it, and what
-    the load does changes with the temperature: ``load * d ** power``, the second signal with one
-    power more.
-
-    Parameters
-    ----------
-    part : str
-        Part whose rate is looked at.
-    on, off : float
-        Rates at which the load comes on and goes off, K/min.
-    settle : float
-        Time constant of the supply, s.
-    power : int
-        How the first signal changes with the deviation of the part.
-
-    """
-
-    part: str
-    on: float = 0.06
-    off: float = 0.03
-    settle: float = 60.0
-    power: int = 0
-
-    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
-        rate = np.abs(history.rate[:, history.nodes.index(self.part)]) * 60.0
-        is_on, load = False, np.empty(len(rate))
-        for k, value in enumerate(rate.tolist()):
-            is_on = value > (self.off if is_on else self.on)
-            load[k] = is_on
-        first = history.lagged(load, self.settle) * history.of(self.part) ** self.power
-        return first, first * history.of(self.part)
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,13 @@ constant powers.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..typing import Floats
 
 AIR = 'air'
-_HELD = 1e-6  # change with the air's below which a part counts as held, K/K
 
 
 @dataclass(frozen=True)
@@ -189,31 +188,9 @@ class ThermalNetwork:
         p[:n] /= rows
         return A, b, p
 
-    def flow(self, state: Floats, air: float, drive: Floats) -> Floats:
+    def convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
         """
-        Return ``dx/dt`` of one state, convection included.
-
-        Parameters
-        ----------
-        state : ndarray, shape (k,)
-            Parts, then the thermostat's integral and set point.
-        air : float
-            Air temperature, degC.
-        drive : ndarray, shape (k,)
-            Constant drive, as `system` gives it, K/s.
-
-        Returns
-        -------
-        ndarray, shape (k,)
-            Derivative, per second.
-
-        """
-        A, b, _ = self.system()
-        return np.asarray(A @ state + b * air + drive + self._convection(state, air)[0])
-
-    def _convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
-        """
-        Return the convective flows into the state and their derivatives by it.
+        Return what convection adds to ``dx/dt`` of one state, and its derivatives by the state.
 
         """
         index = {name: i for i, name in enumerate(self.nodes)}
@@ -244,7 +221,7 @@ class ThermalNetwork:
         # Newton's steps; the flow is convex, so some fifty reach the last digit from anywhere.
         state = np.full(len(b), air + 1.0)
         for _ in range(50):
-            flow, slope = self._convection(state, air)
+            flow, slope = self.convection(state, air)
             state = state - np.linalg.solve(A + slope, A @ state + b * air + drive + flow)
         return state
 
@@ -310,67 +287,3 @@ class ThermalNetwork:
             return 0.0
         A, b, p = self.system()
         return float(np.linalg.solve(A, -b * air - p)[len(self.nodes)])
-
-    def ramp_lag(self, node: str, behind: str = AIR) -> float:
-        """
-        Return by how long a part trails another one in an endless ramp.
-
-        Parameters
-        ----------
-        node : str
-            Part that trails.
-        behind : str, optional
-            Part that leads, or the air.
-
-        Returns
-        -------
-        float
-            Delay of the straight line that the part ends up on, s.
-
-        Raises
-        ------
-        ValueError
-            If the thermostat holds one of the parts, or heat flows by convection.
-
-        """
-        if self.is_convective:
-            raise ValueError('a network with convection has no lag that holds for every ramp')
-        A, b, _ = self.system()
-        gain = np.linalg.solve(A, -b)
-        shortfall = np.linalg.solve(A, -gain)
-
-        def delay(name: str) -> float:
-            if name == AIR:
-                return 0.0
-            i = self.nodes.index(name)
-            if abs(gain[i]) < _HELD:
-                raise ValueError(f'the thermostat holds {name!r}: it does not follow a ramp')
-            return float(shortfall[i] / gain[i])
-
-        return delay(node) - delay(behind)
-
-    def stretched(self, factor: float, keep: tuple[str, ...] = ()) -> ThermalNetwork:
-        """
-        Return the network with every heat capacity multiplied, so that it is slower.
-
-        Parameters
-        ----------
-        factor : float
-            Multiplier of the capacities and of the thermostat's integral time.
-        keep : tuple of str, optional
-            Parts whose capacity stays.
-
-        Returns
-        -------
-        ThermalNetwork
-            Same paths and powers, other time constants.
-
-        """
-        capacity = {
-            name: value * (1.0 if name in keep else factor)
-            for name, value in self.capacity.items()
-        }
-        heat = self.thermostat
-        if heat is not None:
-            heat = replace(heat, integral=heat.integral / factor)
-        return replace(self, capacity=capacity, thermostat=heat)

@@ -27,7 +27,6 @@ from .drift import (
     Effect,
     FlowEffect,
     LeakageEffect,
-    LoadEffect,
     PartEffect,
     SlipEffect,
     Triple,
@@ -279,7 +278,12 @@ def _triad(kind: str, seed: int) -> UnitModel:
         links[1] = Link('case', 'board', 0.15)
         links.append(Link('case', 'board', draw.between(0.15, 0.35), exponent=1.25))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
-    drift = DriftModel((*_tempcos(draw, heads), *(_EXTRA[kind](draw) if kind in _EXTRA else ())))
+    drift = DriftModel(
+        (
+            *_tempcos(draw, ['board'] if kind in _ON_BOARD else heads),
+            *(_EXTRA[kind](draw) if kind in _EXTRA else ()),
+        )
+    )
     others: dict[str, Any] = {}
     if kind == 'switched-load':
         others['loads'] = (SwitchedLoad('board', draw.between(0.3, 0.8)),)
@@ -291,21 +295,21 @@ def _triad(kind: str, seed: int) -> UnitModel:
     return unit.without_drift() if kind == 'plain' else unit
 
 
-def _tempcos(draw: _Specimen, heads: list[str]) -> list[Effect]:
+def _tempcos(draw: _Specimen, parts: list[str]) -> list[Effect]:
     bias, bend = draw.signed(2.0, 12.0), draw.normal(0.08)
     scale, scale_bend = draw.axes(60.0, 0.4), draw.axes(0.2, 0.6)
-    if len(heads) == 1:
-        return [PartEffect(heads[0], bias=bias, bias_curvature=bend, scale=scale,
+    if len(parts) == 1:
+        return [PartEffect(parts[0], bias=bias, bias_curvature=bend, scale=scale,
                            scale_curvature=scale_bend)]  # fmt: skip
     return [
         PartEffect(
-            head,
+            part,
             bias=draw.only(i, bias[i]),
             bias_curvature=draw.only(i, bend[i]),
             scale=draw.only(i, scale[i]),
             scale_curvature=draw.only(i, scale_bend[i]),
         )
-        for i, head in enumerate(heads)
+        for i, part in enumerate(parts)
     ]
 
 
@@ -345,28 +349,37 @@ def _leakage(draw: _Specimen) -> list[Effect]:
 
 
 def _loads(draw: _Specimen) -> list[Effect]:
-    # The paper: while the ambient changes, other offsets and slopes, and a bend.
-    on = draw.between(0.04, 0.08)
-    off, settle = on * draw.between(0.4, 0.7), draw.between(30.0, 120.0)
-    sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 10.0), (0.03, 0.15, 0.3))
+    # The paper: while the ambient changes, other offsets and slopes, and a bend. A heat pump at
+    # the limit of its supply does that.
+    knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
+    sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))
     return [
-        LoadEffect(
-            'case', on, off, settle, power, bias=draw.signed(low, high), scale=draw.normal(ppm)
+        FlowEffect(
+            'case', 'board', exponent, knee, True, power,
+            bias=draw.signed(low, high), scale=draw.normal(ppm),
         )
         for power, (low, high, ppm) in enumerate(sizes)
-    ]
+    ]  # fmt: skip
+
+
+def _sample(draw: _Specimen) -> list[Effect]:
+    # The loads of the paper, and a stress that dies away with the lag of the heads.
+    stress = DifferenceEffect('board', 'head', bias=draw.signed(0.5, 1.5), scale=draw.normal(1.0))
+    return [*_loads(draw), stress]
 
 
 # Three heads with a thermal node each, and heads that hang on the case as well.
 _OWN_HEADS = ('own-lags', 'between', 'switched-load')
 _BETWEEN = ('between', 'switched-load')
+# Without lags but for what a difference of temperatures makes.
+_ON_BOARD = ('paper', 'demo')
 _EXTRA: dict[str, Callable[[_Specimen], list[Effect]]] = {
     'products': _expansion,
     'hysteresis': _slips,
     'even': _flows,
     'convection': _leakage,
     'paper': _loads,
-    'demo': _loads,
+    'demo': _sample,
 }
 # With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
 _TRIAD_DENSITY = 3.0

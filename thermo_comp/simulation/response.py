@@ -111,11 +111,12 @@ class ThermalResponse:
         return state
 
     def _integrate(self, air: Floats, drive: Floats, state: Floats) -> None:
-        slope = np.diff(air) / np.diff(self._time)
+        A, b, _ = self.network.system()
         for k, (begin, end) in enumerate(pairwise(self._time)):
 
-            def flow(t: float, x: Floats, k: int = k, begin: float = begin) -> Floats:
-                return self.network.flow(x, air[k] + slope[k] * (t - begin), drive[k])
+            def flow(t: float, x: Floats, k: int = k) -> Floats:
+                now = float(np.interp(t, self._time, air))
+                return np.asarray(A @ x + b * now + drive[k] + self.network.convection(x, now)[0])
 
             solved = solve_ivp(
                 flow, (begin, end), state, 'LSODA', dense_output=True, rtol=1e-9, atol=1e-9

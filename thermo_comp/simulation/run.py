@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,34 +61,13 @@ class ChamberRipple:
             raise ValueError(f'`period` must be positive, got {self.period}')
 
 
-def simulate(
-    unit: UnitModel,
-    cyclogram: Cyclogram,
-    up: ArrayLike,
-    *,
-    rate_hz: float = 100.0,
-    temperature_rate_hz: float | None = None,
-    seed: int = 0,
-    start_ns: int = START_NS,
-    gravity: float = STANDARD_GRAVITY,
-    warm: bool = True,
-    ripple: ChamberRipple | None = None,
-    switch_s: Sequence[float] | None = None,
-    handling: Handling | None = None,
-    grid_step: float = 1.0,
-) -> SimulatedRun:
+@dataclass(frozen=True)
+class RunOptions:
     """
-    Run a unit through a program.
+    The keywords of `simulate`, `simulate_blocks` and `arrays`.
 
     Parameters
     ----------
-    unit : UnitModel
-        The unit, e.g. from `unit_preset`.
-    cyclogram : Cyclogram
-        The chamber's program; its length is the run's.
-    up : array_like, shape (3,) or (p, 3)
-        Direction of the specific force at rest in the orthogonal frame of the accelerometer; for
-        several rows the block is handled from one to the next within the run.
     rate_hz : float, optional
         Conversion cycles per second. The elementary charge is sized to the cycle, so K in counts
         per cycle does not depend on it.
@@ -105,10 +85,50 @@ def simulate(
         Regulation of the chamber; None is a perfect one.
     switch_s : sequence of float or None, optional
         Starts of the handling between positions, s from the start; None shares the run evenly.
-    handling : Handling or None, optional
-        How the block is handled; None takes the default.
+    handling : Handling, optional
+        How the block is handled.
     grid_step : float, optional
         Step of the thermal grid, s; bias and scale are straight between its points.
+
+    Raises
+    ------
+    ValueError
+        If a rate or step is not positive.
+
+    """
+
+    rate_hz: float = 100.0
+    temperature_rate_hz: float | None = None
+    seed: int = 0
+    start_ns: int = START_NS
+    gravity: float = STANDARD_GRAVITY
+    warm: bool = True
+    ripple: ChamberRipple | None = None
+    switch_s: Sequence[float] | None = None
+    handling: Handling = field(default_factory=Handling)
+    grid_step: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ('rate_hz', 'grid_step'):
+            if not (getattr(self, name) > 0.0 and math.isfinite(getattr(self, name))):
+                raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
+
+
+def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
+    """
+    Run a unit through a program.
+
+    Parameters
+    ----------
+    unit : UnitModel
+        The unit, e.g. from `unit_preset`.
+    cyclogram : Cyclogram
+        The chamber's program; its length is the run's.
+    up : array_like, shape (3,) or (p, 3)
+        Direction of the specific force at rest in the orthogonal frame of the accelerometer; for
+        several rows the block is handled from one to the next within the run.
+    **options
+        As in `RunOptions`.
 
     Returns
     -------
@@ -118,16 +138,11 @@ def simulate(
     Raises
     ------
     ValueError
-        If a rate or step is not positive, the program is shorter than a cycle, or `up`,
-        `switch_s`, `gravity` or the thermostat's power do not fit (see `Attitude` and
-        `ThermalResponse`).
+        If the program is shorter than a cycle, or the options, `up`, `switch_s`, `gravity` or the
+        thermostat's power do not fit (see `RunOptions`, `Attitude` and `ThermalResponse`).
 
     """
-    options = RunOptions(
-        rate_hz, temperature_rate_hz, seed, start_ns, gravity, warm, ripple, switch_s, handling,
-        grid_step,
-    )  # fmt: skip
-    chamber = Chamber(unit, cyclogram, up, options)
+    chamber = Chamber(unit, cyclogram, up, RunOptions(**options))
     return next(chamber.blocks(chamber.n_cycles))
 
 
@@ -137,30 +152,17 @@ def simulate_blocks(
     up: ArrayLike,
     *,
     block_size: int = 65536,
-    rate_hz: float = 100.0,
-    temperature_rate_hz: float | None = None,
-    seed: int = 0,
-    start_ns: int = START_NS,
-    gravity: float = STANDARD_GRAVITY,
-    warm: bool = True,
-    ripple: ChamberRipple | None = None,
-    switch_s: Sequence[float] | None = None,
-    handling: Handling | None = None,
-    grid_step: float = 1.0,
+    **options: Any,
 ) -> Iterator[SimulatedRun]:
     """
     Run a unit through a program in bounded memory: the bits of `simulate`, block by block.
 
     Parameters
     ----------
-    unit, cyclogram, up
+    unit, cyclogram, up, **options
         As in `simulate`.
     block_size : int, optional
         Cycles per block; the result does not depend on it.
-    rate_hz, temperature_rate_hz, seed, start_ns, gravity, warm
-        As in `simulate`.
-    ripple, switch_s, handling, grid_step
-        As in `simulate`.
 
     Returns
     -------
@@ -177,35 +179,7 @@ def simulate_blocks(
     """
     if block_size < 1:
         raise ValueError(f'`block_size` must be at least 1, got {block_size}')
-    options = RunOptions(
-        rate_hz, temperature_rate_hz, seed, start_ns, gravity, warm, ripple, switch_s, handling,
-        grid_step,
-    )  # fmt: skip
-    return Chamber(unit, cyclogram, up, options).blocks(block_size)
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """
-    The keywords of `simulate`.
-
-    """
-
-    rate_hz: float = 100.0
-    temperature_rate_hz: float | None = None
-    seed: int = 0
-    start_ns: int = START_NS
-    gravity: float = STANDARD_GRAVITY
-    warm: bool = True
-    ripple: ChamberRipple | None = None
-    switch_s: Sequence[float] | None = None
-    handling: Handling | None = None
-    grid_step: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ('rate_hz', 'grid_step'):
-            if not (getattr(self, name) > 0.0 and math.isfinite(getattr(self, name))):
-                raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
+    return Chamber(unit, cyclogram, up, RunOptions(**options)).blocks(block_size)
 
 
 class ThermalTruth:
@@ -233,7 +207,6 @@ class ThermalTruth:
             PartHistory(
                 unit.network.nodes,
                 self.temperatures - origin,
-                self.rates,
                 origin,
                 options.grid_step,
             )
@@ -261,12 +234,11 @@ class Chamber:
         if self.n_cycles < 1:
             raise ValueError(f'the program of {duration} s is shorter than one cycle')
         self._unit, self._options = unit, options
-        handling = options.handling or Handling()
         n_positions = 1 if np.ndim(up) == 1 else len(np.asarray(up))
         switch_s = options.switch_s
         if switch_s is None:
             switch_s = [duration * k / n_positions for k in range(1, n_positions)]
-        self._attitude = Attitude(up, switch_s, options.gravity, handling)
+        self._attitude = Attitude(up, switch_s, options.gravity, options.handling)
         self.thermal = thermal or ThermalTruth(unit, cyclogram, options)
         self.bias = self.thermal.bias + _wander(unit, self.thermal.grid, options.seed)
 

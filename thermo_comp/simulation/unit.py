@@ -160,43 +160,6 @@ class UnitModel:
 
         return replace(self, board=changed(self.board), case=changed(self.case))
 
-    def with_lags(self, *, case: float | None = None, board: float | None = None) -> UnitModel:
-        """
-        Return the unit with other thermal lags, by changing heat capacities alone.
-
-        Parameters
-        ----------
-        case : float or None, optional
-            Time constant of the case against the air: a ramp that begins in the air with the rate
-            `r` starts the case off with the second derivative ``r / case``, s; None keeps.
-        board : float or None, optional
-            Lag of the board behind the case in an endless ramp, s; None keeps.
-
-        Returns
-        -------
-        UnitModel
-            The changed unit.
-
-        Raises
-        ------
-        ValueError
-            If a lag is not positive.
-
-        """
-        for label, value in (('case', case), ('board', board)):
-            if value is not None and not value > 0.0:
-                raise ValueError(f'`{label}` must be positive, got {value}')
-        network, node = self.network, self.case.node
-        if case is not None:
-            _, b, _ = network.system()
-            now = 1.0 / b[network.nodes.index(node)]
-            capacity = {**network.capacity, node: network.capacity[node] * case / now}
-            network = replace(network, capacity=capacity)
-        if board is not None:
-            now = network.ramp_lag(self.board.node, behind=node)
-            network = network.stretched(board / now, keep=(node,))
-        return replace(self, network=network)
-
     def sibling(self, seed: int, spread: float = 0.15) -> UnitModel:
         """
         Return another unit of the same type: every coefficient and time constant a bit different.

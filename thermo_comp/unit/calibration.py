@@ -23,9 +23,12 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+import numpy as np
+
+from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings
 from .columns import Column
-from .extremes import smallest_value
+from .extremes import extreme_values
 from .functions import TemperatureFunction
 from .posterior import Block, ParameterLayout, Posterior
 from .schema import Bounds, NotNegative, Positive
@@ -38,7 +41,7 @@ SMALLEST_RELATIVE_SCALE = 0.1
 #: How exactly a function must meet its value at the reference.
 NORMALISATION_TOLERANCE = 1e-9
 
-Range = tuple[float, float]
+Celsius = Annotated[float, Bounds(at_least=-273.15, below=1000.0)]
 Vector = tuple[float, float, float]
 
 
@@ -49,7 +52,11 @@ class Unit:
 
     """
 
-    serial: Annotated[str, Bounds(shortest=1), 'Serial number of the unit.']
+    serial: Annotated[
+        str,
+        Bounds(shortest=1, longest=LONGEST_SERIAL),
+        'Serial number of the unit, one printable line.',
+    ]
     input: Annotated[
         Literal['counts', 'm/s^2'],
         'Unit of the raw samples: counts per conversion cycle, or m/s^2.',
@@ -58,6 +65,9 @@ class Unit:
         Positive, 'A sample at or beyond this magnitude is saturated, in input units.'
     ]
     cycle_time_s: Annotated[Positive, 'Length of a conversion cycle = sample interval [s].']
+
+    def __post_init__(self) -> None:
+        valid_serial(self.serial)
 
 
 @dataclass(frozen=True)
@@ -106,7 +116,8 @@ class AxisSet:
             ('bias_function', self.bias_function, 0.0),
             ('scale_function', self.scale_function, 1.0),
         ):
-            value = function.value(0.0)
+            with np.errstate(all='ignore'):
+                value = function.value(0.0)
             if not abs(value - expected) <= NORMALISATION_TOLERANCE:
                 raise ValueError(f'`{name}` must be {expected:g} at the reference, got {value:g}')
 
@@ -120,8 +131,8 @@ class RegimeSet:
 
     """
 
-    temperature_range_c: Annotated[Range, 'Board temperature [degC].']
-    rate_range_k_min: Annotated[Range, 'dT_board/dt [K/min].']
+    temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Board temperature [degC].']
+    rate_range_k_min: Annotated[tuple[float, float], 'dT_board/dt [K/min].']
     x: AxisSet
     y: AxisSet
     z: AxisSet
@@ -223,7 +234,7 @@ class Calibration:
 
     format_version: Annotated[int, f'Version of this layout: {FORMAT_VERSION}.']
     unit: Unit
-    reference_temperature_c: Annotated[float, 'T_ref; the paper uses 20.']
+    reference_temperature_c: Annotated[Celsius, 'T_ref; the paper uses 20.']
     gravity_m_s2: Annotated[float, Bounds(above=9.0, below=10.5), 'Local gravity used by the fit.']
     axes: Axes
     static: Annotated[RegimeSet, 'The set of the static regime, S = 0.']
@@ -274,7 +285,15 @@ class Calibration:
         self._check_misalignment()
         self._check_sensors()
         for regime, regime_set in (('static', self.static), ('dynamic', self.dynamic)):
+            lower, upper = (
+                edge - self.reference_temperature_c for edge in regime_set.temperature_range_c
+            )
             for axis, name in enumerate(AXES):
+                extremes = extreme_values(regime_set.axes()[axis].bias_function, lower, upper)
+                if not all(map(math.isfinite, extremes)):
+                    raise ValueError(
+                        f'`{regime}.{name}.bias_function` must be finite over its range'
+                    )
                 smallest = self._smallest_scale(regime, regime_set, axis)
                 if not smallest > SMALLEST_RELATIVE_SCALE:
                     raise ValueError(
@@ -321,7 +340,7 @@ class Calibration:
         """
         reference = self.reference_temperature_c
         lower, upper = (edge - reference for edge in regime_set.temperature_range_c)
-        result = smallest_value(regime_set.axes()[axis].scale_function, lower, upper)
+        result, _ = extreme_values(regime_set.axes()[axis].scale_function, lower, upper)
         farthest = max(
             abs(edge - reference) for one in self.regime_sets() for edge in one.temperature_range_c
         )

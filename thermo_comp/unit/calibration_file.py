@@ -17,14 +17,15 @@ from typing import Any
 import yaml
 
 from ..errors import CalibrationError
-from ..files import read_bounded, write_atomically
+from ..files import CALIBRATION, read_bounded, write_atomically
 from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
 from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, json_schema, plain
 from .version_1 import read_version_1
 
-#: A calibration with the whole bank of columns takes some 600 kB, most of it the posterior.
-SIZE_LIMIT = 1 << 20
+#: With the whole bank of columns and one thermometer beside the board a calibration takes some
+#: 600 kB, nearly all of it the posterior; this is enough for two of them.
+SIZE_LIMIT = 1 << 21
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -130,12 +131,19 @@ def dump_calibration(calibration: Calibration) -> str:
         width=98,
         allow_unicode=True,
     )
-    if parse_calibration(text.encode()) != calibration:
+    content = text.encode()
+    if len(content) > SIZE_LIMIT:
+        raise CalibrationError(
+            f'the calibration takes {len(content)} bytes, at most {SIZE_LIMIT} are accepted'
+        )
+    if parse_calibration(content) != calibration:
         raise CalibrationError('the calibration does not survive being written')
     return text
 
 
-def save_calibration(calibration: Calibration, path: str | Path) -> None:
+def save_calibration(
+    calibration: Calibration, path: str | Path, *, overwrite: bool = True
+) -> None:
     """
     Write a calibration file atomically.
 
@@ -144,19 +152,20 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     calibration : Calibration
         The value.
     path : str or Path
-        The file; an existing one is replaced as a whole.
+        The file.
+    overwrite : bool, optional
+        Replace a calibration that is there.
 
     Raises
     ------
     CalibrationError
-        If the file cannot be written (an old one is then untouched) or the value is not valid.
+        If the value is not valid.
+    OutputError
+        If the file may not or cannot be written; an old one is then untouched.
 
     """
     text = dump_calibration(calibration)
-    try:
-        write_atomically(path, text.encode())
-    except OSError as error:
-        raise CalibrationError(f'cannot be written: {error.strerror}', path) from error
+    write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)
 
 
 def calibration_schema() -> dict[str, Any]:
@@ -170,7 +179,10 @@ def calibration_schema() -> dict[str, Any]:
     }
 
 
-class _Dumper(yaml.SafeDumper):
+_BASE: type[yaml.SafeDumper] = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+
+class _Dumper(_BASE):  # type: ignore[valid-type, misc]
     """
     Writes every number so that this reader and any YAML 1.1 reader see the same float.
 

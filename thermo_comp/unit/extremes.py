@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the smallest value that a function of temperature takes over a range.
+Owns the extreme values that a function of temperature takes over a range.
 
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -15,9 +17,11 @@ from .functions import Polynomial, TemperatureFunction
 _GRID = 513
 
 
-def smallest_value(function: TemperatureFunction, lower: float, upper: float) -> float:
+def extreme_values(
+    function: TemperatureFunction, lower: float, upper: float
+) -> tuple[float, float]:
     """
-    Find the smallest value of a function over a range.
+    Find the smallest and the largest value of a function over a range.
 
     Parameters
     ----------
@@ -28,15 +32,21 @@ def smallest_value(function: TemperatureFunction, lower: float, upper: float) ->
 
     Returns
     -------
-    float
-        Its smallest value; not finite where the function overflows.
+    smallest, largest : float
+        Infinite where the function is not finite somewhere.
 
     """
     t = np.linspace(lower, upper, _GRID)
     if isinstance(function, Polynomial):
         t = np.append(t, _extremes(function, lower, upper))
-    with np.errstate(all='ignore'):
-        return float(np.min(function.value(t)))
+    try:
+        with np.errstate(all='ignore'):
+            values = function.value(t)
+    except OverflowError:
+        return -math.inf, math.inf
+    if not np.all(np.isfinite(values)):
+        return -math.inf, math.inf
+    return float(np.min(values)), float(np.max(values))
 
 
 def _extremes(function: Polynomial, lower: float, upper: float) -> Floats:

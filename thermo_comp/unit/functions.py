@@ -27,22 +27,14 @@ from ..typing import Floats
 #: One float, or an array of them: what every evaluation here maps onto itself.
 Number = TypeVar('Number', float, Floats)
 
+#: Knots of any use [K]; what is closer or farther away overflows.
+_KNOT_STEP = 1e-3
+_FARTHEST_KNOT = 2000.0
+
 
 def hold(value: Number, lower: float, upper: float) -> Number:
     """
-    Hold a value at the edges of a range.
-
-    Parameters
-    ----------
-    value : float or ndarray
-        The value.
-    lower, upper : float
-        The edges, in the unit of `value`.
-
-    Returns
-    -------
-    float or ndarray
-        `value`, or the edge it lies beyond.
+    Hold a value at the edges of a range, given in its unit.
 
     """
     if isinstance(value, np.ndarray):
@@ -168,8 +160,10 @@ class CubicSpline:
             )
         _check_finite('knots_k', self.knots_k)
         _check_finite('values', self.values)
-        if any(b <= a for a, b in zip(self.knots_k, self.knots_k[1:], strict=False)):
-            raise ValueError('`knots_k` must rise strictly')
+        if any(b - a < _KNOT_STEP for a, b in zip(self.knots_k, self.knots_k[1:], strict=False)):
+            raise ValueError(f'`knots_k` must rise strictly, by {_KNOT_STEP} K or more')
+        if max(map(abs, self.knots_k)) > _FARTHEST_KNOT:
+            raise ValueError(f'`knots_k` must lie within {_FARTHEST_KNOT:g} K of the reference')
         if 0.0 not in self.knots_k:
             raise ValueError('`knots_k` must contain 0, the reference temperature')
 

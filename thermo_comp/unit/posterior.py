@@ -12,9 +12,10 @@ from __future__ import annotations
 import base64
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..typing import Floats
 from .schema import Bounds
@@ -59,7 +60,7 @@ class Posterior:
             raise ValueError('`rest` must not have a negative variance')
 
     @classmethod
-    def of(cls, matrix: Floats, variances: Floats) -> Posterior:
+    def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
         """
         Encode a factor, shape (n_parameters, rank), and the variances beside it.
 
@@ -135,7 +136,7 @@ class ParameterLayout:
     n_parameters: int
 
 
-def posterior_of(covariance: Floats, tolerance: float = 0.0) -> Posterior:
+def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
     """
     Find the smallest factor that holds a covariance matrix.
 
@@ -145,7 +146,9 @@ def posterior_of(covariance: Floats, tolerance: float = 0.0) -> Posterior:
         Covariance of the parameters, shape (n, n); only its symmetric part counts.
     tolerance : float, optional
         The largest share of a parameter's variance that the factor may leave to the diagonal;
-        what single precision cannot resolve is left there in any case.
+        what single precision cannot resolve is left there in any case. The columns of a response
+        make up for each other, so that what they predict together is known far better than each
+        weight: with a share of 1e-3 the predicted standard deviation grows by up to a half.
 
     Returns
     -------
@@ -175,14 +178,19 @@ def posterior_of(covariance: Floats, tolerance: float = 0.0) -> Posterior:
     left_out = share[:, np.newaxis] - np.cumsum(columns**2, axis=1)
     enough = np.all(left_out <= max(tolerance, _NEGLIGIBLE), axis=0)
     rank = int(np.argmax(enough)) + 1 if diagonal.any() else 0
-    factor = (columns[:, :rank] * scale[:, np.newaxis]).astype(_FLOAT32)
+    factor = _single(columns[:, :rank] * scale[:, np.newaxis])
     held = np.sum(factor.astype(np.float64) ** 2, axis=1)
     return Posterior.of(factor, np.maximum(diagonal - held, 0.0))
 
 
-def _encoded(numbers: Floats) -> str:
+def _encoded(numbers: npt.NDArray[np.floating[Any]]) -> str:
+    return base64.b64encode(_single(numbers).tobytes()).decode('ascii')
+
+
+def _single(numbers: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
+    # What overflows is refused as not finite.
     with np.errstate(over='ignore'):
-        return base64.b64encode(numbers.astype(_FLOAT32).tobytes()).decode('ascii')
+        return numbers.astype(_FLOAT32)
 
 
 def _decoded(key: str, text: str) -> Floats:

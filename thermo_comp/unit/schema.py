@@ -58,7 +58,7 @@ class SchemaError(ValueError):
 @dataclass(frozen=True)
 class Bounds:
     """
-    Where a number must lie, or how long a text must be at least.
+    Where a number must lie, or how long a text must be.
 
     """
 
@@ -66,6 +66,7 @@ class Bounds:
     at_least: float | None = None
     below: float | None = None
     shortest: int = 0
+    longest: int | None = None
 
     def fault(self, value: Any) -> str | None:
         """
@@ -73,9 +74,12 @@ class Bounds:
 
         """
         if isinstance(value, str):
-            s = '' if self.shortest == 1 else 's'
-            short = len(value) < self.shortest
-            return f'must have at least {self.shortest} character{s}' if short else None
+            if len(value) < self.shortest:
+                s = '' if self.shortest == 1 else 's'
+                return f'must have at least {self.shortest} character{s}'
+            if self.longest is not None and len(value) > self.longest:
+                return f'must have at most {self.longest} characters'
+            return None
         if self.above is not None and not value > self.above:
             return f'must be greater than {self.above:g}'
         if self.at_least is not None and not value >= self.at_least:
@@ -94,6 +98,7 @@ class Bounds:
             'minimum': self.at_least,
             'exclusiveMaximum': self.below,
             'minLength': self.shortest or None,
+            'maxLength': self.longest,
         }
         return {word: value for word, value in words.items() if value is not None}
 

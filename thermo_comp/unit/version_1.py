@@ -170,7 +170,9 @@ def read_version_1(data: dict[str, Any]) -> Calibration:
     if not any(axis.covariance for _, _, axes in sets for axis in axes):
         return replace(calibration, response=used)
     gone = [one.response + k for one in blocks for k in unused]
-    posterior = posterior_of(np.delete(np.delete(matrix, gone, axis=0), gone, axis=1))
+    posterior = posterior_of(
+        np.delete(np.delete(matrix, gone, axis=0), gone, axis=1), tolerance=0.0
+    )
     return replace(calibration, response=used, posterior=posterior)
 
 

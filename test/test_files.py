@@ -1,0 +1,249 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How an output comes to be: nothing that is read, and nothing of another kind, is ever replaced.
+
+WHY: `--force` destroyed the recordings that a command read; of two writers one lost its result
+without a word; an output was open to all whatever the umask said, and took the place of a link.
+
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from builders import rich_calibration
+from conftest import Cli
+from test_cli_errors import bag
+
+from thermo_comp.errors import OutputError
+from thermo_comp.files import (
+    BAG,
+    CALIBRATION,
+    CSV,
+    MCAP,
+    PAGE,
+    PARAMETERS,
+    PARQUET,
+    PICTURE,
+    Draft,
+    Kind,
+    check_output,
+    write_atomically,
+)
+from thermo_comp.unit.calibration_file import save_calibration
+
+FILES = (CALIBRATION, PAGE, PARAMETERS, PARQUET, MCAP, PICTURE, CSV)
+
+
+@contextmanager
+def umask(mask: int) -> Iterator[None]:
+    before = os.umask(mask)
+    try:
+        yield
+    finally:
+        os.umask(before)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """
+    Return a folder with a bag of each sort, a calibration, and other names of them.
+
+    """
+    save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
+    bag(tmp_path / 'raw.mcap')
+    bag(tmp_path / 'raw')
+    for name in ('raw.mcap', 'raw', 'unit.yaml'):
+        (tmp_path / f'link_{name}').symlink_to(name)
+    (tmp_path / 'hard.mcap').hardlink_to(tmp_path / 'raw.mcap')
+    (tmp_path / 'hard.yaml').hardlink_to(tmp_path / 'unit.yaml')
+    (tmp_path / 'hard_part.mcap').hardlink_to(tmp_path / 'raw' / 'raw_0.mcap')
+    (tmp_path / 'above').mkdir()
+    (tmp_path / 'above' / 'in.mcap').hardlink_to(tmp_path / 'raw.mcap')
+    (tmp_path / 'above' / 'metadata.yaml').touch()
+    return tmp_path
+
+
+REPLAY = ('replay', '-c', 'unit.yaml', '--serial', 'T-1')
+FIT = ('fit', '--gravity', '9.80665')
+
+
+@pytest.mark.parametrize(
+    ('command', 'source', 'output'),
+    [
+        (REPLAY, 'raw.mcap', 'raw.mcap'),
+        (REPLAY, 'raw.mcap', 'above/../raw.mcap'),
+        (REPLAY, 'raw.mcap', 'link_raw.mcap'),
+        (REPLAY, 'link_raw.mcap', 'raw.mcap'),
+        (REPLAY, 'raw.mcap', 'hard.mcap'),
+        (REPLAY, 'raw.mcap', 'above'),
+        (REPLAY, 'above/in.mcap', 'above'),
+        (REPLAY, 'raw', 'raw'),
+        (REPLAY, 'raw', 'raw/'),
+        (REPLAY, 'raw', 'link_raw'),
+        (REPLAY, 'raw', 'raw/raw_0.mcap'),
+        (REPLAY, 'raw', 'raw/new.mcap'),
+        (REPLAY, 'raw', 'hard_part.mcap'),
+        (REPLAY, 'raw.mcap', '.'),
+        (REPLAY, 'raw.mcap', 'unit.yaml'),
+        (FIT, 'raw.mcap', 'raw.mcap'),
+        (FIT, 'raw', 'raw'),
+        ((*FIT, '--report', 'link_raw.mcap'), 'raw.mcap', 'new.yaml'),
+        ((*FIT, '--report', 'new'), 'raw.mcap', 'new'),
+        (('report',), 'raw.mcap', 'hard.mcap'),
+        (('report', '-c', 'unit.yaml'), 'raw.mcap', 'hard.yaml'),
+        (('export', '--to', 'px4'), 'unit.yaml', 'link_unit.yaml'),
+        (('import', '--serial', '42'), 'unit.yaml', 'hard.yaml'),
+        (('convert',), 'raw.mcap', 'hard.mcap'),
+    ],
+    ids=lambda value: ' '.join(value) if isinstance(value, tuple) else value,
+)
+def test_an_output_is_never_an_input(
+    folder: Path, cli: Cli, command: tuple[str, ...], source: str, output: str
+) -> None:
+    before = {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
+    finished = cli(*command, source, '-o', output, '--force', code=None, cwd=folder)
+    assert finished.returncode in (1, 2), finished.stderr
+    if output != 'unit.yaml':
+        assert 'which the command needs' in finished.stderr
+    assert {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()} == before
+
+
+@pytest.mark.parametrize('kind', FILES, ids=lambda kind: kind.name)
+@pytest.mark.parametrize('there', ['work', 'empty', 'folder', 'fifo', 'device'])
+def test_only_the_same_kind_is_replaced(tmp_path: Path, kind: Kind, there: str) -> None:
+    path = tmp_path / 'output'
+    if there == 'fifo':
+        os.mkfifo(path)
+    elif there == 'folder':
+        path.mkdir()
+    elif there == 'device':
+        path = Path('/dev/null')
+    else:
+        path.write_bytes(b'years of work' if there == 'work' else b'')
+    if there == 'empty':
+        check_output(path, kind, overwrite=True)
+    else:
+        with pytest.raises(OutputError, match='is not replaced: it is '):
+            write_atomically(path, b'new', kind)
+        assert Path('/dev/null').is_char_device()
+    with pytest.raises(OutputError, match='exists already'):
+        write_atomically(path, b'new', kind, overwrite=False)
+
+
+def test_what_a_command_wrote_is_of_its_kind(folder: Path, cli: Cli) -> None:
+    for command in (
+        ('export', 'unit.yaml', '--to', 'px4', '-o', 'a.params'),
+        ('export', 'unit.yaml', '--to', 'ardupilot', '-o', 'a.parm'),
+        ('report', '-c', 'unit.yaml', '-o', 'page.html', '--figures', 'figures'),
+        (*REPLAY, 'raw.mcap', '-o', 'a.mcap'),
+        (*REPLAY, 'raw.mcap', '-o', 'a'),
+    ):
+        cli(*command, cwd=folder)
+        assert 'exists already' in cli(*command, code=1, cwd=folder).stderr
+        cli(*command, '--force', cwd=folder)
+
+
+@pytest.mark.parametrize('kind', [MCAP, BAG], ids=lambda kind: kind.name)
+def test_of_two_writers_one_wins(tmp_path: Path, kind: Kind) -> None:
+    start = threading.Barrier(8)
+    won: list[str] = []
+    lost: list[str] = []
+
+    def write(name: str) -> None:
+        draft = Draft(tmp_path / 'out', kind)
+        where = draft.partial / 'metadata.yaml' if kind.is_folder else draft.partial
+        where.write_text(name)
+        start.wait()
+        try:
+            draft.publish()
+        except OutputError as error:
+            lost.append(error.message)
+            draft.drop()
+        else:
+            won.append(name)
+
+    threads = [threading.Thread(target=write, args=(str(n),)) for n in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (winner,) = won
+    assert lost == ['exists already; --force overwrites it'] * 7
+    found = tmp_path / 'out' / 'metadata.yaml' if kind.is_folder else tmp_path / 'out'
+    assert found.read_text() == winner
+    assert [path.name for path in tmp_path.iterdir()] == ['out']
+
+
+def test_of_two_writers_one_wins_without_hard_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, 'link', refuse)
+    first, second = (Draft(tmp_path / 'out', CSV) for _ in range(2))
+    for draft, text in ((first, 'first'), (second, 'second')):
+        draft.partial.write_text(text)
+    first.publish()
+    with pytest.raises(OutputError, match='exists already'):
+        second.publish()
+    second.drop()
+    assert (tmp_path / 'out').read_text() == 'first'
+    assert [path.name for path in tmp_path.iterdir()] == ['out']
+
+
+@pytest.mark.parametrize('mask', [0o022, 0o077])
+def test_the_umask_decides_who_may_read(folder: Path, cli: Cli, mask: int) -> None:
+    with umask(mask):
+        save_calibration(rich_calibration(), folder / 'private.yaml')
+        cli(*REPLAY, 'raw.mcap', '-o', 'private', code=None, cwd=folder)
+        cli(*REPLAY, 'raw.mcap', '-o', 'private.mcap', code=None, cwd=folder)
+    for name in ('private.yaml', 'private.mcap', 'private/private_0.mcap'):
+        assert stat.S_IMODE((folder / name).stat().st_mode) == 0o666 & ~mask, name
+    assert stat.S_IMODE((folder / 'private').stat().st_mode) == 0o777 & ~mask
+
+
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path) -> None:
+    path = tmp_path / 'unit.yaml'
+    save_calibration(rich_calibration(), path)
+    path.chmod(0o640)
+    save_calibration(rich_calibration(), path)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+
+
+def test_a_link_is_written_through(tmp_path: Path) -> None:
+    (tmp_path / 'store').mkdir()
+    link = tmp_path / 'current.yaml'
+    link.symlink_to('store/unit.yaml')
+    for overwrite in (False, True):  # it leads nowhere first
+        save_calibration(rich_calibration(), link, overwrite=overwrite)
+        assert link.is_symlink()
+        assert not (tmp_path / 'store' / 'unit.yaml').is_symlink()
+    (tmp_path / 'round').symlink_to('round')
+    with pytest.raises(OutputError):
+        save_calibration(rich_calibration(), tmp_path / 'round')
+
+
+def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / 'file').touch()
+    with pytest.raises(OutputError, match=r'unit\.yaml: cannot be written: .*is no directory'):
+        write_atomically(tmp_path / 'file' / 'unit.yaml', b'', CALIBRATION)
+    draft = Draft(tmp_path / 'new' / 'bag', BAG)
+    draft.drop()
+    assert list((tmp_path / 'new').iterdir()) == []
+
+
+@pytest.mark.parametrize('suffix', ['.db3', '.bag', '.csv', '.MCAP'])
+def test_a_bag_has_no_other_suffix(folder: Path, cli: Cli, suffix: str) -> None:
+    output = f'out{suffix}'
+    finished = cli('convert', 'raw.mcap', '-o', output, code=1, cwd=folder)
+    assert f'{output}: cannot be written: {suffix} is none of' in finished.stderr
+    assert not (folder / output).exists()

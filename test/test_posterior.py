@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The posterior: covariance to factor and back, what it may leave out, and where parameters stand.
+
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders import axis_set, calibration, regime_set, term
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermo_comp.errors import CalibrationError
+from thermo_comp.unit.calibration import parameter_layout
+from thermo_comp.unit.calibration_file import SIZE_LIMIT, dump_calibration, parse_calibration
+from thermo_comp.unit.columns import bank
+from thermo_comp.unit.functions import CubicSpline
+from thermo_comp.unit.posterior import Block, Posterior, posterior_of
+
+
+def random_covariance(seed, n, spread=1.0):
+    """Make correlations of any strength, between units that lie decades apart."""
+    rng = np.random.default_rng(seed)
+    factor = rng.normal(size=(n, n)) * np.geomspace(1.0, 1e-4, n) ** spread
+    covariance = factor @ factor.T
+    scale = 10.0 ** rng.uniform(-8.0, 2.0, n) / np.sqrt(np.diag(covariance))
+    return covariance * scale * scale[:, np.newaxis]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.sampled_from([0.0, 1e-5, 1e-3, 0.1]))
+@settings(max_examples=60, deadline=None)
+def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, tolerance):
+    covariance = random_covariance(seed, n)
+    found = posterior_of(covariance, tolerance)
+    sd = np.sqrt(np.diag(covariance))
+    error = (found.covariance() - covariance) / sd / sd[:, np.newaxis]
+    # Single precision of the factor.
+    np.testing.assert_allclose(np.diag(error), 0.0, atol=1e-6)
+    np.testing.assert_allclose(error, 0.0, atol=tolerance + 2e-6)
+    assert (found.variances <= (tolerance + 1e-6) * sd**2).all()
+    assert found.matrix.shape == (n, found.rank)
+
+
+def test_a_tolerance_makes_it_smaller():
+    covariance = random_covariance(1, 30)
+    ranks = [posterior_of(covariance, one).rank for one in (0.1, 1e-3, 1e-5)]
+    assert ranks == sorted(ranks)
+    assert ranks[0] < ranks[-1] <= 30
+
+
+def test_what_is_exactly_known_has_no_variance():
+    covariance = np.zeros((4, 4))
+    assert posterior_of(covariance) == Posterior.of(np.empty((4, 0)), np.zeros(4))
+    covariance[2, 2] = 9.0
+    found = posterior_of(covariance)
+    assert found.rank == 1
+    np.testing.assert_array_equal(found.covariance(), covariance)
+
+
+@pytest.mark.parametrize(
+    ('matrix', 'message'),
+    [
+        ([[-1.0]], 'must not have a negative variance'),
+        ([[np.nan]], 'must not have a negative variance'),
+        ([[1.0, 2.0], [2.0, 1.0]], 'must be positive semidefinite'),
+        ([[1.0, np.inf], [np.inf, 1.0]], 'must be positive semidefinite'),
+        ([[1.0, np.nan], [np.nan, 1.0]], 'must be positive semidefinite'),
+        ([[0.0, 1.0], [1.0, 1.0]], 'must be positive semidefinite'),
+    ],
+)
+def test_matrix_that_is_no_covariance_is_refused(matrix, message):
+    with pytest.raises(ValueError, match=f'`covariance` {message}'):
+        posterior_of(np.array(matrix))
+
+
+def test_numbers_beyond_single_precision_are_refused():
+    with pytest.raises(ValueError, match='`factor` must hold finite numbers'):
+        posterior_of(np.array([[1e80]]))
+
+
+def test_negative_rest_is_refused():
+    with pytest.raises(ValueError, match='`rest` must not have a negative variance'):
+        Posterior.of(np.ones((1, 1)), np.array([-1.0]))
+
+
+def test_views_are_read_only():
+    found = posterior_of(np.eye(2))
+    with pytest.raises(ValueError, match='read-only'):
+        found.matrix[0, 0] = 1.0
+
+
+def test_layout_by_hand():
+    spline = CubicSpline((-5.0, 0.0, 5.0, 9.0), (0.1, 0.0, 0.2, 0.3))
+    value = calibration(
+        static=regime_set(axis_set((0.0, 1.0, 2.0)), axis_set(), axis_set(scale=(1.0, 1e-4))),
+        dynamic=regime_set(x=replace(axis_set(), bias_function=spline)),
+        response=(term('now'), term('board', tau_s=60.0)),
+    )
+    layout = parameter_layout(value)
+    # x: level t t^2 | level three knots | two weights.
+    assert layout.bias[0] == Block(0, 3, 7, 9)
+    assert layout.scale[0] == Block(9, 10, 11, 13)
+    assert layout.bias[1] == Block(13, 14, 15, 17)
+    assert layout.scale[1] == Block(17, 18, 19, 21)
+    assert layout.bias[2] == Block(21, 22, 23, 25)
+    assert layout.scale[2] == Block(25, 27, 28, 30)
+    assert (layout.misalignment, layout.n_parameters) == (30, 33)
+
+
+def whole_bank(sensors):
+    curve = axis_set((0.0, 0.1, 0.01, 1e-3), (1.0, 1e-5, 1e-6, 1e-7))
+    one = regime_set(curve, curve, curve)
+    terms = tuple(
+        term(**{**vars(column), 'range': (-9.0, 9.0)}, bias=(1 / 3,) * 3, scale=(1e-7 / 3,) * 3)
+        for column in bank(sensors)
+    )
+    value = calibration(static=one, dynamic=one, sensors=sensors, response=terms)
+    n = parameter_layout(value).n_parameters
+    factor = np.random.default_rng(5).normal(size=(n, n)) / 3.0
+    return replace(value, posterior=Posterior.of(factor, np.full(n, 1 / 3)))
+
+
+def test_the_whole_bank_of_two_thermometers_fits_into_a_file():
+    value = whole_bank(('case', 'frame'))
+    content = dump_calibration(value).encode()
+    assert len(content) < SIZE_LIMIT
+    assert parse_calibration(content) == value
+
+
+def test_what_no_reader_would_read_is_not_written():
+    with pytest.raises(CalibrationError, match=rf'takes \d+ bytes, at most {SIZE_LIMIT} are'):
+        dump_calibration(whole_bank(('case', 'frame', 'window')))

@@ -1,0 +1,153 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Text that somebody else chose: shown, never obeyed; a serial is one printable line at every entry.
+
+WHY: serials, topics and metadata of a bag reached the terminal raw, with escape sequences and
+lines that looked like the program's own; a Cyrillic serial ended a command on a latin-1 terminal.
+
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import unicodedata
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import rich_calibration
+from conftest import Cli
+from hypothesis import given
+from hypothesis import strategies as st
+
+from thermo_comp.cli.app import run
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import FitOptions, FitSource
+from thermo_comp.fitting.fit import check_serial
+from thermo_comp.recording import BagWriter
+from thermo_comp.text import LONGEST_SERIAL, one_line, valid_serial
+from thermo_comp.unit.calibration import Unit
+from thermo_comp.unit.calibration_file import save_calibration
+
+FORGED = '42\x1b]0;owned\x07\x1b[2J\nthermo_comp: error: forged\r\x9b31m\u202e\u2028'
+BAD_SERIALS = ('', 'a\nb', 'a\x1b[2J', 'x' * (LONGEST_SERIAL + 1), '\u202e', 'a\udcff')
+
+
+@given(st.text())
+def test_one_line_is_one_harmless_line(text: str) -> None:
+    shown = one_line(text)
+    assert len(shown.splitlines()) <= 1
+    assert not {unicodedata.category(c) for c in shown} & {'Cc', 'Cf', 'Cs', 'Zl', 'Zp'}
+    assert one_line(shown) == shown
+    shown.encode()
+    if not re.search(r'[^ -~]', text):
+        assert shown == text
+
+
+@pytest.mark.parametrize('serial', BAD_SERIALS)
+def test_what_is_no_serial(serial: str) -> None:
+    for take in (valid_serial, lambda text: Unit(text, 'counts', 1.0, 0.01)):
+        with pytest.raises(ValueError, match='`serial` must be one printable line of 1 to 64'):
+            take(serial)
+    if serial:
+        source = FitSource('bag', list, serial=serial)
+        with pytest.raises(FitError, match='must be one printable line'):
+            check_serial([source], FitOptions(gravity=9.8))
+
+
+@pytest.mark.parametrize('serial', ['42', 'Блок 7', 'x' * LONGEST_SERIAL])
+def test_what_is_a_serial(serial: str) -> None:
+    assert valid_serial(serial) == serial
+
+
+@pytest.mark.parametrize(
+    'command',
+    [
+        ('fit', 'x', '-o', 'y', '--gravity', '9.8'),
+        ('report', '-c', 'x', '-o', 'y'),
+        ('replay', 'x', '-c', 'y', '-o', 'z'),
+        ('import', 'x', '-o', 'y'),
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_command_line_with_another_serial(
+    command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*command, '--serial', FORGED]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('thermo_comp: error: ')
+    assert '`serial` must be one printable line' in line
+
+
+@pytest.fixture
+def forged(tmp_path: Path) -> Path:
+    path = tmp_path / 'forged.mcap'
+    stamps = np.arange(60) * 10**9
+    with BagWriter(path, metadata={'serial': FORGED, 'converted_from': FORGED}) as bag:
+        bag.write_counts('accel/counts', stamps, np.full((60, 3), 100.0))
+        bag.write_temperature('temperature/board', stamps, np.full(60, 20.0))
+        bag.write_bool(FORGED, stamps, np.zeros(60, bool))
+    return path
+
+
+@pytest.mark.parametrize('is_json', [False, True])
+def test_a_recording_forges_no_line(
+    forged: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], is_json: bool
+) -> None:
+    save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
+    unit = ('-c', str(tmp_path / 'unit.yaml'))
+    out = ('-o', str(tmp_path / 'out.yaml'))
+    for command in (
+        ('info', str(forged)),
+        ('evaluate', str(forged), *unit),
+        ('replay', str(forged), *unit, *out),
+        ('fit', str(forged), *out, '--gravity', '9.8'),
+    ):
+        run([*command, *(['--json'] if is_json and command[0] == 'info' else [])])
+        said, errors = capfd.readouterr()
+        for line in (said + errors).splitlines():
+            assert line.isprintable()
+            assert not line.startswith('thermo_comp: error: forged')
+        if command[0] == 'info':
+            assert r'\x1b' in said or r'\u001b' in said
+            if is_json:
+                assert json.loads(said)['metadata']['serial'] == FORGED
+
+
+@pytest.mark.parametrize('encoding', ['latin-1', 'ascii', 'utf-8'])
+def test_any_terminal_can_show_it(tmp_path: Path, cli: Cli, encoding: str) -> None:
+    calibration = rich_calibration()
+    unit = replace(calibration.unit, serial='Блок')
+    save_calibration(replace(calibration, unit=unit), tmp_path / 'unit.yaml')
+    name = tmp_path / os.fsdecode(b'not \xff utf-8.yaml')
+    (tmp_path / 'unit.yaml').rename(name)
+    for more in ((), ('--json',)):
+        said = cli('info', name, *more, PYTHONIOENCODING=encoding).stdout
+        assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in said
+        assert r'not \udcff utf-8.yaml' in said
+    absent = cli('info', tmp_path / os.fsdecode(b'no\xff.mcap'), code=1)
+    assert r'no\udcff.mcap: ' in absent.stderr
+
+
+def test_what_nobody_has_foreseen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError('boom\nand more')
+
+    monkeypatch.setattr('thermo_comp.cli.info._bag', fail)
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
+    assert run(['info', 'x.mcap']) == 70
+    (line,) = capsys.readouterr().err.splitlines()
+    (log,) = tmp_path.iterdir()
+    assert line.startswith('thermo_comp: error: unexpected RuntimeError: boom and more; ')
+    assert line.endswith(str(log))
+    assert 'Traceback' in log.read_text()
+    assert "raise RuntimeError('boom" in log.read_text()
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path / 'absent'))
+    assert run(['info', 'x.mcap']) == 70
+    assert 'not written (No such file or directory)' in capsys.readouterr().err

@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what becomes of text that somebody else chose: serials, topics, metadata, file names.
+
+"""
+
+from __future__ import annotations
+
+#: A serial stands in file names, parameter files and tables.
+LONGEST_SERIAL = 64
+
+
+def one_line(text: str) -> str:
+    """
+    Return a text as one line that a terminal shows and never obeys.
+
+    Line breaks, escape sequences, marks of direction and bytes that are no text stand there as
+    Python would write them in a literal; everything else stays as it is.
+
+    """
+    if text.isprintable():
+        return text
+    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def valid_serial(serial: str) -> str:
+    """
+    Return a serial that may go into files and onto screens.
+
+    Raises
+    ------
+    ValueError
+        If it is empty, too long, or anything but one printable line.
+
+    """
+    if not serial or len(serial) > LONGEST_SERIAL or not serial.isprintable():
+        shown = one_line(serial[:LONGEST_SERIAL])
+        raise ValueError(
+            f'`serial` must be one printable line of 1 to {LONGEST_SERIAL} characters, '
+            f"got {len(serial)}: '{shown}'"
+        )
+    return serial
