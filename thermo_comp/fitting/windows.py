@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..thermal.memory import MemorySpec, start_covariance
+from ..thermal.memory import MemorySpec, memory_on_grid, start_covariance
 from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Layout
 from ..thermal.tracker import ThermalTracker
@@ -232,12 +232,17 @@ def _states(
         still[:, BOARD] = reference_temperature
         ends = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
         return -1.0, ends, still, np.zeros((2, len(spec.lags)))
-    tracker = ThermalTracker(detector, spec, config)
+    tracker = ThermalTracker(detector, MemorySpec(spec.sensors), config)
     shortest = min((float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1),
                    default=1.0)
     step_s = max(shortest / 5.0, 0.1)
     start_s, states = thermal_states(bag, tracker, step_s)
     grid = start_s + step_s * np.arange(len(states))
+    # The memory is the tracker's, on the grid at once: reading by reading it takes longer than all
+    # the rest of a fit.
+    gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
+    memory = memory_on_grid(spec, step_s, states[:, BOARD], gradients)
+    states = np.hstack((states, memory))
     age = grid - start_s
     shares = np.exp(-age[:, None] / np.array([tau for _, tau in spec.lags]))
     settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])

@@ -33,6 +33,8 @@ NEIGHBOUR_START_SD: Final = 1.0
 SPARSE_SHARE: Final = 0.1
 #: Steps of as many lengths are remembered with their exponentials.
 _KNOWN_STEPS: Final = 256
+#: A lag that keeps less than this has forgotten.
+_FADED: Final = 1e-18
 
 
 @dataclass(frozen=True)
@@ -423,3 +425,67 @@ class ThermalMemory:
         for bank in self.neighbours:
             result = result + bank.start_shares(stamp_ns)
         return result
+
+
+def memory_on_grid(
+    spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
+) -> Floats:
+    """
+    Remember whole columns at once: what `ThermalMemory` gives on a uniform grid, but for rounding.
+
+    Parameters
+    ----------
+    spec : MemorySpec
+        What to remember.
+    step_s : float
+        Step of the grid [s].
+    board : ndarray, shape (n,)
+        Board temperature [degC].
+    gradients : sequence of ndarray, each of shape (n,)
+        ``T_s - T_board`` of each sensor [K].
+
+    Returns
+    -------
+    ndarray, shape (n, 2 * n_lags + n_plays)
+        (lag [K], 0) per lag, then each play less its input [K].
+
+    """
+    inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
+    columns: list[Floats] = []
+    behind: dict[float, Floats] = {}
+    for name, tau in spec.lags:
+        u = inputs[name]
+        lost = -math.expm1(-step_s / tau)
+        m = _recursion(1.0 - lost, np.diff(u, prepend=u[:1]) * (lost * tau / step_s))
+        if name == BOARD_INPUT:
+            behind[tau] = m
+        columns += [m if name == BOARD_INPUT else u - m, np.zeros_like(u)]
+    for tau, width in spec.plays:
+        v = board - behind[tau] if tau else board
+        columns.append(_play(v, width) - v)
+    return np.column_stack(columns) if columns else np.zeros((len(board), 0))
+
+
+def _recursion(decay: float, driven: Floats) -> Floats:
+    """
+    ``m[k] = decay m[k - 1] + driven[k]``, by doubling: stretches of 2^j steps at a time.
+
+    """
+    result = driven.copy()
+    shift, factor = 1, decay
+    while shift < len(result) and factor > _FADED:
+        result[shift:] += factor * result[:-shift]
+        shift, factor = 2 * shift, factor * factor
+    return result
+
+
+def _play(v: Floats, width: float) -> Floats:
+    held = float(v[0])
+    result = []
+    for value in v.tolist():
+        if held < value - width:
+            held = value - width
+        elif held > value + width:
+            held = value + width
+        result.append(held)
+    return np.array(result)

@@ -13,8 +13,10 @@ now        g_s                         heat that flows now
 rate       dT_board/dt [K/s]           the same, as seen by one thermometer
 board      T_board - L_tau(T_board)    parts that lag the board
 neighbour  L_tau(g_s)                  parts between the thermometers
-square     (T_board - L_tau)^2         curves of parts that lag the board
+square     (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a flow
+           g_s^2 where tau is 0
 even       tanh((g_s / width)^2)       heat load whichever way the heat flows
+size       \|g_s\|                      the same, as a heat pump's
 play       P_r(v) - v, v = t or        rate-independent hysteresis
            v = L_tau(t)
 =========  ==========================  ====================================================
@@ -50,6 +52,7 @@ BANK_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 8).round(9).tolist())
 EVEN_WIDTHS: Final = (0.75, 1.5, 3.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2)
 PLAY_TAU: Final = 900.0
+_OF_SENSOR: Final = ('now', 'neighbour', 'square', 'size', 'even')
 
 
 @dataclass(frozen=True)
@@ -69,8 +72,9 @@ class Column:
         'What evidence judges together.',
     ]
     kind: Annotated[
-        Literal['now', 'rate', 'board', 'neighbour', 'square', 'even', 'play'],
-        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2; tanh((g_s / width)^2); '
+        Literal['now', 'rate', 'board', 'neighbour', 'square', 'size', 'even', 'play'],
+        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without lag; '
+        '|g_s|; tanh((g_s / width)^2); '
         'play of t minus t, where g_s = T_s - T_board.',
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
@@ -94,7 +98,7 @@ class Column:
             raise ValueError(
                 f'`range` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
             )
-        for key, kinds in (('tau_s', ('board', 'neighbour', 'square')), ('width_k', ('even', 'play'))):
+        for key, kinds in (('tau_s', ('board', 'neighbour')), ('width_k', ('even', 'play'))):
             if self.kind in kinds and not getattr(self, key) > 0.0:
                 raise ValueError(
                     f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
@@ -142,6 +146,12 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
         for power in (0, 1, 2)
         for width in EVEN_WIDTHS
     ]
+    even += [
+        Column('even', kind, sensor, power=power, range=UNBOUNDED)
+        for sensor in sensors
+        for kind in ('size', 'square')
+        for power in (0, 1)
+    ]
     play = [
         Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
         for tau in (0.0, PLAY_TAU)
@@ -175,7 +185,7 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     lags: set[tuple[str, float]] = set()
     plays: set[tuple[float, float]] = set()
     for column in columns:
-        if column.kind in ('now', 'neighbour', 'even') and column.sensor not in sensors:
+        if column.lag != (BOARD_INPUT, column.tau_s) and column.kind in _OF_SENSOR and column.sensor not in sensors:
             raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
         if column.lag:
             lags.add(column.lag)
@@ -251,7 +261,7 @@ class ColumnTable:
         self._plan: list[tuple[int, float, float, int, str]] = []
         for column in columns:
             width = column.width_k if column.kind == 'even' else 0.0
-            bend = column.kind if column.kind in ('even', 'square') else ''
+            bend = column.kind if column.kind in ('even', 'size', 'square') else ''
             key = (bend, _place(column, layout), width)
             source = sources.setdefault(key, len(sources))
             self._plan.append((source, *column.range, column.power, column.during))
@@ -321,6 +331,8 @@ def _value(bend: str, u: Number, width: float) -> Number:
         return u
     if bend == 'square':
         return u * u
+    if bend == 'size':
+        return abs(u)
     x = u / width
     return _tanh(x * x)
 
