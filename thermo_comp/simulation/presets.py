@@ -339,7 +339,7 @@ def _flows(draw: _Specimen) -> list[Effect]:
     return [
         FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
-        FlowEffect('case', 'head', 1.25, bias=draw.normal(1.0), bias_curvature=draw.normal(0.02)),
+        FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ]
 
 
