@@ -27,6 +27,8 @@ from .calibration import FORMAT_VERSION, Calibration
 #: A calibration of the largest model takes some 60 kB.
 SIZE_LIMIT = 1 << 20
 DEPTH_LIMIT = 12
+#: Keys, values, lists and mappings: some ten times those of the largest model.
+NODE_LIMIT = 20_000
 #: Digits of the longest integer accepted; a float64 needs no more.
 _INTEGER_DIGITS = 20
 #: Longer than any key that there is.
@@ -34,6 +36,12 @@ _LONGEST_NAME = 60
 _NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)')
 
 _ADAPTER: TypeAdapter[Calibration] = TypeAdapter(Calibration)
+#: A file without all of these is something else.
+_REQUIRED = [
+    one.name
+    for one in dataclasses.fields(Calibration)
+    if one.default is one.default_factory is dataclasses.MISSING
+]
 _BASE: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
@@ -159,6 +167,8 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     data = _parse_yaml(content, path)
     if not isinstance(data, dict):
         raise CalibrationError('expected a mapping of keys at the top level', path)
+    missing = [key for key in _REQUIRED if key not in data]
+    rule = f'not a calibration: the key `{missing[0]}` is missing' if missing else None
     version = data.get('format_version')
     if isinstance(version, int) and not isinstance(version, bool) and version > FORMAT_VERSION:
         raise CalibrationError(
@@ -166,12 +176,13 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
             'release reads; update thermo_comp',
             path,
             'format_version',
+            rule,
         )
     try:
         return _ADAPTER.validate_json(json.dumps(data))
     except ValidationError as error:
         message, key = _first_problem(error)
-        raise CalibrationError(message, path, key) from error
+        raise CalibrationError(message, path, key, rule) from error
 
 
 def dump_calibration(calibration: Calibration) -> str:
@@ -288,13 +299,16 @@ def _parse_yaml(content: bytes, path: str | Path | None) -> Any:
         mark = getattr(error, 'problem_mark', None)
         where = f' (line {mark.line + 1})' if mark is not None else ''
         problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
-        raise CalibrationError(f'not valid YAML: {problem}{where}', path) from error
+        rule = f'not valid YAML{where}'
+        raise CalibrationError(f'not valid YAML: {problem}{where}', path, rule=rule) from error
 
 
 def _check_events(text: str, path: str | Path | None) -> None:
     depth = 0
     documents = 0
-    for event in yaml.parse(text, Loader=_BASE):
+    for n, event in enumerate(yaml.parse(text, Loader=_BASE)):
+        if n > NODE_LIMIT:
+            raise CalibrationError(f'more than {NODE_LIMIT} keys and values', path)
         if isinstance(event, yaml.AliasEvent):
             raise CalibrationError(f'YAML aliases are not accepted ({_line(event)})', path)
         if isinstance(event, yaml.CollectionStartEvent):
