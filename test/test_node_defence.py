@@ -26,9 +26,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
 from sensor_msgs.msg import Imu, Temperature
 
-from thermo_comp.calibration_file import NODE_LIMIT, save_calibration
 from thermo_comp.ros.parameters import NodeConfig
 from thermo_comp.ros.requests import PARAMETERS_LIMIT
+from thermo_comp.unit.calibration_file import NODE_LIMIT, save_calibration
 
 START_NS = 1_767_225_600 * SECOND_NS
 CYCLE_NS = 10_000_000
@@ -137,14 +137,14 @@ def test_any_request_is_answered_and_samples_go_on(peer: Peer, unit: Path, toget
         # One bad one among good ones: the good ones are set, or none.
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
-        config: NodeConfig = node._config  # noqa: SLF001
+        config: NodeConfig = node._config
         assert config.frame_id == ('' if together else 'body')
         many = kind.Request(parameters=[good] * (PARAMETERS_LIMIT + 1))
         answer = peer.call(kind, name, many)
         result = answer.result if together else answer.results[0]
         assert f'at most {PARAMETERS_LIMIT}' in result.reason
         samples.go_on()
-        assert node._loop.n_failures == 0  # noqa: SLF001
+        assert node._loop.n_failures == 0
 
 
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer: Peer, unit: Path) -> None:
@@ -158,20 +158,20 @@ def test_a_callback_that_fails_is_logged_counted_and_survived(peer: Peer, unit: 
             raise ZeroDivisionError('nobody foresaw this')
 
         timer = node.node.create_timer(0.005, fail)
-        node._loop._is_stale = True  # noqa: SLF001 - it was made in another thread
+        node._loop._is_stale = True
         status = status_with(peer, heard, 'callbacks failed')
         assert status.level == DiagnosticStatus.ERROR
         samples.go_on()
         timer.cancel()
-        keep, node._affinity.check = node._affinity.check, fail  # noqa: SLF001
+        keep, node._affinity.check = node._affinity.check, fail
         (result,) = peer.set_parameters(frame_id='body')
-        assert result.reason == 'internal error (ZeroDivisionError), see the log of the node'
-        node._affinity.check = keep  # noqa: SLF001
-        keep, node._relay._take_readings = node._relay._take_readings, fail  # noqa: SLF001
-        n_failures = node._loop.n_failures  # noqa: SLF001
+        assert result.reason == "internal error (ZeroDivisionError), see the node's log"
+        node._affinity.check = keep
+        keep, node._relay._take_readings = node._relay._take_readings, fail
+        n_failures = node._loop.n_failures
         samples.driver.temperatures(START_NS + samples.n_sent * CYCLE_NS, 20.0, 20.0)
-        peer.poll(lambda: node._loop.n_failures > n_failures, 'the failure')  # noqa: SLF001
-        node._relay._take_readings = keep  # noqa: SLF001
+        peer.poll(lambda: node._loop.n_failures > n_failures, 'the failure')
+        node._relay._take_readings = keep
         samples.go_on()
 
 
@@ -229,7 +229,7 @@ def test_calibrations_are_taken_from_one_folder_only(
 
 def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:
     with node_in_thread(*arguments(unit)) as node:
-        names = [one for one in node.node._parameters]  # noqa: C416, SLF001
+        names = [one for one in node.node._parameters]  # noqa: C416
         request = GetParameters.Request(names=names)
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert len(values) == len(names) > 20
@@ -257,7 +257,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> N
         values = {one.key: one.value for one in status.values}
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
-        peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')  # noqa: SLF001
+        peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
         # The first ones after it may still be of the other.
         samples.send(20)
         before = len(samples.heard)
@@ -280,7 +280,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> 
             samples.send(10)
         status = status_with(peer, diagnostics, '2 publishers on /temperature/board')
         assert status.level == DiagnosticStatus.ERROR
-        board = node._compensator.tracker.board  # noqa: SLF001
+        board = node._compensator.tracker.board
         assert board.temperature == pytest.approx(20.0, abs=1e-6)
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
 
@@ -301,7 +301,7 @@ def test_a_driver_that_cannot_be_heard_is_named(peer: Peer, unit: Path) -> None:
 
 def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Path) -> None:
     # WHY: with diagnostics_period below the sample interval each empty report was an ERROR.
-    from thermo_comp.calibration import Unit
+    from thermo_comp.unit.calibration import Unit
 
     slow = tmp_path / 'slow.yaml'
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.2)), slow)
@@ -309,7 +309,7 @@ def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Pa
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         driver = drive(peer, node)
         imu = peer.listen(Imu, 'imu/data_raw')
-        peer.poll(lambda: node._relay.samples.count_publishers(), 'the driver')  # noqa: SLF001
+        peer.poll(node._relay.samples.count_publishers, 'the driver')
         for k in range(5):
             stamp_ns = START_NS + k * SECOND_NS // 5
             driver.temperatures(stamp_ns, 20.0, 20.0)
