@@ -110,7 +110,7 @@ STRANGE: list[ParameterMessage] = [
             ('serial', 's' * 65),
             ('transition_time', float('nan')),
             ('transition_time', 1 << 62),
-            ('cpu_affinity', -(1 << 62)),
+            ('diagnostics_period', -(1 << 62)),
             ('input', 'imu'),
             ('use_sim_time', 'perhaps'),
             ('qos_overrides./accel/counts.subscription.depth', 7),
@@ -163,10 +163,10 @@ def test_a_callback_that_fails_is_logged_counted_and_survived(peer: Peer, unit: 
         assert status.level == DiagnosticStatus.ERROR
         samples.go_on()
         timer.cancel()
-        keep, node._affinity.check = node._affinity.check, fail
+        keep, node._requests._apply = node._requests._apply, fail
         (result,) = peer.set_parameters(frame_id='body')
         assert result.reason == "internal error (ZeroDivisionError), see the node's log"
-        node._affinity.check = keep
+        node._requests._apply = keep
         keep, node._relay._take_readings = node._relay._take_readings, fail
         n_failures = node._loop.n_failures
         samples.driver.temperatures(START_NS + samples.n_sent * CYCLE_NS, 20.0, 20.0)
