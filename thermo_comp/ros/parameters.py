@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
+from ..text import LONGEST_SERIAL
 from .conversions import LONGEST_FRAME
 
 _DEFAULTS = CompensatorConfig()
@@ -38,7 +39,7 @@ def _parameter(
     bounds: tuple[float, float] | None = None,
     choices: tuple[str, ...] = (),
     *,
-    longest: int = 64,
+    longest: int = LONGEST_SERIAL,
     is_fixed: bool = False,
 ) -> Any:
     metadata = {
@@ -319,10 +320,10 @@ def _checked(name: str, value: Any) -> Any:
                 f'({type(value).__name__}); quote it: \'"{value!s:.60}"\''
             )
         longest = entry.metadata['longest']
-        if not (value.isprintable() and len(value.encode()) <= longest):
+        if not (value.isprintable() and len(value) <= longest):
             raise ParameterError(
-                f'parameter `{name}` must be one printable line of at most {longest} bytes, got '
-                f'{value!r:.60} ({len(value)} characters)'
+                f'parameter `{name}` must be one printable line of at most {longest} '
+                f'characters, got {len(value)}: {value!r:.60}'
             )
         choices = entry.metadata['choices']
         if choices and value not in choices:
