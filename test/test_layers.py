@@ -212,6 +212,11 @@ def test_help_starts_without_the_heavy_libraries() -> None:
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
 
 
+def test_a_look_at_a_bag_starts_without_the_fit() -> None:
+    heavy = ('scipy', 'matplotlib', 'pydantic', 'rosbags', 'rclpy', 'thermo_comp.fitting')
+    assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
+
+
 def test_core_imports_no_files_and_no_ros() -> None:
     statement = 'import thermo_comp.online.compensator'
     assert loaded_after(statement, 'rclpy', 'rosbags', 'mcap', 'matplotlib', 'scipy') == []
