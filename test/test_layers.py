@@ -55,7 +55,7 @@ HOMES = {
     'matplotlib': {'report'},
     'pyulog': {'convert'},
     'pymavlink': {'convert'},
-    'pyarrow': {'convert', 'fleet'},
+    'pyarrow': {'convert', 'fleet', 'recording'},
     'dask': {'fleet'},
     'distributed': {'fleet'},
     'fsspec': {'fleet'},

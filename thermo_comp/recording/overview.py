@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from ..typing import Floats, Ints
-from . import RecordingInfo, Topics, open_recording
+from .columns import RecordingInfo, Topics
+from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 
 # What a fit asks of one unit's bags together; below the first it refuses.
