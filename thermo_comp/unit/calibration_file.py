@@ -87,6 +87,8 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
         raise CalibrationError(str(error), path) from error
     if not isinstance(data, dict):
         raise CalibrationError('expected a mapping of keys at the top level', path)
+    missing = [key for key in _REQUIRED if key not in data]
+    rule = f'not a calibration: the key `{missing[0]}` is missing' if missing else None
     version = data.get('format_version')
     if type(version) is int and version > FORMAT_VERSION:
         raise CalibrationError(
@@ -94,6 +96,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
             'release reads; update thermo_comp',
             path,
             'format_version',
+            rule,
         )
     try:
         if type(version) is int and version == 1:
