@@ -153,12 +153,11 @@ def _places(
 ) -> dict[Key, Ints]:
     layout = posterior.layout
     names = np.array(regression.windows.groups)
-    return {
-        (part, group): (layout.on_bias if part == 'bias' else layout.on_scale)[
-            :, names == group
-        ].ravel()
-        for part, group in prior.groups
-    }
+    result = {}
+    for part, group in prior.groups:
+        places = layout.on_bias if part == 'bias' else layout.on_scale
+        result[part, group] = places[:, (names == group) & (places[0] >= 0)].ravel()
+    return result
 
 
 def _settle(
@@ -314,7 +313,9 @@ def group_worth(
         determinant = float(np.log(values).sum() + 2.0 * np.log(root).sum())
         earned = 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant
         earned -= len(places) * np.log(sd)
-        added = columns[:, names == group] @ vector[places].reshape(3, -1).T
+        state = posterior.state
+        weights = state.on_bias if part == 'bias' else state.on_scale
+        added = columns[:, names == group] @ weights[:, names == group].T
         if part == 'scale':
             added = added * force
         result.append(

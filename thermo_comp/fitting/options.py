@@ -18,7 +18,9 @@ COUNTS_FULL_SCALE = 32767.0
 #: Families of the curve over temperature.
 CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
 #: What evidence judges: curve and set of the two sets, then the groups of the response.
-GROUPS = ('curve', 'set', 'now', 'board', 'neighbour', 'product', 'even', 'play')
+GROUPS = (
+    'curve', 'set', 'now', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play',
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

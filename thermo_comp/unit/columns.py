@@ -22,8 +22,8 @@ play       P_r(v) - v, v = t or        rate-independent hysteresis
 =========  ==========================  ====================================================
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
-and t at those of the calibrated temperatures. The groups of the bank are its kinds, and
-*product*: a kind of power 1, coefficients that change with temperature.
+and t at those of the calibrated temperatures. The groups of the bank are its kinds; *product* and
+*mixed* are board, and now and neighbour, of power 1: coefficients that change with temperature.
 
 This is the one table of columns: tracker, fit, correction, covariance and file take theirs from
 here, so that another regressor is an entry of `bank` and, if it is of a new kind, of `_value`.
@@ -68,7 +68,9 @@ class Column:
     """
 
     group: Annotated[
-        Literal['now', 'rate', 'board', 'neighbour', 'product', 'even', 'play'],
+        Literal[
+            'now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'
+        ],
         'What evidence judges together.',
     ]
     kind: Annotated[
@@ -137,9 +139,10 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
         for sensor in sensors
         for tau in BANK_TAUS
     ]
-    product = [replace(column, group='product', power=1) for column in (*now, *board, *neighbour)]
+    product = [replace(column, group='product', power=1) for column in board]
+    mixed = [replace(column, group='mixed', power=1) for column in (*now, *neighbour)]
     # A part's own curve bends over its own temperature: (t - m)^2 = t^2 - 2 t m + m^2.
-    product += [replace(column, group='product', kind='square') for column in board]
+    square = [replace(column, group='square', kind='square') for column in board]
     even = [
         Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
         for sensor in sensors
@@ -157,7 +160,7 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
         for tau in (0.0, PLAY_TAU)
         for width in PLAY_WIDTHS
     ]
-    return (*now, *board, *neighbour, *product, *even, *play)
+    return (*now, *board, *neighbour, *product, *mixed, *square, *even, *play)
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
