@@ -213,8 +213,10 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
     ],
 )
 def test_bytes_that_are_no_calibration(content, message):
-    with pytest.raises(CalibrationError, match=message):
+    with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
+    # What it says to those who may not read the file quotes nothing of it.
+    assert caught.value.rule is None or caught.value.rule.startswith('not valid YAML')
 
 
 @given(st.binary(max_size=300))
