@@ -30,6 +30,7 @@ _BAD_FILE = (
     'the calibration that was read runs on; setting it again is refused with path and reason'
 )
 _CALIBRATION_FILES = f'{_PROCESS}::test_calibration_files_that_go_bad'
+_DEFENCE = 'test_node_defence.py'
 
 TOLD = [
     Told(
@@ -64,6 +65,62 @@ TOLD = [
             ('a directory', 'not a regular file'),
             ('a FIFO', 'not a regular file; never waited for'),
         )
+    ),
+    Told(
+        'the calibration file is a list of a million empty lists',
+        'while the node runs',
+        _BAD_FILE,
+        'refusal: more than 20000 keys and values; not built',
+        f'{_DEFENCE}::test_nothing_of_a_file_that_is_no_calibration_is_told',
+    ),
+    Told(
+        'the calibration file is something else, `/etc/shadow`, say',
+        'a request over the network',
+        'refused; with `calibration_directory` nothing outside of it is opened, through no link',
+        'refusal: the path as given and the rule, nothing of the content',
+        f'{_DEFENCE}::test_nothing_of_a_file_that_is_no_calibration_is_told',
+    ),
+    Told(
+        'a request that nobody foresaw',
+        'values of no type, unknown users, names and texts of 10 MB, control characters',
+        'each is answered, samples go on',
+        'refusal: the rule',
+        f'{_DEFENCE}::test_any_request_is_answered_and_samples_go_on',
+    ),
+    Told(
+        'a callback fails',
+        'an exception in a timer, a service, the relay itself',
+        'samples go on',
+        'ERROR "callbacks failed, see the log"; the log has all its lines',
+        f'{_DEFENCE}::test_a_callback_that_fails_is_logged_counted_and_survived',
+    ),
+    Told(
+        'a second publisher of the samples',
+        'another attitude under stamps in between',
+        'nothing is published until one is left, nor what came just after it',
+        'ERROR "2 publishers on /accel/counts"',
+        f'{_DEFENCE}::test_samples_of_a_second_publisher_never_go_out',
+    ),
+    Told(
+        'a second publisher of a temperature',
+        'half a degree more',
+        'its topic is not used until one is left: held, then after the time-out lost',
+        'ERROR "2 publishers on /temperature/board"',
+        f'{_DEFENCE}::test_readings_of_a_second_publisher_are_not_used',
+    ),
+    Told(
+        'a driver that cannot be heard',
+        'best effort for a reliable subscription; a message of another type',
+        'nothing comes in',
+        'ERROR "no messages of a publisher on", with the policy or the type',
+        f'{_DEFENCE}::test_a_driver_that_cannot_be_heard_is_named',
+    ),
+    Told(
+        'one temperature stamped a day ahead',
+        'among good ones',
+        'not used once the next one of its sensor has come',
+        'WARN "temperatures are stamped" until then',
+        f'{_DEFENCE}::test_a_reading_far_ahead_is_forgotten',
     ),
     Told(
         'a storm of reloads',

@@ -155,9 +155,13 @@ class Driver:
     """
 
     def __init__(
-        self, peer: Peer, kind: Any = Vector3Stamped, topic: str = 'accel/counts'
+        self,
+        peer: Peer,
+        kind: Any = Vector3Stamped,
+        topic: str = 'accel/counts',
+        qos: QoSProfile = DEEP,
     ) -> None:
-        self._samples = peer.publisher(kind, topic)
+        self._samples = peer.publisher(kind, topic, qos)
         self._board = peer.publisher(Temperature, 'temperature/board')
         self._case = peer.publisher(Temperature, 'temperature/case')
 
@@ -176,13 +180,17 @@ class Driver:
 
 
 def drive(
-    peer: Peer, node: CompensationNode, kind: Any = Vector3Stamped, topic: str = 'accel/counts'
+    peer: Peer,
+    node: CompensationNode,
+    kind: Any = Vector3Stamped,
+    topic: str = 'accel/counts',
+    qos: QoSProfile = DEEP,
 ) -> Driver:
     """
     Connect drivers to a node of this process.
 
     """
-    driver = Driver(peer, kind, topic)
+    driver = Driver(peer, kind, topic, qos)
     peer.join(node)
     return driver
 

@@ -133,7 +133,7 @@ def event_lists(draw):
                 value = (100.0, -200.0, 2900.0)
             events.append((kind, stamp, value))
         else:
-            late = draw(st.sampled_from([0, 0, 0, -SECOND_NS, 2 * SECOND_NS]))
+            late = draw(st.sampled_from([0, 0, 0, -SECOND_NS, 2 * SECOND_NS, 86_400 * SECOND_NS]))
             celsius = draw(st.one_of(st.floats(-60.0, 90.0), st.sampled_from([math.nan, 20.0])))
             events.append((kind, max(stamp + late, 0), celsius))
     return events

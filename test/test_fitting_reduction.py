@@ -16,7 +16,7 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import ArrayBlock, FitSource, normal_gravity, resolve_gravity
 from thermo_comp.fitting.reduction import Readings, ReducedBag, reduce_source
 from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
-from thermo_comp.fitting.stillness import CellAccumulator, still_intervals
+from thermo_comp.recording.stillness import CellAccumulator, still_intervals
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 
 START_NS = 1_700_000_000_123_456_789

@@ -55,7 +55,7 @@ HOMES = {
     'matplotlib': {'report'},
     'pyulog': {'convert'},
     'pymavlink': {'convert'},
-    'pyarrow': {'convert', 'fleet'},
+    'pyarrow': {'convert', 'fleet', 'recording'},
     'dask': {'fleet'},
     'distributed': {'fleet'},
     'fsspec': {'fleet'},
@@ -210,6 +210,11 @@ def test_node_starts_without_the_offline_libraries() -> None:
 def test_help_starts_without_the_heavy_libraries() -> None:
     heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
+
+
+def test_a_look_at_a_bag_starts_without_the_fit() -> None:
+    heavy = ('scipy', 'matplotlib', 'pydantic', 'rosbags', 'rclpy', 'thermo_comp.fitting')
+    assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 
 
 def test_core_imports_no_files_and_no_ros() -> None:

@@ -58,7 +58,7 @@ def test_every_parameter_is_described() -> None:
         for entry in fields(NodeConfig):
             found = node.describe_parameter(entry.name)
             assert found.description == entry.metadata['description']
-            assert not found.read_only
+            assert found.read_only == (entry.name == 'calibration_directory')
             assert found.type == Parameter.Type.from_parameter_value(entry.default).value
             assert bool(found.floating_point_range) == isinstance(entry.default, float)
             assert bool(found.integer_range) == isinstance(entry.default, int)
@@ -101,7 +101,8 @@ def test_a_bad_override_is_refused_with_its_name_rule_and_value(override: str, t
         ('diagnostics_period', 0.0, 'must be between 0.01 and 60, got 0'),
         ('frame_id', 3, 'must be a string, got 3'),
         ('input', 'gyro', 'must be one of counts, imu'),
-        ('serial', 'two\nlines', '`serial` must be one printable line'),
+        ('frame_id', 'x' * 256, 'must be one printable line of at most 255 characters'),
+        ('serial', 'a\nb', "must be one printable line of at most 64 characters, got 3: 'a"),
     ],
 )
 def test_an_update_is_refused_as_a_whole(name: str, value: Any, text: str) -> None:

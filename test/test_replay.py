@@ -7,6 +7,7 @@ The offline run gives, bit for bit, what a compensator gives sample by sample in
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import tracemalloc
 from pathlib import Path
@@ -15,10 +16,18 @@ import numpy as np
 import pytest
 from builders import rich_calibration
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording import BagWriter, Block, ImuColumns, Topics, read_recording
+from thermo_comp.recording import (
+    BagWriter,
+    Block,
+    ImuColumns,
+    Topics,
+    open_recording,
+    read_recording,
+)
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, ReplayResult, replay, switches
 from thermo_comp.unit.calibration import Calibration, Unit
 
@@ -264,3 +273,108 @@ def test_memory_does_not_grow_with_the_bag(
     assert peaks[1] < 1.1 * peaks[0]
     third = len(held) // 3
     assert max(held[-third:]) < 1.15 * max(held[:third])
+
+
+@pytest.mark.parametrize('imu', [False, True])
+def test_a_table_holds_what_the_bag_holds(tmp_path: Path, imu: bool) -> None:
+    pq = pytest.importorskip('pyarrow.parquet', reason='pyarrow is the extra `parquet`')
+    bag = thermal_test(tmp_path / 'bag', imu=imu)
+    calibration = rich_calibration()
+    if imu:
+        unit = Unit('T-1', 'm/s^2', 100.0, 0.1)
+        calibration = calibrated(unit=unit)
+    for name in ('out', 'out.csv', 'out.parquet'):
+        replay(bag, calibration, tmp_path / name)
+    block, flags = output_of(tmp_path / 'out')
+    with (tmp_path / 'out.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    parquet = pq.read_table(tmp_path / 'out.parquet')
+    assert parquet.schema.metadata[b'serial'] == b'T-1'
+    assert block.imu is not None
+    covariance = block.imu.linear_acceleration_covariance
+    expected = {
+        'stamp_ns': block.accel_stamp_ns,
+        **{f'specific_force_{a}_m_s2': block.accel[:, i] for i, a in enumerate('xyz')},
+        **{
+            f'covariance_{name}_m2_s4': covariance[:, 3 * i + j]
+            for name, i, j in (
+                ('xx', 0, 0),
+                ('xy', 0, 1),
+                ('xz', 0, 2),
+                ('yy', 1, 1),
+                ('yz', 1, 2),
+                ('zz', 2, 2),
+            )
+        },
+    }
+    if imu:
+        for i, a in enumerate('xyz'):
+            expected[f'angular_velocity_{a}_rad_s'] = block.imu.angular_velocity[:, i]
+    assert set(rows[0]) == set(parquet.column_names) == {*expected, 'regime'}
+    for name, column in expected.items():
+        assert np.array_equal(parquet[name].to_numpy(), column), name
+        number = int if name == 'stamp_ns' else float
+        assert [number(row[name]) for row in rows] == column.tolist(), name
+    regimes = parquet['regime'].to_pylist()
+    assert [row['regime'] for row in rows] == regimes
+    names = {False: 'static', True: 'dynamic'}
+    for k in (0, len(rows) // 3, len(rows) // 2, len(rows) - 1):
+        before = [value for stamp, value in flags if stamp <= block.accel_stamp_ns[k]]
+        assert regimes[k] == (names[before[-1]] if before else 'unknown')
+    assert len(rows) == len(block) > 0
+    assert imu or set(regimes) == {'unknown', 'static', 'dynamic'}
+
+
+def test_a_table_holds_no_other_topics(tmp_path: Path) -> None:
+    bag = thermal_test(tmp_path / 'bag', minutes=1.0)
+    with pytest.raises(OutputError, match='the corrected samples alone'):
+        replay(bag, rich_calibration(), tmp_path / 'out.csv', all_topics=True)
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_every_topic_is_copied(tmp_path: Path, storage: str) -> None:
+    # An INS needs the other topics of the recording, too.
+    inputs = thermal_test(tmp_path / 'inputs', minutes=2.0)
+    mcap = tmp_path / 'bag'
+    stamps = START_NS + np.arange(-3, 150) * 10**9
+    messages = [f'message {k}'.encode() * (1 + k % 3) for k in range(len(stamps))]
+    with open_recording(inputs) as reader, BagWriter(mcap) as writer:
+        for block in reader.blocks(raw=True):
+            for raw in block.raw:
+                writer.write_raw(raw.topic, raw.type, raw.log_ns, raw)
+        definition = ('ros2msg', 'string data')
+        writer.write_raw('odd', 'odd_msgs/msg/Odd', stamps, messages, definition)
+        writer.write_bool('gps/ok', stamps, np.arange(len(stamps)) % 2)
+        writer.write_bool(OUTPUT_TOPIC, stamps, np.zeros(len(stamps)))
+    bag = mcap
+    if storage == 'sqlite3':
+        bag = tmp_path / 'sqlite'
+        with (
+            AnyReader([mcap]) as reader_of_all,
+            Writer(bag, version=9, storage_plugin=StoragePlugin.SQLITE3) as sqlite,
+        ):
+            for one in reader_of_all.connections:
+                connection = sqlite.add_connection(
+                    one.topic, one.msgtype, msgdef=one.msgdef.data, rihs01=one.digest or 'RIHS01_0'
+                )
+                for _, stamp, data in reader_of_all.messages(connections=[one]):
+                    sqlite.write(connection, stamp, data)
+    replay(bag, rich_calibration(), tmp_path / 'out', all_topics=True)
+    replay(bag, rich_calibration(), tmp_path / 'plain')
+    with AnyReader([tmp_path / 'out']) as found, AnyReader([mcap]) as given:
+        for topic in ('/odd', '/gps/ok', '/accel/counts', '/temperature/board'):
+            each = [
+                [
+                    (stamp, bytes(data))
+                    for connection, stamp, data in one.messages()
+                    if connection.topic == topic
+                ]
+                for one in (found, given)
+            ]
+            assert each[0] == each[1], topic
+        (output,) = (one for one in found.connections if one.topic == f'/{OUTPUT_TOPIC}')
+        assert output.msgtype == 'sensor_msgs/msg/Imu'
+        times = [stamp for _, stamp, _ in found.messages()]
+        assert times == sorted(times)
+    first, second = (output_of(tmp_path / name)[0] for name in ('out', 'plain'))
+    assert np.array_equal(first.accel, second.accel)

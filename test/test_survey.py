@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.fitting.survey import Survey, survey_recording
 from thermo_comp.recording import BagWriter, Topics
+from thermo_comp.recording.overview import Survey, survey_recording
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000

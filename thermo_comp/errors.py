@@ -33,15 +33,23 @@ class CalibrationError(ThermoCompError):
         The calibration file.
     key : str or None, optional
         The dotted path of the offending key, e.g. ``static.x.scale_function``.
+    rule : str or None, optional
+        What may be said to those who may not read the file, where message or key quote one that
+        is no calibration.
 
     """
 
     def __init__(
-        self, message: str, path: str | Path | None = None, key: str | None = None
+        self,
+        message: str,
+        path: str | Path | None = None,
+        key: str | None = None,
+        rule: str | None = None,
     ) -> None:
         self.message = message
         self.path = None if path is None else str(path)
         self.key = key
+        self.rule = rule
         super().__init__(': '.join(part for part in (self.path, key, message) if part))
 
 

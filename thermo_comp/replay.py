@@ -11,14 +11,18 @@ that got the bag's messages in this order. Memory is bounded by one block.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import __version__
-from .errors import CalibrationError
+from .errors import CalibrationError, OutputError
 from .online.batch import process_block
 from .online.blocks import CompensatedBlock
 from .online.compensator import Compensator
@@ -34,6 +38,7 @@ from .recording import (
     Topics,
     open_recording,
 )
+from .recording.table_out import TABLES, WriteRows, table_writer
 from .typing import Ints
 from .unit.calibration import Calibration
 
@@ -41,6 +46,7 @@ OUTPUT_TOPIC = 'imu/data_raw'
 REGIME_TOPIC = 'regime/dynamic'
 #: Messages corrected at once: enough that what is done per block costs little beside them.
 BLOCK_MESSAGES = 1 << 17
+_REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
 
 @dataclass(frozen=True)
@@ -89,6 +95,9 @@ class ReplayResult:
     counters: Counters
     n_flags: int
     switches: list[tuple[int, bool]]
+
+
+WriteBlock = Callable[[CorrectedBlock], None]
 
 
 def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None = None) -> None:
@@ -151,19 +160,7 @@ def corrected_blocks(
     compensator: Compensator, blocks: Iterable[Block]
 ) -> Iterable[CorrectedBlock]:
     """
-    Run blocks through a compensator.
-
-    Parameters
-    ----------
-    compensator : Compensator
-        Its counters go on counting.
-    blocks : iterable of Block
-        In file order.
-
-    Yields
-    ------
-    CorrectedBlock
-        One for each block.
+    Run blocks, in file order, through a compensator; its counters go on counting.
 
     """
     for block in blocks:
@@ -182,6 +179,7 @@ def replay(
     serial: str | None = None,
     frame_id: str = '',
     keep_inputs: bool = False,
+    all_topics: bool = False,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> ReplayResult:
@@ -195,7 +193,8 @@ def replay(
     calibration : Calibration
         The unit's calibration.
     output : str or Path
-        The bag to write; ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
+        A bag, ``*.mcap`` or a rosbag2 directory; or ``*.csv`` or ``*.parquet``, a table of the
+        corrected samples.
     config : CompensatorConfig or None, optional
         The node's settings.
     topics : Topics or None, optional
@@ -208,6 +207,8 @@ def replay(
         Frame of the output; empty keeps the input's.
     keep_inputs : bool, optional
         Copy the input messages beside the output, at their own stamps.
+    all_topics : bool, optional
+        Copy these and every other topic, at their log times; but none that bears an output's name.
     overwrite : bool, optional
         Replace an output that is there.
     progress : callable or None, optional
@@ -221,7 +222,9 @@ def replay(
     Raises
     ------
     RecordingError
-        If the recording cannot be read or the output cannot be written.
+        If the recording cannot be read.
+    OutputError
+        If the output may not or cannot be written.
     CalibrationError
         If the calibration is for another unit.
 
@@ -237,13 +240,18 @@ def replay(
         }
         total = reader.info.topics[reader.topics['accel']][1]
         flags: list[tuple[int, bool]] = []
-        with BagWriter(output, metadata=metadata, overwrite=overwrite) as writer:
-            blocks = reader.blocks(raw=keep_inputs, n_messages=BLOCK_MESSAGES)
+        is_raw = keep_inputs or all_topics
+        if Path(output).suffix in TABLES:
+            if is_raw:
+                raise OutputError('a table holds the corrected samples alone', output)
+            sink = _rows_of(table_writer(output, metadata, overwrite=overwrite))
+        else:
+            bag = BagWriter(output, metadata=metadata, overwrite=overwrite)
+            sink = _messages_of(bag, reader, frame_id, _others(reader) if all_topics else ())
+        with sink as write:
+            blocks = reader.blocks(raw=is_raw, n_messages=BLOCK_MESSAGES)
             for item in corrected_blocks(compensator, blocks):
-                _write_block(writer, item, frame_id)
-                if keep_inputs:
-                    _write_inputs(writer, item.block, reader)
-                writer.flush()
+                write(item)
                 flags += item.flags
                 if progress is not None:
                     progress(compensator.counters.n_in / max(total, 1))
@@ -258,17 +266,7 @@ def replay(
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
     """
-    Keep the first flag and each that differs from the one before.
-
-    Parameters
-    ----------
-    flags : iterable of (int, bool)
-        Stamp and regime.
-
-    Returns
-    -------
-    list of (int, bool)
-        The changes.
+    Keep the first flag (stamp, regime) and each that differs from the one before.
 
     """
     changes: list[tuple[int, bool]] = []
@@ -278,20 +276,86 @@ def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
     return changes
 
 
-def _write_block(writer: BagWriter, item: CorrectedBlock, frame_id: str) -> None:
-    corrected = item.corrected
-    if len(corrected.stamp_ns):
-        writer.write_imu(
-            OUTPUT_TOPIC,
-            corrected.stamp_ns,
-            corrected.specific_force,
-            corrected.covariance,
-            frame_id or item.block.frame_id,
-            imu=None if item.block.imu is None else _rows(item.block.imu, corrected.index),
-        )
-    if item.flags:
-        stamps, values = zip(*item.flags, strict=True)
-        writer.write_bool(REGIME_TOPIC, np.array(stamps, dtype=np.int64), np.array(values))
+@contextmanager
+def _messages_of(
+    bag: BagWriter, reader: RecordingReader, frame_id: str, others: Iterable[RawMessages]
+) -> Iterator[WriteBlock]:
+    """
+    Write blocks as the node's messages, and beside them what was recorded until then.
+
+    """
+    following = iter(others)
+    one = next(following, None)
+
+    def copy(until_ns: float) -> None:
+        nonlocal one
+        while one is not None and one.log_ns[0] <= until_ns:
+            definition = reader.definitions.get(one.type)
+            writer.write_raw(one.topic, one.type, one.log_ns, one, definition)
+            one = next(following, None)
+
+    def write(item: CorrectedBlock) -> None:
+        corrected, block = item.corrected, item.block
+        if len(corrected.stamp_ns):
+            writer.write_imu(
+                OUTPUT_TOPIC,
+                corrected.stamp_ns,
+                corrected.specific_force,
+                corrected.covariance,
+                frame_id or block.frame_id,
+                imu=None if block.imu is None else _rows(block.imu, corrected.index),
+            )
+        if item.flags:
+            stamps, values = zip(*item.flags, strict=True)
+            writer.write_bool(REGIME_TOPIC, np.array(stamps, dtype=np.int64), np.array(values))
+        _write_inputs(writer, block, reader)
+        if len(block.accel_log_ns):
+            copy(block.accel_log_ns[-1])
+        writer.flush()
+
+    with bag as writer:
+        yield write
+        copy(inf)
+
+
+@contextmanager
+def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
+    """
+    Write blocks as rows, one for each corrected sample.
+
+    """
+    regime = 0
+
+    def write(item: CorrectedBlock) -> None:
+        nonlocal regime
+        corrected = item.corrected
+        columns: dict[str, NDArray[Any]] = {'stamp_ns': corrected.stamp_ns}
+        for axis, name in enumerate('xyz'):
+            columns[f'specific_force_{name}_m_s2'] = corrected.specific_force[:, axis]
+        for name, at in (('xx', 0), ('xy', 1), ('xz', 2), ('yy', 4), ('yz', 5), ('zz', 8)):
+            columns[f'covariance_{name}_m2_s4'] = corrected.covariance[:, at]
+        flags = [regime, *(1 + is_dynamic for _, is_dynamic in item.flags)]
+        switched = np.array([stamp for stamp, _ in item.flags], np.int64)
+        after = np.searchsorted(switched, corrected.stamp_ns, 'right')
+        columns['regime'] = _REGIMES[np.array(flags)[after]]
+        regime = flags[-1]
+        if item.block.imu is not None:
+            rate = item.block.imu.angular_velocity[corrected.index]
+            for axis, name in enumerate('xyz'):
+                columns[f'angular_velocity_{name}_rad_s'] = rate[:, axis]
+        write_rows(columns)
+
+    with table as write_rows:
+        yield write
+
+
+def _others(reader: RecordingReader) -> Iterator[RawMessages]:
+    """
+    Read the topics that are neither inputs nor outputs.
+
+    """
+    taken = {OUTPUT_TOPIC, REGIME_TOPIC, *(topic.strip('/') for topic in reader.topics.values())}
+    return reader.raw({topic for topic in reader.info.topics if topic.strip('/') not in taken})
 
 
 def _rows(imu: ImuColumns, index: Ints) -> ImuColumns:

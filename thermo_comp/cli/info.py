@@ -43,7 +43,7 @@ def info(
 
 
 def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
-    from ..fitting.survey import survey_recording
+    from ..recording.overview import survey_recording
 
     with out.progress(f'reading {path.name}', total=1.0) as done:
         survey = survey_recording(path, options.topics_of(*topics), done)

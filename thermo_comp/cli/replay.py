@@ -24,10 +24,14 @@ def replay(
     bag: options.Bag,
     calibration: options.CalibrationFile,
     output: Annotated[
-        Path, typer.Option('--output', '-o', help='Bag to write; *.mcap makes a bare file.')
+        Path,
+        typer.Option('--output', '-o', help='*.mcap, a folder, *.csv or *.parquet.'),
     ],
     keep_inputs: Annotated[
         bool, typer.Option('--keep-inputs', help='Copy the input messages beside the output.')
+    ] = False,
+    all_topics: Annotated[
+        bool, typer.Option('--all-topics', help='Copy all other topics beside the output, too.')
     ] = False,
     serial: options.Serial = None,
     frame_id: Annotated[
@@ -55,7 +59,8 @@ def replay(
     Correct a whole bag offline, with the values of the live node.
 
     Writes imu/data_raw (sensor_msgs/Imu) and regime/dynamic
-    (std_msgs/Bool); the log time of each message is its stamp.
+    (std_msgs/Bool); the log time of each message is its stamp. Or a table
+    of the corrected samples, which leaves the other topics out.
 
     Example:
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
@@ -63,6 +68,7 @@ def replay(
     """
     from ..files import bag_kind, check_output
     from ..online.status import CompensatorConfig
+    from ..recording.table_out import TABLES
     from ..replay import replay as run
     from ..unit.calibration_file import load_calibration
 
@@ -76,7 +82,9 @@ def replay(
         config = CompensatorConfig(**{k: v for k, v in given.items() if v is not None})
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
-    kind = bag_kind(output)
+    kind = TABLES.get(output.suffix) or bag_kind(output, ', *.csv, *.parquet')
+    if output.suffix in TABLES and (keep_inputs or all_topics):
+        raise options.usage('--keep-inputs and --all-topics are for bags')
     check_output(output, kind, overwrite=force, others=[bag, calibration])
     with out.progress('replaying', total=1.0) as done:
         result = run(
@@ -89,6 +97,7 @@ def replay(
             serial=serial,
             frame_id=frame_id,
             keep_inputs=keep_inputs,
+            all_topics=all_topics,
             overwrite=force,
             progress=done,
         )

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints
 from .sources import FitSource
-from .stillness import CellAccumulator, Cells, still_intervals
 
 # Faster readings are averaged to this interval: no thermometer of this kind is that fast, and the
 # thermometers' recursion runs in Python.

@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import RecordingError
-from ..fitting.stillness import CellAccumulator, Cells, still_intervals
 from ..online.batch import process_block
 from ..online.compensator import Compensator
 from ..online.status import CompensatorConfig, Counters
 from ..recording import Block, Input, RecordingInfo, Topics, open_recording
+from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..replay import check_unit, input_for
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration

@@ -116,10 +116,10 @@ class Compensator:
         self._push(stamp_ns, 1, celsius)
 
     def _push(self, stamp_ns: int, kind: int, celsius: float) -> None:
-        if self._queue.push(stamp_ns, kind, celsius):
-            self._event_ns = min(self._event_ns, stamp_ns)
-        else:
-            self._count_rejected(kind)
+        n_refused = self._queue.push(stamp_ns, kind, celsius)
+        if n_refused:
+            self.count_rejected(kind, n_refused)
+        self._event_ns = min(self._event_ns, stamp_ns)
 
     def process(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
         """
@@ -272,20 +272,24 @@ class Compensator:
             if tracker.board_reading(stamp_ns, celsius):
                 self.counters.n_board += 1
             else:
-                self._count_rejected(kind)
+                self.count_rejected(kind)
         elif tracker.case_reading(stamp_ns, celsius):
             self.counters.n_case += 1
             regime = tracker.detector.regime
             if regime is not Regime.UNKNOWN:
                 self._flags.append((stamp_ns, regime is Regime.DYNAMIC))
         else:
-            self._count_rejected(kind)
+            self.count_rejected(kind)
 
-    def _count_rejected(self, kind: int) -> None:
+    def count_rejected(self, kind: int, n: int = 1) -> None:
+        """
+        Count readings that are not used: kind 0 is the board, 1 the case.
+
+        """
         if kind == 0:
-            self.counters.n_board_rejected += 1
+            self.counters.n_board_rejected += n
         else:
-            self.counters.n_case_rejected += 1
+            self.counters.n_case_rejected += n
 
     def _enter_segment(self, stamp_ns: int) -> bool:
         tracker = self.tracker

@@ -10,7 +10,7 @@ What it raises on a damaged bag is translated here.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import RecordingError
 from .assemble import Part
-from .columns import Role
+from .columns import RawMessages, Role
 from .decode import Decoder, Feed
 from .wire import Encoding
 
@@ -118,6 +118,26 @@ class ForeignSource:
                     yield batch.take()
             if batch.n_messages:
                 yield batch.take()
+
+    def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
+        """
+        Read topics as they are, in the order of log time.
+
+        Raises
+        ------
+        RecordingError
+            Damaged storage, or a ROS 1 bag, whose messages are no CDR.
+
+        """
+        if self._encoding != 'cdr':
+            raise RecordingError('its messages are those of ROS 1: convert the bag', self.path)
+        chosen = [c for c in self._connections if c.topic in topics]
+        with _translated(self.path):
+            for one, log_ns, data in self._reader.messages(connections=chosen) if chosen else ():
+                times, ends = (np.array([number], np.int64) for number in (log_ns, len(data)))
+                yield RawMessages(
+                    one.topic, one.msgtype, times, np.frombuffer(data, np.uint8), ends
+                )
 
     def close(self) -> None:
         """

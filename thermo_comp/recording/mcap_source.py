@@ -13,7 +13,7 @@ is read in the order of the file, each ordinary chunk sorted by log time.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ from ..errors import RecordingError
 from ..typing import Bytes
 from .assemble import Part
 from .chunk import Windows, load_chunk, load_run
-from .columns import Role
-from .decode import Decoder, Feed
+from .columns import RawMessages, Role
+from .decode import Decoder, Feed, pack
 from .mcap_records import ChunkSpan, DamagedError
 from .random_access import LocalFile, OpenFile, RandomAccess
 from .survey import Survey
 from .sweep import in_log_order
 from .topics import shown
-from .walk import Messages
+from .walk import MESSAGE_HEAD_BYTES, Messages
 from .wire import Encoding
 
 _N_LOADERS = 2
@@ -153,6 +153,31 @@ class McapSource:
                     n_ranks = last
                     yield part
 
+    def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
+        """
+        Read topics as they are, in the order of the file.
+
+        Raises
+        ------
+        RecordingError
+            Damaged data, or messages that are no CDR.
+
+        """
+        for survey in self._surveys:
+            own = {n: one for n, one in survey.channels.items() if one.topic in topics}
+            with _translated(survey.path):
+                for channel in own.values():
+                    if channel.encoding != 'cdr':
+                        raise RecordingError(_no_cdr(channel.encoding), topic=shown(channel.topic))
+                for data, messages, _ in _stretches(survey):
+                    for number, channel in own.items():
+                        rows = np.flatnonzero(messages.channel == number)
+                        if len(rows):
+                            start = messages.at[rows] + MESSAGE_HEAD_BYTES
+                            packed = pack(data, start, messages.size[rows])
+                            log_ns = messages.log_ns[rows]
+                            yield RawMessages(channel.topic, channel.type, log_ns, *packed)
+
     def close(self) -> None:
         """
         Close the files.
@@ -231,10 +256,7 @@ def _decoder(survey: Survey, selection: dict[Role, str], raw: bool) -> Decoder |
         if role is None:
             continue
         if channel.encoding not in {'cdr', 'ros1'}:
-            raise RecordingError(
-                f'its messages are encoded as {shown(channel.encoding)!r}, expected cdr',
-                topic=shown(channel.topic),
-            )
+            raise RecordingError(_no_cdr(channel.encoding), topic=shown(channel.topic))
         feed = Feed(channel.topic, channel.type, cast(Encoding, channel.encoding))
         if feeds.setdefault(role, feed) != feed:
             raise RecordingError('its messages have several encodings', topic=shown(channel.topic))
@@ -242,18 +264,25 @@ def _decoder(survey: Survey, selection: dict[Role, str], raw: bool) -> Decoder |
     return Decoder(feeds, roles, raw) if roles else None
 
 
+def _no_cdr(encoding: str) -> str:
+    return f'its messages are encoded as {shown(encoding)!r}, expected cdr'
+
+
 def _in_file_order(survey: Survey, decoder: Decoder) -> Iterator[Part]:
+    yield from filter(None, (decoder.part(*stretch) for stretch in _stretches(survey)))
+
+
+def _stretches(survey: Survey) -> Iterator[tuple[Bytes, Messages, int | None]]:
+    """
+    Read a file stretch by stretch, each with its place as `Decoder.part` takes it.
+
+    """
     for span in survey.spans:
         if isinstance(span, ChunkSpan):
-            data, messages = load_chunk(survey.handle, span, _ignore)
-            part = decoder.part(data, messages, None)
-            if part:
-                yield part
-            continue
-        for data, messages in Windows(survey.handle, span, _ignore):
-            part = decoder.part(data, messages, 0)
-            if part:
-                yield part
+            yield *load_chunk(survey.handle, span, _ignore), None
+        else:
+            for data, messages in Windows(survey.handle, span, _ignore):
+                yield data, messages, 0
 
 
 def _decoded(

@@ -18,7 +18,7 @@ from typing import Protocol
 
 from ..errors import RecordingError
 from .assemble import Part, assemble, join_blocks
-from .columns import ROLES, Block, Input, Recording, RecordingInfo, Role, Topics
+from .columns import ROLES, Block, Input, RawMessages, Recording, RecordingInfo, Role, Topics
 from .foreign import ForeignSource
 from .mcap_source import McapSource
 from .random_access import OpenFile
@@ -43,6 +43,13 @@ class Source(Protocol):
     def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
         """
         Decode the messages of the chosen topics, in reading order.
+
+        """
+        ...
+
+    def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
+        """
+        Give the messages of topics as they are.
 
         """
         ...
@@ -124,6 +131,28 @@ class RecordingReader:
         parts = self._source.parts(self._selection, raw=raw)
         is_imu = self.info.input == 'imu'
         yield from assemble(parts, is_imu=is_imu, names=names, n_messages=n_messages)
+
+    def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
+        """
+        Read topics as they are, a stretch of one topic at a time, about in order of log time.
+
+        Parameters
+        ----------
+        topics : collection of str
+            The bag's own names.
+
+        Yields
+        ------
+        RawMessages
+            Of limited size.
+
+        Raises
+        ------
+        RecordingError
+            Damaged data, or messages that are no CDR.
+
+        """
+        yield from self._source.raw(topics)
 
     def close(self) -> None:
         """

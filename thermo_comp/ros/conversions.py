@@ -33,6 +33,10 @@ Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
 _PASSED = 25
 _IMU = 37
 _LAYOUTS_KEPT = 64
+#: The longest name of a frame, in bytes, given or received.
+LONGEST_FRAME = 255
+#: An Imu with such a name is shorter; what is longer is not kept, and not even read.
+_LONGEST_MESSAGE = 1024
 
 # What rclpy raises for bytes that are not the message, or for a name that is not UTF-8.
 _UNREADABLE = (RuntimeError, ValueError)
@@ -171,7 +175,7 @@ class SampleConverter:
             return None
         order = '<' if data[1] & 1 else '>'
         (length,) = Struct(order + 'I').unpack_from(data, 12)
-        if not 0 < length <= len(data) - 16:
+        if not 0 < length <= min(len(data) - 16, LONGEST_FRAME + 1):
             return None
         key = (data[:4], data[12 : 16 + length], len(data))
         if key not in self._layouts:
@@ -225,6 +229,9 @@ class SampleConverter:
         Take the ordinary way, for what no layout fits.
 
         """
+        if len(data) > _LONGEST_MESSAGE:
+            self.n_malformed += 1
+            return None
         try:
             message = deserialize_message(data, self._message_type)
         except _UNREADABLE:
@@ -275,6 +282,8 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
     """
     # A node that sleeps between samples pays for each line of code it has not touched for long:
     # rclpy's deserialization costs it as much as several samples.
+    if len(data) > _LONGEST_MESSAGE:
+        return None
     if data[:4] == _ENCAPSULATION and len(data) >= _SHORTEST_READING:
         sec, nanosec, length = _HEADER.unpack_from(data, 4)
         values = 16 + length + -(12 + length) % 8

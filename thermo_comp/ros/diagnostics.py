@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from ..online.status import CompensatorStatus, Counters
 from ..thermal.plausibility import Fault
@@ -25,6 +25,8 @@ from .loading import LoadedCalibration
 RATE_TOLERANCE = 0.1
 #: Readings stamped this much ahead of the samples wait too long to be of one clock with them [s].
 AHEAD_S = 5.0
+#: Samples that are late by so many cycles, and by so long [s], do not come any more.
+SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: |f| at rest may miss gravity by this many of its own standard deviations.
 GRAVITY_SIGMAS = 5.0
 
@@ -49,10 +51,31 @@ class Traffic:
     n_flags: int = 0
     #: Samples that took the slow way through rclpy's deserialization.
     n_fallback: int = 0
-    #: Publishers that the node has found on its inputs.
-    n_sample_publishers: int = 0
-    n_board_publishers: int = 0
-    n_case_publishers: int = 0
+    #: Messages not used because their input had more than one publisher.
+    n_contested: int = 0
+    #: Callbacks of the node that ended in an exception.
+    n_failures: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """
+    A topic that the node reads.
+
+    Attributes
+    ----------
+    topic : str
+        Its name, remapped.
+    n_publishers : int
+        Those that the node gets messages from.
+    mismatch : str
+        Why it gets none from a publisher that is there; empty where that is not so.
+
+    """
+
+    topic: str
+    n_publishers: int
+    mismatch: str = ''
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,24 +89,30 @@ class Snapshot:
     traffic : Traffic
     variances : tuple of float or None
         Diagonal of the covariance last published [m^2/s^4].
+    silence_s : float
+        For how long there have been no samples [s].
+    inputs : tuple of Input
+        Samples, board and case.
 
     """
 
     status: CompensatorStatus
     traffic: Traffic
     variances: tuple[float, float, float] | None
+    silence_s: float
+    inputs: tuple[Input, Input, Input]
 
 
 def build(
     name: str, loaded: LoadedCalibration, now: Snapshot, before: Snapshot
-) -> DiagnosticArray:
+) -> DiagnosticStatus:
     """
     Say how the compensation is doing.
 
     Parameters
     ----------
     name : str
-        Name of the node.
+        Full name of the node: two units are two entries.
     loaded : LoadedCalibration
         The running calibration.
     now, before : Snapshot
@@ -91,22 +120,17 @@ def build(
 
     Returns
     -------
-    diagnostic_msgs.msg.DiagnosticArray
-        Stamped with the newest input stamp, or 0 before there is any.
+    diagnostic_msgs.msg.DiagnosticStatus
 
     """
     findings = sorted(_findings(loaded, now, before), key=lambda finding: -finding[0])
-    status = DiagnosticStatus(
+    return DiagnosticStatus(
         level=bytes([findings[0][0] if findings else 0]),
         name=f'{name}: compensation',
         message='; '.join(text for _, text in findings) or _all_well(now),
         hardware_id=loaded.calibration.unit.serial,
         values=[KeyValue(key=key, value=value) for key, value in _values(loaded, now, before)],
     )
-    array = DiagnosticArray(status=[status])
-    stamp_ns = now.status.stamp_ns or 0
-    array.header.stamp.sec, array.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
-    return array
 
 
 def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
@@ -116,8 +140,9 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> lis
     """
     error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
     status, new = now.status, _since(now.status.counters, before.status.counters)
-    found: list[tuple[int, str]] = []
-    if new.n_in == 0:
+    found = _input_findings(now, before)
+    silent_s = max(SILENT_S, SILENT_CYCLES * loaded.calibration.unit.cycle_time_s)
+    if new.n_in == 0 and now.silence_s > silent_s:
         found.append((error, 'no samples are coming in'))
     if status.state is None:
         found.append((error, 'no board temperature yet, nothing is published'))
@@ -171,6 +196,28 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> lis
     rate, calibrated = _sample_rate(now, before), 1.0 / loaded.calibration.unit.cycle_time_s
     if rate is not None and abs(rate / calibrated - 1.0) > RATE_TOLERANCE:
         found.append((warn, f'{rate:.4g} samples/s, calibrated for {calibrated:.4g}'))
+    return found
+
+
+def _input_findings(now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
+    """
+    Say what is wrong with those who send, and with the node itself.
+
+    """
+    error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
+    found: list[tuple[int, str]] = []
+    for one, level in zip(now.inputs, (error, error, warn), strict=True):
+        if one.n_publishers > 1:
+            text = f'{one.n_publishers} publishers on {one.topic}'
+            found.append((error, f'{text}, it is not used until one is left'))
+        if one.mismatch:
+            found.append((level, f'no messages of a publisher on {one.topic}: {one.mismatch}'))
+    n_contested = now.traffic.n_contested - before.traffic.n_contested
+    if n_contested:
+        found.append((error, f'{n_contested} messages of more than one publisher, dropped'))
+    n_failures = now.traffic.n_failures - before.traffic.n_failures
+    if n_failures:
+        found.append((error, f'{n_failures} callbacks failed, see the log of the node'))
     return found
 
 
@@ -302,8 +349,13 @@ def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[
         (entry.name.removeprefix('n_').replace('_', ' '), str(getattr(now.traffic, entry.name)))
         for entry in fields(Traffic)
     ]
+    values += [
+        (f'{name} publishers', str(one.n_publishers))
+        for name, one in zip(('sample', 'board', 'case'), now.inputs, strict=True)
+    ]
     return [
         *values,
+        ('sample stamp [ns]', 'none' if status.stamp_ns is None else str(status.stamp_ns)),
         ('serial', loaded.calibration.unit.serial),
         ('calibration file', loaded.path),
         ('calibration sha256', loaded.sha256),

@@ -14,6 +14,7 @@ import gc
 import sys
 import time
 from copy import copy
+from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -25,6 +26,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
@@ -34,13 +36,16 @@ from ..online.compensator import Compensator
 from ..online.snapshot import take_snapshot
 from . import parameters
 from .conversions import SampleConverter
-from .diagnostics import Snapshot, Traffic, build
-from .loading import check, load
+from .diagnostics import Input, Snapshot, Traffic, build
+from .discovery import mismatch
+from .loading import LoadedCalibration, check, load, read
 from .middleware import use_profile
 from .parameters import NodeConfig, ParameterError
+from .raw import RawSubscription
 from .relay import Relay
+from .requests import ParameterRequests
 from .signals import SignalWatch
-from .waitloop import RawSubscription, WaitLoop, undeclared_overrides
+from .waitloop import WaitLoop, undeclared_overrides
 
 NODE_NAME = 'thermo_comp'
 
@@ -121,10 +126,12 @@ class CompensationNode:
         self._loop = WaitLoop(self.node, REST_S)
         self._relay = self._open_topics()
         self._reported = self._snapshot()
-        self._prepared = (self._config, self._loaded)
+        self._read: LoadedCalibration | None = None
+        self._prepared = (self._config, self._loaded, self._relay.samples)
         self.node.add_pre_set_parameters_callback(parameters.coerce)
         self.node.add_on_set_parameters_callback(self._on_set)
         self.node.add_post_set_parameters_callback(self._post_set)
+        self._requests = ParameterRequests(self.node, self._loop, self._prepare, self._set)
         self._loop.call_every(self._config.diagnostics_period, self._report)
         self._log = self.node.get_logger()
         inputs = tuple(
@@ -155,6 +162,7 @@ class CompensationNode:
         Destroy the node.
 
         """
+        self._requests.close()
         self._loop.close()
         self.node.destroy_node()
 
@@ -163,17 +171,16 @@ class CompensationNode:
         Create the subscriptions and publishers, and what connects them.
 
         """
-        subscribe, overridable = self._loop.subscribe, QoSOverridingOptions.with_default_policies()
-        compensator = self._compensator
+        overridable, compensator = QoSOverridingOptions.with_default_policies(), self._compensator
+        samples = self._open_samples(self._config)
+        temperatures = [
+            (self._subscribe(Temperature, topic, TEMPERATURE_QOS, is_hot=False), push)
+            for topic, push in (
+                ('temperature/board', compensator.push_board),
+                ('temperature/case', compensator.push_case),
+            )
+        ]
         try:
-            samples = self._open_samples(self._config)
-            temperatures = [
-                (subscribe(Temperature, topic, TEMPERATURE_QOS, is_hot=False), push)
-                for topic, push in (
-                    ('temperature/board', compensator.push_board),
-                    ('temperature/case', compensator.push_case),
-                )
-            ]
             imu, flag, self._diagnostics = (
                 self.node.create_publisher(
                     message_type, topic, copy(qos), qos_overriding_options=overridable
@@ -190,7 +197,15 @@ class CompensationNode:
         return Relay(self.node, compensator, converter, samples, temperatures, imu, flag)
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
-        return self._loop.subscribe(*_INPUTS[config.input], SAMPLE_QOS)
+        return self._subscribe(*_INPUTS[config.input], SAMPLE_QOS)
+
+    def _subscribe(
+        self, kind: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
+    ) -> RawSubscription:
+        try:
+            return self._loop.subscribe(kind, topic, qos, is_hot=is_hot)
+        except (RuntimeError, InvalidQosOverridesError) as error:
+            raise ParameterError(f'a topic cannot be opened: {error}') from error
 
     def _new_converter(self, config: NodeConfig) -> SampleConverter:
         return SampleConverter(_INPUTS[config.input][0], config.frame_id)
@@ -198,19 +213,29 @@ class CompensationNode:
     def _snapshot(self) -> Snapshot:
         relay, converter = self._relay, self._relay.converter
         last = converter.last_result
-        found = [one.subscription.get_publisher_count() for one in relay.inputs]
         traffic = Traffic(
             n_lost=self._n_lost,
             n_unpublished=relay.n_unpublished,
             n_malformed=self._n_malformed + relay.n_malformed + converter.n_malformed,
             n_flags=relay.n_flags,
             n_fallback=self._n_fallback + converter.n_fallback,
-            n_sample_publishers=found[0],
-            n_board_publishers=found[1],
-            n_case_publishers=found[2],
+            n_contested=relay.n_contested,
+            n_failures=self._loop.n_failures,
         )
         variances = None if last is None else (last[3], last[6], last[8])
-        return Snapshot(take_snapshot(self._compensator), traffic, variances)
+        samples, board, case = (self._look_at(one.subscription) for one in relay.inputs)
+        return Snapshot(
+            take_snapshot(self._compensator),
+            traffic,
+            variances,
+            time.monotonic() - self._last_samples,
+            (samples, board, case),
+        )
+
+    def _look_at(self, subscription: Subscription) -> Input:
+        n_publishers = subscription.get_publisher_count()
+        reason = '' if n_publishers else mismatch(self.node, subscription)
+        return Input(subscription.topic_name, n_publishers, reason)
 
     def _report(self) -> None:
         """
@@ -218,16 +243,17 @@ class CompensationNode:
 
         """
         self._count_lost()
-        now = self._snapshot()
-        if now.status.counters.n_in != self._reported.status.counters.n_in:
+        if self._compensator.counters.n_in != self._reported.status.counters.n_in:
             self._last_samples = time.monotonic()
-        elif time.monotonic() - self._last_samples > IDLE_S:
-            self._relay.advance_without_samples()
-            now = self._snapshot()
-        array = build(self.node.get_name(), self._loaded, now, self._reported)
+        silence_s = time.monotonic() - self._last_samples
+        if silence_s > IDLE_S:
+            self._relay.advance_without_samples(int(silence_s * 1e9))
+        now = self._snapshot()
+        status = build(self.node.get_fully_qualified_name(), self._loaded, now, self._reported)
         self._reported = now
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
-        status = array.status[0]
         if status.level != self._level:
             self._level = status.level
             # rclpy wants one call per severity and place.
@@ -249,21 +275,48 @@ class CompensationNode:
         if before == self._n_publishers == 1:
             self._n_lost += n_lost
 
-    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
+    def _prepare(self, changes: list[Parameter]) -> LoadedCalibration | None:
         """
-        Check a change as a whole and keep what was parsed on the way.
+        Read the calibration that a change asks for, beside the samples.
 
         """
+        names = [one.value for one in changes if one.name == 'calibration_file']
+        if not names or not isinstance(names[-1], str):
+            return None
+        return read(names[-1], self._config.calibration_directory)
+
+    def _set(
+        self, changes: list[Parameter], loaded: LoadedCalibration | None
+    ) -> SetParametersResult:
+        """
+        Set what was prepared, between two samples.
+
+        """
+        self._read = loaded
+        try:
+            return self.node.set_parameters_atomically(changes)
+        finally:
+            self._read = None
+
+    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
+        """
+        Check a change as a whole and keep what was made on the way.
+
+        """
+        samples = self._relay.samples
+        # A topic that is opened below declares parameters of its own and comes here again.
+        loaded, self._read = self._read or self._loaded, None
         try:
             config = parameters.updated(self._config, changes)
-            if any(change.name == 'calibration_file' for change in changes):
-                loaded = load(config)
-            else:
-                loaded = self._loaded
-                check(loaded, config)
+            if config.calibration_file != loaded.path:
+                # Set by code of this process, not through a service.
+                loaded = read(config.calibration_file, config.calibration_directory)
+            check(loaded, config)
+            if config.input != self._config.input:
+                samples = self._open_samples(config)
         except ThermoCompError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self._prepared = (config, loaded)
+        self._prepared = (config, loaded, samples)
         return SetParametersResult(successful=True)
 
     def _post_set(self, _changes: list[Parameter]) -> None:
@@ -272,12 +325,11 @@ class CompensationNode:
 
         """
         before, relay = self._config, self._relay
-        config, loaded = self._prepared
+        config, loaded, samples = self._prepared
         if loaded is not self._loaded:
             self._loaded = loaded
             self._compensator.swap(loaded.calibration)
             self._say_calibration()
-        # Before anything below declares parameters of its own and comes here again.
         self._config = config
         if config.compensator_config() != before.compensator_config():
             self._compensator.reconfigure(config.compensator_config())
@@ -285,9 +337,9 @@ class CompensationNode:
             self._n_malformed += relay.converter.n_malformed
             self._n_fallback += relay.converter.n_fallback
             relay.converter = self._new_converter(config)
-        if config.input != before.input:
+        if samples is not relay.samples:
             self._loop.unsubscribe(relay.samples)
-            relay.samples = self._open_samples(config)
+            relay.samples = samples
         if config.diagnostics_period != before.diagnostics_period:
             self._loop.call_every(config.diagnostics_period, self._report)
 

@@ -21,7 +21,8 @@ from rclpy.parameter import Parameter
 
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
-from ..text import valid_serial
+from ..text import LONGEST_SERIAL
+from .conversions import LONGEST_FRAME
 
 _DEFAULTS = CompensatorConfig()
 
@@ -37,19 +38,28 @@ def _parameter(
     description: str,
     bounds: tuple[float, float] | None = None,
     choices: tuple[str, ...] = (),
+    *,
+    longest: int = LONGEST_SERIAL,
+    is_fixed: bool = False,
 ) -> Any:
-    metadata = {'description': description, 'bounds': bounds, 'choices': choices}
+    metadata = {
+        'description': description,
+        'bounds': bounds,
+        'choices': choices,
+        'longest': longest,
+        'is_fixed': is_fixed,
+    }
     return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
     """
-    The node's parameters, every one of them live.
+    The node's parameters, all of them live but `calibration_directory`.
 
     Attributes
     ----------
-    calibration_file, serial, input, frame_id : str
+    calibration_file, calibration_directory, serial, input, frame_id : str
     transition_time, temperature_timeout, case_timeout, stuck_timeout, diagnostics_period : float
         Seconds.
     local_gravity, gravity_tolerance : float
@@ -58,7 +68,16 @@ class NodeConfig:
     """
 
     calibration_file: str = _parameter(
-        '', 'Path of the calibration (YAML). Required. Setting it again reads the file again.'
+        '',
+        'Path of the calibration (YAML). Required. Setting it again reads the file again.',
+        longest=4096,
+    )
+    calibration_directory: str = _parameter(
+        '',
+        'Folder that `calibration_file` must lie in, wherever links lead; empty allows any. Only '
+        'at start.',
+        longest=4096,
+        is_fixed=True,
     )
     serial: str = _parameter(
         '', 'Serial number that the calibration must be for; empty accepts any.'
@@ -69,7 +88,9 @@ class NodeConfig:
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(
-        '', "Frame of the output; empty keeps the input's. The values are not rotated."
+        '',
+        "Frame of the output; empty keeps the input's. The values are not rotated.",
+        longest=LONGEST_FRAME,
     )
     transition_time: float = _parameter(
         _DEFAULTS.transition_time_s,
@@ -182,6 +203,7 @@ def descriptor(name: str) -> ParameterDescriptor:
         name=name,
         type=_TYPES[type(entry.default)].value,
         description=entry.metadata['description'],
+        read_only=entry.metadata['is_fixed'],
     )
     if entry.metadata['bounds']:
         lower, upper = entry.metadata['bounds']
@@ -294,24 +316,25 @@ def _checked(name: str, value: Any) -> Any:
     if isinstance(entry.default, str):
         if not isinstance(value, str):
             raise ParameterError(
-                f'parameter `{name}` must be a string, got {value!r} '
-                f'({type(value).__name__}); quote it: \'"{value}"\''
+                f'parameter `{name}` must be a string, got {value!r:.60} '
+                f'({type(value).__name__}); quote it: \'"{value!s:.60}"\''
+            )
+        longest = entry.metadata['longest']
+        if not (value.isprintable() and len(value) <= longest):
+            raise ParameterError(
+                f'parameter `{name}` must be one printable line of at most {longest} '
+                f'characters, got {len(value)}: {value!r:.60}'
             )
         choices = entry.metadata['choices']
         if choices and value not in choices:
             raise ParameterError(
-                f'parameter `{name}` must be one of {", ".join(choices)}, got {value!r}'
+                f'parameter `{name}` must be one of {", ".join(choices)}, got {value!r:.60}'
             )
-        if name == 'serial' and value:
-            try:
-                valid_serial(value)
-            except ValueError as mistake:
-                raise ParameterError(f'parameter {mistake}') from mistake
         return value
     is_whole = isinstance(entry.default, int)
     if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float):
         kind = 'whole number' if is_whole else 'number'
-        raise ParameterError(f'parameter `{name}` must be a {kind}, got {value!r}')
+        raise ParameterError(f'parameter `{name}` must be a {kind}, got {value!r:.60}')
     lower, upper = entry.metadata['bounds']
     if not (math.isfinite(value) and lower <= value <= upper):
         raise ParameterError(

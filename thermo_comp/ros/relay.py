@@ -6,6 +6,9 @@ Owns the way of the samples through the node: in the order of arrival, compensat
 A wake-up takes what has arrived of all three inputs, samples first, and works through it in the
 order of arrival. So it does not matter how the wake-ups fell.
 
+An input has one source. A message does not tell whose it is, so while there are two nothing of
+that input is used, nor the first messages after it, which may still be of the one that left.
+
 """
 
 from __future__ import annotations
@@ -21,7 +24,8 @@ from std_msgs.msg import Bool
 
 from ..online.compensator import Compensator
 from .conversions import SampleConverter, read_temperature
-from .waitloop import RawPublisher, RawSubscription, RCLError
+from .raw import RawPublisher, RawSubscription
+from .waitloop import RCLError
 
 #: Without samples, readings take effect but for those not older than the newest by this [ns]: a
 #: sample that Fast DDS has to repeat can be 3 s late.
@@ -84,6 +88,9 @@ class Relay:
         self.n_unpublished = 0
         #: Changes of the flag.
         self.n_flags = 0
+        #: Messages not used because their input had more than one publisher.
+        self.n_contested = 0
+        self._contested: set[RawSubscription] = set()
 
     @property
     def inputs(self) -> list[RawSubscription]:
@@ -101,22 +108,48 @@ class Relay:
         messages, received_ns = self.samples.drain(is_paced=True)
         for subscription, push in self._temperatures:
             readings, read_ns = subscription.drain()
-            if readings:
+            if readings and self._is_of_one(subscription, len(readings)):
                 self._take_readings(readings, read_ns, push)
-        if not messages:
+        if not messages or not self._is_of_one(self.samples, len(messages)):
             return
         if self._readings:
             messages = self._relay_with_readings(messages, received_ns)
         self._relay(messages)
 
-    def advance_without_samples(self) -> None:
+    def _is_of_one(self, subscription: RawSubscription, n: int) -> bool:
+        """
+        Tell whether messages are of an input's only publisher; count them where they are not.
+
+        """
+        is_contested = subscription.count_publishers() > 1
+        if not (is_contested or self._contested):
+            return True
+        was_contested = subscription in self._contested
+        if is_contested:
+            self._contested.add(subscription)
+        elif was_contested:
+            self._contested.remove(subscription)
+        if is_contested or was_contested:
+            self.n_contested += n
+        return not (is_contested or was_contested)
+
+    def advance_without_samples(self, silence_ns: int) -> None:
         """
         Let readings take effect that no sample will come to, so that the flag stays alive.
+
+        Parameters
+        ----------
+        silence_ns : int
+            How long there have been no samples: a reading cannot be newer than the last one by
+            much more, whatever its stamp says.
 
         """
         if self._newest_reading_ns is None:
             return
         horizon_ns = self._newest_reading_ns - IDLE_NS
+        last_ns = self._compensator.now_ns
+        if last_ns is not None:
+            horizon_ns = min(horizon_ns, last_ns + silence_ns)
         for _, stamp_ns, celsius, push in self._readings:
             if stamp_ns <= horizon_ns:
                 push(stamp_ns, celsius)

@@ -11,8 +11,10 @@ only when a wait set says that one of these is ready; while samples flow, the lo
 and then, without waiting. With best effort, where wake-ups cost the most, messages that come
 faster than anybody waits for them may gather a little, so that one wake-up serves several.
 
-Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
-`take_message` and `publish_raw` of the handles, `SignalHandlerGuardCondition`, and the node's
+No exception of a callback ends the loop: it is logged and counted, and samples go on.
+
+Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the method
+`service_take_request` of a service's handle, `SignalHandlerGuardCondition`, and the node's
 `_parameter_overrides`.
 `test/test_waitloop.py` fails when any of them changes.
 
@@ -21,6 +23,8 @@ Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), th
 from __future__ import annotations
 
 import time
+import traceback
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from copy import copy
@@ -34,14 +38,13 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.service import Service
 from rclpy.signals import SignalHandlerGuardCondition
 from rclpy.subscription import Subscription
 
-#: The most messages taken in one go, so that a flood cannot keep the rest of the node waiting.
-DRAIN_LIMIT = 4096
+from .raw import RawSubscription
 
 #: While samples flow, services and timers are looked after this often [ns].
 OTHERS_PERIOD_NS = 20_000_000
@@ -49,107 +52,27 @@ OTHERS_PERIOD_NS = 20_000_000
 #: Longer than any machine runs, and what the middleware can still count [ns].
 _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 
+#: A failure is logged with all its lines, but not more often than this [ns].
+_LOG_PERIOD_NS = 10 * 10**9
+
 RCLError = rclpy_implementation.RCLError
 
-
-class RawSubscription:
-    """
-    A subscription read in serialized form by whoever runs the loop, not by an executor.
-
-    Parameters
-    ----------
-    subscription : rclpy.subscription.Subscription
-        Created by `WaitLoop.subscribe`.
-
-    """
-
-    def __init__(self, subscription: Subscription) -> None:
-        self.subscription = subscription
-        #: Whether messages that did not arrive are not sent again.
-        self.is_best_effort = subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT
-        self._message_type = subscription.msg_type
-        self._take: Callable[[Any, bool], Any] = subscription.handle.take_message
-        self._sequence: int | None = None
-        self._newest_ns = 0
-        #: Messages that were sent and did not get here, as far as one publisher numbers them.
-        self.n_lost = 0
-        #: What lay between the last two messages, on average over one drain [ns].
-        self.interval_ns = 0
-
-    def drain(self, *, is_paced: bool = False) -> tuple[list[bytes], list[int]]:
-        """
-        Take what waits in the queue, oldest first, at most `DRAIN_LIMIT` messages.
-
-        Parameters
-        ----------
-        is_paced : bool, optional
-            Do not look whether there is another message before its turn, going by the last two:
-            one that comes early is there at the next wake-up. For subscriptions that wake.
-
-        Returns
-        -------
-        messages : list of bytes
-            Serialized.
-        received_ns : list of int
-            When the middleware got each of them; comparable between subscriptions.
-
-        """
-        messages: list[bytes] = []
-        received_ns: list[int] = []
-        take, message_type = self._take, self._message_type
-        taken = take(message_type, True)
-        if taken is None:
-            return messages, received_ns
-        before_ns = newest_ns = self._newest_ns
-        while taken is not None:
-            message, info = taken
-            messages.append(message)
-            received = info['received_timestamp']
-            received_ns.append(received)
-            interval_ns, newest_ns = received - newest_ns, received
-            is_early = is_paced and time.time_ns() - received < interval_ns
-            if is_early or len(messages) == DRAIN_LIMIT:
-                break
-            taken = take(message_type, True)
-        self._newest_ns = newest_ns
-        self.interval_ns = (newest_ns - before_ns) // len(messages)
-        self._count_lost(info['publication_sequence_number'], len(messages))
-        return messages, received_ns
-
-    def _count_lost(self, sequence: int | None, n_taken: int) -> None:
-        before, self._sequence = self._sequence, sequence
-        if before is not None and sequence is not None:
-            # Another publisher's numbers can go back.
-            self.n_lost += max(0, sequence - before - n_taken)
-
-
-class RawPublisher:
-    """
-    A publisher of serialized messages.
-
-    Parameters
-    ----------
-    publisher : rclpy.publisher.Publisher
-        An ordinary publisher of the node.
-
-    """
-
-    def __init__(self, publisher: Publisher) -> None:
-        self.publisher = publisher
-        #: Called with the bytes of one message; raises `RCLError` when they can't go out.
-        self.publish: Callable[[bytes], None] = publisher.handle.publish_raw
+#: Takes a request and what sends the answer, now or later, in the loop's thread.
+Serve = Callable[[Any, Callable[[Any], None]], None]
 
 
 @dataclass(frozen=True, slots=True)
 class _Entities:
     """
-    A wait set, and what goes into it; the first two guards are those that stop the loop.
+    A wait set, and what goes into it; the first two guards are those that stop the loop, and the
+    first services those that the loop itself serves.
 
     """
 
     wait_set: Any
     content: list[tuple[Callable[[Any], Any], Any]]
     other_subscriptions: range
+    other_services: range
 
     def fill(self) -> None:
         """
@@ -175,9 +98,9 @@ class _Entities:
         """
         ready, is_ready = self.wait_set.get_ready_entities, self.wait_set.is_ready
         return bool(
-            ready('service')
-            or ready('timer')
+            ready('timer')
             or ready('client')
+            or any(is_ready('service', index) for index in self.other_services)
             or any(is_ready('subscription', index) for index in self.other_subscriptions)
         )
 
@@ -207,11 +130,16 @@ class WaitLoop:
         self._stop_guard = GuardCondition(None, None, context=node.context)
         self._look_guard = GuardCondition(None, None, context=node.context)
         self._signal_guard = SignalHandlerGuardCondition(context=node.context)
-        # Keeps the hot subscriptions from the executor.
+        # Keeps the hot subscriptions and the services of this loop from the executor.
         self._reserved = ReentrantCallbackGroup()
-        self._reserved.can_execute = _is_no_subscription
+        self._reserved.can_execute = _is_event
         self._raw: list[RawSubscription] = []
         self._hot: list[RawSubscription] = []
+        self._services: list[tuple[Service, Serve]] = []
+        self._soon: deque[Callable[[], None]] = deque()
+        #: Callbacks that ended in an exception.
+        self.n_failures = 0
+        self._logged_ns = -_LOG_PERIOD_NS
         self._is_stopping = False
         self._is_stale = True
         self._period_ns = _NEVER_NS
@@ -275,6 +203,31 @@ class WaitLoop:
         self._is_stale = True
         self._node.destroy_subscription(raw.subscription)
 
+    def serve(self, service: Service, callback: Serve) -> None:
+        """
+        Take a service of the node over from the executor, whose callback has to answer at once.
+
+        Parameters
+        ----------
+        service : rclpy.service.Service
+            Of this node.
+        callback : callable
+            Called with each request and with what sends the answer, now or later.
+
+        """
+        service.callback_group = self._reserved
+        self._services.append((service, callback))
+        self._is_stale = True
+
+    def call_soon(self, callback: Callable[[], None]) -> None:
+        """
+        Call back in the loop's thread, one callback a wake-up; callable from any thread.
+
+        """
+        self._soon.append(callback)
+        with suppress(InvalidHandle):
+            self._look_guard.trigger()
+
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
         """
         Call back at regular times, in place of the last such callback; for a timer of rclpy the
@@ -319,7 +272,12 @@ class WaitLoop:
                     # Only there a wake-up costs more than to sleep a little.
                     if all(one.is_best_effort for one in self._hot):
                         rest_ns = int(self._rest_s * 1e9)
-                    self._serve(on_data, wait_sets, rest_ns)
+                    try:
+                        self._serve(on_data, wait_sets, rest_ns)
+                    except (RCLError, ExternalShutdownException):
+                        raise
+                    except Exception as error:  # noqa: BLE001 - samples go on, whatever it was
+                        self._note_failure(error)
         except (RCLError, ExternalShutdownException):
             if self._node.context.ok():
                 raise
@@ -344,15 +302,18 @@ class WaitLoop:
         hot = [one.subscription for one in self._hot]
         others = [one for one in node.subscriptions if one not in raw]
         guards = [self._stop_guard, self._signal_guard, self._look_guard]
-        served = [guards, list(node.timers), list(node.clients), list(node.services)]
+        own = [service for service, _ in self._services]
+        services = [*own, *[one for one in node.services if one not in own]]
+        served = [guards, list(node.timers), list(node.clients), services]
         for entity in (*raw, *others, *[one for kind in served for one in kind]):
             in_use.enter_context(entity.handle)
         in_use.enter_context(node.context.handle)
         self._is_stale = False
+        at = len(raw)
         return [
             self._entities([hot, [], [], [], []], range(0)),
             self._entities([others, *served], range(len(others))),
-            self._entities([raw + others, *served], range(len(raw), len(raw) + len(others))),
+            self._entities([raw + others, *served], range(at, at + len(others))),
         ]
 
     def _entities(self, kinds: list[list[Any]], other_subscriptions: range) -> _Entities:
@@ -372,7 +333,8 @@ class WaitLoop:
         content = [
             (add, one.handle) for add, kind in zip(adds, kinds, strict=True) for one in kind
         ]
-        return _Entities(wait_set, content, other_subscriptions)
+        other_services = range(len(self._services), counts[-1])
+        return _Entities(wait_set, content, other_subscriptions, other_services)
 
     def _serve(
         self, on_data: Callable[[], None], wait_sets: list[_Entities], rest_ns: int
@@ -387,6 +349,10 @@ class WaitLoop:
         now_ns, others_due_ns = time.monotonic_ns, 0
         is_flowing = False
         while not (self._is_stopping or self._is_stale):
+            if self._soon:
+                self._guarded(self._soon.popleft())
+                if not is_flowing:
+                    continue
             now = now_ns()
             if now >= self._call_ns:
                 self._call_ns += self._period_ns
@@ -427,27 +393,52 @@ class WaitLoop:
 
     def _look_after(self, entities: _Entities) -> None:
         """
-        Serve one thing that is ready.
+        Serve one request of each service of this loop, and one other thing that is ready.
 
         """
         if entities.is_stop_asked():
             self._is_stopping = True
-        elif entities.is_other_ready():
+            return
+        for index, (service, callback) in enumerate(self._services):
+            if entities.wait_set.is_ready('service', index):
+                self._guarded(partial(_take_request, service, callback))
+        if entities.is_other_ready():
             # Runs one callback of the node.
             self._guarded(partial(self._executor.spin_once, timeout_sec=0.0))
             self._is_stale = True
 
     def _guarded(self, callback: Callable[[], None]) -> None:
         """
-        Call back; samples go on where that fails in the middleware.
+        Call back; samples go on where that fails.
 
         """
         try:
             callback()
-        except RCLError as error:
+        except ExternalShutdownException:
+            raise
+        except Exception as error:
             if not self._node.context.ok():
-                raise
-            self._node.get_logger().error(f'a callback failed: {error}')
+                raise ExternalShutdownException from error
+            self._note_failure(error)
+
+    def _note_failure(self, error: Exception) -> None:
+        """
+        Count an exception, and log it unless another one has just been.
+
+        """
+        self.n_failures += 1
+        now = time.monotonic_ns()
+        if now - self._logged_ns >= _LOG_PERIOD_NS:
+            self._logged_ns = now
+            lines = ''.join(traceback.format_exception(error))
+            self._node.get_logger().error(f'a callback failed, samples go on:\n{lines}')
+
+
+def _take_request(service: Service, callback: Serve) -> None:
+    with service.handle:
+        request, header = service.handle.service_take_request(service.srv_type.Request)
+    if header is not None:
+        callback(request, lambda response: service.send_response(response, header))
 
 
 def _nothing() -> None:
@@ -457,12 +448,12 @@ def _nothing() -> None:
     """
 
 
-def _is_no_subscription(entity: Any) -> bool:
+def _is_event(entity: Any) -> bool:
     """
-    Leave middleware events to the executor, but not the messages.
+    Leave middleware events to the executor, but neither messages nor requests.
 
     """
-    return not isinstance(entity, Subscription)
+    return not isinstance(entity, Subscription | Service)
 
 
 def _never_called(message: bytes) -> None:

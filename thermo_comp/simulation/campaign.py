@@ -127,7 +127,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(name, cyclogram_preset('held-out'), ups)
     if name.startswith('chamber'):
-        n, preset = (18, 'paper') if name == 'chamber-18' else (9, 'three-hours')
+        n, preset = (18, 'long') if name == 'chamber-18' else (9, 'three-hours')
         return _positions('chamber', cyclogram_preset(preset), positions(n, seed))
     bench: list[Position] = []
     for up in positions(18, seed):

@@ -260,7 +260,15 @@ def _chamber() -> Cyclogram:
 
 def _three_hours() -> Cyclogram:
     # The shortest that shows the whole range, both directions and some rest.
-    return ramps_and_soaks(20.0, 10.0, [(35, 1, 30), (5, 1.2, 45), (22, 1, 38)])
+    return ramps_and_soaks(20.0, 10.0, [(35, 0.8, 30), (5, 1.2, 40), (22, 0.5, 22.25)])
+
+
+def _long() -> Cyclogram:
+    # Nine hours and a half: slow and quick ramps both ways, so that no other is beyond them.
+    return ramps_and_soaks(
+        20.0, 30.0, [(35, 0.5, 60), (5, 1, 60), (25, 0.3, 40), (10, 0.7, 45), (33, 0.9, 40),
+                     (15, 0.35, 40), (20, 0.5, 20)],
+    ).cut(9.5 * _HOUR)  # fmt: skip
 
 
 def _held_out() -> Cyclogram:
@@ -301,6 +309,7 @@ _PRESETS: dict[str, Callable[[], Cyclogram]] = {
     'paper': _paper,
     'chamber': _chamber,
     'three-hours': _three_hours,
+    'long': _long,
     'held-out': _held_out,
     'staircase': _staircase,
     'triangle': _triangle,

@@ -264,6 +264,9 @@ def _triad(kind: str, seed: int) -> UnitModel:
     draw = _Specimen(kind, seed)
     heads = [f'head-{axis}' for axis in _AXES] if kind in _OWN_HEADS else ['head']
     board_tau, taus = draw.between(400.0, 900.0), [draw.between(500.0, 1500.0) for _ in heads]
+    if kind == 'demo':
+        # Sample bags are short: their soaks must come to rest.
+        board_tau *= 0.25
     capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}
     links = [*draw.links((AIR, 'case', 4.0)), Link('case', 'board', 0.4)]
     for head, tau in zip(heads, taus, strict=True):
@@ -339,7 +342,7 @@ def _flows(draw: _Specimen) -> list[Effect]:
     return [
         FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
-        FlowEffect('case', 'head', 1.25, bias=draw.normal(1.0), bias_curvature=draw.normal(0.02)),
+        FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ]
 
 
@@ -363,9 +366,10 @@ def _loads(draw: _Specimen) -> list[Effect]:
 
 
 def _sample(draw: _Specimen) -> list[Effect]:
-    # The loads of the paper, and a stress that dies away with the lag of the heads.
-    stress = DifferenceEffect('board', 'head', bias=draw.signed(0.5, 1.5), scale=draw.normal(1.0))
-    return [*_loads(draw), stress]
+    # Loads of the paper, large ones, and a stress that dies away with the lag of the heads.
+    stress = DifferenceEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
+    load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
+    return [*_loads(draw), load, stress]
 
 
 # Three heads with a thermal node each, and heads that hang on the case as well.

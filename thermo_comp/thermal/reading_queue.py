@@ -16,6 +16,9 @@ Entry = tuple[int, int, int, float]
 
 #: More readings than this that wait mean that their clock is not the samples'.
 PENDING_LIMIT: Final = 4096
+#: A reading that comes after another of its sensor is stamped earlier by no more than this [ns],
+#: or the other one was not of this clock.
+DISORDER_NS: Final = 5_000_000_000
 #: Later than any stamp.
 NEVER_NS: Final = 1 << 62
 
@@ -31,6 +34,8 @@ class ReadingQueue:
     def __init__(self) -> None:
         self._entries: list[Entry] = []
         self._n_pushed = 0
+        #: Stamps of the readings pushed last, board and case.
+        self._last_ns = [-NEVER_NS, -NEVER_NS]
 
     @property
     def next_ns(self) -> int:
@@ -40,16 +45,24 @@ class ReadingQueue:
         """
         return self._entries[0][0] if self._entries else NEVER_NS
 
-    def push(self, stamp_ns: int, kind: int, celsius: float) -> bool:
+    def push(self, stamp_ns: int, kind: int, celsius: float) -> int:
         """
-        Add a reading; False where too many wait already.
+        Add a reading; return how many were refused: this one where too many wait, or those that
+        wait with stamps which this one shows to be of another clock.
 
         """
+        n_before = len(self._entries)
+        last_ns, self._last_ns[kind] = self._last_ns[kind], stamp_ns
+        if stamp_ns < last_ns - DISORDER_NS:
+            latest_ns = stamp_ns + DISORDER_NS
+            self._entries = [e for e in self._entries if e[1] != kind or e[0] <= latest_ns]
+            heapq.heapify(self._entries)
         if len(self._entries) >= PENDING_LIMIT:
-            return False
+            return 1
+        n_refused = n_before - len(self._entries)
         heapq.heappush(self._entries, (stamp_ns, kind, self._n_pushed, celsius))
         self._n_pushed += 1
-        return True
+        return n_refused
 
     def due(self, stamp_ns: int) -> Iterator[Entry]:
         """

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..recording import RecordingInfo, Topics, open_recording
 from ..typing import Floats, Ints
+from .columns import RecordingInfo, Topics
+from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 
 # What a fit asks of one unit's bags together; below the first it refuses.

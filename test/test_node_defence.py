@@ -1,0 +1,340 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What strangers on the network may ask of the node and send to it: it answers, and samples go on.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from builders import calibration
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Vector3Stamped
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
+from sensor_msgs.msg import Imu, Temperature
+
+from thermo_comp.plain_yaml import NODE_LIMIT
+from thermo_comp.ros.parameters import NodeConfig
+from thermo_comp.ros.requests import PARAMETERS_LIMIT
+from thermo_comp.unit.calibration_file import save_calibration
+
+START_NS = 1_767_225_600 * SECOND_NS
+CYCLE_NS = 10_000_000
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    path = tmp_path / 'unit.yaml'
+    save_calibration(calibration(), path)
+    return path
+
+
+def arguments(unit: Path, *overrides: str) -> list[str]:
+    words = [f'calibration_file:={unit}', 'diagnostics_period:=0.05', *overrides]
+    return [word for override in words for word in ('-p', override)]
+
+
+class Samples:
+    """Sends samples of a unit that stands and hears what comes of them."""
+
+    def __init__(self, peer: Peer, node: Any) -> None:
+        self._peer = peer
+        self.heard = peer.listen(Imu, 'imu/data_raw')
+        self.driver = drive(peer, node)
+        self.n_sent = 0
+
+    def send(self, n: int = 20) -> None:
+        for k in range(self.n_sent, self.n_sent + n):
+            if k % 10 == 0:
+                self.driver.temperatures(START_NS + k * CYCLE_NS, 20.0, 20.0)
+            self.driver.counts(START_NS + k * CYCLE_NS, *standing(k))
+        self.n_sent += n
+
+    def go_on(self) -> None:
+        """All samples of a further burst come out."""
+        before = len(self.heard)
+        self.send()
+        self._peer.wait_for(lambda: len(self.heard) >= before + 20, '20 further samples')
+
+
+def status_with(peer: Peer, heard: list[DiagnosticArray], text: str) -> DiagnosticStatus:
+    del heard[:]
+    found: list[DiagnosticStatus] = []
+
+    def look() -> bool:
+        found.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
+        return bool(found)
+
+    peer.wait_for(look, f'{text!r} among {[a.status[0].message for a in heard][-3:]}')
+    return found[0]
+
+
+def odd(name: str, kind: int) -> ParameterMessage:
+    return ParameterMessage(name=name, value=ParameterValue(type=kind))
+
+
+#: Anything that a request may hold; every one of them is answered.
+STRANGE: list[ParameterMessage] = [
+    *[odd(name, kind) for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
+    *[
+        Parameter(name, value=value).to_parameter_msg()
+        for name, value in (
+            ('calibration_file', '~nosuchuser/u.yaml'),
+            ('calibration_file', '~' * 5000),
+            ('calibration_file', ''),
+            ('calibration_file', 'a\0b'),
+            ('calibration_file', [1.0, 2.0]),
+            ('calibration_directory', '/'),
+            ('frame_id', 'x' * 10_000_000),
+            ('frame_id', 'a\nb'),
+            ('frame_id', 'a\x1b[2Jb'),
+            ('serial', 's' * 65),
+            ('transition_time', float('nan')),
+            ('transition_time', 1 << 62),
+            ('diagnostics_period', -(1 << 62)),
+            ('input', 'imu'),
+            ('use_sim_time', 'perhaps'),
+            ('qos_overrides./accel/counts.subscription.depth', 7),
+        )
+    ],
+]
+
+
+@pytest.mark.parametrize('together', [False, True], ids=['each', 'together'])
+def test_any_request_is_answered_and_samples_go_on(peer: Peer, unit: Path, together: bool) -> None:
+    with node_in_thread(*arguments(unit)) as node:
+        samples = Samples(peer, node)
+        samples.go_on()
+        kind = SetParametersAtomically if together else SetParameters
+        name = f'thermo_comp/{"set_parameters_atomically" if together else "set_parameters"}'
+        for message in STRANGE:
+            answer = peer.call(kind, name, kind.Request(parameters=[message]))
+            result = answer.result if together else answer.results[0]
+            assert not result.successful, message.name
+            assert result.reason, message.name
+            assert '\n' not in result.reason
+            assert len(result.reason) < 10_000, message.name
+        samples.go_on()
+        # One bad one among good ones: the good ones are set, or none.
+        good = Parameter('frame_id', value='body').to_parameter_msg()
+        answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
+        config: NodeConfig = node._config
+        assert config.frame_id == ('' if together else 'body')
+        many = kind.Request(parameters=[good] * (PARAMETERS_LIMIT + 1))
+        answer = peer.call(kind, name, many)
+        result = answer.result if together else answer.results[0]
+        assert f'at most {PARAMETERS_LIMIT}' in result.reason
+        samples.go_on()
+        assert node._loop.n_failures == 0
+
+
+def test_a_callback_that_fails_is_logged_counted_and_survived(peer: Peer, unit: Path) -> None:
+    # WHY: the class of fault: whatever nobody foresaw, in a service, a timer or the relay itself.
+    with node_in_thread(*arguments(unit)) as node:
+        heard = peer.listen(DiagnosticArray, '/diagnostics')
+        samples = Samples(peer, node)
+        samples.go_on()
+
+        def fail(*_: Any) -> None:
+            raise ZeroDivisionError('nobody foresaw this')
+
+        timer = node.node.create_timer(0.005, fail)
+        node._loop._is_stale = True
+        status = status_with(peer, heard, 'callbacks failed')
+        assert status.level == DiagnosticStatus.ERROR
+        samples.go_on()
+        timer.cancel()
+        keep, node._requests._apply = node._requests._apply, fail
+        (result,) = peer.set_parameters(frame_id='body')
+        assert result.reason == "internal error (ZeroDivisionError), see the node's log"
+        node._requests._apply = keep
+        keep, node._relay._take_readings = node._relay._take_readings, fail
+        n_failures = node._loop.n_failures
+        samples.driver.temperatures(START_NS + samples.n_sent * CYCLE_NS, 20.0, 20.0)
+        peer.poll(lambda: node._loop.n_failures > n_failures, 'the failure')
+        node._relay._take_readings = keep
+        samples.go_on()
+
+
+NOT_CALIBRATIONS = {
+    'root:x:0:0:secret:/root:/bin/sh\n': '',
+    'secret_key: 1\n': 'not a calibration: the key `format_version` is missing',
+    '"secret": *secret\n': 'YAML aliases are not accepted (line 1)',
+    'a: 1\nb: "secret\n': 'not valid YAML (line 3)',
+    'secret: 1\nsecret: 2\n': 'not valid YAML (line 2)',
+    '[secret]: 1\n': 'not valid YAML',
+    '- secret\n': 'expected a mapping',
+    'format_version: 987654321\nsecret: 1\n': 'not a calibration: the key `unit` is missing',
+    f'a: [{"[], " * NODE_LIMIT}]\n': f'more than {NODE_LIMIT} keys and values',
+}
+
+
+def test_nothing_of_a_file_that_is_no_calibration_is_told(
+    peer: Peer, unit: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / 'other'
+    with node_in_thread(*arguments(unit)):
+        for content, rule in NOT_CALIBRATIONS.items():
+            other.write_text(content)
+            (result,) = peer.set_parameters(calibration_file=str(other))
+            assert not result.successful
+            assert result.reason.startswith(f'{other}: {rule}')
+            for word in ('secret', 'root', '987654321'):
+                assert word not in result.reason.removeprefix(str(other))
+
+
+def test_calibrations_are_taken_from_one_folder_only(
+    peer: Peer, unit: Path, tmp_path: Path
+) -> None:
+    folder, outside = tmp_path / 'units', tmp_path / 'outside.yaml'
+    folder.mkdir()
+    save_calibration(calibration(), outside)
+    inside = folder / 'unit.yaml'
+    save_calibration(calibration(), inside)
+    (folder / 'link.yaml').symlink_to(outside)
+    (folder / 'up').symlink_to(tmp_path)
+    (folder / 'good.yaml').symlink_to('unit.yaml')
+    with node_in_thread(*arguments(inside, f'calibration_directory:={folder}')):
+        for name in (outside, folder / '../outside.yaml', folder / 'link.yaml', '/etc/shadow'):
+            (result,) = peer.set_parameters(calibration_file=str(name))
+            expected = 'must be in the folder that the parameter `calibration_directory` names'
+            assert result.reason == f'{name}: {expected}'
+        (result,) = peer.set_parameters(calibration_file=str(folder / 'up' / 'outside.yaml'))
+        assert 'calibration_directory' in result.reason
+        (result,) = peer.set_parameters(calibration_file=str(folder / 'good.yaml'))
+        assert result.successful, result.reason
+        (result,) = peer.set_parameters(calibration_directory='/')
+        assert not result.successful
+        assert peer.describe('calibration_directory')[0].read_only
+
+
+def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:
+    with node_in_thread(*arguments(unit)) as node:
+        names = [one for one in node.node._parameters]  # noqa: C416
+        request = GetParameters.Request(names=names)
+        values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
+        assert len(values) == len(names) > 20
+        dumped = [ParameterMessage(name=n, value=v) for n, v in zip(names, values, strict=True)]
+        loaded = SetParameters.Request(parameters=dumped)
+        results = peer.call(SetParameters, 'thermo_comp/set_parameters', loaded).results
+        assert [one.reason for one in results if not one.successful] == []
+
+
+def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> None:
+    # WHY: a second driver's samples, another attitude, went out as if they were the unit's.
+    with node_in_thread(*arguments(unit)) as node:
+        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
+        samples = Samples(peer, node)
+        samples.go_on()
+        other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
+        peer.poll(other.get_subscription_count, 'the second publisher')
+        for k in range(50):
+            samples.send(1)
+            strange = stamped(Vector3Stamped(), START_NS + samples.n_sent * CYCLE_NS - 5)
+            strange.vector.x, strange.vector.y = 2000.0 + k % 3, -2000.0 + k % 5
+            other.publish(strange)
+        status = status_with(peer, diagnostics, '2 publishers on /accel/counts')
+        assert status.level == DiagnosticStatus.ERROR
+        values = {one.key: one.value for one in status.values}
+        assert values['sample publishers'] == '2'
+        peer.node.destroy_publisher(other)
+        peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
+        # The first ones after it may still be of the other.
+        samples.send(20)
+        before = len(samples.heard)
+        peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
+        assert all(abs(imu.linear_acceleration.x) < 1.0 for imu in samples.heard)
+        assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
+
+
+def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> None:
+    with node_in_thread(*arguments(unit)) as node:
+        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
+        samples = Samples(peer, node)
+        samples.go_on()
+        other = peer.node.create_publisher(Temperature, 'temperature/board', DEEP)
+        peer.poll(other.get_subscription_count, 'the second publisher')
+        for _ in range(10):
+            other.publish(
+                stamped(Temperature(temperature=20.5), START_NS + samples.n_sent * CYCLE_NS)
+            )
+            samples.send(10)
+        status = status_with(peer, diagnostics, '2 publishers on /temperature/board')
+        assert status.level == DiagnosticStatus.ERROR
+        board = node._compensator.tracker.board
+        assert board.temperature == pytest.approx(20.0, abs=1e-6)
+        assert board.stamp_ns < START_NS + 20 * CYCLE_NS
+
+
+def test_a_driver_that_cannot_be_heard_is_named(peer: Peer, unit: Path) -> None:
+    reliable = 'qos_overrides./accel/counts.subscription.reliability:=reliable'
+    with node_in_thread(*arguments(unit, reliable)):
+        heard = peer.listen(DiagnosticArray, '/diagnostics')
+        unheard = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        peer.node.create_publisher(Vector3Stamped, 'accel/counts', unheard)
+        peer.node.create_publisher(Imu, 'temperature/case', DEEP)
+        status = status_with(peer, heard, 'no messages of a publisher on /accel/counts: ')
+        assert status.level == DiagnosticStatus.ERROR
+        assert 'est effort publisher and reliable subscription' in status.message
+        text = 'no messages of a publisher on /temperature/case: its type is sensor_msgs/msg/Imu'
+        status_with(peer, heard, text)
+
+
+def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Path) -> None:
+    # WHY: with diagnostics_period below the sample interval each empty report was an ERROR.
+    from thermo_comp.unit.calibration import Unit
+
+    slow = tmp_path / 'slow.yaml'
+    save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.2)), slow)
+    with node_in_thread(*arguments(slow, 'diagnostics_period:=0.01')) as node:
+        heard = peer.listen(DiagnosticArray, '/diagnostics')
+        driver = drive(peer, node)
+        imu = peer.listen(Imu, 'imu/data_raw')
+        peer.poll(node._relay.samples.count_publishers, 'the driver')
+        for k in range(5):
+            stamp_ns = START_NS + k * SECOND_NS // 5
+            driver.temperatures(stamp_ns, 20.0, 20.0)
+            driver.counts(stamp_ns, *standing(k))
+            n = len(imu)
+            peer.wait_for(lambda n=n: len(imu) > n, 'the sample')
+            del heard[:]
+            peer.wait_for(lambda: len(heard) > 10, 'reports')
+            said = [array.status[0].message for array in heard[1:10]]
+            assert not any('no samples' in text for text in said), said
+        status_with(peer, heard, 'no samples are coming in')
+
+
+def test_a_reading_far_ahead_is_forgotten(peer: Peer, unit: Path) -> None:
+    # WHY: one reading a day ahead kept WARN until a sample of that day came.
+    with node_in_thread(*arguments(unit)) as node:
+        heard = peer.listen(DiagnosticArray, '/diagnostics')
+        samples = Samples(peer, node)
+        samples.go_on()
+        samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)
+        samples.n_sent += 1  # without the readings of every tenth sample
+        samples.send(5)
+        status_with(peer, heard, 's ahead of the samples')
+        samples.go_on()
+        peer.wait_for(
+            lambda: heard and 'ahead' not in heard[-1].status[0].message, 'the end of the warning'
+        )

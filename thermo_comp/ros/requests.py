@@ -1,0 +1,191 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the services that set parameters: prepared beside the samples, applied between two of them.
+
+rclpy serves such a request in one go, in the thread of the samples, and a request that it cannot
+read ends the node. Here a thread of its own does what takes time, reading a file; what is left
+for the loop is to exchange one reference. Requests are answered in the order in which they came,
+whatever is wrong with them.
+
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.exceptions import ParameterNotDeclaredException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from ..errors import ThermoCompError
+from .waitloop import WaitLoop
+
+#: More requests than this that wait, or parameters in one of them, are refused.
+WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
+#: While something is prepared the samples' thread waits no longer than this for its turn [s].
+SWITCH_S = 0.2e-3
+
+#: Runs beside the samples: what takes time about a change.
+Prepare = Callable[[list[Parameter]], Any]
+#: Runs between two samples: sets what was prepared.
+Apply = Callable[[list[Parameter], Any], SetParametersResult]
+
+
+class ParameterRequests:
+    """
+    What answers `set_parameters` and `set_parameters_atomically` of a node.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        With parameter services.
+    loop : WaitLoop
+        Serves the node.
+    prepare, apply : callable
+        The two halves of a change; their exceptions are refusals.
+
+    """
+
+    def __init__(self, node: Node, loop: WaitLoop, prepare: Prepare, apply: Apply) -> None:
+        self._node = node
+        self._loop = loop
+        self._prepare = prepare
+        self._apply = apply
+        self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(WAITING_LIMIT)
+        self._thread = threading.Thread(target=self._run, name='parameters', daemon=True)
+        self._thread.start()
+        for service in node.services:
+            if service.srv_type is SetParameters:
+                loop.serve(service, self._set_each)
+            elif service.srv_type is SetParametersAtomically:
+                loop.serve(service, self._set_together)
+
+    def close(self) -> None:
+        """
+        Finish what is being prepared; nothing is applied any more.
+
+        """
+        self._waiting.put(None)
+        self._thread.join()
+
+    def _set_each(self, request: Any, answer: Callable[[Any], None]) -> None:
+        def respond(results: list[SetParametersResult]) -> None:
+            answer(SetParameters.Response(results=results))
+
+        self._take([[one] for one in request.parameters], respond)
+
+    def _set_together(self, request: Any, answer: Callable[[Any], None]) -> None:
+        def respond(results: list[SetParametersResult]) -> None:
+            answer(SetParametersAtomically.Response(result=results[0]))
+
+        self._take([request.parameters], respond)
+
+    def _take(
+        self,
+        groups: list[list[ParameterMessage]],
+        respond: Callable[[list[SetParametersResult]], None],
+    ) -> None:
+        """
+        Let a request wait for its turn.
+
+        """
+        n = sum(len(group) for group in groups)
+        try:
+            if n > PARAMETERS_LIMIT:
+                raise ThermoCompError(f'{n} parameters at once, at most {PARAMETERS_LIMIT}')
+            self._waiting.put_nowait(partial(self._work, groups, respond))
+        except (ThermoCompError, queue.Full) as error:
+            reason = str(error) or 'too many requests wait already, try again'
+            respond([_refusal(reason) for _ in groups])
+
+    def _run(self) -> None:
+        """
+        Prepare one request after the other, in the thread.
+
+        """
+        while (work := self._waiting.get()) is not None:
+            usual_s = sys.getswitchinterval()
+            sys.setswitchinterval(SWITCH_S)
+            try:
+                work()
+            finally:
+                sys.setswitchinterval(usual_s)
+
+    def _work(
+        self,
+        groups: list[list[ParameterMessage]],
+        respond: Callable[[list[SetParametersResult]], None],
+    ) -> None:
+        results: list[SetParametersResult] = []
+        for group in groups:
+            try:
+                changes = [_read(message) for message in group]
+                prepared = self._prepare(changes)
+            except Exception as error:  # noqa: BLE001 - whatever it is, it is answered
+                changes, prepared = [], error
+            self._loop.call_soon(partial(self._set, changes, prepared, results))
+        self._loop.call_soon(partial(respond, results))
+
+    def _set(
+        self, changes: list[Parameter], prepared: Any, results: list[SetParametersResult]
+    ) -> None:
+        """
+        Apply one group in the loop's thread; what nobody foresaw is logged there, too.
+
+        """
+        try:
+            if isinstance(prepared, Exception):
+                raise prepared
+            news = [one for one in changes if not self._is_in_force(one)]
+            results.append(
+                self._apply(news, prepared) if news else SetParametersResult(successful=True)
+            )
+        except (ThermoCompError, ParameterNotDeclaredException) as error:
+            results.append(_refusal(str(error)))
+        except Exception as error:
+            results.append(
+                _refusal(f"internal error ({type(error).__name__}), see the node's log")
+            )
+            raise
+
+    def _is_in_force(self, change: Parameter) -> bool:
+        """
+        Tell whether a change leaves what cannot be set as it is: `param load` of a `param dump`.
+
+        """
+        node = self._node
+        return bool(
+            node.has_parameter(change.name)
+            and node.describe_parameter(change.name).read_only
+            and node.get_parameter(change.name).value == change.value
+        )
+
+
+def _read(message: ParameterMessage) -> Parameter:
+    """
+    Read a parameter off the network.
+
+    """
+    if not message.name:
+        # rclpy takes it for declared.
+        raise ThermoCompError('a parameter without a name')
+    try:
+        return Parameter.from_parameter_msg(message)
+    except (ValueError, TypeError) as error:
+        raise ThermoCompError(
+            f'parameter `{message.name:.60}` has no value that can be read '
+            f'(type {message.value.type})'
+        ) from error
+
+
+def _refusal(reason: str) -> SetParametersResult:
+    return SetParametersResult(successful=False, reason=reason)
