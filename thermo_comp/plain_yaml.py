@@ -34,17 +34,19 @@ class PlainYamlError(ValueError):
     Parameters
     ----------
     problem : str
-        What is wrong; may quote the text.
+        What is wrong; quotes nothing of the text.
     line : int or None, optional
         Where, from 1.
+    detail : str, optional
+        More of it; may quote the text.
 
     """
 
-    def __init__(self, problem: str, line: int | None = None) -> None:
+    def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
-        #: The same without quoting anything.
-        self.rule = f'not valid YAML{where}'
-        super().__init__(f'{problem}{where}')
+        #: The same without the detail.
+        self.rule = f'{problem}{where}'
+        super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 
 def load_plain_yaml(
@@ -77,9 +79,9 @@ def load_plain_yaml(
         mark = getattr(error, 'problem_mark', None)
         problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
         line = None if mark is None else mark.line + 1
-        raise PlainYamlError(f'not valid YAML: {problem}', line) from error
+        raise PlainYamlError('not valid YAML', line, problem) from error
     except UnicodeEncodeError as error:
-        raise PlainYamlError(f'not valid YAML: {error.reason}') from error
+        raise PlainYamlError('not valid YAML', detail=error.reason) from error
 
 
 def is_plain_text(text: str) -> bool:
@@ -113,11 +115,11 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
             elif keys[-1] is None:
                 if type(value) is not str:
                     raise PlainYamlError(
-                        f'not valid YAML: a key must be a text, got {value!r:.40}', _line(event)
+                        'not valid YAML', _line(event), f'a key must be a text, got {value!r:.40}'
                     )
                 if value in holder:
                     raise PlainYamlError(
-                        f'not valid YAML: the key {value!r:.60} stands twice', _line(event)
+                        'not valid YAML', _line(event), f'the key {value!r:.60} stands twice'
                     )
                 keys[-1] = value
             else:
@@ -149,7 +151,9 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
     if _INTEGER.fullmatch(text):
         if len(text) > _INTEGER_DIGITS:
             raise PlainYamlError(
-                f'not valid YAML: an integer of {len(text)} digits is not accepted', _line(event)
+                'not valid YAML',
+                _line(event),
+                f'an integer of {len(text)} digits is not accepted',
             )
         return int(text)
     if _FLOAT.fullmatch(text):
