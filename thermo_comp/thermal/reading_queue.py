@@ -11,7 +11,7 @@ import heapq
 from collections.abc import Iterator
 from typing import Final
 
-#: (stamp [ns], kind: 0 board, 1 case, order of arrival, degC).
+#: (stamp [ns], kind: 0 board, 1 and up the others, order of arrival, degC).
 Entry = tuple[int, int, int, float]
 
 #: More readings than this that wait mean that their clock is not the samples'.
@@ -34,8 +34,8 @@ class ReadingQueue:
     def __init__(self) -> None:
         self._entries: list[Entry] = []
         self._n_pushed = 0
-        #: Stamps of the readings pushed last, board and case.
-        self._last_ns = [-NEVER_NS, -NEVER_NS]
+        #: Stamp of the reading of each kind that was pushed last.
+        self._last_ns: dict[int, int] = {}
 
     @property
     def next_ns(self) -> int:
@@ -52,7 +52,7 @@ class ReadingQueue:
 
         """
         n_before = len(self._entries)
-        last_ns, self._last_ns[kind] = self._last_ns[kind], stamp_ns
+        last_ns, self._last_ns[kind] = self._last_ns.get(kind, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:
             latest_ns = stamp_ns + DISORDER_NS
             self._entries = [e for e in self._entries if e[1] != kind or e[0] <= latest_ns]
