@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The correction with full banks: stream = batch to the bit, axes apart, sd = scatter of what is drawn.
+Corrections with full banks: stream = batch to the bit, axes apart, sd = scatter of what is drawn.
 
 """
 
@@ -113,18 +113,18 @@ def assert_same(blocks, rows):
     np.testing.assert_array_equal(covariance[:, [0, 1, 2, 4, 5, 8]], rows[:, 3:])
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 900))
-@settings(max_examples=5, deadline=None, phases=[Phase.generate])
+@given(st.integers(0, 2**32 - 1), st.integers(40, 900))
+@settings(max_examples=4, deadline=None, phases=[Phase.generate])
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    events = run_of(rng)
+    events = run_of(rng, seconds=50)
     rows = stream(Compensator(unit, UNCHECKED), events)
     whole, cut = Compensator(unit, UNCHECKED), Compensator(unit, UNCHECKED)
     assert_same([process_block(whole, columns_from_events(events))], rows)
     pieces = [events[k : k + chunk] for k in range(0, len(events), chunk)]
     assert_same([process_block(cut, columns_from_events(piece)) for piece in pieces], rows)
-    assert len(rows) > 900
+    assert len(rows) > 190
 
 
 def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
@@ -234,7 +234,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     unit = full_bank(rng)
     correction = Correction(unit)
     lags = correction.memory.lags
-    tracker, states = states_of(unit, rng)
+    _, states = states_of(unit, rng)
     _, state, shares = states[0]
     slow = SlowUncertainty(unit, correction).at(state, shares)
     first = 5 + 2 * len(SENSORS)
@@ -285,9 +285,7 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
 
 
 def test_a_further_sensor_that_is_lost_is_paid_for():
-    unit = calibration(
-        sensors=SENSORS, response=(term('now', (30.0, 0.0, 0.0), sensor='tip'),)
-    )
+    unit = calibration(sensors=SENSORS, response=(term('now', (30.0, 0.0, 0.0), sensor='tip'),))
     compensator = Compensator(unit, UNCHECKED)
     variances = []
     for k in range(200):

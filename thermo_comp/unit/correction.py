@@ -267,14 +267,14 @@ class Correction:
                 a, b, c = _with(a, b, c, state[place + VAR_GRADIENT - GRADIENT], bias / K, scale)
             for place, (bias, scale) in zip(self._lags, felt.on_lags(on_input, nil), strict=True):
                 a, b, c = _with(a, b, c, state[place + 1], bias / K, scale)
-            bias, scale = self._weights[axis].add(nil, nil, cut_off)
-            a, b, c = _with(a, b, c, nil + 1.0, bias / K, scale)
             a, b, c = a + slow[axis][0], b + slow[axis][1], c + slow[axis][2]
             # Far outside, the residual of the fit says nothing any more: it grows with the excess.
             present = self._weights[axis].present
             relative = outside + self.table.excess(raw, held, nil, present)
             grown = 1.0 + relative * relative
             a, b, c = _with(grown * a, grown * b, grown * c, doubt, *gaps[axis])
+            bias, scale = self._weights[axis].add(nil, nil, cut_off)
+            a, b, c = _with(a, b, c, nil + 1.0, bias / K, scale)
             variances.append((a + self.noise[axis], b, c))
         return self._bias_scale(state, phi), variances
 
