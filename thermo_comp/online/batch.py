@@ -15,7 +15,7 @@ from array import array
 
 import numpy as np
 
-from ..thermal.reading_queue import DISORDER_NS
+from ..thermal.reading_queue import refused_readings
 from ..typing import Bools, Floats, Ints, Stamps
 from .blocks import AccelBlock, CompensatedBlock
 from .compensator import TIME_JUMP_NS, Compensator
@@ -170,7 +170,7 @@ def _run_thermal_side(
     arrival = np.concatenate(after)
     effect = np.maximum(np.searchsorted(stamps, reading_stamps, side='left'), arrival)
     order = np.lexsort((np.concatenate(orders), kind_column, reading_stamps, effect))
-    refused = _refused(reading_stamps, kind_column, arrival, effect)
+    refused = refused_readings(reading_stamps, kind_column, arrival, effect)
     if refused is not None:
         for kind, n_refused in enumerate(np.bincount(kind_column[refused]).tolist()):
             compensator.thermal.count_rejected(kind, n_refused)
@@ -198,22 +198,6 @@ def _run_thermal_side(
     if position < n_samples:
         _add_segments(compensator, segments, stamps, position, n_samples, n_seen)
     return segments
-
-
-def _refused(stamps: Stamps, kinds: Ints, arrival: Ints, effect: Ints) -> Bools | None:
-    """
-    Find the readings that a later one shows to be of another clock while they wait, as the
-    stream's queue does; None where there are none.
-
-    """
-    refused = np.zeros(len(stamps), dtype=np.bool_)
-    for kind in range(int(kinds.max(initial=-1)) + 1):
-        own = np.flatnonzero(kinds == kind)
-        for k in np.flatnonzero(np.diff(stamps[own]) < -DISORDER_NS).tolist():
-            before, this = own[: k + 1], own[k + 1]
-            is_other = stamps[before] > stamps[this] + DISORDER_NS
-            refused[before[is_other & (effect[before] >= arrival[this])]] = True
-    return refused if refused.any() else None
 
 
 def _add_segments(

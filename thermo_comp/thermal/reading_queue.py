@@ -11,6 +11,10 @@ import heapq
 from collections.abc import Iterator
 from typing import Final
 
+import numpy as np
+
+from ..typing import Bools, Ints, Stamps
+
 #: (stamp [ns], kind: 0 board, 1 and up the others, order of arrival, degC).
 Entry = tuple[int, int, int, float]
 
@@ -96,3 +100,30 @@ class ReadingQueue:
         if not self._entries:
             return 0.0
         return (max(entry[0] for entry in self._entries) - stamp_ns) * 1e-9
+
+
+def refused_readings(stamps: Stamps, kinds: Ints, arrival: Ints, effect: Ints) -> Bools | None:
+    """
+    Find what a queue refuses of many readings, as a later one is of another clock.
+
+    Parameters
+    ----------
+    stamps, kinds : ndarray of int64, shape (n,)
+        The readings, those of each kind in order of arrival.
+    arrival, effect : ndarray of int64, shape (n,)
+        Samples before each reading comes, and before it takes effect.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,), or None
+        None where there are none.
+
+    """
+    refused = np.zeros(len(stamps), dtype=np.bool_)
+    for kind in range(int(kinds.max(initial=-1)) + 1):
+        own = np.flatnonzero(kinds == kind)
+        for k in np.flatnonzero(np.diff(stamps[own]) < -DISORDER_NS).tolist():
+            before, this = own[: k + 1], own[k + 1]
+            is_other = stamps[before] > stamps[this] + DISORDER_NS
+            refused[before[is_other & (effect[before] >= arrival[this])]] = True
+    return refused if refused.any() else None
