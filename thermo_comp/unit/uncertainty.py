@@ -51,7 +51,12 @@ class SlowUncertainty:
         matrix, rest = posterior.matrix, posterior.variances
         for bias, scale in zip(layout.bias, layout.scale, strict=True):
             of_bias, of_scale = slice(bias.static, bias.end), slice(scale.static, scale.end)
-            self._blocks.append((matrix[of_bias], rest[of_bias], matrix[of_scale], rest[of_scale]))
+            rows = np.concatenate((matrix[of_bias], matrix[of_scale]))
+            if matrix.shape[1] > len(rows):
+                # The same covariance of one axis from fewer columns.
+                rows = np.ascontiguousarray(np.linalg.qr(rows.T)[1].T)
+            n_bias = bias.end - bias.static
+            self._blocks.append((rows[:n_bias], rest[of_bias], rows[n_bias:], rest[of_scale]))
 
     def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[Variance[float]]:
         """
