@@ -298,21 +298,7 @@ class ColumnTable:
 
     def weighted(self, factors: Sequence[Number], board: Number, weight: Number) -> list[Number]:
         """
-        Multiply a number per column by that column's power of t and share of its regime.
-
-        Parameters
-        ----------
-        factors : sequence of float or of ndarray
-            One per column; u itself, held, makes phi.
-        board : float or ndarray
-            Board temperature [degC].
-        weight : float or ndarray
-            Weight of the dynamic regime.
-
-        Returns
-        -------
-        list of float or of ndarray
-            The products.
+        Multiply a number per column by its power of t and share of its regime; u held makes phi.
 
         """
         powers = self._powers(board)
