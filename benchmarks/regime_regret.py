@@ -199,7 +199,7 @@ def compensated(
     # a charge without noise may stand still
     compensator = Compensator(calibration, CompensatorConfig(stuck_timeout_s=0.0))
     if weight is not None:
-        compensator.tracker.weight_at = lambda _stamp_ns: weight
+        compensator.thermal.tracker.weight_at = lambda _stamp_ns: weight
     found = process_block(compensator, block)
     return found.specific_force, found.stamp_ns, compensator.take_flags()
 

@@ -150,9 +150,9 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
             message = store.deserialize_cdr(data, connection.msgtype)
             stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
             if connection.topic == '/temperature/board':
-                compensator.push_board(stamp_ns, message.temperature)
+                compensator.push('board', stamp_ns, message.temperature)
             elif connection.topic == '/temperature/case':
-                compensator.push_case(stamp_ns, message.temperature)
+                compensator.push('case', stamp_ns, message.temperature)
             else:
                 v = message.vector
                 row = compensator.process(stamp_ns, v.x, v.y, v.z)

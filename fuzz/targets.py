@@ -162,7 +162,7 @@ def check_cdr(data: bytes) -> None:
 
     compensator = COMPENSATOR
     compensator.reset()
-    compensator.push_board(0, 20.0)
+    compensator.push('board', 0, 20.0)
     converters = [SampleConverter(Vector3Stamped), SampleConverter(Imu, 'body')]
     at = n = 0
     while at + 2 <= len(data) and n < MOST_MESSAGES:
@@ -173,8 +173,7 @@ def check_cdr(data: bytes) -> None:
         if kind % 4 > 1:
             reading = read_temperature(message)
             if reading is not None:
-                push = compensator.push_board if kind % 4 == 2 else compensator.push_case
-                push(*reading)
+                compensator.push('board' if kind % 4 == 2 else 'case', *reading)
             continue
         written = converters[kind % 4].convert(message, compensator.process)
         if written is not None:

@@ -101,36 +101,32 @@ class Columns:
 
     accel_stamp_ns: np.ndarray
     accel: np.ndarray
-    board_stamp_ns: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
-    board: np.ndarray = field(default_factory=lambda: np.empty(0))
-    board_after: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
-    case_stamp_ns: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
-    case: np.ndarray = field(default_factory=lambda: np.empty(0))
-    case_after: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+    temperatures: dict = field(default_factory=dict)
 
 
 def columns_from_events(events):
     """
-    Columns from (kind, stamp_ns, value) in file order; kind is 'accel', 'board' or 'case'.
+    Columns from (kind, stamp_ns, value) in file order; kind is 'accel' or a thermometer's name.
 
     """
     accel = [(s, v) for kind, s, v in events if kind == 'accel']
-    readings = {'board': ([], [], []), 'case': ([], [], [])}
+    readings = {}
     n_accel = 0
     for kind, stamp, value in events:
         if kind == 'accel':
             n_accel += 1
         else:
-            for column, item in zip(readings[kind], (stamp, value, n_accel), strict=True):
-                column.append(item)
-    board, case = readings['board'], readings['case']
+            readings.setdefault(kind, []).append((stamp, value, n_accel))
     return Columns(
         np.array([s for s, _ in accel], dtype=np.int64),
         np.array([v for _, v in accel], dtype=float).reshape(-1, 3),
-        np.array(board[0], dtype=np.int64),
-        np.array(board[1], dtype=float),
-        np.array(board[2], dtype=np.int64),
-        np.array(case[0], dtype=np.int64),
-        np.array(case[1], dtype=float),
-        np.array(case[2], dtype=np.int64),
+        {
+            name: tuple(
+                np.array(column, dtype)
+                for column, dtype in zip(
+                    zip(*rows, strict=True), (np.int64, float, np.int64), strict=True
+                )
+            )
+            for name, rows in readings.items()
+        },
     )

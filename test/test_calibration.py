@@ -8,6 +8,7 @@ The calibration value and its file: round trip to the bit, and every refusal wit
 import contextlib
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -213,8 +214,12 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
     ],
 )
 def test_bytes_that_are_no_calibration(content, message):
-    with pytest.raises(CalibrationError, match=message):
+    with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
+    # Those who may not read the file hear as much, but for what may quote it.
+    told, whole = caught.value.rule or str(caught.value), str(caught.value)
+    quotes = whole.startswith('not valid YAML: ')
+    assert re.fullmatch(r'not valid YAML( \(line \d+\))?', told) if quotes else told == whole
 
 
 @given(st.binary(max_size=300))

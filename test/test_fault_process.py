@@ -49,7 +49,7 @@ def expected(events: list[Any]) -> np.ndarray:
         if topic == 'counts':
             rows.append(compensator.process(stamp_ns, *value))
         else:
-            getattr(compensator, f'push_{topic}')(stamp_ns, value)
+            compensator.push(topic, stamp_ns, value)
     return np.array([row for row in rows if row is not None])
 
 

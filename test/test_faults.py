@@ -55,7 +55,7 @@ def undisturbed(events: list) -> tuple[np.ndarray, np.ndarray]:
                 stamps.append(stamp_ns)
                 force.append(row[:3])
         else:
-            getattr(compensator, f'push_{topic}')(stamp_ns, value)
+            compensator.push(topic, stamp_ns, value)
     return np.array(stamps), np.array(force)
 
 

@@ -184,7 +184,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
     def forces(weight: float | None) -> Floats:
         compensator = Compensator(golovach.calibration)
         if weight is not None:
-            compensator.tracker.weight_at = lambda _stamp_ns: weight  # type: ignore[method-assign]
+            compensator.thermal.tracker.weight_at = lambda _stamp_ns: weight  # type: ignore[method-assign]
         blocks = source_of(UNIT, positions(1, 5)[0], 905).blocks()
         found = [process_block(compensator, CausalBlock.of(block)) for block in blocks]
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}

@@ -16,10 +16,10 @@ from builders import SECOND_NS
 from thermo_comp.thermal.memory import (
     LagBank,
     MemorySpec,
-    Plays,
     ThermalMemory,
     start_covariance,
 )
+from thermo_comp.thermal.plays import Plays
 
 TAUS = (60.0, 900.0, 7680.0)
 

@@ -103,8 +103,8 @@ def test_publishes_the_compensators_values_under_the_inputs_stamps(
             stamp_ns = START_NS + k * CYCLE_NS + 123
             if k % 10 == 0:
                 driver.temperatures(stamp_ns - 50, 20.0 + 0.001 * k, 21.0 + 0.002 * k)
-                compensator.push_board(stamp_ns - 50, 20.0 + 0.001 * k)
-                compensator.push_case(stamp_ns - 50, 21.0 + 0.002 * k)
+                compensator.push('board', stamp_ns - 50, 20.0 + 0.001 * k)
+                compensator.push('case', stamp_ns - 50, 21.0 + 0.002 * k)
             driver.counts(stamp_ns, 100.0 + k, -5.0 * k, 2900.0, frame_id='accel_link')
             expected.append((stamp_ns, compensator.process(stamp_ns, 100.0 + k, -5.0 * k, 2900.0)))
         peer.wait_for(lambda: len(heard) == 300, '300 samples')
@@ -138,8 +138,8 @@ def test_a_reading_that_comes_late_counts_from_the_next_sample(
                 # Stamped three samples before the one that it follows.
                 late = stamp_ns - 3 * CYCLE_NS
                 driver.temperatures(late, 20.0 + 0.01 * k, 22.0 + 0.01 * k)
-                compensator.push_board(late, 20.0 + 0.01 * k)
-                compensator.push_case(late, 22.0 + 0.01 * k)
+                compensator.push('board', late, 20.0 + 0.01 * k)
+                compensator.push('case', late, 22.0 + 0.01 * k)
         expected = [values for values in expected if values is not None]
         peer.wait_for(lambda: len(heard) == len(expected), f'{len(expected)} samples')
     found = [(m.linear_acceleration.x, m.linear_acceleration.y) for m in heard]

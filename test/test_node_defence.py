@@ -26,9 +26,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
 from sensor_msgs.msg import Imu, Temperature
 
+from thermo_comp.plain_yaml import NODE_LIMIT
 from thermo_comp.ros.parameters import NodeConfig
 from thermo_comp.ros.requests import PARAMETERS_LIMIT
-from thermo_comp.unit.calibration_file import NODE_LIMIT, save_calibration
+from thermo_comp.unit.calibration_file import save_calibration
 
 START_NS = 1_767_225_600 * SECOND_NS
 CYCLE_NS = 10_000_000

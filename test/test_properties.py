@@ -153,7 +153,7 @@ def test_any_messages_give_sound_numbers(
         # Stamps are those that a message can carry.
         now_ns = min(max(now_ns + step, -(2**31) * 10**9), 2**31 * 10**9 - 1)
         if topic != 'counts':
-            getattr(compensator, f'push_{topic}')(now_ns, value)
+            compensator.push(topic, now_ns, value)
             continue
         n_counts += 1
         row = compensator.process(now_ns, *value)

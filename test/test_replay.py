@@ -92,14 +92,9 @@ def one_by_one(
     """
     compensator = Compensator(calibration)
     readings = [
-        (int(after), kind, int(stamp), float(value))
-        for kind, (afters, stamps, values) in enumerate(
-            (
-                (block.board_after, block.board_stamp_ns, block.board),
-                (block.case_after, block.case_stamp_ns, block.case),
-            )
-        )
-        for after, stamp, value in zip(afters, stamps, values, strict=True)
+        (int(after), name, int(stamp), float(value))
+        for name, columns in block.temperatures.items()
+        for stamp, value, after in zip(*columns, strict=True)
     ]
     readings.sort(key=lambda reading: reading[0])
     published = []
@@ -108,8 +103,7 @@ def one_by_one(
         zip(block.accel_stamp_ns.tolist(), block.accel.tolist(), strict=True)
     ):
         while k < len(readings) and readings[k][0] <= i:
-            push = (compensator.push_board, compensator.push_case)[readings[k][1]]
-            push(readings[k][2], readings[k][3])
+            compensator.push(*readings[k][1:])
             k += 1
         result = compensator.process(stamp, *sample)
         if result is not None:

@@ -150,14 +150,14 @@ def test_bag_with_calibration_shows_what_the_compensator_gives(bag):
     one = run(0)
     compensator = Compensator(calibration)
     readings = sorted(
-        [(int(s), 0, v) for s, v in zip(one.board_stamp_ns, one.board, strict=True)]
-        + [(int(s), 1, v) for s, v in zip(one.case_stamp_ns, one.case, strict=True)]
+        [(int(s), 'board', v) for s, v in zip(one.board_stamp_ns, one.board, strict=True)]
+        + [(int(s), 'case', v) for s, v in zip(one.case_stamp_ns, one.case, strict=True)]
     )
     force = np.full((len(one.counts), 3), np.nan)
     for i, (stamp, count) in enumerate(zip(one.accel_stamp_ns, one.counts, strict=True)):
         while readings and readings[0][0] <= stamp:
             reading = readings.pop(0)
-            (compensator.push_board, compensator.push_case)[reading[1]](reading[0], reading[2])
+            compensator.push(reading[1], reading[0], reading[2])
         row = compensator.process(int(stamp), *map(float, count))
         if row is not None:
             force[i] = row[:3]

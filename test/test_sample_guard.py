@@ -55,7 +55,7 @@ def run(compensator, events):
                 stamps.append(stamp_ns)
                 rows.append(row)
         else:
-            getattr(compensator, f'push_{kind}')(stamp_ns, value)
+            compensator.push(kind, stamp_ns, value)
     return stamps, rows
 
 

@@ -31,7 +31,22 @@ class PlainYamlError(ValueError):
     """
     A text that is not YAML of plain values; says what and in which line.
 
+    Parameters
+    ----------
+    problem : str
+        What is wrong; quotes nothing of the text.
+    line : int or None, optional
+        Where, from 1.
+    detail : str, optional
+        More of it; may quote the text.
+
     """
+
+    def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
+        where = '' if line is None else f' (line {line})'
+        #: The same without the detail.
+        self.rule = f'{problem}{where}'
+        super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 
 def load_plain_yaml(
@@ -62,11 +77,11 @@ def load_plain_yaml(
         return _load(text, depth_limit, node_limit)
     except yaml.YAMLError as error:
         mark = getattr(error, 'problem_mark', None)
-        where = f' (line {mark.line + 1})' if mark is not None else ''
         problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
-        raise PlainYamlError(f'not valid YAML: {problem}{where}') from error
+        line = None if mark is None else mark.line + 1
+        raise PlainYamlError('not valid YAML', line, problem) from error
     except UnicodeEncodeError as error:
-        raise PlainYamlError(f'not valid YAML: {error.reason}') from error
+        raise PlainYamlError('not valid YAML', detail=error.reason) from error
 
 
 def is_plain_text(text: str) -> bool:
@@ -88,7 +103,7 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
             raise PlainYamlError(f'more than {node_limit} keys and values')
         if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
             if event.tag not in (None, '!'):
-                raise PlainYamlError(f'YAML tags are not accepted ({_line(event)})')
+                raise PlainYamlError('YAML tags are not accepted', _line(event))
             holder = open_ones[-1]
             value: Any = {}
             if isinstance(event, yaml.ScalarEvent):
@@ -100,11 +115,11 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
             elif keys[-1] is None:
                 if type(value) is not str:
                     raise PlainYamlError(
-                        f'not valid YAML: a key must be a text, got {value!r:.40} ({_line(event)})'
+                        'not valid YAML', _line(event), f'a key must be a text, got {value!r:.40}'
                     )
                 if value in holder:
                     raise PlainYamlError(
-                        f'not valid YAML: the key {value!r:.60} stands twice ({_line(event)})'
+                        'not valid YAML', _line(event), f'the key {value!r:.60} stands twice'
                     )
                 keys[-1] = value
             else:
@@ -112,14 +127,14 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
                 keys[-1] = None
             if isinstance(event, yaml.CollectionStartEvent):
                 if len(open_ones) > depth_limit:
-                    raise PlainYamlError(f'nested deeper than {depth_limit} ({_line(event)})')
+                    raise PlainYamlError(f'nested deeper than {depth_limit}', _line(event))
                 open_ones.append(value)
                 keys.append(None)
         elif isinstance(event, yaml.CollectionEndEvent):
             open_ones.pop()
             keys.pop()
         elif isinstance(event, yaml.AliasEvent):
-            raise PlainYamlError(f'YAML aliases are not accepted ({_line(event)})')
+            raise PlainYamlError('YAML aliases are not accepted', _line(event))
         elif isinstance(event, yaml.DocumentStartEvent):
             if has_document:
                 raise PlainYamlError('expected one YAML document, found more')
@@ -136,8 +151,9 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
     if _INTEGER.fullmatch(text):
         if len(text) > _INTEGER_DIGITS:
             raise PlainYamlError(
-                f'not valid YAML: an integer of {len(text)} digits is not accepted '
-                f'({_line(event)})'
+                'not valid YAML',
+                _line(event),
+                f'an integer of {len(text)} digits is not accepted',
             )
         return int(text)
     if _FLOAT.fullmatch(text):
@@ -145,5 +161,5 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
     return text
 
 
-def _line(event: Any) -> str:
-    return f'line {event.start_mark.line + 1}'
+def _line(event: Any) -> int:
+    return int(event.start_mark.line) + 1

@@ -159,7 +159,7 @@ def thermal_windows(
         )
         raw = table.raw(tuple(states.T))
         curves, groups = sets.columns(states[:, BOARD] - reference_temperature, states[:, WEIGHT])
-        values = [*curves, *table.weighted(raw, tuple(states.T))]
+        values = [*curves, *table.weighted(raw, states[:, BOARD], states[:, WEIGHT])]
         moved = _moved(columns, spec, raw, states, shares, reference_temperature)
         whole = np.column_stack(
             (states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved)

@@ -15,11 +15,12 @@ from array import array
 
 import numpy as np
 
-from ..thermal.reading_queue import DISORDER_NS
+from ..thermal.reading_queue import refused_readings
 from ..typing import Bools, Floats, Ints, Stamps
 from .blocks import AccelBlock, CompensatedBlock
-from .compensator import SEGMENT_NS, TIME_JUMP_NS, Compensator
+from .compensator import TIME_JUMP_NS, Compensator
 from .kernel import Lines, correct
+from .segments import SEGMENT_NS, lay_lines
 
 #: Where xx, xy, xz, yy, yz, zz stand in a row of the covariance.
 _UNIQUE = [0, 1, 2, 4, 5, 8]
@@ -40,6 +41,7 @@ class _Segments:
         'is_new',
         'is_too_fast',
         'noise_excess',
+        'slow',
         'start_ns',
         'states',
     )
@@ -54,19 +56,19 @@ class _Segments:
         #: Held back because the samples come too fast; and what the rate adds to their noise.
         self.is_too_fast: list[bool] = []
         self.noise_excess: list[float] = []
+        #: What parameters and starts leave uncertain, nine numbers each.
+        self.slow = array('d')
         #: The thermal states at both ends, one behind the other.
         self.states = array('d')
         self.end_states = array('d')
 
-    def ends(self) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
+    def columns(self, numbers: array[float]) -> list[Floats]:
         """
-        Give the thermal states at the beginnings and at the ends, as columns.
+        Give what stands one behind the other, as columns.
 
         """
-        n = len(self.start_ns)
-        states = np.frombuffer(self.states).reshape(n, -1)
-        end_states = np.frombuffer(self.end_states).reshape(n, -1)
-        return tuple(states.T.copy()), tuple(end_states.T.copy())
+        table = np.frombuffer(numbers).reshape(len(self.start_ns), -1)
+        return list(table.T.copy())
 
 
 def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
@@ -106,28 +108,25 @@ def _one_by_one(compensator: Compensator, block: AccelBlock) -> CompensatedBlock
 
     """
     events = [
-        (int(after), 0, int(s), float(v))
-        for after, s, v in zip(block.board_after, block.board_stamp_ns, block.board, strict=True)
-    ]
-    events += [
-        (int(after), 1, int(s), float(v))
-        for after, s, v in zip(block.case_after, block.case_stamp_ns, block.case, strict=True)
+        (int(after), name, int(stamp_ns), float(celsius))
+        for name in compensator.thermal.inputs
+        if name in block.temperatures
+        for stamp_ns, celsius, after in zip(*block.temperatures[name], strict=True)
     ]
     events.sort(key=lambda event: event[0])
-    push = (compensator.push_board, compensator.push_case)
     index, rows = [], []
     k = 0
     stamps = block.accel_stamp_ns.tolist()
     for i, (stamp_ns, sample) in enumerate(zip(stamps, block.accel.tolist(), strict=True)):
         while k < len(events) and events[k][0] <= i:
-            push[events[k][1]](events[k][2], events[k][3])
+            compensator.push(*events[k][1:])
             k += 1
         row = compensator.process(stamp_ns, *sample)
         if row is not None:
             index.append(i)
             rows.append(row)
-    for _, kind, stamp_ns, celsius in events[k:]:
-        push[kind](stamp_ns, celsius)
+    for _, name, stamp_ns, celsius in events[k:]:
+        compensator.push(name, stamp_ns, celsius)
     where = np.array(index, dtype=np.int64)
     table = np.array(rows).reshape(-1, 9)
     return CompensatedBlock(
@@ -154,12 +153,10 @@ def _run_thermal_side(
     orders = [np.array([entry[2] for entry in pending], dtype=np.int64)]
     values = [np.array([entry[3] for entry in pending])]
     after = [np.zeros(len(pending), dtype=np.int64)]
-    for kind, (s, v, a) in enumerate(
-        (
-            (block.board_stamp_ns, block.board, block.board_after),
-            (block.case_stamp_ns, block.case, block.case_after),
-        )
-    ):
+    for kind, name in enumerate(compensator.thermal.inputs):
+        if name not in block.temperatures:
+            continue
+        s, v, a = block.temperatures[name]
         reading_ns.append(np.asarray(s, dtype=np.int64))
         kinds.append(np.full(len(s), kind))
         # Behind whatever was pushed before: only the order within one sensor and stamp counts.
@@ -173,10 +170,10 @@ def _run_thermal_side(
     arrival = np.concatenate(after)
     effect = np.maximum(np.searchsorted(stamps, reading_stamps, side='left'), arrival)
     order = np.lexsort((np.concatenate(orders), kind_column, reading_stamps, effect))
-    refused = _refused(reading_stamps, kind_column, arrival, effect)
+    refused = refused_readings(reading_stamps, kind_column, arrival, effect)
     if refused is not None:
-        for kind in (0, 1):
-            compensator.count_rejected(kind, int((kind_column[refused] == kind).sum()))
+        for kind, n_refused in enumerate(np.bincount(kind_column[refused]).tolist()):
+            compensator.thermal.count_rejected(kind, n_refused)
         order = order[~refused[order]]
     effect = effect[order]
     events = zip(
@@ -186,7 +183,8 @@ def _run_thermal_side(
         value_column[order].tolist(),
         strict=True,
     )
-    apply_reading = compensator.apply_reading
+    thermal = compensator.thermal
+    apply_reading = thermal.apply
     position = 0
     for at, stamp_ns, kind, celsius in events:
         if at > position:
@@ -194,28 +192,12 @@ def _run_thermal_side(
             _add_segments(compensator, segments, stamps, position, stop, n_seen)
             position = at
         if at >= n_samples:
-            (compensator.push_board, compensator.push_case)[kind](stamp_ns, celsius)
+            compensator.push(thermal.inputs[kind], stamp_ns, celsius)
         else:
             apply_reading(stamp_ns, kind, celsius)
     if position < n_samples:
         _add_segments(compensator, segments, stamps, position, n_samples, n_seen)
     return segments
-
-
-def _refused(stamps: Stamps, kinds: Ints, arrival: Ints, effect: Ints) -> Bools | None:
-    """
-    Find the readings that a later one shows to be of another clock while they wait, as the
-    stream's queue does; None where there are none.
-
-    """
-    refused = np.zeros(len(stamps), dtype=np.bool_)
-    for kind in (0, 1):
-        own = np.flatnonzero(kinds == kind)
-        for k in np.flatnonzero(np.diff(stamps[own]) < -DISORDER_NS).tolist():
-            before, this = own[: k + 1], own[k + 1]
-            is_other = stamps[before] > stamps[this] + DISORDER_NS
-            refused[before[is_other & (effect[before] >= arrival[this])]] = True
-    return refused if refused.any() else None
 
 
 def _add_segments(
@@ -230,36 +212,35 @@ def _add_segments(
     Add the segments of samples first..after, over which no reading takes effect.
 
     """
-    tracker = compensator.tracker
-    board_ns, updated_ns = tracker.board.stamp_ns, tracker.updated_ns
-    if board_ns is None or updated_ns is None:
-        compensator.counters.n_no_temperature += after - first
-        return
+    thermal = compensator.thermal
+    tracker = thermal.tracker
     last_ns = stamps.item(after - 1)
-    if last_ns - board_ns > compensator.timeout_ns:
-        fresh = int(
-            np.searchsorted(stamps[first:after], board_ns + compensator.timeout_ns, 'right')
-        )
-        compensator.counters.n_stale += after - first - fresh
+    fresh_ns = thermal.fresh_until_ns
+    if last_ns > fresh_ns:
+        fresh = int(np.searchsorted(stamps[first:after], fresh_ns, 'right'))
+        thermal.count_unmeasured(after - first - fresh)
         after = first + fresh
     while first < after:
         stamp_ns = stamps.item(first)
-        start_ns = stamp_ns - (stamp_ns - updated_ns) % SEGMENT_NS
+        start_ns = thermal.start_of(stamp_ns)
         end_ns = start_ns + SEGMENT_NS
         if last_ns < end_ns:
             stop = after
         else:
             stop = first + int(np.searchsorted(stamps[first:after], end_ns, 'left'))
-        is_new = compensator.open_segment(start_ns, n_seen + first, stamp_ns)
-        is_too_fast = compensator.rate_refuses and (is_new or compensator.is_refusing)
+        is_new = thermal.open(start_ns, n_seen + first, stamp_ns)
+        is_too_fast = thermal.rate_refuses and (is_new or compensator.is_refusing)
         segments.start_ns.append(start_ns)
         segments.first.append(first)
         segments.after.append(stop)
         segments.is_new.append(is_new)
         segments.is_too_fast.append(is_too_fast)
-        segments.noise_excess.append(compensator.noise_excess)
+        segments.noise_excess.append(thermal.noise_excess)
+        end = tracker.sample(end_ns)
+        for of_axis in thermal.slow_at(start_ns, end):
+            segments.slow.extend(of_axis)
         segments.states.extend(tracker.sample(start_ns))
-        segments.end_states.extend(tracker.sample(end_ns))
+        segments.end_states.extend(end)
         first = stop
 
 
@@ -272,16 +253,15 @@ def _apply(
 ) -> CompensatedBlock:
     if not segments.first:
         return CompensatedBlock(index[:0], stamps[:0], np.empty((0, 3)), np.empty((0, 9)))
-    starts, ends = segments.ends()
-    at_start = compensator.correction.bias_scale(starts)
-    at_end, variances = compensator.correction.evaluate(ends)
-    columns: list[Floats] = []
-    for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
-        columns += [bias, bias_end - bias, scale, scale_end - scale]
-    excess = np.array(segments.noise_excess)
-    correction = compensator.correction
-    for (a, b, c), noise in zip(variances, correction.noise, strict=True):
-        columns += (a + excess * noise, b, c)
+    slow = segments.columns(segments.slow)
+    correction = compensator.thermal.correction
+    columns = lay_lines(
+        correction,
+        segments.columns(segments.states),
+        segments.columns(segments.end_states),
+        [(slow[k], slow[k + 1], slow[k + 2]) for k in (0, 3, 6)],
+        np.array(segments.noise_excess),
+    )
     first = np.array(segments.first)
     counts = np.array(segments.after) - first
     source = _covered(first, counts, len(stamps))
@@ -378,7 +358,7 @@ def _refuted(
     Let the first sample of each segment tell of gravity; say which segments are held back for it.
 
     """
-    gravity, trace = compensator.gravity, compensator.correction.noise_trace
+    gravity, trace = compensator.gravity, compensator.thermal.correction.noise_trace
     is_refuted: list[bool] = []
     firsts = zip(
         stamps[begins].tolist(),

@@ -7,17 +7,19 @@ Owns the shape of a batch: columns in file order in, columns of published sample
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from ..typing import Floats, Ints, Stamps
+
+#: Of one thermometer: stamps, readings [degC], and how many of the block's samples came before.
+Readings: TypeAlias = tuple[Stamps, Floats, Stamps]
 
 
 class AccelBlock(Protocol):
     """
     Columns of a run of messages in file order.
-
-    `board_after[k]` and `case_after[k]` say how many of the block's samples come before reading k.
 
     """
 
@@ -36,44 +38,9 @@ class AccelBlock(Protocol):
         """
 
     @property
-    def board_stamp_ns(self) -> Stamps:
+    def temperatures(self) -> Mapping[str, Readings]:
         """
-        Stamps of the board readings, shape (m,).
-
-        """
-
-    @property
-    def board(self) -> Floats:
-        """
-        Board readings [degC], shape (m,).
-
-        """
-
-    @property
-    def board_after(self) -> Stamps:
-        """
-        Samples before each board reading, shape (m,).
-
-        """
-
-    @property
-    def case_stamp_ns(self) -> Stamps:
-        """
-        Stamps of the case readings, shape (k,).
-
-        """
-
-    @property
-    def case(self) -> Floats:
-        """
-        Case readings [degC], shape (k,).
-
-        """
-
-    @property
-    def case_after(self) -> Stamps:
-        """
-        Samples before each case reading, shape (k,).
+        Readings by the name of their thermometer, ``'board'`` and the others.
 
         """
 

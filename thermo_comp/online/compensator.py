@@ -3,11 +3,6 @@
 """
 Owns (counts, temperatures) -> (specific force, covariance, regime, status), streaming and batch.
 
-Between two thermal events the bias and the scale of each axis move linearly in time. An event is
-a temperature reading or, while none comes, the end of a one-second segment; there the correction
-is evaluated in full (at the segment's start and end), so a sample costs a few operations, follows
-the temperature without a staircase, and a batch needs the full evaluation once per segment.
-
 A reading takes effect at the first sample whose stamp is not before its own and that comes after
 it; so the result depends on stamps and order of arrival, not on when the code happened to run,
 and a node that got everything in order publishes the bits that the offline replay writes.
@@ -23,24 +18,14 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from ..thermal.reading_queue import ReadingQueue
-from ..thermal.regime import Regime
-from ..thermal.settings import ThermalConfig
-from ..thermal.tracker import ThermalTracker
 from ..unit.calibration import Calibration
-from ..unit.correction import Correction
 from .health import GravityMonitor
-from .sample_guard import RateWatch, StuckWatch
+from .sample_guard import StuckWatch
+from .segments import EVER_NS, SEGMENT_NS, ThermalSide, lay_lines
 from .status import CompensatorConfig, Counters
 
-#: Samples this much faster than calibrated, relative, still have the calibrated noise.
-RATE_TOLERANCE: Final = 0.1
-#: Longest time over which bias and scale are taken as linear in time.
-SEGMENT_NS: Final = 1_000_000_000
 #: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
 TIME_JUMP_NS: Final = 1_000_000_000
-#: Earlier than any stamp.
-_EVER_NS: Final = -(1 << 62)
 
 _Nine = tuple[float, float, float, float, float, float, float, float, float]
 _Twelve = tuple[
@@ -66,34 +51,15 @@ class Compensator:
     def __init__(self, calibration: Calibration, config: CompensatorConfig | None = None) -> None:
         self.config = config or CompensatorConfig()
         self.counters = Counters()
-        self._queue = ReadingQueue()
-        #: Age of the board temperature beyond which nothing is published.
-        self.timeout_ns = _timeout_ns(self.config)
-        self._flags: list[tuple[int, bool]] = []
-        self._n_applied = 0
-        self._segment_key: tuple[int, int] | None = None
         self.stuck = StuckWatch(self.config.stuck_timeout_s)
+        self.thermal = ThermalSide(calibration, self.config, self.counters)
         self._use(calibration)
-        self.tracker = ThermalTracker(
-            calibration.detector, calibration.memory_time_constants_s, self._thermal_config()
-        )
-        self.last_ns = self._event_ns = _EVER_NS
+        self.last_ns = self._event_ns = EVER_NS
 
     def _use(self, calibration: Calibration) -> None:
         self.calibration = calibration
-        self.correction = Correction(calibration)
         self._full_scale = self._limit = calibration.unit.full_scale
-        self._counts_cycles = calibration.unit.input == 'counts'
-        self.rate = RateWatch(calibration.unit.cycle_time_s)
         self.gravity = self._gravity_monitor()
-
-    def _thermal_config(self) -> ThermalConfig:
-        return ThermalConfig(
-            self.correction.gentle_transition(self.config.transition_time_s),
-            self.config.case_timeout_s,
-            self.calibration.board_lag_s,
-            self.config.temperature_timeout_s,
-        )
 
     def _gravity_monitor(self) -> GravityMonitor:
         return GravityMonitor(
@@ -101,24 +67,21 @@ class Compensator:
             self.config.gravity_tolerance_m_s2,
         )
 
-    def push_board(self, stamp_ns: int, celsius: float) -> None:
+    def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """
-        Queue a board temperature [degC]; it takes effect at the first sample not before it.
+        Queue a temperature; it takes effect at the first sample not before it.
+
+        Parameters
+        ----------
+        name : str
+            ``'board'`` or one of the calibration's sensors; another one is left out.
+        stamp_ns : int
+            When it was measured.
+        celsius : float
+            The reading [degC].
 
         """
-        self._push(stamp_ns, 0, celsius)
-
-    def push_case(self, stamp_ns: int, celsius: float) -> None:
-        """
-        Queue a case temperature [degC]; it takes effect at the first sample not before it.
-
-        """
-        self._push(stamp_ns, 1, celsius)
-
-    def _push(self, stamp_ns: int, kind: int, celsius: float) -> None:
-        n_refused = self._queue.push(stamp_ns, kind, celsius)
-        if n_refused:
-            self.count_rejected(kind, n_refused)
+        self.thermal.push(name, stamp_ns, celsius)
         self._event_ns = min(self._event_ns, stamp_ns)
 
     def process(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
@@ -189,7 +152,7 @@ class Compensator:
     def _count_bad(self, x: float, y: float, z: float) -> None:
         full_scale = self._full_scale
         if self.is_refusing:
-            if self.rate_refuses:
+            if self.thermal.rate_refuses:
                 self.counters.n_too_fast += 1
             else:
                 self.counters.n_refuted += 1
@@ -205,41 +168,49 @@ class Compensator:
         Correct the first sample after an event, which serves the checks, too.
 
         """
-        key = self._segment_key
-        if not self._advance(stamp_ns):
+        if not self._admit(stamp_ns):
             return None
-        if self._segment_key == key:
+        thermal = self.thermal
+        thermal.flush(stamp_ns)
+        fresh_ns = thermal.fresh_until_ns
+        if stamp_ns > fresh_ns:
+            thermal.count_unmeasured(1)
+            # Every sample comes back here until there is a temperature, and is counted here.
+            self._event_ns = EVER_NS
+            self.last_ns = stamp_ns
+            return None
+        counters = self.counters
+        start_ns = thermal.start_of(stamp_ns)
+        is_new = thermal.open(start_ns, counters.n_in - counters.n_out_of_order, stamp_ns)
+        self._event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
+        line, variance = self._lay_line(start_ns)
+        self._segment = (start_ns, line, variance, thermal.correction.misalignment)
+        if not is_new:
             return self.process(stamp_ns, x, y, z)
-        self.is_refusing = self.rate_refuses
+        self.is_refusing = thermal.rate_refuses
         row = self.process(stamp_ns, x, y, z)
-        if self.gravity.is_refuted and not self.rate_refuses:
+        if self.gravity.is_refuted and not thermal.rate_refuses:
             # It still tells when the trust is restored.
             self.is_refusing = True
             if row is not None:
-                self.counters.n_out -= 1
-                self.counters.n_refuted += 1
+                counters.n_out -= 1
+                counters.n_refuted += 1
         if row is not None and self.gravity.wants(stamp_ns):
-            self.gravity.add(stamp_ns, row[:3], row[3:], self.correction.noise_trace)
+            self.gravity.add(stamp_ns, row[:3], row[3:], thermal.correction.noise_trace)
         return None if self.is_refusing else row
 
-    @property
-    def rate_refuses(self) -> bool:
-        """
-        Whether samples are held back because they cannot be conversions of the calibrated cycle.
-
-        """
-        return self.rate.is_too_fast and self._counts_cycles
-
-    def _advance(self, stamp_ns: int) -> bool:
-        """
-        Bring the thermal state and the segment to a stamp; False where no sample may go out.
-
-        """
-        if not self._admit(stamp_ns):
-            return False
-        for reading_ns, kind, _, celsius in self._queue.due(stamp_ns):
-            self.apply_reading(reading_ns, kind, celsius)
-        return self._enter_segment(stamp_ns)
+    def _lay_line(self, start_ns: int) -> tuple[_Twelve, _Nine]:
+        thermal = self.thermal
+        start = thermal.tracker.sample(start_ns)
+        end = thermal.tracker.sample(start_ns + SEGMENT_NS)
+        slow = thermal.slow_at(start_ns, end)
+        numbers = lay_lines(thermal.correction, start, end, slow, thermal.noise_excess)
+        bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = numbers[:12]
+        ax, lx, qx, ay, ly, qy, az, lz, qz = numbers[12:]
+        return (
+            (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1),
+            (ax, lx, qx, ay, ly, qy, az, lz, qz),
+        )
 
     def _admit(self, stamp_ns: int) -> bool:
         if stamp_ns > self.last_ns:
@@ -248,8 +219,7 @@ class Compensator:
             self.counters.n_out_of_order += 1
             return False
         # Readings of the old time that no sample reached belong to the time that is gone.
-        self._queue.drop_after(stamp_ns)
-        self.tracker.reset()
+        self.thermal.queue.drop_after(stamp_ns)
         self._forget_samples()
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
@@ -257,124 +227,16 @@ class Compensator:
 
     def _forget_samples(self) -> None:
         # What comes is another recording.
+        self.thermal.reset()
         self.stuck.reset()
-        self.rate.reset()
         self.gravity = self._gravity_monitor()
-
-    def apply_reading(self, stamp_ns: int, kind: int, celsius: float) -> None:
-        """
-        Let a reading take effect now: kind 0 is the board, 1 the case.
-
-        """
-        self._n_applied += 1
-        tracker = self.tracker
-        if kind == 0:
-            if tracker.board_reading(stamp_ns, celsius):
-                self.counters.n_board += 1
-            else:
-                self.count_rejected(kind)
-        elif tracker.case_reading(stamp_ns, celsius):
-            self.counters.n_case += 1
-            regime = tracker.detector.regime
-            if regime is not Regime.UNKNOWN:
-                self._flags.append((stamp_ns, regime is Regime.DYNAMIC))
-        else:
-            self.count_rejected(kind)
-
-    def count_rejected(self, kind: int, n: int = 1) -> None:
-        """
-        Count readings that are not used: kind 0 is the board, 1 the case.
-
-        """
-        if kind == 0:
-            self.counters.n_board_rejected += n
-        else:
-            self.counters.n_case_rejected += n
-
-    def _enter_segment(self, stamp_ns: int) -> bool:
-        tracker = self.tracker
-        board_ns = tracker.board.stamp_ns
-        updated_ns = tracker.updated_ns
-        next_ns = self._queue.next_ns
-        if board_ns is None or updated_ns is None:
-            self.counters.n_no_temperature += 1
-            # Every sample comes back here until there is a temperature, and is counted here.
-            self._event_ns = _EVER_NS
-            self.last_ns = stamp_ns
-            return False
-        if stamp_ns - board_ns > self.timeout_ns:
-            self.counters.n_stale += 1
-            self._event_ns = _EVER_NS
-            self.last_ns = stamp_ns
-            return False
-        # Segments count from the last reading, wherever the first sample in one may lie.
-        start_ns = updated_ns + (stamp_ns - updated_ns) // SEGMENT_NS * SEGMENT_NS
-        counters = self.counters
-        self.open_segment(start_ns, counters.n_in - counters.n_out_of_order, stamp_ns)
-        line, variance = self._evaluate(start_ns)
-        self._segment = (start_ns, line, variance, self.correction.misalignment)
-        deadline_ns = board_ns + self.timeout_ns + 1
-        self._event_ns = min(next_ns, start_ns + SEGMENT_NS, deadline_ns)
-        return True
-
-    def open_segment(self, start_ns: int, n_seen: int, stamp_ns: int) -> bool:
-        """
-        Check the rate at a segment's first sample; False if the segment only goes on.
-
-        Parameters
-        ----------
-        start_ns : int
-            Where the segment begins.
-        n_seen : int
-            Samples in order that came before.
-        stamp_ns : int
-            Stamp of its first sample.
-
-        Returns
-        -------
-        bool
-            Whether it is a new segment, not one that a block's end has cut.
-
-        """
-        key = (self._n_applied, start_ns)
-        if key == self._segment_key:
-            return False
-        self._segment_key = key
-        self.rate.update(n_seen, stamp_ns)
-        return True
-
-    @property
-    def noise_excess(self) -> float:
-        """
-        What the rate adds to the noise of a sample, relative; density^2 / cycle is for the cycle.
-
-        """
-        excess = self.rate.ratio - 1.0
-        return excess if excess > RATE_TOLERANCE else 0.0
-
-    def _evaluate(self, start_ns: int) -> tuple[_Twelve, _Nine]:
-        """
-        Lay a line from a segment's beginning to its end: bias and scale, their change; a, b, c.
-
-        """
-        correction = self.correction
-        (bx, sx), (by, sy), (bz, sz) = correction.bias_scale(self.tracker.sample(start_ns))
-        at_end, variance = correction.evaluate(self.tracker.sample(start_ns + SEGMENT_NS))
-        (bx1, sx1), (by1, sy1), (bz1, sz1) = at_end
-        (ax, lx, qx), (ay, ly, qy), (az, lz, qz) = variance
-        nx, ny, nz = correction.noise
-        excess = self.noise_excess
-        return (
-            (bx, bx1 - bx, sx, sx1 - sx, by, by1 - by, sy, sy1 - sy, bz, bz1 - bz, sz, sz1 - sz),
-            (ax + excess * nx, lx, qx, ay + excess * ny, ly, qy, az + excess * nz, lz, qz),
-        )
 
     def take_flags(self) -> list[tuple[int, bool]]:
         """
-        Take the regime flags that became due: (stamp of the case reading, S).
+        Take the regime flags that became due: (stamp of the leading sensor's reading, S).
 
         """
-        flags, self._flags = self._flags, []
+        flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
     @property
@@ -394,52 +256,28 @@ class Compensator:
         Take the readings that no sample has reached: (stamp, kind, order, degC).
 
         """
-        self._event_ns = _EVER_NS
-        return self._queue.take()
+        self._event_ns = EVER_NS
+        return self.thermal.queue.take()
 
     def flush(self, stamp_ns: int) -> None:
         """
         Let queued readings up to a stamp take effect without a sample (no samples are coming).
 
         """
-        for reading_ns, kind, _, celsius in self._queue.due(stamp_ns):
-            self.apply_reading(reading_ns, kind, celsius)
-        self._event_ns = _EVER_NS
+        self.thermal.flush(stamp_ns)
+        self._event_ns = EVER_NS
 
     def swap(self, calibration: Calibration) -> None:
         """
         Take over another calibration between two samples.
 
         The thermometers, the regime and the memory go on where the new calibration reads them in
-        the same way; a calibration with another detector or other time constants starts them anew.
+        the same way and remembers the same; otherwise they start anew.
 
         """
-        same = (
-            calibration.detector == self.calibration.detector
-            and calibration.memory_time_constants_s == self.calibration.memory_time_constants_s
-        )
+        self.thermal.swap(calibration, self.now_ns)
         self._use(calibration)
-        self._segment_key = None
-        if same:
-            self.tracker.reconfigure(self._thermal_config(), self.now_ns)
-        else:
-            self.tracker = self._restarted(calibration)
-        self._event_ns = _EVER_NS
-
-    def _restarted(self, calibration: Calibration) -> ThermalTracker:
-        """
-        Make a tracker that starts from the temperatures just seen, so that no sample is lost.
-
-        """
-        tracker = ThermalTracker(
-            calibration.detector, calibration.memory_time_constants_s, self._thermal_config()
-        )
-        old = self.tracker
-        if old.board.stamp_ns is not None:
-            tracker.board_reading(old.board.stamp_ns, old.board.temperature)
-        if old.case.stamp_ns is not None:
-            tracker.case_reading(old.case.stamp_ns, old.case.temperature)
-        return tracker
+        self._event_ns = EVER_NS
 
     def reconfigure(self, config: CompensatorConfig) -> None:
         """
@@ -449,11 +287,9 @@ class Compensator:
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckWatch(config.stuck_timeout_s)
         self.config = config
-        self.timeout_ns = _timeout_ns(config)
         self.gravity = self._gravity_monitor()
-        self._segment_key = None
-        self.tracker.reconfigure(self._thermal_config(), self.now_ns)
-        self._event_ns = _EVER_NS
+        self.thermal.reconfigure(config, self.now_ns)
+        self._event_ns = EVER_NS
 
     @property
     def now_ns(self) -> int | None:
@@ -461,27 +297,21 @@ class Compensator:
         Stamp of the last sample; None before the first.
 
         """
-        return self.last_ns if self.last_ns != _EVER_NS else None
+        return self.last_ns if self.last_ns != EVER_NS else None
 
     def pending_ahead(self, stamp_ns: int) -> float:
         """
         How far the farthest reading that waits for a sample lies ahead of a stamp [s]; 0 if none.
 
         """
-        return self._queue.ahead(stamp_ns)
+        return self.thermal.queue.ahead(stamp_ns)
 
     def reset(self) -> None:
         """
         Forget temperatures, regime and queue; counters stay.
 
         """
-        self.tracker.reset()
-        self._queue.take()
-        self._flags.clear()
+        self.thermal.queue.take()
+        self.thermal.flags.clear()
         self._forget_samples()
-        self._segment_key = None
-        self.last_ns = self._event_ns = _EVER_NS
-
-
-def _timeout_ns(config: CompensatorConfig) -> int:
-    return int(config.temperature_timeout_s * 1e9)
+        self.last_ns = self._event_ns = EVER_NS

@@ -25,7 +25,8 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     Say how a compensator stands at the stamp of its last sample.
 
     """
-    tracker = compensator.tracker
+    thermal = compensator.thermal
+    tracker = thermal.tracker
     stamp_ns = compensator.now_ns
     if stamp_ns is None:
         stamp_ns = tracker.updated_ns
@@ -54,12 +55,10 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     if usual < stale_after:
         stale_after = max(usual, SHORTEST_STALE_S)
     state = tracker.sample(stamp_ns)
-    regime_set = (
-        compensator.correction.dynamic
-        if tracker.detector.regime == Regime.DYNAMIC
-        else compensator.correction.static
-    )
-    _, excess = regime_set.regressors(state)
+    correction = thermal.correction
+    board, case = (tracker.guards[name] for name in thermal.inputs[:2])
+    is_dynamic = tracker.detector.regime == Regime.DYNAMIC
+    excess = (correction.dynamic if is_dynamic else correction.static).excess(state)
     return CompensatorStatus(
         counters,
         stamp_ns,
@@ -68,18 +67,18 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         math.inf if case_ns is None else (stamp_ns - case_ns) * 1e-9,
         board_age > stale_after,
         board_age > compensator.config.temperature_timeout_s,
-        not tracker.is_case_live(stamp_ns),
-        regime_set.relative_excess(excess),
+        not tracker.is_live(stamp_ns),
+        correction.relative_excess(state),
         excess.temperature,
         excess.rate * 60.0,
-        gradient_excess_k=excess.gradient,
-        board_fault=tracker.board_guard.fault,
-        case_fault=tracker.case_guard.fault,
-        board_step_k=tracker.board_guard.step,
-        case_step_k=tracker.case_guard.step,
+        gradient_excess_k=correction.gradient_excess(state),
+        board_fault=board.fault,
+        case_fault=case.fault,
+        board_step_k=board.step,
+        case_step_k=case.step,
         is_lead_reversed=tracker.lead.is_reversed,
-        rate_ratio=compensator.rate.ratio,
-        is_too_fast=compensator.rate_refuses,
+        rate_ratio=thermal.rate.ratio,
+        is_too_fast=thermal.rate_refuses,
         gravity=compensator.gravity.result,
         is_refuted=compensator.gravity.is_refuted,
         pending_ahead_s=ahead_s,

@@ -177,6 +177,17 @@ class Block:
         """
         return len(self.accel_stamp_ns)
 
+    @property
+    def temperatures(self) -> dict[str, tuple[Ints, Floats, Ints]]:
+        """
+        Readings by the name of their thermometer: stamps, degC, samples before.
+
+        """
+        return {
+            'board': (self.board_stamp_ns, self.board, self.board_after),
+            'case': (self.case_stamp_ns, self.case, self.case_after),
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class Recording:

@@ -14,6 +14,7 @@ import gc
 import sys
 import time
 from copy import copy
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -174,11 +175,11 @@ class CompensationNode:
         overridable, compensator = QoSOverridingOptions.with_default_policies(), self._compensator
         samples = self._open_samples(self._config)
         temperatures = [
-            (self._subscribe(Temperature, topic, TEMPERATURE_QOS, is_hot=False), push)
-            for topic, push in (
-                ('temperature/board', compensator.push_board),
-                ('temperature/case', compensator.push_case),
+            (
+                self._subscribe(Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False),
+                partial(compensator.push, name),
             )
+            for name in compensator.thermal.inputs
         ]
         try:
             imu, flag, self._diagnostics = (

@@ -7,9 +7,6 @@ A lag L of an input u obeys ``dL/dt = (u - L) / tau``. Kept is ``m = u - L``; wi
 two readings (first-order hold) its exact step over dt is
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
 
-A play of half-width r follows its input v only where that pushes it:
-``P = min(max(P, v - r), v + r)`` (the part of which rate-independent hysteresis is made).
-
 """
 
 from __future__ import annotations
@@ -22,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from ..typing import Floats
+from .plays import Plays
 
 #: The input of a lag or play that is the board's own temperature.
 BOARD_INPUT: Final = 'board'
@@ -279,56 +277,6 @@ class LagBank:
         start_ns = self.start_ns
         age = 0.0 if start_ns is None else max(stamp_ns - start_ns, 0) * 1e-9
         return [math.exp(-age / tau) for tau in self.taus]
-
-
-class Plays:
-    """
-    Play operators on one input.
-
-    Parameters
-    ----------
-    widths : tuple of float
-        Half-widths [K].
-
-    """
-
-    def __init__(self, widths: tuple[float, ...]) -> None:
-        self.widths = widths
-        self._held: list[float] = []
-
-    def forget(self) -> None:
-        """
-        Begin anew with the next input, in the middle of every play.
-
-        """
-        self._held = []
-
-    def step(self, v: float) -> None:
-        """
-        Take the next value of the input.
-
-        """
-        held = self._held
-        if not held:
-            self._held = [v] * len(self.widths)
-            return
-        self._held = [
-            v - r if p < v - r else v + r if p > v + r else p
-            for p, r in zip(held, self.widths, strict=True)
-        ]
-
-    def at(self, v: float) -> list[float]:
-        """
-        Give each play less its input, for a value that is not remembered.
-
-        """
-        if not self._held:
-            return [0.0] * len(self.widths)
-        result = []
-        for held, r in zip(self._held, self.widths, strict=True):
-            beside = held - v
-            result.append(-r if beside < -r else r if beside > r else beside)
-        return result
 
 
 class ThermalMemory:

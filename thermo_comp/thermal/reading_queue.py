@@ -11,7 +11,11 @@ import heapq
 from collections.abc import Iterator
 from typing import Final
 
-#: (stamp [ns], kind: 0 board, 1 case, order of arrival, degC).
+import numpy as np
+
+from ..typing import Bools, Ints, Stamps
+
+#: (stamp [ns], kind: 0 board, 1 and up the others, order of arrival, degC).
 Entry = tuple[int, int, int, float]
 
 #: More readings than this that wait mean that their clock is not the samples'.
@@ -34,8 +38,8 @@ class ReadingQueue:
     def __init__(self) -> None:
         self._entries: list[Entry] = []
         self._n_pushed = 0
-        #: Stamps of the readings pushed last, board and case.
-        self._last_ns = [-NEVER_NS, -NEVER_NS]
+        #: Stamp of the reading of each kind that was pushed last.
+        self._last_ns: dict[int, int] = {}
 
     @property
     def next_ns(self) -> int:
@@ -52,7 +56,7 @@ class ReadingQueue:
 
         """
         n_before = len(self._entries)
-        last_ns, self._last_ns[kind] = self._last_ns[kind], stamp_ns
+        last_ns, self._last_ns[kind] = self._last_ns.get(kind, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:
             latest_ns = stamp_ns + DISORDER_NS
             self._entries = [e for e in self._entries if e[1] != kind or e[0] <= latest_ns]
@@ -96,3 +100,30 @@ class ReadingQueue:
         if not self._entries:
             return 0.0
         return (max(entry[0] for entry in self._entries) - stamp_ns) * 1e-9
+
+
+def refused_readings(stamps: Stamps, kinds: Ints, arrival: Ints, effect: Ints) -> Bools | None:
+    """
+    Find what a queue refuses of many readings, as a later one is of another clock.
+
+    Parameters
+    ----------
+    stamps, kinds : ndarray of int64, shape (n,)
+        The readings, those of each kind in order of arrival.
+    arrival, effect : ndarray of int64, shape (n,)
+        Samples before each reading comes, and before it takes effect.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,), or None
+        None where there are none.
+
+    """
+    refused = np.zeros(len(stamps), dtype=np.bool_)
+    for kind in range(int(kinds.max(initial=-1)) + 1):
+        own = np.flatnonzero(kinds == kind)
+        for k in np.flatnonzero(np.diff(stamps[own]) < -DISORDER_NS).tolist():
+            before, this = own[: k + 1], own[k + 1]
+            is_other = stamps[before] > stamps[this] + DISORDER_NS
+            refused[before[is_other & (effect[before] >= arrival[this])]] = True
+    return refused if refused.any() else None

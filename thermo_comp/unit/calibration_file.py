@@ -20,7 +20,7 @@ from ..errors import CalibrationError
 from ..files import CALIBRATION, read_bounded, write_atomically
 from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
 from .calibration import FORMAT_VERSION, Calibration
-from .schema import SchemaError, build, json_schema, plain
+from .schema import SchemaError, build, json_schema, plain, required_keys
 from .version_1 import read_version_1
 
 #: With the whole bank of columns and one thermometer beside the board a calibration takes some
@@ -84,10 +84,10 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     except UnicodeDecodeError as error:
         raise CalibrationError(f'not UTF-8 text (byte {error.start})', path) from error
     except PlainYamlError as error:
-        raise CalibrationError(str(error), path) from error
+        raise CalibrationError(str(error), path, rule=error.rule) from error
     if not isinstance(data, dict):
         raise CalibrationError('expected a mapping of keys at the top level', path)
-    missing = [key for key in _REQUIRED if key not in data]
+    missing = [key for key in required_keys(Calibration) if key not in data]
     rule = f'not a calibration: the key `{missing[0]}` is missing' if missing else None
     version = data.get('format_version')
     if type(version) is int and version > FORMAT_VERSION:
@@ -103,7 +103,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
             return read_version_1(data)
         return build(Calibration, data)
     except SchemaError as error:
-        raise CalibrationError(error.message, path, error.key or None) from error
+        raise CalibrationError(error.message, path, error.key or None, rule) from error
 
 
 def dump_calibration(calibration: Calibration) -> str:

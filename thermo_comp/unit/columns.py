@@ -52,7 +52,6 @@ BANK_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 8).round(9).tolist())
 EVEN_WIDTHS: Final = (0.75, 1.5, 3.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2)
 PLAY_TAU: Final = 900.0
-_OF_SENSOR: Final = ('now', 'neighbour', 'square', 'size', 'even')
 
 
 @dataclass(frozen=True)
@@ -105,6 +104,14 @@ class Column:
                 raise ValueError(
                     f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
                 )
+
+    @property
+    def is_of_gradient(self) -> bool:
+        """
+        Whether the value is made of the present gradient of `sensor`.
+
+        """
+        return self.kind in ('now', 'even', 'size') or (self.kind == 'square' and not self.tau_s)
 
     @property
     def lag(self) -> tuple[str, float] | None:
@@ -188,7 +195,7 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     lags: set[tuple[str, float]] = set()
     plays: set[tuple[float, float]] = set()
     for column in columns:
-        if column.lag != (BOARD_INPUT, column.tau_s) and column.kind in _OF_SENSOR and column.sensor not in sensors:
+        if (column.is_of_gradient or column.kind == 'neighbour') and column.sensor not in sensors:
             raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
         if column.lag:
             lags.add(column.lag)
@@ -259,6 +266,8 @@ class ColumnTable:
         lower, upper = temperature_range_c
         self._t_range = lower - reference_temperature, upper - reference_temperature
         self._n_powers = max((column.power for column in columns), default=0)
+        #: Whether any column belongs to one regime alone.
+        self.differs = any(column.during != 'always' for column in columns)
         # What differs only in power, range or regime is evaluated once.
         sources: dict[tuple[str, int, float], int] = {}
         self._plan: list[tuple[int, float, float, int, str]] = []
@@ -288,31 +297,103 @@ class ColumnTable:
             for u, (_, lower, upper, _, _) in zip(raw, self._plan, strict=True)
         ]
 
+    def excess(
+        self, raw: Sequence[Number], held: Sequence[Number], nil: Number, which: Iterable[int]
+    ) -> Number:
+        """
+        Say how far the farthest of some columns lies outside its range, in half ranges.
+
+        """
+        result = nil
+        for k in which:
+            _, lower, upper, _, _ = self._plan[k]
+            excess = abs(raw[k] - held[k]) / ((upper - lower) / 2.0)
+            if isinstance(excess, np.ndarray):
+                result = np.maximum(result, excess)
+            elif excess > result:
+                result = excess
+        return result
+
     def values(self, state: Sequence[Number]) -> list[Number]:
         """
         Evaluate phi of each column.
 
         """
-        return self.weighted(self.held(self.raw(state)), state)
+        return self.weighted(self.held(self.raw(state)), state[BOARD], state[WEIGHT])
 
-    def weighted(self, held: Sequence[Number], state: Sequence[Number]) -> list[Number]:
+    def weighted(self, factors: Sequence[Number], board: Number, weight: Number) -> list[Number]:
         """
-        Multiply a number per column by that column's power of t and weight of its regime.
+        Multiply a number per column by its power of t and share of its regime; u held makes phi.
 
         """
-        t = hold(state[BOARD] - self._reference, *self._t_range)
-        powers = [t, t]
-        for _ in range(1, self._n_powers):
-            powers.append(powers[-1] * t)
-        weight = state[WEIGHT]
+        powers = self._powers(board)
         rest = 1.0 - weight
         result = []
-        for u, (_, _, _, power, during) in zip(held, self._plan, strict=True):
-            phi = u * powers[power] if power else u
+        for factor, (_, _, _, power, during) in zip(factors, self._plan, strict=True):
+            phi = factor * powers[power] if power else factor
             if during != 'always':
                 phi = phi * (rest if during == 'static' else weight)
             result.append(phi)
         return result
+
+    def slopes(
+        self, state: Sequence[Number], raw: Sequence[Number]
+    ) -> tuple[list[Number], list[Number]]:
+        """
+        Differentiate phi, ranges aside.
+
+        Parameters
+        ----------
+        state : sequence of float or of ndarray
+            See `values`.
+        raw : sequence of float or of ndarray
+            What `raw` gives for it.
+
+        Returns
+        -------
+        on_input : list of float or of ndarray
+            By what u is made of: rate, gradient, lag or play.
+        on_power : list of float or of ndarray
+            By the t that multiplies u.
+
+        """
+        board, weight = state[BOARD], state[WEIGHT]
+        one = board * 0.0 + 1.0
+        inner = []
+        for u, (source, _, _, _, _) in zip(raw, self._plan, strict=True):
+            bend, place, width = self._sources[source]
+            slope = one
+            if bend == 'even':
+                slope = 2.0 / (width * width) * state[place] * (1.0 - u * u)
+            elif bend == 'square':
+                slope = 2.0 * state[place]
+            elif bend == 'size':
+                slope = _sign(state[place])
+            inner.append(slope)
+        powers = self._powers(board)
+        rest = 1.0 - weight
+        outer = []
+        for u, (_, _, _, power, during) in zip(raw, self._plan, strict=True):
+            slope = one * 0.0
+            if power:
+                slope = u * float(power)
+            if power > 1:
+                slope = slope * powers[power - 1]
+            if during != 'always':
+                slope = slope * (rest if during == 'static' else weight)
+            outer.append(slope)
+        return self.weighted(inner, board, weight), outer
+
+    def _powers(self, board: Number) -> list[Number]:
+        """
+        Raise t to the powers that occur; that of 0 is not used.
+
+        """
+        t = hold(board - self._reference, *self._t_range)
+        powers = [t, t]
+        for _ in range(1, self._n_powers):
+            powers.append(powers[-1] * t)
+        return powers
 
 
 def _place(column: Column, layout: Layout) -> int:
@@ -338,6 +419,12 @@ def _value(bend: str, u: Number, width: float) -> Number:
         return abs(u)
     x = u / width
     return _tanh(x * x)
+
+
+def _sign(x: Number) -> Number:
+    if isinstance(x, np.ndarray):
+        return np.sign(x)
+    return math.copysign(1.0, x) if x else 0.0
 
 
 def _tanh(x: Number) -> Number:

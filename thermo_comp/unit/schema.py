@@ -164,6 +164,14 @@ def plain(value: Any) -> Any:
     return [plain(item) for item in value] if isinstance(value, tuple) else value
 
 
+def required_keys(cls: type) -> tuple[str, ...]:
+    """
+    Return the keys of a dataclass that must be given.
+
+    """
+    return _fields(cls)[1]
+
+
 def json_schema(cls: type) -> dict[str, Any]:
     """
     Return the JSON Schema of a dataclass and of all that it holds.
@@ -212,19 +220,17 @@ def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 @lru_cache(maxsize=256)
-def _fields(cls: type) -> tuple[dict[str, Any], frozenset[str]]:
+def _fields(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
     """
     Return the hints of a dataclass by key, and which keys must be given.
 
     """
     hints = get_type_hints(cls, include_extras=True)
     fields = dataclasses.fields(cls)
-    required = {
-        f.name
-        for f in fields
-        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-    }
-    return {f.name: hints[f.name] for f in fields}, frozenset(required)
+    required = tuple(
+        f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING
+    )
+    return {f.name: hints[f.name] for f in fields}, required
 
 
 def _scalar(hint: type, data: Any, key: str) -> Any:
@@ -253,8 +259,8 @@ def _object(cls: type, data: Any, key: str) -> Any:
     for name in data:
         if name not in hints:
             raise SchemaError(_joined(key, _shown_name(name)), 'unknown key')
-    for name in hints:
-        if name in required and name not in data:
+    for name in required:
+        if name not in data:
             raise SchemaError(_joined(key, name), 'this key is missing')
     values = {
         name: _build(hint, data[name], _joined(key, name))
@@ -368,4 +374,4 @@ def _define(cls: Any, definitions: dict[str, Any]) -> None:
             factory = field.default_factory
             value = field.default if factory is dataclasses.MISSING else factory()
             result['properties'][field.name]['default'] = plain(value)
-    result['required'] = [name for name in hints if name in required]
+    result['required'] = list(required)

@@ -1,0 +1,336 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Corrections with full banks: stream = batch to the bit, axes apart, sd = scatter of what is drawn.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders import (
+    SECOND_NS,
+    axis_set,
+    calibration,
+    columns_from_events,
+    regime_set,
+    rich_calibration,
+    term,
+)
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.online.status import CompensatorConfig
+from thermo_comp.thermal.memory import start_covariance
+from thermo_comp.thermal.tracker import ThermalTracker
+from thermo_comp.unit.calibration import Axes, AxisReference, ResponseTerm, parameter_layout
+from thermo_comp.unit.columns import bank
+from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.posterior import posterior_of
+from thermo_comp.unit.uncertainty import SlowUncertainty
+
+SENSORS = ('case', 'tip')
+UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+
+
+def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
+    """Draw a unit with every column of the bank of two sensors."""
+    terms = []
+    for column in bank(SENSORS):
+        # Of some counts and 1e-4 at the edges, whatever the column's power.
+        sd = 10.0**-column.power * size
+        bias, scale = np.zeros(3), np.zeros(3)
+        bias[list(axes)] = 0.05 * sd * rng.standard_normal(len(axes))
+        scale[list(axes)] = 1e-6 * sd * rng.standard_normal(len(axes))
+        keys = {
+            name: getattr(column, name)
+            for name in ('group', 'kind', 'sensor', 'tau_s', 'width_k', 'power', 'during')
+        }
+        edge = 1.0 if column.kind == 'even' else 4.0 + 4.0 * rng.random()
+        terms.append(
+            ResponseTerm(
+                **keys,
+                range=(-edge, edge),
+                bias=tuple(bias.tolist()),
+                scale=tuple(scale.tolist()),
+            )
+        )
+    one = axis_set((0.0, 0.3, 1e-3), (1.0, 7e-5), residual_sd_m_s2=1e-5)
+    two = axis_set((0.0, 0.3, 2e-3), (1.0, 6e-5), delta=0.05)
+    unit = calibration(
+        static=regime_set(one, one, one),
+        dynamic=regime_set(two, two, two),
+        sensors=SENSORS,
+        response=tuple(terms),
+    )
+    if not posterior:
+        return unit
+    n = parameter_layout(unit).n_parameters
+    root = rng.standard_normal((n, 7)) * 1e-4
+    return replace(unit, posterior=posterior_of(root @ root.T + 1e-10 * np.eye(n)))
+
+
+def run_of(rng, seconds=240, rate=4):
+    """Any messages in order: samples, three thermometers that jitter and drop out."""
+    events = []
+    for k in range(seconds * rate):
+        stamp = k * SECOND_NS // rate + int(rng.integers(0, 1_000_000))
+        if k % rate == 0:
+            wave = 12.0 * math.sin(k / rate / 150.0)
+            for name, ahead in (('board', 0.0), ('case', 3.0), ('tip', -1.0)):
+                if rng.random() > 0.1 and not (name == 'tip' and 60 < k / rate < 160):
+                    late = int(rng.integers(-30_000_000, 2_000_000))
+                    celsius = 22.0 + wave * (1.0 + 0.1 * ahead) + ahead
+                    noise = 0.005 * rng.standard_normal()
+                    events.append((name, max(stamp + late, 0), celsius + noise))
+        sample = (rng.normal(0, 900), rng.normal(0, 900), 2900.0)
+        events.append(('accel', stamp, sample))
+    return events
+
+
+def stream(compensator, events):
+    rows = []
+    for kind, stamp, value in events:
+        if kind == 'accel':
+            row = compensator.process(stamp, *value)
+            if row is not None:
+                rows.append(row)
+        else:
+            compensator.push(kind, stamp, value)
+    return np.array(rows).reshape(-1, 9)
+
+
+def assert_same(blocks, rows):
+    force = np.concatenate([block.specific_force for block in blocks])
+    covariance = np.concatenate([block.covariance for block in blocks])
+    np.testing.assert_array_equal(force, rows[:, :3])
+    np.testing.assert_array_equal(covariance[:, [0, 1, 2, 4, 5, 8]], rows[:, 3:])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(40, 900))
+@settings(max_examples=4, deadline=None, phases=[Phase.generate])
+def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
+    rng = np.random.default_rng(seed)
+    unit = full_bank(rng, posterior=True)
+    events = run_of(rng, seconds=50)
+    rows = stream(Compensator(unit, UNCHECKED), events)
+    whole, cut = Compensator(unit, UNCHECKED), Compensator(unit, UNCHECKED)
+    assert_same([process_block(whole, columns_from_events(events))], rows)
+    pieces = [events[k : k + chunk] for k in range(0, len(events), chunk)]
+    assert_same([process_block(cut, columns_from_events(piece)) for piece in pieces], rows)
+    assert len(rows) > 190
+
+
+def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
+    events = run_of(rng)
+    plain = stream(Compensator(full_bank(rng, axes=()), UNCHECKED), events)
+    moved = stream(Compensator(full_bank(rng, axes=(0,)), UNCHECKED), events)
+    assert (moved[:, 0] != plain[:, 0]).all()
+    # y, z and their (co)variances.
+    for column in (1, 2, 6, 7, 8):
+        np.testing.assert_array_equal(moved[:, column], plain[:, column])
+
+
+def states_of(unit, rng, n=5):
+    """Give a tracker in the middle of a run, and states along its way."""
+    tracker = ThermalTracker(unit.detector, Correction(unit).memory)
+    found = []
+    for k, (kind, stamp, value) in enumerate(run_of(rng, seconds=1200, rate=1)):
+        if kind != 'accel':
+            tracker.read(kind, stamp, value)
+        if k % (4800 // n) == 4799 // n:
+            found.append((stamp, tracker.sample(stamp), tracker.memory.start_shares(stamp)))
+    return tracker, found
+
+
+def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_posterior(rng):
+    # Axes' levels, curves, and every weight of a full bank, all correlated: what the drawn
+    # calibrations make of a state must scatter as SlowUncertainty says, at any specific force.
+    unit = replace(full_bank(rng), noise_density_m_s2_sqrt_hz=(1e-4,) * 3)
+    layout = parameter_layout(unit)
+    n = layout.n_parameters
+    sd = np.full(n, 1e-3)
+    for block in layout.scale:
+        sd[block.static : block.end] = 1e-6
+    sd[layout.misalignment :] = 0.0
+    root = rng.standard_normal((n, 5)) * sd[:, np.newaxis]
+    covariance = root @ root.T + np.diag(0.3 * sd**2)
+    posterior = posterior_of(covariance)
+    judged = replace(unit, posterior=posterior)
+    _, states = states_of(unit, rng)
+    slow = SlowUncertainty(judged, Correction(judged))
+    nobody = [0.0] * len(Correction(unit).memory.lags)
+    draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
+    for weight in (0.0, 0.3):
+        _, state, _ = states[-1]
+        state = (*state[:3], weight, *state[4:])
+        nominal = Correction(unit).bias_scale(state)
+        scatter = []
+        for d in draws.tolist():
+            moved = Correction(drawn(unit, layout, d)).bias_scale(state)
+            levels = [
+                (1.0 - weight) * d[block.static] + weight * d[block.dynamic]
+                for block in layout.scale
+            ]
+            scatter.append(
+                [
+                    ((bias - b) / 300.0, (scale - s) / 300.0 + level)
+                    for (bias, scale), (b, s), level in zip(moved, nominal, levels, strict=True)
+                ]
+            )
+        scatter = np.array(scatter)
+        for axis, (a, b, c) in enumerate(slow.at(state, nobody)):
+            for x in (-9.8, 0.0, 9.8):
+                found = np.var(scatter[:, axis, 0] + scatter[:, axis, 1] * x)
+                # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %: 4 sigma.
+                assert a + b * x + c * x * x == pytest.approx(found, rel=0.33)
+
+
+def drawn(unit, layout, d):
+    """Move every parameter of a unit but the levels of the scale, which a curve of 1 has not."""
+
+    def moved(regime_set_, start):
+        axes = []
+        for axis, one in enumerate(regime_set_.axes()):
+            bias, scale = start(layout.bias[axis]), start(layout.scale[axis])
+            fs, fc = one.bias_function, one.scale_function
+            axes.append(
+                replace(
+                    one,
+                    delta=one.delta + d[bias],
+                    bias_function=fs.with_free(
+                        tuple(c + d[bias + 1 + k] for k, c in enumerate(fs.free_coefficients))
+                    ),
+                    scale_function=fc.with_free(
+                        tuple(c + d[scale + 1 + k] for k, c in enumerate(fc.free_coefficients))
+                    ),
+                )
+            )
+        return replace(regime_set_, x=axes[0], y=axes[1], z=axes[2])
+
+    response = tuple(
+        replace(
+            one,
+            bias=tuple(w + d[layout.bias[i].response + k] for i, w in enumerate(one.bias)),
+            scale=tuple(w + d[layout.scale[i].response + k] for i, w in enumerate(one.scale)),
+        )
+        for k, one in enumerate(unit.response)
+    )
+    return replace(
+        unit,
+        static=moved(unit.static, lambda block: block.static),
+        dynamic=moved(unit.dynamic, lambda block: block.dynamic),
+        response=response,
+    )
+
+
+def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
+    unit = full_bank(rng)
+    correction = Correction(unit)
+    lags = correction.memory.lags
+    _, states = states_of(unit, rng)
+    _, state, shares = states[0]
+    slow = SlowUncertainty(unit, correction).at(state, shares)
+    first = 5 + 2 * len(SENSORS)
+    draws = rng.multivariate_normal(np.zeros(len(lags)), start_covariance(lags), size=4000)
+    state = np.array(state)
+    moved = np.repeat(state[:, np.newaxis], len(draws), axis=1)
+    wide = replace(
+        unit,
+        response=tuple(replace(one, range=(-1000.0, 1000.0)) for one in unit.response),
+    )
+    moved[first : first + 2 * len(lags) : 2] += (draws * np.array(shares)).T
+    found = Correction(wide).bias_scale(tuple(moved))
+    for axis, (a, b, c) in enumerate(slow):
+        bias, scale = found[axis]
+        for x in (-9.8, 0.0, 9.8):
+            expected = np.var(bias / 300.0 + scale / 300.0 * x)
+            # 4000 draws: 2.2 %; 4 sigma.
+            assert a + b * x + c * x * x == pytest.approx(expected, rel=0.09)
+
+
+def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
+    # Of a lag of 60 s that started unseen, nothing else is uncertain: the sd falls as exp(-t/60).
+    unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
+    compensator = Compensator(unit, UNCHECKED)
+    noise = compensator.thermal.correction.noise[0]
+    begin = 1_000_000_000_003
+    found = []
+    for k in range(120):
+        stamp = begin * 1_000 + k * SECOND_NS
+        flicker = 1e-5 * (-1) ** k
+        compensator.push('board', stamp, 20.0 + flicker)
+        compensator.push('case', stamp, 20.0 - flicker)
+        row = compensator.process(stamp, 0.0, 0.0, 1.0)
+        found.append((stamp, row[3] - noise))
+    last = {}
+    sd = 0.387 * 30.0 / 300.0
+    for stamp, variance in found[30:]:
+        last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
+    assert len(last) >= 9
+    for span in last.values():
+        # The thermometer's own part, 30 counts/K of some mK, is all that changes within.
+        own = (30.0 / 300.0 * 0.005) ** 2
+        stamp, variance = span[0]
+        age = (stamp - found[0][0]) * 1e-9 + 1.0
+        expected = (sd * math.exp(-age / 60.0)) ** 2
+        assert variance == pytest.approx(expected, rel=0.01, abs=own)
+        assert [v for _, v in span] == pytest.approx([variance] * len(span), abs=own)
+
+
+def test_a_further_sensor_that_is_lost_is_paid_for():
+    unit = calibration(sensors=SENSORS, response=(term('now', (30.0, 0.0, 0.0), sensor='tip'),))
+    compensator = Compensator(unit, UNCHECKED)
+    variances = []
+    for k in range(200):
+        for name in ('board', 'case', 'tip') if k < 100 else ('board', 'case'):
+            compensator.push(name, k * SECOND_NS, 20.0 + 0.02 * k + (name == 'tip'))
+        variances.append(compensator.process(k * SECOND_NS, 0.0, 0.0, 1.0)[3])
+    assert variances[-1] > variances[99] + (0.3 * 900.0 * 0.02 * 30.0 / 300.0) ** 2
+
+
+def test_a_thermometer_that_the_calibration_does_not_know_changes_nothing(rng):
+    events = [('lid', stamp, 99.0) for _, stamp, _ in run_of(rng, seconds=20)]
+    known = run_of(rng, seconds=20)
+    both = [event for pair in zip(known, events, strict=False) for event in pair]
+    unit = rich_calibration()
+    np.testing.assert_array_equal(
+        stream(Compensator(unit, UNCHECKED), known), stream(Compensator(unit, UNCHECKED), both)
+    )
+
+
+def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
+    unit = full_bank(rng)
+    events = run_of(rng, seconds=60)
+    compensator = Compensator(unit, UNCHECKED)
+    stream(compensator, events)
+    tracker = compensator.thermal.tracker
+    compensator.swap(replace(unit, response=full_bank(rng).response))
+    assert compensator.thermal.tracker is tracker
+    compensator.swap(replace(unit, response=unit.response[:5]))
+    assert compensator.thermal.tracker is not tracker
+    # What was seen last is not lost.
+    assert compensator.thermal.tracker.board.stamp_ns == tracker.board.stamp_ns
+    assert compensator.process(61 * SECOND_NS, 0.0, 0.0, 2900.0) is not None
+
+
+def test_the_state_at_the_edge_of_a_column_is_held_and_what_is_cut_off_is_paid_for():
+    unit = calibration(
+        axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
+        response=(term('now', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
+    )
+    correction = Correction(unit)
+    nothing = [(0.0, 0.0, 0.0)] * 3
+    inside, outside = ((20.0, 0.0, 0.0, 0.0, 0.0, g, 0.0) for g in (1.0, 3.0))
+    assert correction.bias_scale(inside) == correction.bias_scale(outside)
+    (_, edge), (_, beyond) = (correction.evaluate(s, nothing) for s in (inside, outside))
+    assert math.sqrt(beyond[0][0] - edge[0][0]) == pytest.approx(30.0 / 300.0 * 2.0)
+    assert beyond[1] == edge[1]
+    assert correction.relative_excess(outside) == pytest.approx(2.0)
+    assert correction.gradient_excess(outside) == 2.0

@@ -1,0 +1,302 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the segments: from temperature readings to runs of time over which the correction is linear.
+
+Between two thermal events the bias and the scale of each axis move linearly in time. An event is
+a temperature reading or, while none comes, the end of a one-second segment; there the correction
+is evaluated in full (at the segment's start and end), so a sample costs a few operations, follows
+the temperature without a staircase, and a batch needs the full evaluation once per segment.
+
+What parameters and the starts of the lags leave uncertain changes slowly: it is evaluated at the
+first segment that begins in each span of ten seconds of the stamps, and held.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from ..thermal.memory import BOARD_INPUT
+from ..thermal.reading_queue import ReadingQueue
+from ..thermal.regime import Regime
+from ..thermal.settings import ThermalConfig
+from ..thermal.tracker import ThermalTracker
+from ..unit.calibration import Calibration
+from ..unit.correction import Correction, Variance
+from ..unit.functions import Number
+from ..unit.uncertainty import SlowUncertainty
+from .sample_guard import RateWatch
+from .status import CompensatorConfig, Counters
+
+#: Longest time over which bias and scale are taken as linear in time.
+SEGMENT_NS: Final = 1_000_000_000
+#: How long what changes slowly is held.
+SLOW_NS: Final = 10_000_000_000
+#: Samples this much faster than calibrated, relative, still have the calibrated noise.
+RATE_TOLERANCE: Final = 0.1
+#: Earlier than any stamp.
+EVER_NS: Final = -(1 << 62)
+
+
+class ThermalSide:
+    """
+    What stream and batch share: readings, thermal state, and the gate that they open for samples.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The unit.
+    config : CompensatorConfig
+        The user's settings.
+    counters : Counters
+        Where readings, and samples without a temperature, are counted.
+
+    """
+
+    def __init__(
+        self, calibration: Calibration, config: CompensatorConfig, counters: Counters
+    ) -> None:
+        self.counters = counters
+        self.queue = ReadingQueue()
+        self.flags: list[tuple[int, bool]] = []
+        self._n_applied = 0
+        self._use(calibration, config)
+        self.tracker = self._new_tracker()
+
+    def _use(self, calibration: Calibration, config: CompensatorConfig) -> None:
+        self.config = config
+        #: Age of the board temperature beyond which nothing is published.
+        self._timeout_ns = int(config.temperature_timeout_s * 1e9)
+        self.calibration = calibration
+        self.correction = Correction(calibration)
+        self._uncertainty = SlowUncertainty(calibration, self.correction)
+        self.inputs = (BOARD_INPUT, *calibration.sensors)
+        self.rate = RateWatch(calibration.unit.cycle_time_s)
+        self._counts_cycles = calibration.unit.input == 'counts'
+        self._forget_segment()
+
+    def _forget_segment(self) -> None:
+        self._segment_key: tuple[int, int] | None = None
+        self._slow_key: int | None = None
+        self._slow: list[Variance[float]] = []
+
+    def _thermal_config(self) -> ThermalConfig:
+        return ThermalConfig(
+            self.correction.gentle_transition(self.config.transition_time_s),
+            self.config.case_timeout_s,
+            self.calibration.board_lag_s,
+            self.config.temperature_timeout_s,
+        )
+
+    def _new_tracker(self) -> ThermalTracker:
+        return ThermalTracker(
+            self.calibration.detector, self.correction.memory, self._thermal_config()
+        )
+
+    def swap(self, calibration: Calibration, now_ns: int | None) -> None:
+        """
+        Take over another calibration; see `Compensator.swap`.
+
+        """
+        old, sensors = self.tracker, self.inputs
+        detector = self.calibration.detector
+        self._use(calibration, self.config)
+        if self.inputs != sensors:
+            waiting, self.queue = self.queue.take(), ReadingQueue()
+            for stamp_ns, kind, _, celsius in sorted(waiting, key=lambda entry: entry[2]):
+                self.push(sensors[kind], stamp_ns, celsius)
+        if calibration.detector == detector and self.correction.memory == old.spec:
+            old.reconfigure(self._thermal_config(), now_ns)
+            return
+        self.tracker = self._new_tracker()
+        # It starts from the temperatures just seen, so that no sample is lost.
+        for name, sensor in zip(sensors, (old.board, *old.sensors), strict=True):
+            if name in self.inputs and sensor.stamp_ns is not None:
+                self.tracker.read(name, sensor.stamp_ns, sensor.temperature)
+
+    def reconfigure(self, config: CompensatorConfig, now_ns: int | None) -> None:
+        """
+        Take over other settings.
+
+        """
+        self.config = config
+        self._timeout_ns = int(config.temperature_timeout_s * 1e9)
+        self._forget_segment()
+        self.tracker.reconfigure(self._thermal_config(), now_ns)
+
+    def reset(self) -> None:
+        """
+        Forget temperatures, regime and rate; what waits, and counters, stay.
+
+        """
+        self.tracker.reset()
+        self.rate.reset()
+        self._forget_segment()
+
+    def push(self, name: str, stamp_ns: int, celsius: float) -> None:
+        """
+        Queue a reading; one of a thermometer that the calibration does not know is nothing to it.
+
+        """
+        if name in self.inputs:
+            kind = self.inputs.index(name)
+            self.count_rejected(kind, self.queue.push(stamp_ns, kind, celsius))
+
+    def apply(self, stamp_ns: int, kind: int, celsius: float) -> None:
+        """
+        Let a reading of one of `inputs` take effect now.
+
+        """
+        self._n_applied += 1
+        tracker = self.tracker
+        is_used = tracker.read(self.inputs[kind], stamp_ns, celsius)
+        if not is_used:
+            self.count_rejected(kind, 1)
+        elif kind == 0:
+            self.counters.n_board += 1
+        else:
+            self.counters.n_case += 1
+        if is_used and kind == 1:
+            regime = tracker.detector.regime
+            if regime is not Regime.UNKNOWN:
+                self.flags.append((stamp_ns, regime is Regime.DYNAMIC))
+
+    def count_rejected(self, kind: int, n_readings: int) -> None:
+        """
+        Count readings of one of `inputs` that are not used.
+
+        """
+        if kind == 0:
+            self.counters.n_board_rejected += n_readings
+        else:
+            self.counters.n_case_rejected += n_readings
+
+    def flush(self, stamp_ns: int) -> None:
+        """
+        Let what waits take effect up to a stamp.
+
+        """
+        for reading_ns, kind, _, celsius in self.queue.due(stamp_ns):
+            self.apply(reading_ns, kind, celsius)
+
+    @property
+    def fresh_until_ns(self) -> int:
+        """
+        The last stamp at which the board temperature is not too old; before any without one.
+
+        """
+        board_ns = self.tracker.board.stamp_ns
+        return EVER_NS if board_ns is None else board_ns + self._timeout_ns
+
+    def count_unmeasured(self, n_samples: int) -> None:
+        """
+        Count samples that came without a board temperature, or too long after it.
+
+        """
+        if self.tracker.board.stamp_ns is None:
+            self.counters.n_no_temperature += n_samples
+        else:
+            self.counters.n_stale += n_samples
+
+    def start_of(self, stamp_ns: int) -> int:
+        """
+        Find where the segment of a stamp begins: counted from the last reading.
+
+        """
+        updated_ns = self.tracker.updated_ns or 0
+        return stamp_ns - (stamp_ns - updated_ns) % SEGMENT_NS
+
+    def open(self, start_ns: int, n_seen: int, stamp_ns: int) -> bool:
+        """
+        Check the rate at a segment's first sample; False if the segment only goes on.
+
+        Parameters
+        ----------
+        start_ns : int
+            Where the segment begins.
+        n_seen : int
+            Samples in order that came before.
+        stamp_ns : int
+            Stamp of its first sample.
+
+        Returns
+        -------
+        bool
+            Whether it is a new segment, not one that a block's end has cut.
+
+        """
+        key = (self._n_applied, start_ns)
+        if key == self._segment_key:
+            return False
+        self._segment_key = key
+        self.rate.update(n_seen, stamp_ns)
+        return True
+
+    @property
+    def rate_refuses(self) -> bool:
+        """
+        Whether samples are held back because they cannot be conversions of the calibrated cycle.
+
+        """
+        return self.rate.is_too_fast and self._counts_cycles
+
+    @property
+    def noise_excess(self) -> float:
+        """
+        What the rate adds to the noise of a sample, relative to that of the calibrated cycle.
+
+        """
+        excess = self.rate.ratio - 1.0
+        return excess if excess > RATE_TOLERANCE else 0.0
+
+    def slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[Variance[float]]:
+        """
+        Give the slow part of the variance of a segment, evaluated at its end or held.
+
+        """
+        key = start_ns // SLOW_NS
+        if key != self._slow_key:
+            self._slow_key = key
+            shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
+            self._slow = self._uncertainty.at(end_state, shares)
+        return self._slow
+
+
+def lay_lines(
+    correction: Correction,
+    start: Sequence[Number],
+    end: Sequence[Number],
+    slow: Sequence[Variance[Number]],
+    noise_excess: Number,
+) -> list[Number]:
+    """
+    Lay a line from the beginning of a segment, or of many, to the end.
+
+    Parameters
+    ----------
+    correction : Correction
+        The unit's.
+    start, end : tuple of float or of ndarray
+        Thermal states at both ends.
+    slow : sequence of (a, b, c)
+        Of each axis (`ThermalSide.slow_at`).
+    noise_excess : float or ndarray
+        `ThermalSide.noise_excess`.
+
+    Returns
+    -------
+    list of float or of ndarray
+        Per axis bias, its change per second, scale, its change per second; then per axis a, b, c
+        of the error variance.
+
+    """
+    at_start = correction.bias_scale(start)
+    at_end, variances = correction.evaluate(end, slow)
+    result: list[Number] = []
+    for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
+        result += [bias, bias_end - bias, scale, scale_end - scale]
+    for (a, b, c), noise in zip(variances, correction.noise, strict=True):
+        result += [a + noise_excess * noise, b, c]
+    return result

@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the part of the error variance that changes slowly: parameters, and lags that started unseen.
+
+It is evaluated for one state at a time, by stream and batch alike, and held in between, so both
+have the same bits whatever library multiplies.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..thermal.memory import start_covariance
+from ..thermal.state import BOARD, WEIGHT
+from ..typing import Floats
+from .calibration import Calibration, parameter_layout
+from .correction import Correction, Variance
+from .response import Sensitivity
+
+
+class SlowUncertainty:
+    """
+    What the posterior and the start of the lags leave uncertain.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The unit.
+    correction : Correction
+        Its correction.
+
+    """
+
+    def __init__(self, calibration: Calibration, correction: Correction) -> None:
+        self._correction = correction
+        axes = calibration.axes
+        self._K = [axis.scale_factor for axis in (axes.x, axes.y, axes.z)]
+        memory = correction.memory
+        self._felt = [Sensitivity(calibration.response, axis, memory) for axis in range(3)]
+        start = start_covariance(memory.lags)
+        self._root = np.asarray(np.linalg.cholesky(start), dtype=np.float64)
+        self._blocks: list[tuple[Floats, Floats, Floats, Floats]] = []
+        posterior = calibration.posterior
+        if posterior is None:
+            return
+        layout = parameter_layout(calibration)
+        matrix, rest = posterior.matrix, posterior.variances
+        for bias, scale in zip(layout.bias, layout.scale, strict=True):
+            of_bias, of_scale = slice(bias.static, bias.end), slice(scale.static, scale.end)
+            rows = np.concatenate((matrix[of_bias], matrix[of_scale]))
+            if matrix.shape[1] > len(rows):
+                # The same covariance of one axis from fewer columns.
+                rows = np.ascontiguousarray(np.linalg.qr(rows.T)[1].T)
+            n_bias = bias.end - bias.static
+            self._blocks.append((rows[:n_bias], rest[of_bias], rows[n_bias:], rest[of_scale]))
+
+    def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[Variance[float]]:
+        """
+        Evaluate (a, b, c) of each axis at one state.
+
+        Parameters
+        ----------
+        state : sequence of float
+            As `ThermalTracker.sample` gives it.
+        start_shares : sequence of float
+            What is left of each lag's start, 1 to 0 (`ThermalMemory.start_shares`).
+
+        Returns
+        -------
+        list of (a, b, c)
+            ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
+
+        """
+        table = self._correction.table
+        raw = table.raw(state)
+        phi = table.weighted(table.held(raw), state[BOARD], state[WEIGHT])
+        on_input, _ = table.slopes(state, raw)
+        shares = np.array(start_shares)
+        result = []
+        for axis, K in enumerate(self._K):
+            felt: Floats = np.array(self._felt[axis].on_lags(on_input, 0.0)).reshape(-1, 2)
+            bias, scale = ((self._root * (felt[:, k] * shares)[:, np.newaxis]) for k in (0, 1))
+            a, b, c = _products(bias.sum(axis=0) / K, scale.sum(axis=0))
+            if self._blocks:
+                of_bias, var_bias, of_scale, var_scale = self._blocks[axis]
+                on_bias, on_scale = self._regressors(state, phi, axis)
+                on_bias = on_bias / K
+                bias = (of_bias * on_bias[:, np.newaxis]).sum(axis=0)
+                scale = (of_scale * on_scale[:, np.newaxis]).sum(axis=0)
+                more = _products(bias, scale)
+                a += more[0] + float((var_bias * on_bias * on_bias).sum())
+                b += more[1]
+                c += more[2] + float((var_scale * on_scale * on_scale).sum())
+            result.append((a, b, c))
+        return result
+
+    def _regressors(
+        self, state: Sequence[float], phi: list[float], axis: int
+    ) -> tuple[Floats, Floats]:
+        """
+        Give what multiplies each parameter of bias and of scale, in the order of the posterior.
+
+        """
+        weight = state[WEIGHT]
+        bias: list[float] = []
+        scale: list[float] = []
+        for share, curves in (
+            (1.0 - weight, self._correction.static),
+            (weight, self._correction.dynamic),
+        ):
+            of_bias, of_scale = curves.bases(state[BOARD])[axis]
+            bias += [share, *(share * value for value in of_bias)]
+            scale += [share, *(share * value for value in of_scale)]
+        return np.array(bias + phi), np.array(scale + phi)
+
+
+def _products(bias: Floats, scale: Floats) -> tuple[float, float, float]:
+    # Sums along the rows above, and of products here: the same bits wherever the arrays lie.
+    return (
+        float((bias * bias).sum()),
+        2.0 * float((bias * scale).sum()),
+        float((scale * scale).sum()),
+    )
