@@ -117,18 +117,6 @@ def read_bounded(path: str | Path, limit: int) -> bytes:
 
     A directory, a FIFO or a device is refused before anything is read, so a reader never blocks.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    limit : int
-        The largest size accepted [bytes].
-
-    Returns
-    -------
-    bytes
-        The content.
-
     Raises
     ------
     OSError
