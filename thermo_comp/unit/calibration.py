@@ -386,6 +386,18 @@ class Calibration:
         """
         return self.static, self.dynamic
 
+    @property
+    def has_uncertainty(self) -> bool:
+        """
+        Whether the calibration says anything of how well it is known; else it claims nothing.
+
+        """
+        return any(self.misalignment_sd) or any(
+            axis.covariance or axis.residual_sd_m_s2
+            for part in self.regime_sets()
+            for axis in part.axes()
+        )
+
 
 def _check_covariance(rows: tuple[tuple[float, ...], ...], expected: int) -> None:
     if len(rows) != expected or any(len(row) != i + 1 for i, row in enumerate(rows)):
