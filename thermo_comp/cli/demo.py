@@ -204,7 +204,9 @@ def _judge(bag: Path, calibrations: dict[str, Calibration]) -> Evaluation:
     from ..judging import evaluate
 
     judged = ['node', *(name for name in calibrations if name != 'node')]
-    return evaluate([bag], [(name, calibrations[name]) for name in judged], gravity=STANDARD_GRAVITY)
+    return evaluate(
+        [bag], [(name, calibrations[name]) for name in judged], gravity=STANDARD_GRAVITY
+    )
 
 
 def _say(out: Output, result: Evaluation, model: str) -> None:
@@ -236,7 +238,8 @@ def _draw(bag: Path, calibration: Calibration, output: Path) -> tuple[Path, Path
     Write the certificate and its figures; return the page and the figure of |g|.
 
     """
-    from ..report import evidence_of_bags, open_bag, write_report
+    from ..judging import open_bag
+    from ..report import evidence_of_bags, write_report
 
     page, figures = output / 'report.html', output / 'figures'
     evidence = evidence_of_bags([open_bag(bag)], calibration, gravity=STANDARD_GRAVITY)

@@ -7,6 +7,7 @@ Owns ``thermo_comp evaluate``: what a calibration leaves of |g| on bags it has n
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -119,21 +120,16 @@ def say(out: Output, result: Evaluation) -> None:
     for section in SECTIONS:
         raw = judged.sections[section]
         if raw.n:
-            ug = (raw.raw_rms / MICRO_G, raw.raw_peak / MICRO_G)
-            rows.append((section, 'raw', raw.n, *map(micro_g, ug), None, None))
+            rms, peak = micro_g(raw.raw_rms / MICRO_G), micro_g(raw.raw_peak / MICRO_G)
+            rows.append((section, 'raw', raw.n, rms, peak, None, None))
         for name, judgement in judgements.items():
             one = judgement.sections[section]
             if one.n:
-                ug = (one.rms / MICRO_G, one.peak / MICRO_G)
-                claimed = one.claimed_rms / MICRO_G
-                has_claim = claimed == claimed
-                rows.append(
-                    (
-                        *(section, name, one.n, *map(micro_g, ug)),
-                        micro_g(claimed) if has_claim else None,
-                        f'{one.ratio:.2f}' if has_claim else None,
-                    )
-                )
+                rms, peak = micro_g(one.rms / MICRO_G), micro_g(one.peak / MICRO_G)
+                claim: tuple[Cell, Cell] = (None, None)
+                if isfinite(one.claimed_rms):
+                    claim = (micro_g(one.claimed_rms / MICRO_G), f'{one.ratio:.2f}')
+                rows.append((section, name, one.n, rms, peak, *claim))
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
         rows,

@@ -11,14 +11,14 @@ node's; what is kept of a bag of any length is a row per window.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 
 from ..errors import RecordingError
-from ..fitting.reduction import ReducedBag
+from ..fitting.reduction import ReducedBag, StillInterval
 from ..online.compensator import Compensator
 from ..online.snapshot import take_snapshot
 from ..online.status import CompensatorConfig
@@ -145,37 +145,23 @@ def sum_length(window_s: float) -> float:
     return window_s / float(np.ceil(window_s / _LONGEST_SUM_S))
 
 
-def whole_windows(bag: ReducedBag, window_s: float) -> Iterator[tuple[int, slice, int]]:
+def usual_window(bags: Sequence[ReducedBag]) -> float:
     """
-    Find the windows in a reduced bag.
+    Choose the length of the windows of bags that were not read for a length in particular [s].
 
     Parameters
     ----------
-    bag : ReducedBag
-        The bag.
-    window_s : float
-        Length of a window [s].
+    bags : sequence of ReducedBag
+        At least one.
 
-    Yields
-    ------
-    (int, slice, int)
-        Number of the still interval, its sums that fill windows, and sums per window.
-
-    Raises
-    ------
-    RecordingError
-        If a window is no whole number of the bag's sums.
+    Returns
+    -------
+    float
+        60 s, or what is next to it where the bags' sums do not fill that.
 
     """
-    per = max(1, round(window_s / bag.window_s))
-    if abs(per * bag.window_s - window_s) > 1e-6 * window_s:
-        raise RecordingError(
-            f'its samples are too slow for windows of {window_s:g} s: {bag.window_s:g} s or a '
-            'multiple of it are needed',
-            path=bag.source.name,
-        )
-    for number, interval in enumerate(bag.intervals):
-        yield number, slice(0, interval.n_whole // per * per), per
+    longest = max(bag.window_s for bag in bags)
+    return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 
 
 def corrected_windows(
@@ -217,94 +203,184 @@ def corrected_windows(
     config = replace(
         config or CompensatorConfig(), stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
     )
-    parts: list[Floats] = []
-    first_position = 0
-    for number, bag in enumerate(bags):
-        parts += _of_bag(bag, number, first_position, calibration, config, window_s)
-        first_position += len(bag.intervals)
-    table = np.concatenate(parts) if parts else np.zeros((0, _WIDTH))
+
+    def correct(bag: ReducedBag, sums: Floats) -> None:
+        _correct(Compensator(calibration, config), bag, sums)
+
+    table = _table(bags, window_s, correct)
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     K = np.array([axis.scale_factor for axis in axes])
     bias = np.array([axis.bias for axis in axes])
     M = np.array(calibration.misalignment)
-    count, mean, force = table[:, _COUNT], table[:, _MEAN], table[:, _FORCE]
-    along = force / np.linalg.norm(force, axis=1, keepdims=True) @ M
+    along = table[:, _FORCE] / np.linalg.norm(table[:, _FORCE], axis=1, keepdims=True) @ M
     white = along**2 @ np.array(Compensator(calibration, config).correction.noise)
-    sd = np.sqrt(np.maximum(table[:, _VARIANCE] - white, 0.0) + white / count)
-    starts = [
-        bag.start_ns + np.rint(table[table[:, _BAG] == i, _START] * 1e9).astype(np.int64)
-        for i, bag in enumerate(bags)
-    ]
-    return Windows(
-        window_s=window_s,
-        gravity=calibration.gravity_m_s2 if gravity is None else gravity,
-        bag=table[:, _BAG].astype(np.int64),
-        position=table[:, _POSITION].astype(np.int64),
-        start_ns=np.concatenate(starts) if starts else np.zeros(0, np.int64),
-        time=table[:, _TIME],
-        count=count,
-        mean=mean,
-        board=table[:, _BOARD],
-        rate=table[:, _RATE],
-        is_dynamic=table[:, _WEIGHT] > 0.5,
-        is_inside=table[:, _EXCESS] <= _EDGE,
-        raw=np.asarray((mean - bias) / K @ M.T),
-        force=force,
-        claimed_sd=sd,
-        noise_sd=np.sqrt(white / count),
+    mean_white = white / table[:, _COUNT]
+    return _windows(
+        bags,
+        table,
+        window_s,
+        calibration.gravity_m_s2 if gravity is None else gravity,
+        raw=np.asarray((table[:, _MEAN] - bias) / K @ M.T),
+        claimed_sd=np.sqrt(np.maximum(table[:, _VARIANCE] - white, 0.0) + mean_white),
+        noise_sd=np.sqrt(mean_white),
     )
 
 
-# Columns of a row; averaged over a window's sums but for the first two and the excess.
-_BAG, _POSITION, _COUNT, _START, _TIME, _BOARD, _RATE, _WEIGHT, _EXCESS, _VARIANCE = range(10)
+def raw_windows(bags: Sequence[ReducedBag], gravity: float, window_s: float) -> Windows:
+    """
+    Take the windows of bags as they are: static all of them, inside any range, without a claim.
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        Bags with a board temperature.
+    gravity : float
+        Local gravity; NaN where nobody knows it.
+    window_s : float
+        Length of a window [s].
+
+    Returns
+    -------
+    Windows
+        Its forces are the means of the samples.
+
+    Raises
+    ------
+    RecordingError
+        If the samples of a bag are too slow for such windows.
+
+    """
+
+    def keep(bag: ReducedBag, sums: Floats) -> None:
+        since = (bag.board.stamp_ns - bag.start_ns) * 1e-9
+        sums[:, _BOARD] = np.interp(sums[:, _TIME], since, bag.board.value)
+        sums[:, _FORCE] = sums[:, _MEAN]
+        sums[:, [_RATE, _WEIGHT, _EXCESS, _VARIANCE]] = 0.0
+
+    table = _table(bags, window_s, keep)
+    nothing = np.full(len(table), np.nan)
+    return _windows(
+        bags, table, window_s, gravity, table[:, _MEAN], claimed_sd=nothing, noise_sd=nothing
+    )
+
+
+# Columns of a sum and of a window. Averaged over a window's sums are all from the time on.
+_BAG, _POSITION, _START, _COUNT, _EXCESS, _TIME, _BOARD, _RATE, _WEIGHT, _VARIANCE = range(10)
 _MEAN, _FORCE, _WIDTH = slice(10, 13), slice(13, 16), 16
 
 
-def _of_bag(
-    bag: ReducedBag,
-    number: int,
-    first_position: int,
-    calibration: Calibration,
-    config: CompensatorConfig,
-    window_s: float,
-) -> Iterator[Floats]:
-    compensator = Compensator(calibration, config)
-    readings = _Readings(bag)
-    for place, rows, per in whole_windows(bag, window_s):
-        interval = bag.intervals[place]
-        sums = np.full((rows.stop, _WIDTH), np.nan)
-        sums[:, _BAG], sums[:, _POSITION] = number, first_position + place
-        sums[:, _COUNT], sums[:, _TIME] = interval.count[rows], interval.time[rows]
-        sums[:, _START] = interval.begin_s + bag.window_s * np.arange(rows.stop)
-        sums[:, _MEAN] = interval.mean[rows]
-        for row, mean in zip(sums, interval.mean[rows].tolist(), strict=True):
-            stamp_ns = bag.start_ns + round(row[_TIME] * 1e9)
-            readings.until(compensator, stamp_ns)
-            corrected = compensator.process(stamp_ns, *mean)
-            status = take_snapshot(compensator)
-            if corrected is None or status.state is None:
-                continue
-            state = status.state
-            row[_FORCE] = corrected[:3]
-            row[_BOARD], row[_RATE], row[_WEIGHT] = state.board, state.rate, state.weight
-            row[_EXCESS] = status.relative_excess
-            row[_VARIANCE] = _along(corrected[:3], corrected[3:])
-        yield _joined(sums, per)
+def _table(
+    bags: Sequence[ReducedBag], window_s: float, correct: Callable[[ReducedBag, Floats], None]
+) -> Floats:
+    """
+    Put the sums of bags together to windows, a row each.
+
+    """
+    parts = [np.zeros((0, _WIDTH))]
+    first_position = 0
+    for number, bag in enumerate(bags):
+        per = max(1, round(window_s / bag.window_s))
+        if abs(per * bag.window_s - window_s) > 1e-6 * window_s:
+            raise RecordingError(
+                f'its samples are too slow for windows of {window_s:g} s: {bag.window_s:g} s or '
+                'a multiple of it are needed',
+                path=bag.source.name,
+            )
+        sums = [
+            _sums(interval, bag.window_s, interval.n_whole // per * per)
+            for interval in bag.intervals
+        ]
+        for place, one in enumerate(sums):
+            one[:, _BAG], one[:, _POSITION] = number, first_position + place
+        first_position += len(sums)
+        if sums:
+            whole = np.concatenate(sums)
+            correct(bag, whole)
+            parts.append(_joined(whole, per))
+    return np.concatenate(parts)
+
+
+def _sums(interval: StillInterval, sum_s: float, n: int) -> Floats:
+    sums = np.full((n, _WIDTH), np.nan)
+    sums[:, _START] = interval.begin_s + sum_s * np.arange(n)
+    sums[:, _COUNT] = interval.count[:n]
+    sums[:, _TIME] = interval.time[:n]
+    sums[:, _MEAN] = interval.mean[:n]
+    return sums
 
 
 def _joined(sums: Floats, per: int) -> Floats:
     """
-    Put sums together to windows, leaving out those that were not corrected as a whole.
+    Join so many sums to a window each; out are those that were not corrected as a whole.
 
     """
     grouped = sums.reshape(-1, per, _WIDTH)
     count = grouped[:, :, _COUNT]
-    share = count / count.sum(axis=1, keepdims=True)
-    result = np.einsum('nk,nkc->nc', share, grouped)
-    result[:, [_BAG, _POSITION, _START]] = grouped[:, 0, [_BAG, _POSITION, _START]]
+    result = np.array(grouped[:, 0])
     result[:, _COUNT] = count.sum(axis=1)
     result[:, _EXCESS] = grouped[:, :, _EXCESS].max(axis=1)
+    share = count / count.sum(axis=1, keepdims=True)
+    result[:, _TIME:] = np.einsum('nk,nkc->nc', share, grouped[:, :, _TIME:])
     return np.asarray(result[np.isfinite(result[:, _EXCESS])])
+
+
+def _windows(
+    bags: Sequence[ReducedBag],
+    table: Floats,
+    window_s: float,
+    gravity: float,
+    raw: Floats,
+    claimed_sd: Floats,
+    noise_sd: Floats,
+) -> Windows:
+    bag = table[:, _BAG].astype(np.int64)
+    origin = np.array([one.start_ns for one in bags], dtype=np.int64)
+    return Windows(
+        window_s=window_s,
+        gravity=gravity,
+        bag=bag,
+        position=table[:, _POSITION].astype(np.int64),
+        start_ns=np.rint(table[:, _START] * 1e9).astype(np.int64) + origin[bag],
+        time=table[:, _TIME],
+        count=table[:, _COUNT],
+        mean=table[:, _MEAN],
+        board=table[:, _BOARD],
+        rate=table[:, _RATE],
+        is_dynamic=table[:, _WEIGHT] > 0.5,
+        is_inside=table[:, _EXCESS] <= _EDGE,
+        raw=raw,
+        force=table[:, _FORCE],
+        claimed_sd=claimed_sd,
+        noise_sd=noise_sd,
+    )
+
+
+def _correct(compensator: Compensator, bag: ReducedBag, sums: Floats) -> None:
+    """
+    Run sums through the compensator, with the readings that came before each.
+
+    """
+    stamps = np.concatenate((bag.board.stamp_ns, bag.case.stamp_ns))
+    order = np.argsort(stamps, kind='stable')
+    values = np.concatenate((bag.board.value, bag.case.value))[order].tolist()
+    is_case = (order >= len(bag.board.value)).tolist()
+    readings = zip(stamps[order].tolist(), values, is_case, strict=True)
+    reading = next(readings, None)
+    for row in sums:
+        stamp_ns = bag.start_ns + round(float(row[_TIME]) * 1e9)
+        while reading is not None and reading[0] <= stamp_ns:
+            (compensator.push_case if reading[2] else compensator.push_board)(*reading[:2])
+            compensator.flush(reading[0])
+            reading = next(readings, None)
+        corrected = compensator.process(stamp_ns, *row[_MEAN].tolist())
+        status = take_snapshot(compensator)
+        if corrected is None or status.state is None:
+            continue
+        row[_FORCE] = corrected[:3]
+        row[_VARIANCE] = _along(corrected[:3], corrected[3:])
+        row[_EXCESS] = status.relative_excess
+        state = status.state
+        row[_BOARD], row[_RATE], row[_WEIGHT] = state.board, state.rate, state.weight
 
 
 def _along(force: Sequence[float], covariance: Sequence[float]) -> float:
@@ -316,30 +392,3 @@ def _along(force: Sequence[float], covariance: Sequence[float]) -> float:
     xx, xy, xz, yy, yz, zz = covariance
     square = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)
     return square / (x * x + y * y + z * z)
-
-
-class _Readings:
-    """
-    Hands a bag's readings to a compensator as their stamps come due, the board's first.
-
-    """
-
-    def __init__(self, bag: ReducedBag) -> None:
-        stamps = np.concatenate((bag.board.stamp_ns, bag.case.stamp_ns))
-        values = np.concatenate((bag.board.value, bag.case.value))
-        is_case = np.repeat((False, True), (len(bag.board.value), len(bag.case.value)))
-        order = np.argsort(stamps, kind='stable')
-        columns = (stamps[order].tolist(), values[order].tolist(), is_case[order].tolist())
-        self._all = list(zip(*columns, strict=True))
-        self._next = 0
-
-    def until(self, compensator: Compensator, stamp_ns: int) -> None:
-        """
-        Let all readings up to a stamp take effect.
-
-        """
-        while self._next < len(self._all) and self._all[self._next][0] <= stamp_ns:
-            reading_ns, value, is_case = self._all[self._next]
-            (compensator.push_case if is_case else compensator.push_board)(reading_ns, value)
-            compensator.flush(reading_ns)
-            self._next += 1
