@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ..fitting import FitResult, predicted_sd
-from ..judging import Judgement, Kind
+from ..judging import Judgement, Verdict
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
 
@@ -204,7 +204,7 @@ def is_valid(row: Row) -> bool:
     Whether a unit's calibration was shown to be valid on its own bags.
 
     """
-    return str(row['verdict']).startswith((Kind.VALID.value, Kind.WIDE.value))
+    return str(row['verdict']).startswith((Verdict.VALID.value, Verdict.WIDE.value))
 
 
 def calibration_cells(calibration: Calibration) -> dict[str, Cell]:

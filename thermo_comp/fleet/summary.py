@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..judging import Kind
+from ..judging import Verdict
 from ..typing import Floats
 from ..unit.calibration import AXES
 from .row import Row, is_fitted
@@ -451,7 +451,7 @@ def _kind(verdict: str) -> str:
     Leave the amount out of a verdict, so that like ones count together.
 
     """
-    wide = Kind.WIDE.value
+    wide = Verdict.WIDE.value
     return f'{wide} little' if verdict.startswith(wide) else verdict
 
 

@@ -10,7 +10,7 @@ Owns the judgement of a calibration against recordings: one judge, for every com
 """
 
 from .evaluation import Evaluation, OpenedBag, evaluate, judge_bags, open_bag
-from .judgement import SECTIONS, Judgement, Kind, Section, judge
+from .judgement import SECTIONS, Judgement, Section, Verdict, judge
 from .shifts import AxisShift
 from .windows import WINDOW_S, Windows, corrected_windows
 
@@ -20,9 +20,9 @@ __all__ = [
     'AxisShift',
     'Evaluation',
     'Judgement',
-    'Kind',
     'OpenedBag',
     'Section',
+    'Verdict',
     'Windows',
     'corrected_windows',
     'evaluate',

@@ -34,7 +34,7 @@ _FEWEST = 6
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
 
 
-class Kind(Enum):
+class Verdict(Enum):
     """
     The verdicts; the value is the verdict's wording.
 
@@ -53,7 +53,7 @@ class Kind(Enum):
         Whether the calibration was shown to hold.
 
         """
-        return self in (Kind.VALID, Kind.WIDE)
+        return self in (Verdict.VALID, Verdict.WIDE)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Judgement:
 
     Parameters
     ----------
-    kind : Kind
+    kind : Verdict
         The verdict.
     reason : str
         One sentence of numbers.
@@ -119,7 +119,7 @@ class Judgement:
 
     """
 
-    kind: Kind
+    kind: Verdict
     reason: str
     sections: dict[str, Section]
     tolerance: float | None
@@ -151,7 +151,7 @@ class Judgement:
         The verdict in words.
 
         """
-        if self.kind is Kind.WIDE:
+        if self.kind is Verdict.WIDE:
             return f'{self.kind.value} {spoken(self.sections["all"].claimed_rms)}'
         return str(self.kind.value)
 
@@ -251,28 +251,28 @@ def _verdict(
     tolerance: float | None,
     moved: tuple[str, ...],
     claims: bool,
-) -> tuple[Kind, str]:
+) -> tuple[Verdict, str]:
     one, outside = sections['all'], sections['outside']
     if not one.n:
         reason = (
             f'all {_windows(outside.n, windows)} lie there, {_span(windows)}; {_numbers(outside)}'
         )
-        return Kind.OUTSIDE, reason
+        return Verdict.OUTSIDE, reason
     judged = [s for s in (sections['static'], sections['dynamic']) if s.n >= _FEWEST] or [one]
     worst = max((*judged, one), key=lambda s: s.rms)
     ratio = max(s.ratio for s in (*judged, one))
     # A NaN of no claim compares false.
     is_wide = one.claimed_rms > (tolerance or min(_WIDE_PART * one.raw_rms, _WIDE_CLAIM))
     if one.rms >= one.raw_rms:
-        kind = Kind.NO_BETTER
+        kind = Verdict.NO_BETTER
     elif tolerance is not None and worst.rms > tolerance:
-        kind = Kind.RECALIBRATE
+        kind = Verdict.RECALIBRATE
     elif tolerance is None and not claims:
-        kind = Kind.NO_CLAIM
+        kind = Verdict.NO_CLAIM
     elif tolerance is None and (ratio > LARGEST_RATIO or moved):
-        kind = Kind.RECALIBRATE
+        kind = Verdict.RECALIBRATE
     else:
-        kind = Kind.WIDE if is_wide else Kind.VALID
+        kind = Verdict.WIDE if is_wide else Verdict.VALID
     said = [f'{_numbers(one)} over {_windows(one.n, windows)}']
     if tolerance is not None:
         said.append(f'{spoken(worst.rms)} in the worse regime, {spoken(tolerance)} tolerated')

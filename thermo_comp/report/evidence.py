@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from ..fitting.reduction import Readings
-from ..judging import Judgement, Kind, Windows
+from ..judging import Judgement, Verdict, Windows
 from ..simulation import Cyclogram
 from ..typing import Floats
 from ..unit.calibration import Calibration
@@ -209,11 +209,11 @@ class Evidence:
         How the verdict is to be coloured: valid; with reservations; not; nothing was judged.
 
         """
-        if self.judgement is None or self.judgement.kind in (Kind.OUTSIDE, Kind.NO_CLAIM):
+        if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
             return 'poor'
-        is_good = self.judgement.kind is Kind.VALID and not self.findings
+        is_good = self.judgement.kind is Verdict.VALID and not self.findings
         return 'good' if is_good else 'reserved'
 
     @property
