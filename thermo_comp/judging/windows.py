@@ -32,6 +32,8 @@ WINDOW_S = 60.0
 _LONGEST_SUM_S = 10.0
 # Less than this beyond a calibrated range, in half ranges, is its edge: thermometers have noise.
 _EDGE = 0.02
+# A sum of fewer than this part of the usual samples does not last as long.
+_LEAST_FILLED = 0.9
 
 
 @dataclass(frozen=True)
@@ -293,9 +295,12 @@ def _table(
         for place, one in enumerate(sums):
             one[:, _BAG], one[:, _POSITION] = number, first_position + place
         first_position += len(sums)
-        if sums:
+        if any(map(len, sums)):
             whole = np.concatenate(sums)
             correct(bag, whole)
+            # Messages were lost, or the bag ends within it.
+            usual = np.median(whole[:, _COUNT])
+            whole[whole[:, _COUNT] < _LEAST_FILLED * usual, _EXCESS] = np.nan
             parts.append(_joined(whole, per))
     return np.concatenate(parts)
 

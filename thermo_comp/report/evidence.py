@@ -201,6 +201,8 @@ class Evidence:
             return str(self.judgement)
         if self.calibration is not None:
             return 'the calibration as it stands: no recording was judged with it'
+        if not self.bags:
+            return 'nothing to show yet: no file could be read'
         return 'a thermal record: no calibration was judged'
 
     @property
