@@ -67,6 +67,7 @@ def evaluate(
 
     out = Output(as_json, quiet)
     limit = options.acceleration(tolerance)
+    window_s = options.positive(window, '--window')
     gravity = options.place(gravity, latitude, height)
     if csv is not None:
         options.refuse_existing(csv, force)
@@ -81,7 +82,7 @@ def evaluate(
             bags,
             models,
             gravity=gravity,
-            window_s=options.positive(window, '--window'),
+            window_s=window_s,
             tolerance=limit,
             topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
             input=input_.value,

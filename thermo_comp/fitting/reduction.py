@@ -24,6 +24,7 @@ from .sources import FitSource
 # Faster readings are averaged to this interval: no thermometer of this kind is that fast, and the
 # thermometers' recursion runs in Python.
 _SHORTEST_READING_INTERVAL_S = 0.2
+_LEAST_FILLED = 0.9
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ def reduce_source(
         n_saturated=found.n_saturated,
         n_cells=len(found.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
-        window_s=per_window * found.cell_s,
+        window_s=round(per_window * found.cell_s, 6),
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
         is_integer=found.is_integer,
     )
@@ -196,6 +197,9 @@ def _windows(cells: Cells, bag: int, lower: int, upper: int, per_window: int) ->
     offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
+    # Where the bag ends within a cell, its window does not last as long.
+    if n_whole and total[n_whole - 1] < _LEAST_FILLED * np.median(total):
+        n_whole -= 1
     mean = np.add.reduceat(cells.mean[rows] * count[:, None], offsets, axis=0) / total[:, None]
     return StillInterval(
         bag=bag,
