@@ -79,7 +79,7 @@ PICTURE = Kind('PNG picture', rb'\A\x89PNG\r\n')
 PARAMETERS = Kind('parameter file of ours', rb'\A# Thermal calibration of unit ')
 RECORD = Kind('JSON record', rb'\A\{')
 PARQUET = Kind('Parquet file', rb'\APAR1')
-CSV = Kind('CSV table of ours', rb'\A(stamp_ns|name|section),')
+CSV = Kind('CSV table of ours', rb'\A(stamp_ns|name|section|bag),')
 MCAP = Kind('MCAP file', rb'\A\x89MCAP')
 BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z', is_folder=True)
 

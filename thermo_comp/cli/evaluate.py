@@ -60,7 +60,7 @@ def evaluate(
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
 
     """
-    from ..files import write_atomically
+    from ..files import CSV, check_output, write_atomically
     from ..judging import evaluate as run
     from ..judging.table import csv_of
     from ..unit.calibration_file import load_calibration
@@ -70,7 +70,7 @@ def evaluate(
     window_s = options.positive(window, '--window')
     gravity = options.place(gravity, latitude, height)
     if csv is not None:
-        options.refuse_existing(csv, force)
+        check_output(csv, CSV, overwrite=force, others=[*bags, *calibration])
     names = [path.stem for path in calibration]
     if len(set(names)) < len(names):
         names = [str(path) for path in calibration]
@@ -92,7 +92,8 @@ def evaluate(
     is_torn = out.torn(bag.info for bag in result.bags)
     judged = result.judgements[names[0]]
     if csv is not None:
-        write_atomically(csv, csv_of(judged.windows, [bag.name for bag in bags]).encode())
+        text = csv_of(judged.windows, [bag.name for bag in bags])
+        write_atomically(csv, text.encode(), CSV, overwrite=force)
     say(out, result)
     out.json(
         {
