@@ -4,16 +4,15 @@
 Owns the services that set parameters: prepared beside the samples, applied between two of them.
 
 rclpy serves such a request in one go, in the thread of the samples, and a request that it cannot
-read ends the node. Here a thread of its own does what takes time, reading a file; what is left
-for the loop is to exchange one reference. Requests are answered in the order in which they came,
-whatever is wrong with them.
+read ends the node. Here a thread of its own waits for what takes time, the reading of a file; what
+is left for the loop is to exchange one reference. Requests are answered in the order in which they
+came, whatever is wrong with them.
 
 """
 
 from __future__ import annotations
 
 import queue
-import sys
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -31,8 +30,6 @@ from .waitloop import WaitLoop
 
 #: More requests than this that wait, or parameters in one of them, are refused.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
-#: While something is prepared the samples' thread waits no longer than this for its turn [s].
-SWITCH_S = 0.2e-3
 
 #: Runs beside the samples: what takes time about a change.
 Prepare = Callable[[list[Parameter]], Any]
@@ -113,12 +110,7 @@ class ParameterRequests:
 
         """
         while (work := self._waiting.get()) is not None:
-            usual_s = sys.getswitchinterval()
-            sys.setswitchinterval(SWITCH_S)
-            try:
-                work()
-            finally:
-                sys.setswitchinterval(usual_s)
+            work()
 
     def _work(
         self,
