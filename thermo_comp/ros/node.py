@@ -80,6 +80,9 @@ example: thermo_comp_node --ros-args -p calibration_file:=unit42.yaml -r accel/c
 parameters:
 """
 
+#: What the launch file calls a parameter whose argument was not given.
+NOT_GIVEN = 'not_given.'
+
 _INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
 
 
@@ -142,7 +145,7 @@ class CompensationNode:
         )
         for name in undeclared_overrides(self.node):
             # The input that is not open may be opened later, with these.
-            if not name.startswith(inputs):
+            if not name.startswith((*inputs, NOT_GIVEN)):
                 self._log.warning(f'there is no parameter `{name}`, it has no effect')
 
     def run(self) -> None:

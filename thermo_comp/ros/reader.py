@@ -144,7 +144,8 @@ class Reader:
         process, self._process = self._process, None
         if process is not None:
             process.kill()
-            with process:
+            # What is left to be asked may find nobody any more.
+            with suppress(BrokenPipeError), process:
                 pass
 
 

@@ -37,6 +37,13 @@ Prepare = Callable[[list[Parameter]], Any]
 Apply = Callable[[list[Parameter], Any], SetParametersResult]
 
 
+class RequestError(ThermoCompError):
+    """
+    A request that cannot be taken, whatever it asks for.
+
+    """
+
+
 class ParameterRequests:
     """
     What answers `set_parameters` and `set_parameters_atomically` of a node.
@@ -98,9 +105,9 @@ class ParameterRequests:
         n = sum(len(group) for group in groups)
         try:
             if n > PARAMETERS_LIMIT:
-                raise ThermoCompError(f'{n} parameters at once, at most {PARAMETERS_LIMIT}')
+                raise RequestError(f'{n} parameters at once, at most {PARAMETERS_LIMIT}')
             self._waiting.put_nowait(partial(self._work, groups, respond))
-        except (ThermoCompError, queue.Full) as error:
+        except (RequestError, queue.Full) as error:
             reason = str(error) or 'too many requests wait already, try again'
             respond([_refusal(reason) for _ in groups])
 
@@ -120,7 +127,7 @@ class ParameterRequests:
         results: list[SetParametersResult] = []
         for group in groups:
             try:
-                changes = [_read(message) for message in group]
+                changes = [read_parameter(message) for message in group]
                 prepared = self._prepare(changes)
             except Exception as error:  # noqa: BLE001 - whatever it is, it is answered
                 changes, prepared = [], error
@@ -162,19 +169,33 @@ class ParameterRequests:
         )
 
 
-def _read(message: ParameterMessage) -> Parameter:
+def read_parameter(message: ParameterMessage) -> Parameter:
     """
     Read a parameter off the network.
+
+    Parameters
+    ----------
+    message : rcl_interfaces.msg.Parameter
+        As it came in.
+
+    Returns
+    -------
+    rclpy.parameter.Parameter
+
+    Raises
+    ------
+    RequestError
+        If it has no name, or a value of a type that there is not.
 
     """
     if not message.name:
         # rclpy takes it for declared.
-        raise ThermoCompError('a parameter without a name')
+        raise RequestError('a parameter without a name')
     try:
         return Parameter.from_parameter_msg(message)
     except (ValueError, TypeError) as error:
-        raise ThermoCompError(
-            f'parameter `{message.name:.60}` has no value that can be read '
+        raise RequestError(
+            f'parameter {message.name!r:.60} has no value that can be read '
             f'(type {message.value.type})'
         ) from error
 
