@@ -9,7 +9,9 @@ A file on this machine is one kind; whoever keeps bags elsewhere brings another.
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -63,14 +65,17 @@ class LocalFile:
     Raises
     ------
     OSError
-        If it cannot be opened.
+        If it cannot be opened, or is a FIFO or a device: these would never end.
 
     """
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_RDONLY)
+        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         try:
-            self.size = os.fstat(self._descriptor).st_size
+            status = os.fstat(self._descriptor)
+            if not stat.S_ISREG(status.st_mode):
+                raise OSError(errno.EINVAL, 'not a regular file', str(path))
+            self.size = status.st_size
         except BaseException:
             os.close(self._descriptor)
             raise
