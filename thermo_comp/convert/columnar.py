@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import __version__
+from ..files import open_regular
 from ..typing import Floats, Ints
 from .columns import ColumnMap, Thermometer
 from .log import ForeignLog, Readings, thin
@@ -95,7 +96,7 @@ def origin(path: str | Path, serial: str | None) -> dict[str, str]:
 
     """
     digest = hashlib.sha256()
-    with Path(path).open('rb') as file:
+    with open_regular(path) as file:
         for chunk in iter(lambda: file.read(1 << 20), b''):
             digest.update(chunk)
     return {

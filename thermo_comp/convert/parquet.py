@@ -14,8 +14,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
+from ..files import open_regular
 from ..typing import Floats, Ints
 from .table import NO_STAMP, Column, Table, place
+
+_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 
 def read_parquet(
@@ -55,10 +58,13 @@ def read_parquet(
             "a Parquet file needs pyarrow: pip install 'thermo_comp[parquet]'", path=path
         ) from failure
     try:
-        headings = list(pq.read_schema(path).names)
-        names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
-        places = {name: place(path, name, headings, len(headings)) for name in names}
-        table = pq.read_table(path, columns=[headings[i] for i in sorted(set(places.values()))])
+        with open_regular(path) as file:
+            headings = list(pq.read_schema(file).names)
+            names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
+            places = {name: place(path, name, headings, len(headings)) for name in names}
+            file.seek(0)
+            wanted = [headings[i] for i in sorted(set(places.values()))]
+            table = pq.read_table(file, columns=wanted)
     except (ArrowException, OSError) as failure:
         reason = ' '.join(str(failure).split())
         raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
@@ -98,15 +104,17 @@ def _stamps(path: Path, name: str, column: Any, exponent: int) -> Ints:
 
     known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)
     if pa.types.is_timestamp(column.type):
-        whole = column.cast(pa.timestamp('ns')).cast(pa.int64())
-        exponent = 0
-    elif pa.types.is_integer(column.type):
-        whole = column.cast(pa.int64())
+        exponent = _EXPONENTS[column.type.unit]
+        column = column.cast(pa.int64())
+    if pa.types.is_integer(column.type):
+        values = column.fill_null(0).to_numpy()
+        limit = (2**63 - 1) // 10**exponent
+        known &= (values <= limit) & (values >= -limit if values.dtype.kind == 'i' else True)
+        factor = 10**exponent
     else:
-        values = _floats(path, name, column)
-        known &= np.isfinite(values)
-        stamps = np.full(len(values), NO_STAMP, dtype=np.int64)
-        stamps[known] = np.rint(values[known] * 10.0**exponent).astype(np.int64)
-        return stamps
-    integers = np.asarray(whole.fill_null(0).to_numpy(), dtype=np.int64)
-    return np.where(known, integers * 10**exponent, NO_STAMP)
+        factor = 1
+        values = np.rint(_floats(path, name, column) * 10.0**exponent)
+        known &= np.abs(values) < 2.0**63
+    stamps = np.full(len(values), NO_STAMP, dtype=np.int64)
+    stamps[known] = values[known].astype(np.int64) * factor
+    return stamps

@@ -129,7 +129,7 @@ def open_bag(
         total = info.topics[name][1] if name else 0
         source = FitSource(
             name=path.name,
-            blocks=lambda: _told(reader.blocks(), total, progress),
+            blocks=lambda: _told(reader.blocks_on_one_clock(), total, progress),
             sha256=digest(path) if is_hashed else None,
             serial=info.metadata.get('serial'),
         )
@@ -141,6 +141,7 @@ def open_bag(
             min_still_s=_MIN_STILL_S,
             full_scale=full_scale,
         )
+        info = reader.info
     if not len(reduced.board.value):
         raise RecordingError('no board temperature in it', path=str(path))
     return OpenedBag(info, reduced)

@@ -9,12 +9,12 @@ A file on this machine is one kind; whoever keeps bags elsewhere brings another.
 
 from __future__ import annotations
 
-import errno
 import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
+
+from ..files import open_regular
 
 
 class RandomAccess(Protocol):
@@ -70,26 +70,19 @@ class LocalFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-        try:
-            status = os.fstat(self._descriptor)
-            if not stat.S_ISREG(status.st_mode):
-                raise OSError(errno.EINVAL, 'not a regular file', str(path))
-            self.size = status.st_size
-        except BaseException:
-            os.close(self._descriptor)
-            raise
+        self._file = open_regular(path)
+        self.size = os.fstat(self._file.fileno()).st_size
 
     def read_at(self, at: int, n_bytes: int) -> bytes:
         """
         Read up to so many bytes.
 
         """
-        return os.pread(self._descriptor, n_bytes, at)
+        return os.pread(self._file.fileno(), n_bytes, at)
 
     def close(self) -> None:
         """
         Close the file.
 
         """
-        os.close(self._descriptor)
+        self._file.close()

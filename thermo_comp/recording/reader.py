@@ -20,6 +20,7 @@ from typing import Protocol
 
 from ..errors import RecordingError
 from .assemble import Part, assemble, join_blocks
+from .clock import without_jumps
 from .columns import ROLES, Block, Input, RawMessages, Recording, RecordingInfo, Role, Topics
 from .expanded import ExpandedSource
 from .foreign import ForeignSource
@@ -141,6 +142,28 @@ class RecordingReader:
             yield block
         for role, (name, _) in names.items():
             self._miss(name, n_read[role], self.info.topics[name][1])
+
+    def blocks_on_one_clock(self) -> Iterator[Block]:
+        """
+        Read the bag for whoever walks its time: jumps of its clock are taken out.
+
+        Yields
+        ------
+        Block
+            As `blocks` gives them; see `clock` for the stamps behind a jump.
+
+        Raises
+        ------
+        RecordingError
+            As for `blocks`, and stamps that are no clock.
+
+        """
+        try:
+            yield from without_jumps(self.blocks())
+        except RecordingError as error:
+            raise RecordingError(
+                error.message, error.path or self.info.path, error.topic
+            ) from error
 
     def _miss(self, topic: str, n_read: int, n_promised: int) -> None:
         """
