@@ -18,7 +18,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import RecordingError
-from .columns import Block, Ints
+from ..typing import Ints
+from .columns import Block
 
 #: What a longer jump of the stamps becomes [ns].
 LONGEST_PAUSE_NS = 3600 * 10**9

@@ -302,6 +302,7 @@ class _Readings:
         rates = np.diff(mean) / np.maximum(np.diff(mean_time), 1e-9) * 60.0
         steps = np.abs(np.diff(celsius))
         intervals = np.diff(stamp_ns)
+        intervals = intervals[intervals > 0]
         return ThermometerSurvey(
             n=len(celsius),
             rate_hz=1e9 / float(np.median(intervals)) if len(intervals) else float('nan'),

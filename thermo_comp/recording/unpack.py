@@ -28,6 +28,8 @@ _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
 _READ_BYTES = 1 << 20
+#: Up to so much before a damage is lost with it.
+_STEP_BYTES = 1 << 16
 
 
 def growth_limit(n_packed: int) -> int:
@@ -57,7 +59,7 @@ def expand(packed: Path, target: Path) -> str | None:
     Raises
     ------
     DamagedError
-        It holds more than it may.
+        It holds more than it may, or nothing.
     OSError
         The disk is full or the like.
 
@@ -66,18 +68,21 @@ def expand(packed: Path, target: Path) -> str | None:
     limit = growth_limit(handle.size)
     stream = open_stream('zstd', Region(handle, 0, handle.size))
     n_bytes = 0
+    loss = None
     try:
         with target.open('wb') as file:
-            while data := stream.read(_READ_BYTES):
+            while data := stream.read(_STEP_BYTES):
                 n_bytes += len(data)
                 if n_bytes > limit:
                     raise DamagedError(f'{handle.size} bytes hold more than {limit}')
                 file.write(data)
     except _CompressionError as error:
-        return f'{packed.name} is unreadable behind {n_bytes} bytes of its content ({error})'
+        loss = f'{packed.name} is unreadable behind {n_bytes} bytes of its content ({error})'
     finally:
         handle.close()
-    return None
+    if not n_bytes:
+        raise DamagedError(loss or 'it holds nothing that can be decompressed')
+    return loss
 
 
 def unpack_message(packed: bytes) -> bytes:
