@@ -7,6 +7,7 @@ Owns Parquet tables, behind the extra ``parquet``.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from ..files import open_regular
 from ..typing import Floats, Ints
 from .table import NO_STAMP, Column, Table, place
 
+#: What packs numbers more tightly holds no measurement.
+_MOST_ROWS_PER_BYTE = 1000
 _EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 
@@ -51,7 +54,6 @@ def read_parquet(
 
     """
     try:
-        from pyarrow import ArrowException
         from pyarrow import parquet as pq
     except ImportError as failure:
         raise RecordingError(
@@ -59,13 +61,16 @@ def read_parquet(
         ) from failure
     try:
         with open_regular(path) as file:
-            headings = list(pq.read_schema(file).names)
+            found = pq.ParquetFile(file)
+            if found.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
+                raise RecordingError(f'it claims {found.metadata.num_rows} rows', path=path)
+            headings = list(found.schema_arrow.names)
             names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
             places = {name: place(path, name, headings, len(headings)) for name in names}
-            file.seek(0)
-            wanted = [headings[i] for i in sorted(set(places.values()))]
-            table = pq.read_table(file, columns=wanted)
-    except (ArrowException, OSError) as failure:
+            table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
+    except RecordingError:
+        raise
+    except Exception as failure:  # a damaged file surfaces there as nearly any exception type
         reason = ' '.join(str(failure).split())
         raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
     if not table.num_rows:
