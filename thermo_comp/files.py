@@ -112,6 +112,14 @@ def bag_kind(path: str | Path, others: str = '') -> Kind:
     return BAG
 
 
+def shown_name(path: str | Path) -> str:
+    """
+    Give the last part of a path as text that can be written anywhere, even where it is no UTF-8.
+
+    """
+    return os.fsencode(Path(path).name).decode('utf-8', 'replace')
+
+
 def open_regular(path: str | Path) -> BinaryIO:
     """
     Open a regular file for reading.

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import FitError
+from ..files import shown_name
 from ..recording import Block, Input, RecordingInfo, Role, Topics, open_recording
 from . import FitSource
 
@@ -116,7 +117,7 @@ def recording_source(
             latest = again.info
 
     source = FitSource(
-        path.name,
+        shown_name(path),
         blocks,
         serial=info.metadata.get('serial'),
         missing=lambda: latest.truncated,

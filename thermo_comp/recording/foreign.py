@@ -83,6 +83,9 @@ class ForeignSource:
                     if reader.message_count:
                         spans.append((int(reader.start_time), int(reader.end_time) - 1))
                 for connection in reader.connections:
+                    # A database holds whatever it was given, in any column.
+                    if not all(isinstance(c, str) for c in (connection.topic, connection.msgtype)):
+                        raise RecordingError('a topic has no name or no type', file)
                     counts[connection.topic] += connection.msgcount
                     known = types.setdefault(connection.topic, [])
                     if connection.msgtype not in known:

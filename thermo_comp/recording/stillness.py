@@ -29,6 +29,8 @@ _QUANTUM_SAMPLES = 20000
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)
 # Stamps may lie anywhere; no unit rests in one cell for a day.
 _LONGEST_CELL_NS = 86400e9
+# A sample beyond has a square that is no number; it is none itself.
+_LARGEST = 1e100
 # Noise below this many quanta leaves a sensor on one number for long.
 _STUCK = 0.3
 
@@ -129,7 +131,7 @@ class CellAccumulator:
         samples = np.asarray(samples, dtype=np.float64)
         if not len(stamp_ns):
             return
-        use = np.isfinite(samples).all(axis=1)
+        use = (np.abs(samples) < _LARGEST).all(axis=1)
         before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
         if self._full_scale is not None:
