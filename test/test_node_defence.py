@@ -26,8 +26,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
 from sensor_msgs.msg import Imu, Temperature
 
+from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
 from thermo_comp.ros.parameters import NodeConfig
+from thermo_comp.ros.reader import Reader
 from thermo_comp.ros.requests import PARAMETERS_LIMIT
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -226,6 +228,22 @@ def test_calibrations_are_taken_from_one_folder_only(
         (result,) = peer.set_parameters(calibration_directory='/')
         assert not result.successful
         assert peer.describe('calibration_directory')[0].read_only
+
+
+def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
+    # WHY: whatever a file does to the process that reads it, the node only hears of it.
+    reader = Reader()
+    assert reader.read(str(unit), '').calibration == calibration()
+    process = reader._process
+    assert process is not None
+    process.kill()
+    process.wait()
+    with pytest.raises(CalibrationError, match='the process that reads it ended'):
+        reader.read(str(unit), '')
+    assert reader.read(str(unit), '').calibration == calibration()
+    with pytest.raises(CalibrationError, match=r'^none\.yaml: cannot be read: No such file'):
+        reader.read('none.yaml', '')
+    reader.close()
 
 
 def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:

@@ -1,0 +1,31 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the fit: bags of a thermal test -> still positions -> regression -> calibration, with proof.
+
+"""
+
+from .evidence import PositionReport, ResidualRow
+from .fit import FitResult, fit, fit_bags, reduce_bag
+from .gravity import normal_gravity, resolve_gravity
+from .options import FitOptions
+from .reduction import ReducedBag
+from .sources import ArrayBlock, FitSource, SourceBlock
+from .verdict import Finding
+
+__all__ = [
+    'ArrayBlock',
+    'Finding',
+    'FitOptions',
+    'FitResult',
+    'FitSource',
+    'PositionReport',
+    'ReducedBag',
+    'ResidualRow',
+    'SourceBlock',
+    'fit',
+    'fit_bags',
+    'normal_gravity',
+    'reduce_bag',
+    'resolve_gravity',
+]

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import FitError
 from ..text import valid_serial
+from ..text import valid_serial
 from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..typing import Floats
 from ..unit.calibration import Calibration, Unit
@@ -267,9 +268,12 @@ def fit_bags(
         options.reference_temperature,
         options.model,
     )
-    calibration = build_calibration(
-        windows, regression, learnt, columns, sets, nominal, bags, facts, residuals, findings
-    )
+    try:
+        calibration = build_calibration(
+            windows, regression, learnt, columns, sets, nominal, bags, facts, residuals, findings
+        )
+    except ValueError as error:
+        raise FitError(f'these data give no calibration that can be used: {error}') from error
     return FitResult(
         calibration=calibration,
         learnt=learnt,

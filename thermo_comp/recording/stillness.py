@@ -19,12 +19,18 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# A cell's variance, of n >= 32 samples, exceeds 4 times its mean by chance with probability
-# below 1e-12; vibration worth cutting out is far above.
+# A cell's variance, of n >= 30 samples, exceeds 4 times its mean by chance with probability
+# below 1e-11; vibration worth cutting out is far above.
 _VARIANCE_RATIO = 4.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
 _QUANTUM_SAMPLES = 20000
+#: How many windows a cell lasts where the samples are slow.
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)
+# Stamps may lie anywhere; no unit rests in one cell for a day.
+_LONGEST_CELL_NS = 86400e9
+# A sample beyond has a square that is no number; it is none itself.
+_LARGEST = 1e100
 # Noise below this many quanta leaves a sensor on one number for long.
 _STUCK = 0.3
 
@@ -79,16 +85,22 @@ class CellAccumulator:
     Parameters
     ----------
     cell_s : float
-        Shortest length of a cell [s]; cells are longer where it would hold fewer than 32 samples.
+        Shortest length of a cell [s]; cells are longer where it would hold fewer than 30 samples.
     full_scale : float or None
         Magnitude at which a sample is saturated.
+    window_s : float or None, optional
+        What a whole number of cells is to last [s]; where even one cell of that length would hold
+        too few samples, a cell lasts one of `STRETCHES` times as long.
 
     """
 
-    _MIN_SAMPLES = 32
+    _MIN_SAMPLES = 30
 
-    def __init__(self, cell_s: float, full_scale: float | None) -> None:
+    def __init__(
+        self, cell_s: float, full_scale: float | None, window_s: float | None = None
+    ) -> None:
         self._asked_cell_s = cell_s
+        self._window_s = window_s
         self._full_scale = full_scale
         self._cell_ns = 0
         self._start_ns = 0
@@ -119,7 +131,7 @@ class CellAccumulator:
         samples = np.asarray(samples, dtype=np.float64)
         if not len(stamp_ns):
             return
-        use = np.isfinite(samples).all(axis=1)
+        use = (np.abs(samples) < _LARGEST).all(axis=1)
         before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
         if self._full_scale is not None:
@@ -173,7 +185,8 @@ class CellAccumulator:
 
     def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
         step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
-        self._cell_ns = int(max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0))
+        least = min(max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0), _LONGEST_CELL_NS)
+        self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
         self._quantum = _quantum_of(samples[:_QUANTUM_SAMPLES])
@@ -200,6 +213,18 @@ class CellAccumulator:
         if len(ids) > 1:
             self._ids.append(ids[:-1])
             self._sums.append(sums[:-1].copy())
+
+
+def _part_of(window_s: float, least: float) -> float:
+    """
+    Find the length of a cell of which a whole number fills the window, or some windows [ns].
+
+    """
+    for stretch in STRETCHES:
+        n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
+        if n_cells:
+            return stretch * window_s * 1e9 / n_cells
+    return least
 
 
 def _quantum_of(samples: Floats) -> Floats:
@@ -241,6 +266,8 @@ def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
     if not n:
         return []
     full = cells.count >= max(2.0, 0.5 * float(np.median(cells.count)))
+    if not full.any():
+        return []
     quiet = full & _is_quiet(cells, full)
     broken = ~_is_joined(cells, quiet)
     # A cell beside a moving one, or on either side of a step, holds the edge of the motion.

@@ -19,7 +19,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from ..online.status import CompensatorStatus, Counters
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
-from .loading import LoadedCalibration
+from .reader import LoadedCalibration
 
 #: A sample rate further from the calibrated one than this is worth a warning.
 RATE_TOLERANCE = 0.1

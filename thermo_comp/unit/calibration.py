@@ -327,7 +327,7 @@ class Calibration:
                 f'got {list(names)}'
             )
         for k, term in enumerate(self.response):
-            if term.kind in ('now', 'neighbour', 'even') and term.sensor not in names:
+            if (term.is_of_gradient or term.kind == 'neighbour') and term.sensor not in names:
                 raise ValueError(
                     f'`response[{k}].sensor` must be one of sensors {list(names)}, '
                     f'got {term.sensor!r}'
@@ -359,6 +359,18 @@ class Calibration:
 
         """
         return self.static, self.dynamic
+
+    @property
+    def has_uncertainty(self) -> bool:
+        """
+        Whether the calibration says anything of how well it is known; else it claims nothing.
+
+        """
+        return any(self.misalignment_sd) or any(
+            axis.covariance or axis.residual_sd_m_s2
+            for part in self.regime_sets()
+            for axis in part.axes()
+        )
 
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
