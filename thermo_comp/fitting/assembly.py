@@ -49,8 +49,6 @@ _EDGE_MARGIN = 0.02
 _LINEAR_REACH = 2.0
 # Bags without any temperature say nothing of a range: the curve is flat, its prior wide.
 _UNSEEN_RANGE_C = 0.5
-# Of each parameter's variance, what may leave its correlations for the diagonal.
-_LEFT_ON_DIAGONAL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -215,14 +213,14 @@ def build_calibration(
             GroupEvidence(
                 group=worth.group,
                 part='bias' if worth.part == 'bias' else 'scale',
-                explains_m_s2=worth.explains,
-                effective_parameters=max(worth.effective, 0.0),
-                log_evidence_change=worth.evidence,
-                prior_sd=(worth.sd,),
+                explains_m_s2=float(worth.explains),
+                effective_parameters=max(float(worth.effective), 0.0),
+                log_evidence_change=float(worth.evidence),
+                prior_sd=(float(worth.sd),),
             )
             for worth in learnt.worth
         ),
-        posterior=posterior_of(covariance, _LEFT_ON_DIAGONAL),
+        posterior=posterior_of(covariance),
     )
 
 

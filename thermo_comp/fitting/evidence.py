@@ -113,7 +113,9 @@ def residual_rows(
     residuals = [norm_residual(force, regression.gravity) for force in steps]
     left_out = left_out_residual(regression, learnt)
     is_dynamic = windows.weight > 0.5
-    tables = [statistics_by_regime(r, is_dynamic) for r in (*residuals, left_out)]
+    known = np.isfinite(left_out)
+    tables = [statistics_by_regime(r, is_dynamic) for r in residuals]
+    tables.append(statistics_by_regime(left_out[known], is_dynamic[known]))
     rows = tuple(
         ResidualRow(section, *(table[section] for table in tables))
         for section in ('static', 'dynamic', 'all')
@@ -140,13 +142,16 @@ def _with_only(regression: Regression, learnt: Learnt, groups: tuple[str, ...]) 
 
 def left_out_residual(regression: Regression, learnt: Learnt) -> Floats:
     """
-    ``|f| - g`` of each position's windows by the other positions, shape (n,) [m/s^2].
+    ``|f| - g`` of each position's windows by the others, shape (n,) [m/s^2]; NaN for a position
+    that tells what no other does.
 
     """
     position = regression.windows.position
-    result = np.empty(len(position))
+    result = np.full(len(position), np.nan)
     for p in range(regression.windows.n_positions):
         state = regression.without(learnt.posterior, learnt.prior, p)
+        if state is None:
+            continue
         rows = position == p
         result[rows] = norm_residual(regression.force(state), regression.gravity)[rows]
     return result

@@ -30,6 +30,8 @@ from .whitening import Whitener
 
 # Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
 _JITTER = 1e-13
+# Of what is known of a direction, the least that is left without one position.
+_LEAST_LEFT = 1e-5
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
 
 
@@ -513,7 +515,7 @@ class Regression:
         )
         return other, G, g
 
-    def without(self, posterior: Posterior, prior: Prior, p: int) -> State:
+    def without(self, posterior: Posterior, prior: Prior, p: int) -> State | None:
         """
         The mode that the other positions alone would give, to first order.
 
@@ -528,8 +530,9 @@ class Regression:
 
         Returns
         -------
-        State
-            What belongs to the unit has moved; the rest is as it was.
+        State or None
+            What belongs to the unit has moved; the rest is as it was. None where the others do
+            not tell something that this one does.
 
         """
         layout, n = posterior.layout, posterior.layout.n_unit
@@ -556,9 +559,17 @@ class Regression:
         )
         told = hessian[:n, :n] - hessian[:n, n:] @ inner[:, :n]
         pull = gradient[:n] - hessian[:n, n:] @ inner[:, n]
-        C = posterior.covariance
+        # In coordinates of unit variance: what this position alone told is near 1, and stays within
+        # what the others leave open.
+        scale = np.sqrt(np.diag(posterior.covariance))
+        root = np.linalg.cholesky(posterior.covariance / np.outer(scale, scale) + _JITTER * np.eye(n))
+        root *= scale[:, None]
+        shares, directions = np.linalg.eigh(root.T @ told @ root)
+        left = 1.0 - shares
+        if left.min() < _LEAST_LEFT:
+            return None
         step = np.zeros(layout.n)
-        step[:n] = -np.linalg.solve(np.eye(n) - C @ told, C @ pull)
+        step[:n] = -root @ (directions @ ((directions.T @ (root.T @ pull)) / left))
         return self._moved(posterior.state, step, layout)
 
     def force(self, state: State) -> Floats:
