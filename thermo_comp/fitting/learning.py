@@ -115,7 +115,12 @@ def learn(
     """
     tell = tell or (lambda _part: None)
     kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
-    silent = _silent(regression.solve(state, prior), prior)
+    if prior.known is None:
+        silent = _silent(regression.solve(state, prior), prior)
+    else:
+        # Nothing is asked of a column whose weights are known beforehand.
+        kept = np.ones(len(prior.on_bias), dtype=bool)
+        silent = {part: _widths(prior, part) > 0.0 for part in ('bias', 'scale')}
     fixed = _Fixed(silent, kept)
     posterior, prior = _settle(regression, state, prior, fixed)
     tell(0.4)
@@ -177,8 +182,8 @@ def _told(posterior: Posterior, part: str) -> Floats:
 
     """
     places = _places(posterior, part)
-    learnt = np.append(1.0 - posterior.precision * posterior.variance, 0.0)
-    return np.asarray(np.where(places >= 0, learnt[places], 0.0).sum(axis=0))
+    told = np.append(posterior.told, 0.0)
+    return np.asarray(np.where(places >= 0, told[places], 0.0).sum(axis=0))
 
 
 def _silent(posterior: Posterior, prior: Prior) -> dict[str, Bools]:
@@ -213,7 +218,7 @@ def _settle(
             power = np.where(places >= 0, vector[places] ** 2, 0.0).sum(axis=0)
             asked = (sd > 0.0) & ~fixed.silent[part]
             new = np.where(asked, np.sqrt(power / np.maximum(told, 1e-9)), sd)
-            new = np.where(asked, np.maximum(new, 1e-3 * sd), sd)
+            new = np.where(asked, np.maximum(new, _smallest(regression, prior, part)), sd)
             lively = asked & (told > _IDLE)
             if lively.any():
                 change = max(change, float(np.abs(np.log(new[lively] / sd[lively])).max()))
@@ -245,14 +250,22 @@ def _settle(
     return regression.solve(state, prior), prior
 
 
+def _smallest(regression: Regression, prior: Prior, part: str) -> float:
+    """
+    A width that the data cannot tell from 0: a column that stays all the same keeps it.
+
+    """
+    sd = 1e-2 * float(np.mean(prior.sigma)) / np.sqrt(len(regression.windows.time))
+    return sd if part == 'bias' else sd / regression.gravity
+
+
 def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float, float]:
     """
     Effective parameters of some unknowns, and the sum of their squares.
 
     """
     where = places.ravel()
-    told = 1.0 - posterior.precision[where] * posterior.variance[where]
-    return float(told.sum()), float(np.sum(vector[where] ** 2))
+    return float(posterior.told[where].sum()), float(np.sum(vector[where] ** 2))
 
 
 def _position_sd(regression: Regression, prior: Prior) -> float:
@@ -267,11 +280,10 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
     """
     n = len(posterior.whitened)
     square = np.sum(posterior.whitened**2, axis=0)
-    learnt = 1.0 - posterior.precision * posterior.variance
-    layout = posterior.layout
-    own = learnt[layout.axis].sum(axis=1) + learnt[layout.offset].sum(axis=0)
+    told, layout = posterior.told, posterior.layout
+    own = told[layout.axis].sum(axis=1) + told[layout.offset].sum(axis=0)
     # Attitudes, misalignment and start states are told by all three.
-    shared = learnt[layout.skew].sum() + layout.up.size + learnt[layout.start].sum()
+    shared = told[layout.skew].sum() + layout.up.size + told[layout.start].sum()
     spent = own + shared / 3.0
     return np.asarray(prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n)))
 
