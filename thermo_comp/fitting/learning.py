@@ -40,6 +40,8 @@ _MOST_ROUNDS = 40
 _SETTLED = 0.03
 # What must be gained in log evidence to stay.
 _EARNED = 0.5
+# Of the noise of a window, what a column may add unseen before it counts.
+_OPEN = 1.0
 # Windows this many sds off lose weight, after Huber.
 _HUBER_SDS = 3.0
 
@@ -115,6 +117,7 @@ def learn(
     """
     tell = tell or (lambda _part: None)
     kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
+    allowed = prior
     if prior.known is None:
         silent = _silent(regression.solve(state, prior), prior)
     else:
@@ -146,8 +149,33 @@ def learn(
     tell(0.9)
     prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
+    if prior.known is None:
+        prior = _left_open(regression, posterior, prior, allowed)
+        posterior = regression.solve(posterior.state, prior)
     tell(1.0)
     return Learnt(posterior, prior, group_worth(regression, posterior, prior))
+
+
+def _left_open(
+    regression: Regression, posterior: Posterior, prior: Prior, allowed: Prior
+) -> Prior:
+    """
+    Take columns back that the data could not have seen, lest they be claimed to be 0.
+
+    A column that left was not needed; whether it is 0 the data tell to ``1 / sqrt(S)``, S what they
+    say of it beside the columns that stayed. Where that is more than the noise of a window it comes
+    back, with this width.
+
+    """
+    told = regression.told_of_absent(posterior.state, prior, allowed)
+    widths = {}
+    for part, unit in (('bias', 1.0), ('scale', 1.0 / regression.gravity)):
+        wide, S = _widths(allowed, part), told[part]
+        sd = np.minimum(1.0 / np.sqrt(np.maximum(S, 1e-300)), wide)
+        matters = (_widths(prior, part) == 0.0) & (wide > 0.0)
+        matters &= sd > _OPEN * float(np.mean(prior.sigma)) * unit
+        widths[part] = np.where(matters, sd, _widths(prior, part))
+    return replace(prior, on_bias=widths['bias'], on_scale=widths['scale'])
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -322,6 +322,24 @@ class Regression:
             found = self._cache[axis] = _Whitened(rho, gains, base, grams, determinant)
         return found
 
+    def plain_prior(self) -> Prior:
+        """
+        A prior in which every column takes part, of widths that say nothing.
+
+        """
+        n = len(self.windows.groups)
+        return Prior(
+            bias_mean=np.zeros(3),
+            bias_sd=np.ones(3),
+            scale_sd=1.0,
+            skew_sd=1.0,
+            on_bias=np.ones(n),
+            on_scale=self.windows.in_scale.astype(np.float64),
+            offset_sd=1e-6,
+            sigma=np.full(3, 1e-5),
+            rho=np.zeros(3),
+        )
+
     def layout(self, prior: Prior) -> Layout:
         """
         Give every unknown its place, those of the unit first; -1 for columns that take no part.
@@ -550,6 +568,60 @@ class Regression:
             )
         )
         return other, G, g
+
+    def told_of_absent(self, state: State, prior: Prior, allowed: Prior) -> dict[str, Floats]:
+        """
+        What the data say of columns that take no part, beside those that do.
+
+        Parameters
+        ----------
+        state : State
+            The mode.
+        prior : Prior
+            Its prior.
+        allowed : Prior
+            The columns that could take part.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (m,)
+            'bias' and 'scale': inverse variance of a weight, mean over the axes; 0 for columns
+            that take part or may not.
+
+        """
+        everything = replace(
+            prior,
+            on_bias=np.maximum(prior.on_bias, allowed.on_bias),
+            on_scale=np.maximum(prior.on_scale, allowed.on_scale),
+        )
+        layout = self.layout(everything)
+        hessian = self._equations(state, everything, layout).hessian
+        absent = np.zeros(layout.n, dtype=bool)
+        parts = (
+            ('bias', layout.on_bias, prior.on_bias),
+            ('scale', layout.on_scale, prior.on_scale),
+        )
+        for _, places, sd in parts:
+            away = places[:, (sd == 0.0) & (places[0] >= 0)]
+            absent[away] = True
+        present = np.flatnonzero(~absent)
+        hessian[np.diag_indices(layout.n)] += self.precision(everything, layout)
+        for where, matrix in self._inform(prior, layout):
+            hessian[where, where] += matrix
+        kept = hessian[np.ix_(present, present)]
+        root = np.sqrt(np.diag(kept))
+        factor = cho_factor(kept / np.outer(root, root) + _JITTER * np.eye(len(root)))
+        cross = hessian[np.ix_(present, np.flatnonzero(absent))] / root[:, None]
+        told = np.zeros(layout.n + 1)
+        told[np.flatnonzero(absent)] = np.diag(hessian)[absent] - np.sum(
+            cross * cho_solve(factor, cross), axis=0
+        )
+        precision = np.append(self.precision(everything, layout), 0.0)
+        result = {}
+        for part, places, sd in parts:
+            data = np.where((places >= 0) & (sd == 0.0), told[places] - precision[places], 0.0)
+            result[part] = np.maximum(data.mean(axis=0), 0.0)
+        return result
 
     def without(self, posterior: Posterior, prior: Prior, p: int) -> State | None:
         """
