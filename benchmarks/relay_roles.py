@@ -10,14 +10,17 @@ They talk to their parent by lines on standard input and output, and to each oth
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import select
 import struct
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 RELIABILITIES = ('best_effort', 'reliable')
@@ -218,26 +221,34 @@ def _node(arguments: argparse.Namespace) -> None:
 
 def _reloader(arguments: argparse.Namespace) -> None:
     """
-    Set `calibration_file` again and again; print how long each answer took.
+    Set `calibration_file` again and again, to the calibration and to the largest file that is
+    read to its end and refused; print how long each answer took.
 
     """
     import rclpy
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
 
+    from thermo_comp.unit.calibration_file import NODE_LIMIT, SIZE_LIMIT
+
     rclpy.init()
     node = rclpy.create_node('reloader')
     client = node.create_client(SetParameters, 'thermo_comp/set_parameters')
     client.wait_for_service()
-    value = Parameter('calibration_file', value=arguments.calibration).to_parameter_msg()
     times: list[float] = []
     print('ready', flush=True)
-    while not select.select([sys.stdin], [], [], 0.5)[0]:
-        start = time.monotonic()
-        future = client.call_async(SetParameters.Request(parameters=[value]))
-        rclpy.spin_until_future_complete(node, future, timeout_sec=10.0)
-        assert future.result().results[0].successful
-        times.append((time.monotonic() - start) * 1e3)
+    with tempfile.TemporaryDirectory() as folder:
+        worst = Path(folder) / 'worst.yaml'
+        worst.write_text('a:\n' + '- [[], {}]\n' * (NODE_LIMIT // 7) + '#' * (SIZE_LIMIT // 2))
+        files = itertools.cycle([arguments.calibration, str(worst)])
+        while not select.select([sys.stdin], [], [], 0.5)[0]:
+            path = next(files)
+            value = Parameter('calibration_file', value=path).to_parameter_msg()
+            start = time.monotonic()
+            future = client.call_async(SetParameters.Request(parameters=[value]))
+            rclpy.spin_until_future_complete(node, future, timeout_sec=10.0)
+            assert future.result().results[0].successful == (path == arguments.calibration)
+            times.append((time.monotonic() - start) * 1e3)
     print(json.dumps(times), flush=True)
     sys.stdin.read()
 

@@ -74,8 +74,9 @@ of their covariance is -1 (REP 145).
 
 {parameters}
 
-A change is checked as a whole before anything is applied. A `calibration_file` that cannot be used is
-refused in the response, with the reason, and the running calibration stays. The coefficients are in the
+A change is checked as a whole before anything is applied. A calibration is read and checked beside the
+samples, by a process of its own; what is left for theirs is to exchange one reference. A `calibration_file` that
+cannot be used is refused in the response, with the reason, and the running calibration stays. The coefficients are in the
 file and not in parameters, because parameters arrive one at a time and half a polynomial is a wrong one.
 
 ```console
@@ -100,6 +101,9 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | counts the same to the bit for `stuck_timeout`, or all zero | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude at rest that misses gravity by `gravity_tolerance` | nothing is published, ERROR |
+| a second publisher of a topic | nothing of that topic is used until one is left, ERROR |
+| a message of more than 1 kB (a `frame_id` without end) | dropped, counted |
+| a temperature stamped more than 5 s after the next one of its sensor | not used |
 | a stamp that repeats or goes back a little | dropped, counted |
 | a stamp that goes back by more than a second | the estimators start anew, said once |
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what is fuzzed: the three doors through which bytes of strangers come, and what must hold.
+Owns what is fuzzed: the doors through which bytes of strangers come, and what must hold.
 
 Each target takes any bytes and raises where a promise is broken; its seeds are small and whole, so
 that the fuzzer begins behind the first checks.
@@ -186,6 +186,42 @@ def check_cdr(data: bytes) -> None:
     assert compensator.counters.n_in >= compensator.counters.n_out
 
 
+def check_parameters(data: bytes) -> None:
+    """
+    Any requests to set parameters: each is answered, with a reason where it is refused.
+
+    """
+    # ROS is needed for this target and the one above only.
+    from rcl_interfaces.msg import Parameter, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.serialization import deserialize_message
+
+    from thermo_comp.errors import CalibrationError
+    from thermo_comp.ros.parameters import NodeConfig, ParameterError, coerce, updated
+    from thermo_comp.ros.reader import read
+    from thermo_comp.ros.requests import RequestError, read_parameter
+
+    try:
+        messages = deserialize_message(data, SetParameters.Request).parameters
+    except (RuntimeError, ValueError):
+        # No request, but the beginning of a value of the type that the first byte says.
+        text = data[1:].decode(errors='replace').replace('\0', '')
+        value = ParameterValue(type=data[0] if data else 0, string_value=text)
+        messages = [Parameter(name=name, value=value) for name in ('frame_id', 'calibration_file')]
+
+    def ask(message: Parameter) -> None:
+        try:
+            config = updated(NodeConfig(), coerce([read_parameter(message)]))
+            if config.calibration_file:
+                read(config.calibration_file, '/nowhere')
+        except (RequestError, ParameterError, CalibrationError) as error:
+            assert str(error)
+            assert '\n' not in str(error), error
+
+    for message in messages[:MOST_MESSAGES]:
+        ask(message)
+
+
 def _record(opcode: int, content: bytes) -> bytes:
     return struct.pack('<BQ', opcode, len(content)) + content
 
@@ -265,4 +301,5 @@ def targets() -> dict[str, Target]:
         ),
         'mcap': Target(check_mcap, [_bag(''), _bag('zstd'), _bag('lz4')], 4096),
         'cdr': Target(check_cdr, _messages(), 340),
+        'parameters': Target(check_parameters, [b'\4~nobody/unit.yaml', b'\4imu', b'\x4d'], 340),
     }

@@ -95,6 +95,20 @@ TOLD = [
         f'{_DEFENCE}::test_a_callback_that_fails_is_logged_counted_and_survived',
     ),
     Told(
+        'the launch file is given a parameter file',
+        'and no argument, or some',
+        'what was given as an argument counts, everything else stands as the file says',
+        '',
+        'test_launch.py::test_a_parameter_is_set_only_where_its_argument_was_given',
+    ),
+    Told(
+        'the process that reads calibrations ends',
+        'kill -9',
+        'the request is refused; the next one begins another process; samples go on',
+        'refusal: the process that reads it ended',
+        f'{_DEFENCE}::test_a_reader_that_ends_is_begun_anew',
+    ),
+    Told(
         'a second publisher of the samples',
         'another attitude under stamps in between',
         'nothing is published until one is left, nor what came just after it',

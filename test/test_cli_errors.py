@@ -19,6 +19,7 @@ from builders import axis_set, calibration, regime_set, rich_calibration
 from conftest import Cli
 
 from thermo_comp.recording import BagWriter, Topics
+from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
@@ -85,6 +86,8 @@ class TestUsage:
             (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
             (('fit', 'a', '-o', 'b', '--latitude', '60'), r'--latitude and --height'),
             (('evaluate', 'a', '-c', 'b', '--window', '0'), r'--window must be positive'),
+            (('evaluate', 'a', '-c', 'b', '--tolerance', '9'), r'--tolerance: expected .*, got'),
+            (('report', '-c', 'b', '-o', 'c', '--tolerance', '9ft'), r'like 100ug .*9ft'),
             (('evaluate', 'a', '-c', 'b', '--height', '3'), r'--latitude and --height'),
             (('simulate', '-o', 'a', '--unit', 'gold'), r'must be one of thermostatted'),
             (('simulate', '-o', 'a', '--plan', 'oven'), r'must be one of chamber-18'),
@@ -273,9 +276,18 @@ class TestEvaluations:
             writer.write_temperature(TOPICS.board, stamps[::10], np.full(300, 20.0))
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
-        assert 'it makes |g| worse' in finished.stdout
-        save_calibration(calibration(), tmp_path / 'right.yaml')
-        cli('evaluate', path, '-c', tmp_path / 'right.yaml')
+        assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
+        # This one takes 10 mg of bias back that its constants put on; it claims nothing.
+        right = axis_set(delta=30.0)
+        sets = regime_set(right, right, right)
+        axes = Axes(*[AxisReference(300.0, -30.0)] * 3)
+        save_calibration(
+            calibration(axes=axes, static=sets, dynamic=sets), tmp_path / 'right.yaml'
+        )
+        arguments = ('evaluate', path, '-c', tmp_path / 'right.yaml')
+        assert 'no claim: ' in cli(*arguments, code=1).stdout
+        assert 'valid: ' in cli(*arguments, '--tolerance', '1mg').stdout
+        assert 'recalibrate: ' in cli(*arguments, '--tolerance', '1e-5ug', code=1).stdout
 
     def test_never_at_rest(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
         rng = np.random.default_rng(1)
@@ -283,7 +295,7 @@ class TestEvaluations:
         with BagWriter(tmp_path / 'bag') as writer:
             writer.write_temperature(TOPICS.board, stamps[::10], np.full(5, 20.0))
             writer.write_counts(TOPICS.counts, stamps, 1000.0 * rng.standard_normal((50, 3)))
-        refused(cli, 1, r'no window of 10 s at rest', 'evaluate', tmp_path / 'bag', '-c', unit)
+        refused(cli, 1, r'no window of 60 s at rest', 'evaluate', tmp_path / 'bag', '-c', unit)
 
 
 def test_a_torn_bag_is_worked_through_and_the_exit_code_tells(

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, assess, fit
+from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit
 from thermo_comp.fitting.sources import SourceBlock
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
@@ -203,61 +203,6 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
     assert jump < min(1.0, 0.3 * min(UNIT.noise_density))
     # constant acceleration for a second, at the most
     assert moved.max() * 1.0 < 1e-5
-
-
-def test_a_unit_as_it_was_is_still_valid(chosen: FitResult) -> None:
-    told: list[float] = []
-    found = assess(chosen.calibration, sources_of(UNIT, 6, 7), progress=told.append)
-    assert found.is_valid
-    assert found.verdict.startswith('still valid: ')
-    assert found.ratio < 1.5
-    assert (found.n_positions, len(found.shifts), told[-1]) == (6, 3, 1.0)
-    for shift in found.shifts:
-        assert abs(shift.bias) < 5.0 * shift.bias_sd
-        assert abs(shift.scale) < 5.0 * shift.scale_sd
-    static, dynamic, everything = found.rows
-    assert static.corrected.n + dynamic.corrected.n == everything.corrected.n
-    assert everything.corrected.rms < 0.02 * everything.raw.rms
-    # Each axis by itself, to a constant: the noise of 60 s, 0.65 ug and quanta.
-    assert np.nanmax(found.wander) < 1.2 * MICRO_G
-
-
-def test_a_unit_that_moved_is_found_out(chosen: FitResult) -> None:
-    moved = replace(
-        UNIT,
-        bias_at_reference=(
-            UNIT.bias_at_reference[0] + 20.0 * MICRO_G_COUNTS[0],
-            *UNIT.bias_at_reference[1:],
-        ),
-        scale_factor=(
-            UNIT.scale_factor[0], UNIT.scale_factor[1] * (1.0 + 30e-6), UNIT.scale_factor[2]
-        ),
-    )  # fmt: skip
-    found = assess(chosen.calibration, sources_of(moved, 6, 8))
-    assert not found.is_valid
-    assert found.verdict.startswith('re-calibrate: ')
-    assert 'x bias +' in found.verdict
-    assert 'y scale +' in found.verdict
-    # 20 ug and 30 ppm, to a few claimed standard deviations.
-    assert found.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.5)
-    assert found.shifts[1].scale == pytest.approx(30e-6, abs=1.5e-6)
-
-
-def test_one_position_is_judged_without_shifts(chosen: FitResult) -> None:
-    found = assess(chosen.calibration, sources_of(UNIT, 1, 9))
-    assert found.is_valid
-    assert (found.shifts, found.n_positions) == ((), 1)
-
-
-def test_nothing_and_another_unit_are_not_judged(chosen: FitResult) -> None:
-    with pytest.raises(FitError, match='no bag was given'):
-        assess(chosen.calibration, [])
-    other = sources_of(unit_preset('thermostatted', 2), 1, 0)
-    with pytest.raises(FitError, match='is of unit thermostatted-0002, the calibration of'):
-        assess(chosen.calibration, other)
-    empty = FitSource('empty', list)
-    with pytest.raises(FitError, match='empty: no still interval with a board temperature'):
-        assess(chosen.calibration, [empty])
 
 
 def test_too_few_positions_are_refused() -> None:

@@ -155,8 +155,38 @@ def test_nothing_gives_nothing() -> None:
 def test_slow_samples_get_longer_cells(rng: np.random.Generator) -> None:
     cells = CellAccumulator(0.5, None)
     cells.add(stamps(640, 10.0), rng.standard_normal((640, 3)))
-    # 32 samples at 10 Hz.
-    assert cells.finish().cell_s == pytest.approx(3.2)
+    # 30 samples at 10 Hz.
+    assert cells.finish().cell_s == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ('rate_hz', 'cell_s', 'window_s'),
+    # Cells of half a second fill ten; 30 samples of 4 Hz do not, and those of 1 Hz take longer.
+    [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
+)
+def test_windows_are_as_long_as_stated(
+    rate_hz: float, cell_s: float, window_s: float, rng: np.random.Generator
+) -> None:
+    n = round(150 * rate_hz)
+    accel = np.array((0.0, 0.0, 3000.0)) + 0.3 * rng.standard_normal((n, 3))
+    none = np.zeros(0, dtype=np.int64)
+    bag = reduced([ArrayBlock(stamps(n, rate_hz), accel, none, none * 1.0, none, none * 1.0)])
+    (interval,) = bag.intervals
+    assert bag.window_s == window_s
+    assert bag.n_cells == pytest.approx(150 / cell_s)
+    assert interval.n_whole == len(interval.time) == 150 / window_s
+    # A sample lies in one window or in the next.
+    np.testing.assert_allclose(interval.count, window_s * rate_hz, atol=1.0)
+    np.testing.assert_allclose(np.diff(interval.time), window_s, atol=1.0 / rate_hz)
+
+
+@pytest.mark.parametrize(('seconds', 'left'), [(24.0, 0), (26.0, 600)])
+def test_what_is_left_over_is_kept_from_half_a_window_on(
+    seconds: float, left: int, rng: np.random.Generator
+) -> None:
+    (interval,) = reduced([block(still(rng, seconds, (0.0, 0.0, 3000.0)))]).intervals
+    assert interval.n_whole == 2
+    assert interval.count.tolist() == [1000.0, 1000.0, *([float(left)] if left else [])]
 
 
 def test_fast_readings_are_averaged(rng: np.random.Generator) -> None:

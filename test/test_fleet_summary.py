@@ -63,7 +63,7 @@ def fleet_of(
                 name=f'{lots[i % len(lots)]}/u{i:03d}@{day:g}',
                 serial=f'S{i:03d}',
                 lot=lots[i % len(lots)],
-                verdict='good',
+                verdict='valid',
                 model='linear',
                 start=f'{MONDAY + timedelta(days=day):%Y-%m-%dT%H:%M:%SZ}',
                 raw_ug=300.0,

@@ -68,6 +68,59 @@ class TestEveryFile:
             assert set(re.findall(r'(\w+):=', arguments)) <= declared(parse(path))
 
 
+def parameters_set(arguments: dict[str, str]) -> dict[str, str]:
+    """
+    Give the parameters that our launch file sets, as launch evaluates its substitutions.
+
+    """
+    given = {one.get('name', ''): one.get('default', '') for one in parse(OURS).findall('arg')}
+    given |= arguments
+
+    def value(text: str) -> str:
+        text = re.sub(r'\$\(var (\w+)\)', lambda found: given[found[1]], text)
+        equal = re.fullmatch(r'\$\(if \$\(equals (.*) (\S+)\) (\S+) (\S+)\)', text)
+        return text if equal is None else equal[3 if equal[1] == equal[2] else 4]
+
+    (node,) = parse(OURS).findall('node')
+    found = [one for one in node.findall('param') if one.get('name')]
+    return {value(one.get('name', '')): value(one.get('value', '')) for one in found}
+
+
+def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path: Path) -> None:
+    # WHY: the defaults of the arguments came after the user's file and took its values away.
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    import rclpy
+    import yaml
+    from builders import calibration
+    from rclpy.context import Context
+
+    from thermo_comp.ros.node import NOT_GIVEN, CompensationNode
+    from thermo_comp.ros.waitloop import undeclared_overrides
+    from thermo_comp.unit.calibration import Unit
+    from thermo_comp.unit.calibration_file import save_calibration
+
+    unit = tmp_path / 'unit.yaml'
+    save_calibration(calibration(unit=Unit('0042', 'm/s^2', 160.0, 0.01)), unit)
+    mine = {'calibration_file': str(unit), 'serial': '0042', 'input': 'imu', 'frame_id': 'mine'}
+    some: list[dict[str, str]] = [{}, {'frame_id': 'body'}, {'serial': '0042', 'input': 'counts'}]
+    for arguments in some:
+        files = []
+        # As launch gives them: the user's file, then its own.
+        for name, values in (('mine', mine), ('launch', parameters_set(arguments))):
+            path = tmp_path / f'{name}.yaml'
+            path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+            files += ['--params-file', str(path)]
+        context = Context()
+        rclpy.init(args=['--ros-args', *files], context=context)
+        node = CompensationNode(context)
+        found = {name: node.node.get_parameter(name).value for name in mine}
+        strangers = undeclared_overrides(node.node)
+        node.close()
+        context.try_shutdown()
+        assert found == mine | arguments
+        assert all(one.startswith(NOT_GIVEN) for one in strangers)
+
+
 def test_our_node_s_executable_parameters_and_topics() -> None:
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from dataclasses import fields
@@ -81,7 +134,8 @@ def test_our_node_s_executable_parameters_and_topics() -> None:
     config = configparser.ConfigParser()
     config.read(ROOT / 'setup.cfg')
     assert config['install']['install_scripts'].endswith('lib/thermo_comp')
-    named = {one.get('name') for one in node.findall('param') if one.get('name')}
+    named = set(parameters_set(dict.fromkeys(declared(parse(OURS)), 'given')))
+    assert named == {'calibration_file', 'serial', 'input', 'frame_id'}
     assert named <= {field.name for field in fields(NodeConfig)}
     # A serial such as 0042 would otherwise arrive as a number.
     assert all(one.get('type') == 'str' for one in node.findall('param') if one.get('name'))

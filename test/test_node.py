@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+from conftest import ROOT
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
@@ -309,3 +311,9 @@ def test_namespace_and_remapping(peer: Peer, saved: Callable[..., list[str]]) ->
         assert '/accel/counts' not in topics
         names = {name for name, _ in node.node.get_service_names_and_types()}
         assert '/imu0/thermo_comp/set_parameters' in names
+        # Two units are two entries, and the aggregator's group has both.
+        _, status, _ = diagnosis(peer)(lambda *_: True)
+        assert status.name == '/imu0/thermo_comp: compensation'
+        config = ROOT / 'config' / 'diagnostic_aggregator.yaml'
+        group = yaml.safe_load(config.read_text())['/**']['ros__parameters']['thermo_comp']
+        assert any(word in status.name for word in group['contains'])

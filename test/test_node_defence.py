@@ -26,8 +26,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
 from sensor_msgs.msg import Imu, Temperature
 
+from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
 from thermo_comp.ros.parameters import NodeConfig
+from thermo_comp.ros.reader import Reader
 from thermo_comp.ros.requests import PARAMETERS_LIMIT
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -228,6 +230,22 @@ def test_calibrations_are_taken_from_one_folder_only(
         assert peer.describe('calibration_directory')[0].read_only
 
 
+def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
+    # WHY: whatever a file does to the process that reads it, the node only hears of it.
+    reader = Reader()
+    assert reader.read(str(unit), '').calibration == calibration()
+    process = reader._process
+    assert process is not None
+    process.kill()
+    process.wait()
+    with pytest.raises(CalibrationError, match='the process that reads it ended'):
+        reader.read(str(unit), '')
+    assert reader.read(str(unit), '').calibration == calibration()
+    with pytest.raises(CalibrationError, match=r'^none\.yaml: cannot be read: No such file'):
+        reader.read('none.yaml', '')
+    reader.close()
+
+
 def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:
     with node_in_thread(*arguments(unit)) as node:
         names = [one for one in node.node._parameters]  # noqa: C416
@@ -281,7 +299,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> 
             samples.send(10)
         status = status_with(peer, diagnostics, '2 publishers on /temperature/board')
         assert status.level == DiagnosticStatus.ERROR
-        board = node._compensator.tracker.board
+        board = node._compensator.thermal.tracker.board
         assert board.temperature == pytest.approx(20.0, abs=1e-6)
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
 

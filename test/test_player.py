@@ -31,7 +31,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
-from thermo_comp.errors import RecordingError, ThermoCompError
+from thermo_comp.errors import OutputError, RecordingError, ThermoCompError
 from thermo_comp.recording import BagWriter, ImuColumns, Topics, read_recording
 from thermo_comp.ros import player
 from thermo_comp.ros.player import play
@@ -313,8 +313,28 @@ def test_record_ends_when_told_or_when_nothing_comes(peer: Peer, tmp_path: Path)
     silent = {'nobody/is/there': Imu}
     quiet = record(tmp_path / 'no.mcap', lambda _: False, topics=silent, timeout_s=0.2)
     assert quiet == {'nobody/is/there': 0}
-    with pytest.raises(RecordingError, match=r'out.mcap'):
+    with pytest.raises(OutputError, match=r'out.mcap'):
         record(path, lambda _: True, topics=topics)
+
+
+def test_a_recorder_says_that_the_disk_is_full(
+    peer: Peer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OutputError('cannot be written: No space left on device', tmp_path / 'out')
+
+    monkeypatch.setattr(BagWriter, 'write_raw', full)
+
+    def run() -> None:
+        with Recorder(tmp_path / 'out', topics={'imu/data_raw': Imu}) as recorder:
+            imu = peer.publisher(Imu, 'imu/data_raw')
+            assert recorder.wait_for_publishers(TIMEOUT)
+            imu.publish(Imu())
+            assert not recorder.wait_until(lambda counts: counts['imu/data_raw'] > 0, TIMEOUT)
+
+    with pytest.raises(OutputError, match='No space left on device'):
+        run()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_recording_that_fails_leaves_nothing(tmp_path: Path) -> None:

@@ -20,21 +20,17 @@ from report_helpers import PROGRAM, RATE_HZ, certificate, evidence, fitted, run,
 from thermo_comp import __version__
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.fitting.reduction import Readings
-from thermo_comp.online.compensator import Compensator
+from thermo_comp.judging import open_bag
 from thermo_comp.recording import BagWriter
 from thermo_comp.report import (
     Evidence,
     evidence_of_bags,
     evidence_of_fit,
-    judge,
-    open_bag,
     write_report,
 )
-from thermo_comp.report.evidence import CHOSEN, ONE_SET, RAW
 from thermo_comp.report.plates import PLATES, png_files
 from thermo_comp.simulation import ideal_regime, parse_cyclogram
 from thermo_comp.thermal.regime import Regime
-from thermo_comp.unit.gravity import MICRO_G
 
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 
@@ -132,44 +128,15 @@ def test_page_has_each_id_once_and_refers_to_ids_it_has(page):
     assert set(re.findall(r'(?:url\(|href=")#([^)"]*)', page.source)) <= set(ids)
 
 
-def test_statistics_are_those_of_the_fit():
-    # Second route: the fit's own table, made from its solutions by its own code.
-    for row in fitted().residuals:
-        for rung, theirs in ((RAW, row.raw), (CHOSEN, row.fitted)):
-            ours = evidence().statistics[rung][row.section]
-            assert ours.n == theirs.n
-            assert ours.rms == pytest.approx(theirs.rms, rel=1e-9)
-        # The comparison is fitted anew and ends within its convergence limit.
-        ours = evidence().statistics[ONE_SET][row.section].rms
-        assert ours == pytest.approx(row.one_set.rms, rel=0.02)
-
-
-def test_bag_with_calibration_shows_what_the_compensator_gives(bag):
+def test_bag_says_whether_its_fit_has_seen_it(bag, tmp_path):
     calibration = fitted().calibration
-    found = evidence_of_bags([open_bag(bag)], calibration)
-    one = run(0)
-    compensator = Compensator(calibration)
-    readings = sorted(
-        [(int(s), 'board', v) for s, v in zip(one.board_stamp_ns, one.board, strict=True)]
-        + [(int(s), 'case', v) for s, v in zip(one.case_stamp_ns, one.case, strict=True)]
-    )
-    force = np.full((len(one.counts), 3), np.nan)
-    for i, (stamp, count) in enumerate(zip(one.accel_stamp_ns, one.counts, strict=True)):
-        while readings and readings[0][0] <= stamp:
-            reading = readings.pop(0)
-            compensator.push(reading[1], reading[0], reading[2])
-        row = compensator.process(int(stamp), *map(float, count))
-        if row is not None:
-            force[i] = row[:3]
-    windows = found.windows
-    middle = np.rint(windows.time * RATE_HZ).astype(int)
-    inside = (middle > 30) & (middle < len(force) - 30)
-    theirs = np.array([force[m - 25 : m + 25].mean(axis=0) for m in middle[inside]])
-    ours = windows.forces[CHOSEN][inside]
-    # Windows and runs of 50 samples differ by a sample or two at their edges: at 5 Hz that is
-    # some 2 % of the scatter of single counts, 3e-3 m/s^2 each.
-    assert np.abs(ours - theirs).max() < 3e-4
-    assert found.statistics[CHOSEN]['all'].rms < found.statistics[RAW]['all'].rms / 2.0
+    assert 'rests in bags of its own fit' in Page(certificate()).text
+    unseen = evidence_of_bags([open_bag(bag)], calibration)
+    assert 'rests in bags that the fit has not seen' in page_of(unseen, tmp_path).text
+    sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].sha256),)
+    provenance = replace(calibration.provenance, sources=sources)
+    seen = evidence_of_bags([open_bag(bag)], replace(calibration, provenance=provenance))
+    assert 'rests in bags of its own fit' in page_of(seen, tmp_path).text
 
 
 def test_bag_alone_shows_temperatures_derivatives_and_flag(bag, tmp_path):
@@ -244,20 +211,15 @@ def test_hours_of_bag_stay_a_small_page(tmp_path):
     value = 20.0 + 15.0 * np.sin(time / 9000.0) + np.random.default_rng(1).normal(size=len(time))
     readings = Readings(shown.start_ns + (time * 1e9).astype(np.int64), value, len(time))
     rows = np.resize(np.arange(len(windows)), 8640)
-    force = {name: part[rows] for name, part in windows.forces.items()}
     long = replace(
         evidence(),
         shown=replace(shown, board=readings, case=readings),
         bags=tuple(replace(one, duration_s=86400.0) for one in evidence().bags),
         windows=replace(
-            windows,
+            windows.select(rows),
             bag=np.zeros(8640, np.int64),
             position=np.zeros(8640, np.int64),
             time=np.arange(8640) * 10.0,
-            mean=windows.mean[rows],
-            board=windows.board[rows],
-            is_dynamic=windows.is_dynamic[rows],
-            forces=force,
         ),
     )
     write_report(long, tmp_path / 'long.html')
@@ -303,28 +265,22 @@ def test_page_is_written_atomically(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']
 
 
-def test_verdicts(bag):
-    assert judge(evidence()).level in ('good', 'reserved')
+def test_verdict_and_its_colour(bag, tmp_path):
+    assert evidence().level in ('good', 'reserved')
     calibration = fitted().calibration
     opened = [open_bag(bag)]
-    # A bias wrong by 5 mg on every axis makes |g| worse than no thermal correction at all.
-    axes = calibration.axes
-    wrong = replace(
-        calibration,
-        axes=replace(
-            axes,
-            x=replace(axes.x, bias=axes.x.bias + 5e3 * MICRO_G * axes.x.scale_factor),
-        ),
-    )
-    verdict = judge(evidence_of_bags(opened, wrong))
-    assert verdict.level == 'poor'
-    assert any('another unit' in text for text in verdict.reservations)
     narrow = {
         name: replace(getattr(calibration, name), temperature_range_c=(19.0, 22.0))
         for name in ('static', 'dynamic')
     }
-    verdict = judge(evidence_of_bags(opened, replace(calibration, **narrow)))
-    assert any('outside the calibrated 19.0 to 22.0' in t for t in verdict.reservations)
+    found = evidence_of_bags(opened, replace(calibration, **narrow))
+    assert found.judgement.sections['outside'].n > 0
+    assert 'outside the calibrated ranges not judged' in found.headline
+    strict = evidence_of_bags(opened, calibration, tolerance=1e-9)
+    assert (strict.level, strict.judgement.verdict) == ('poor', 'recalibrate')
+    page = page_of(strict, tmp_path)
+    assert '<section class="verdict poor"' in page.source
+    assert strict.judgement.reason.replace(' ug', ' µg') in page.text
 
 
 def test_another_units_calibration_is_refused(bag):

@@ -116,7 +116,7 @@ def test_trace_covers_the_bag_without_a_gap():
     board = Readings(one.board_stamp_ns, one.board, len(one.board))
     case = Readings(one.case_stamp_ns, one.case, len(one.case))
     span = int(one.accel_stamp_ns[0]), int(one.accel_stamp_ns[-1])
-    trace, _ = thermal_trace(board, case, span, DetectorSettings())
+    trace = thermal_trace(board, case, span, DetectorSettings())
     stretches = trace.stretches
     assert stretches[0].regime == Regime.UNKNOWN
     assert stretches[0].start == 0.0
@@ -131,15 +131,10 @@ def test_trace_without_a_case_sensor_follows_the_board():
     board = Readings(one.board_stamp_ns, one.board, len(one.board))
     none = Readings(one.case_stamp_ns[:0], one.case[:0], 0)
     span = int(one.accel_stamp_ns[0]), int(one.accel_stamp_ns[-1])
-    trace, states = thermal_trace(
-        board, none, span, DetectorSettings(), query_ns=np.array([span[0] - 10**12, span[1]])
-    )
+    trace = thermal_trace(board, none, span, DetectorSettings())
     assert not trace.is_case_leading
     assert not np.isfinite(trace.case_rate).any()
     assert any(stretch.regime == Regime.DYNAMIC for stretch in trace.stretches)
-    # Before the first reading nothing is known.
-    assert np.isnan(states[0][0])
-    assert states[0][1] == pytest.approx(one.board[-1], abs=0.1)
 
 
 def look(line: Artist) -> tuple[object, ...]:

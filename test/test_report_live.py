@@ -114,7 +114,7 @@ def test_first_bad_file_makes_a_page_that_goes_on_asking(tmp_path):
     bad.write_text('format_version: <b>1</b>')
     report = LiveReport(bad)
     page = report.page()
-    assert 'Nothing to show yet' in page
+    assert 'nothing to show yet' in page
     assert 'fetch("version"' in page
     assert '<b>1' not in page
     bad.unlink()

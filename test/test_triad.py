@@ -34,6 +34,8 @@ def still(rng, up, matrix=M, n=5, sd=0.3):
                 bag=0,
                 start_ns=0,
                 end_ns=1,
+                begin_s=10.0 * number,
+                n_whole=n,
                 time=10.0 * number + np.arange(n),
                 count=np.full(n, 100.0),
                 mean=counts + sd * rng.standard_normal((n, 3)),

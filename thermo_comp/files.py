@@ -79,7 +79,7 @@ PICTURE = Kind('PNG picture', rb'\A\x89PNG\r\n')
 PARAMETERS = Kind('parameter file of ours', rb'\A# Thermal calibration of unit ')
 RECORD = Kind('JSON record', rb'\A\{')
 PARQUET = Kind('Parquet file', rb'\APAR1')
-CSV = Kind('CSV table of ours', rb'\A(stamp_ns|name|section),')
+CSV = Kind('CSV table of ours', rb'\A(stamp_ns|name|section|bag),')
 MCAP = Kind('MCAP file', rb'\A\x89MCAP')
 BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z', is_folder=True)
 
@@ -116,18 +116,6 @@ def read_bounded(path: str | Path, limit: int) -> bytes:
     Read a regular file of at most `limit` bytes.
 
     A directory, a FIFO or a device is refused before anything is read, so a reader never blocks.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    limit : int
-        The largest size accepted [bytes].
-
-    Returns
-    -------
-    bytes
-        The content.
 
     Raises
     ------

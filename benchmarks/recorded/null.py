@@ -15,7 +15,7 @@ import numpy as np
 from thermo_comp.fitting.one_pose import PoseOptions, fit_branches, read_pose
 from thermo_comp.fitting.partial import recording_source
 from thermo_comp.fitting.triad import TriadFit
-from thermo_comp.judging.evaluation import evaluate
+from thermo_comp.judging import Judgement, evaluate
 from thermo_comp.recording import BagWriter
 from thermo_comp.unit.calibration import (
     Axes,
@@ -24,7 +24,6 @@ from thermo_comp.unit.calibration import (
     Calibration,
     Provenance,
     RegimeSet,
-    ResidualSummary,
     Unit,
 )
 from thermo_comp.unit.functions import Polynomial
@@ -73,37 +72,39 @@ def constant_calibration(fit: TriadFit, unit: Handheld, serial: str) -> Calibrat
     Write nine constants as a calibration, for the sake of the check only.
 
     """
-    flat = AxisSet(Polynomial((0.0,)), Polynomial((1.0,)))
+    rms = float(np.sqrt(np.mean(fit.residual**2)))
+    # The biases are the sets': raw is the unit without them.
+    x_set, y_set, z_set = (
+        AxisSet(
+            Polynomial((0.0,)),
+            Polynomial((1.0,)),
+            delta=float(bias),
+            residual_sd_m_s2=rms,
+        )
+        for bias in fit.bias
+    )
     one = RegimeSet(
         # Nobody knows at which temperature they hold: nothing is excused by being out of range.
         temperature_range_c=(-40.0, 85.0),
         rate_range_k_min=(-20.0, 20.0),
-        x=flat,
-        y=flat,
-        z=flat,
+        x=x_set,
+        y=y_set,
+        z=z_set,
     )
     sample_sd = np.median([interval.sample_sd for interval in unit.intervals], axis=0)
-    rms = float(np.sqrt(np.mean(fit.residual**2)))
     x, y, z = (float(v) for v in sample_sd * np.sqrt(0.01))
-    largest = float(np.max(np.abs(fit.residual)))
-    rows = tuple(
-        ResidualSummary(section, len(fit.residual), rms, rms, largest)
-        for section in ('static', 'dynamic')
-    )
     matrix = tuple(tuple(float(v) for v in line) for line in fit.misalignment)
     return Calibration(
         format_version=2,
         unit=Unit(serial, 'm/s^2', 4.0 * GRAVITY, 0.01),
         reference_temperature_c=ROOM_C,
         gravity_m_s2=GRAVITY,
-        axes=Axes(
-            *(AxisReference(float(K), float(b)) for K, b in zip(fit.scale, fit.bias, strict=True))
-        ),
+        axes=Axes(*(AxisReference(float(K), 0.0) for K in fit.scale)),
         static=one,
         dynamic=one,
         noise_density_m_s2_sqrt_hz=(x, y, z),
         misalignment=matrix,
-        provenance=Provenance(model='constant', residuals=rows),
+        provenance=Provenance(model='constant'),
     )
 
 
@@ -117,7 +118,8 @@ class Crossed:
     data: int
     calibration: int
     rms_mg: float
-    findings: tuple[str, ...]
+    verdict: str
+    is_valid: bool
 
 
 def wrong_units(bags: dict[int, Path], units: dict[int, Handheld], work: Path) -> list[Crossed]:
@@ -131,11 +133,7 @@ def wrong_units(bags: dict[int, Path], units: dict[int, Handheld], work: Path) -
         for number, unit in units.items():
             # The serial is made to match: what must notice is the data.
             calibration = constant_calibration(unit.ours, unit, f'unit-{data}')
-            found = evaluate(
-                lent, [('it', calibration)], gravity=GRAVITY, window_s=1.0, input='imu'
-            )
-            rms = found.statistics['it']['all'].rms / (GRAVITY * 1e-3)
-            result.append(Crossed(data, number, rms, found.findings))
+            result.append(_crossed(data, number, lent, calibration, 1.0))
     return result
 
 
@@ -145,6 +143,14 @@ def freezer_under_another_unit(bag: Path, unit: Handheld) -> Crossed:
 
     """
     calibration = constant_calibration(unit.ours, unit, 'freezer-mpu6050')
-    found = evaluate(bag, [('it', calibration)], gravity=GRAVITY, window_s=10.0, input='imu')
-    rms = found.statistics['it']['all'].rms / (GRAVITY * 1e-3)
-    return Crossed(-1, unit.unit, rms, found.findings)
+    return _crossed(-1, unit.unit, bag, calibration, 10.0)
+
+
+def _crossed(
+    data: int, number: int, bag: Path, calibration: Calibration, window_s: float
+) -> Crossed:
+    found: Judgement = evaluate(
+        [bag], [('it', calibration)], gravity=GRAVITY, window_s=window_s, input='imu'
+    ).judgements['it']
+    rms = found.sections['all'].rms / (GRAVITY * 1e-3)
+    return Crossed(data, number, rms, found.verdict, found.is_valid)

@@ -329,17 +329,15 @@ def null_section(
         'A wrong unit: the handheld recordings, each under the constants of each unit (serials '
         'made to match, a thermometer that stands still lent to them), judged by `evaluate`:',
         '',
-        '| data of | calibration of | |f| - g, mg RMS | finding |',
+        '| data of | calibration of | |f| - g, mg RMS | verdict |',
         '|---|---|---|---|',
     ]
     lines += [
         *(
-            f'| unit {one.data} | unit {one.calibration} | {one.rms_mg:.2f} '
-            f'| {"; ".join(one.findings) or "still valid"} |'
+            f'| unit {one.data} | unit {one.calibration} | {one.rms_mg:.2f} | {one.verdict} |'
             for one in crossed
         ),
-        f'| freezer | unit {freezer.calibration} | {freezer.rms_mg:.2f} '
-        f'| {"; ".join(freezer.findings) or "still valid"} |',
+        f'| freezer | unit {freezer.calibration} | {freezer.rms_mg:.2f} | {freezer.verdict} |',
         '',
     ]
     return '\n'.join(lines).replace('| |f| - g, mg RMS |', '| \\|f\\| - g, mg RMS |')

@@ -26,7 +26,7 @@ from .output import Cell, Output, micro_g
 from .play import require_ros
 
 if TYPE_CHECKING:
-    from ..judging.evaluation import Evaluation
+    from ..judging import Evaluation
     from ..unit.calibration import Calibration
 
 _SAMPLES, _OUTPUT = 'accel/counts', 'imu/data_raw'
@@ -107,7 +107,7 @@ def demo(
             'is_equal_to_offline': is_same,
             'bag_s': played.bag_s,
             'wall_s': played.wall_s,
-            'statistics_m_s2': result.statistics,
+            'judgements': {name: one.facts() for name, one in result.judgements.items()},
             'recorded': recorded,
             'figure': figure,
         }
@@ -201,25 +201,33 @@ def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool
 
 
 def _judge(bag: Path, calibrations: dict[str, Calibration]) -> Evaluation:
-    from ..judging.evaluation import evaluate
+    from ..judging import evaluate
 
     judged = ['node', *(name for name in calibrations if name != 'node')]
-    return evaluate(bag, [(name, calibrations[name]) for name in judged], gravity=STANDARD_GRAVITY)
+    return evaluate(
+        [bag], [(name, calibrations[name]) for name in judged], gravity=STANDARD_GRAVITY
+    )
 
 
 def _say(out: Output, result: Evaluation, model: str) -> None:
-    from ..judging.evaluation import RAW
+    from ..judging import SECTIONS
+    from ..unit.gravity import MICRO_G
 
-    columns = [RAW, *_MODELS]
     rows: list[tuple[Cell, ...]] = []
-    for section in ('static', 'dynamic', 'all'):
-        statistics = [result.statistics[name][section].micro_g for name in columns]
-        cells = [f'{micro_g(one.rms):>4} / {micro_g(one.peak):>4}' for one in statistics]
-        rows.append((section, statistics[0].n, *cells))
+    for section in SECTIONS:
+        parts = [result.judgements[name].sections[section] for name in _MODELS]
+        if not parts[0].n:
+            continue
+        pairs = [(parts[0].raw_rms, parts[0].raw_peak), *((one.rms, one.peak) for one in parts)]
+        cells = [
+            f'{micro_g(rms / MICRO_G):>4} / {micro_g(peak / MICRO_G):>4}' for rms, peak in pairs
+        ]
+        rows.append((section, parts[0].n, *cells))
+    window_s = result.judgements['node'].windows.window_s
     out.table(
-        ('section', 'windows', *columns),
+        ('section', 'windows', 'raw', *_MODELS),
         rows,
-        title=f'|g| error in ug over {result.window_s:g} s, RMS / max',
+        title=f'|g| error in ug over {window_s:g} s, RMS / max',
     )
     out.line('one set: one quadratic for all; two sets: static and dynamic polynomials, as in')
     out.line(f'the paper; node: the two sets that the fit chose on held-out sections, {model}')
@@ -230,7 +238,8 @@ def _draw(bag: Path, calibration: Calibration, output: Path) -> tuple[Path, Path
     Write the certificate and its figures; return the page and the figure of |g|.
 
     """
-    from ..report import evidence_of_bags, open_bag, write_report
+    from ..judging import open_bag
+    from ..report import evidence_of_bags, write_report
 
     page, figures = output / 'report.html', output / 'figures'
     evidence = evidence_of_bags([open_bag(bag)], calibration, gravity=STANDARD_GRAVITY)

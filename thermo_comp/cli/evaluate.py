@@ -7,20 +7,17 @@ Owns ``thermo_comp evaluate``: what a calibration leaves of |g| on bags it has n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..errors import FitError
 from . import options
 from .output import Cell, Output, micro_g
 
 if TYPE_CHECKING:
-    from ..fitting import Assessment
-    from ..judging.evaluation import Evaluation
+    from ..judging import Evaluation, Judgement
 
 
 def evaluate(
@@ -36,148 +33,118 @@ def evaluate(
     gravity: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
-    window: Annotated[float, typer.Option(help='Length of a window at rest, in s.')] = 10.0,
+    window: options.Window = 60.0,
+    tolerance: options.Tolerance = None,
+    csv: Annotated[
+        Path | None, typer.Option(help='File for the windows, one a line.', metavar='FILE')
+    ] = None,
     serial: options.Serial = None,
     input_: options.InputOption = options.InputChoice.auto,
     counts_topic: options.CountsTopic = 'accel/counts',
     imu_topic: options.ImuTopic = 'imu/uncompensated',
     board_topic: options.BoardTopic = 'temperature/board',
     case_topic: options.CaseTopic = 'temperature/case',
+    force: options.Force = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """
     Judge a calibration on new bags: |f| - g at rest, raw and corrected.
 
-    The verdict holds the residual against what the calibration claims; six
-    positions or more tell which axis has moved. Exit code 1 when it does not
-    hold: it makes |g| worse, leaves much more than on the bags of its fit or
-    than it claims, or an axis has moved.
+    The verdict holds the RMS residual against your --tolerance or, without
+    one, against what the calibration claims for the same windows; six
+    positions or more tell which axis has moved. Exit code 0 only where the
+    calibration is shown to be valid.
 
     Example:
-      thermo_comp evaluate held_out.mcap -c unit42.yaml
+      thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
 
     """
-    from ..fitting import assess
-    from ..fitting.fit_sources import fit_sources
-    from ..judging.evaluation import evaluate as run
-    from ..judging.evaluation import joined
-    from ..online.status import CompensatorConfig
-    from ..replay import input_for
+    from ..files import CSV, check_output, write_atomically
+    from ..judging import evaluate as run
+    from ..judging.table import csv_of
     from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
-    if not window > 0.0:
-        raise options.usage(f'--window must be positive, got {window:g}')
+    limit = options.acceleration(tolerance)
+    window_s = options.positive(window, '--window')
     gravity = options.place(gravity, latitude, height)
+    if csv is not None:
+        check_output(csv, CSV, overwrite=force, others=[*bags, *calibration])
     names = [path.stem for path in calibration]
     if len(set(names)) < len(names):
         names = [str(path) for path in calibration]
     models = [
         (name, load_calibration(path)) for name, path in zip(names, calibration, strict=True)
     ]
-    topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
-    config = CompensatorConfig()
     with out.progress('evaluating', total=1.0) as done:
-        # half of the way to the table, half to the verdict
-        part = 0.5 / len(bags)
-        parts = [
-            run(
-                bag,
-                models,
-                gravity=gravity,
-                window_s=window,
-                config=config,
-                topics=topics,
-                input=input_.value,
-                serial=serial,
-                progress=_part_of(done, part * number, part),
-            )
-            for number, bag in enumerate(bags)
-        ]
-        _, judged = models[0]
-        kind = input_for(judged, input_.value)
-        sources, _ = fit_sources(bags, topics, kind, serial, hashed=False)
-        verdict: Assessment | str
-        try:
-            verdict = assess(
-                judged,
-                # whose they are has been checked
-                [replace(source, serial=None) for source in sources],
-                gravity=gravity,
-                config=config,
-                progress=_part_of(done, 0.5, 0.5),
-            )
-        except FitError as why:
-            verdict = f'no verdict: {why}'
-    result = joined(parts, judged)
-    is_torn = out.torn(part.info for part in parts)
-    say(out, result, verdict, bags)
-    if result.findings or not (isinstance(verdict, str) or verdict.is_valid):
-        raise typer.Exit(1)
+        result = run(
+            bags,
+            models,
+            gravity=gravity,
+            window_s=window_s,
+            tolerance=limit,
+            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            input=input_.value,
+            serial=serial,
+            progress=done,
+        )
+    is_torn = out.torn(bag.info for bag in result.bags)
+    judged = result.judgements[names[0]]
+    if csv is not None:
+        text = csv_of(judged.windows, [bag.name for bag in bags])
+        write_atomically(csv, text.encode(), CSV, overwrite=force)
+    say(out, result)
+    out.json(
+        {
+            'bags': bags,
+            'notes': result.notes,
+            **judged.facts(),
+            'calibrations': {name: one.facts() for name, one in result.judgements.items()},
+        }
+    )
+    if judged.exit_code:
+        raise typer.Exit(judged.exit_code)
     out.end(is_torn=is_torn)
 
 
-def _part_of(
-    done: Callable[[float], None], begin: float, length: float
-) -> Callable[[float], None]:
-    return lambda share: done(begin + length * share)
-
-
-def say(out: Output, result: Evaluation, verdict: Assessment | str, bags: Sequence[Path]) -> None:
+def say(out: Output, result: Evaluation) -> None:
     """
-    Print an evaluation.
-
-    Parameters
-    ----------
-    out : Output
-        Where to.
-    result : Evaluation
-        The evaluation.
-    verdict : Assessment or str
-        The judgement, or why there is none.
-    bags : sequence of Path
-        The recordings.
+    Print an evaluation: a table of all calibrations, what is known of the first one, its verdict.
 
     """
+    from ..judging import SECTIONS
+    from ..unit.gravity import MICRO_G
+
+    judgements = result.judgements
+    judged = next(iter(judgements.values()))
     rows: list[tuple[Cell, ...]] = []
-    for section in ('static', 'dynamic', 'all'):
-        for name, statistics in result.statistics.items():
-            one = statistics[section]
+    for section in SECTIONS:
+        raw = judged.sections[section]
+        if raw.n:
+            rms, peak = micro_g(raw.raw_rms / MICRO_G), micro_g(raw.raw_peak / MICRO_G)
+            rows.append((section, 'raw', raw.n, rms, peak, None, None))
+        for name, judgement in judgements.items():
+            one = judgement.sections[section]
             if one.n:
-                ug = one.micro_g
-                rows.append((section, name, one.n, *map(micro_g, (ug.mean, ug.rms, ug.peak))))
+                rms, peak = micro_g(one.rms / MICRO_G), micro_g(one.peak / MICRO_G)
+                claim: tuple[Cell, Cell] = (None, None)
+                if isfinite(one.claimed_rms):
+                    claim = (micro_g(one.claimed_rms / MICRO_G), f'{one.ratio:.2f}')
+                rows.append((section, name, one.n, rms, peak, *claim))
     out.table(
-        ('section', 'model', 'windows', 'mean ug', 'RMS ug', 'max ug'),
+        ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
         rows,
-        title=f'|f| - g over {result.window_s:g} s at rest',
+        title=f'|f| - g over {judged.windows.window_s:g} s at rest; outside: of the calibrated '
+        'ranges',
     )
-    if isinstance(verdict, str):
-        out.line(f'- {verdict}')
-    else:
-        _say_axes(out, verdict)
-    for line in (*result.notes, *result.findings):
+    _say_axes(out, judged)
+    for line in result.notes:
         out.line(f'- {line}')
-    if not isinstance(verdict, str):
-        out.line(verdict.verdict)
-    out.json(
-        {
-            'bags': [str(bag) for bag in bags],
-            'gravity': result.gravity,
-            'window_s': result.window_s,
-            'statistics_m_s2': result.statistics,
-            'counters': result.counters,
-            'notes': result.notes,
-            'findings': result.findings,
-            'verdict': verdict if isinstance(verdict, str) else verdict.verdict,
-            'is_valid': None if isinstance(verdict, str) else verdict.is_valid,
-            'shifts': () if isinstance(verdict, str) else verdict.shifts,
-            'wander_m_s2': None if isinstance(verdict, str) else verdict.wander.tolist(),
-        }
-    )
+    out.line(str(judged))
 
 
-def _say_axes(out: Output, verdict: Assessment) -> None:
+def _say_axes(out: Output, judged: Judgement) -> None:
     """
     Print what is known axis by axis: wander always, shifts where the positions tell.
 
@@ -185,13 +152,13 @@ def _say_axes(out: Output, verdict: Assessment) -> None:
     from ..unit.gravity import MICRO_G
 
     columns = ['axis', 'static ug', 'dynamic ug']
-    if verdict.shifts:
+    if judged.shifts:
         columns += ['bias ug', '+-', 'scale ppm', '+-']
     rows: list[tuple[Cell, ...]] = []
     for axis, name in enumerate('xyz'):
-        row: list[Cell] = [name, *(micro_g(one / MICRO_G) for one in verdict.wander[:, axis])]
-        if verdict.shifts:
-            shift = verdict.shifts[axis]
+        row: list[Cell] = [name, *(micro_g(one / MICRO_G) for one in judged.wander[:, axis])]
+        if judged.shifts:
+            shift = judged.shifts[axis]
             row += [
                 micro_g(shift.bias / MICRO_G),
                 micro_g(shift.bias_sd / MICRO_G),
@@ -199,7 +166,7 @@ def _say_axes(out: Output, verdict: Assessment) -> None:
                 micro_g(1e6 * shift.scale_sd),
             ]
         rows.append(tuple(row))
-    title = 'what temperature moves each axis at rest (60 s means, RMS)'
-    if verdict.shifts:
+    title = 'what temperature moves each axis at rest (RMS of its windows)'
+    if judged.shifts:
         title += '; shift since the fit'
     out.table(columns, rows, title=title)

@@ -85,7 +85,7 @@ def fit(
     DIR itself are sorted by the serial in them. Results go to OUT/units,
     the table of all to OUT/fleet.parquet and .csv, what it tells to
     OUT/fleet.html. A second run does only what is missing or has changed.
-    Exit code 1 if a unit has no calibration, or not of all of its bags.
+    Exit code 1 if a unit has no valid calibration, or not of all of its bags.
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates

@@ -76,6 +76,38 @@ NewSerial = Annotated[
     str | None,
     typer.Option('--serial', help="Serial, instead of the bags'.", callback=check_serial),
 ]
+Window = Annotated[
+    float, typer.Option('--window', help='Length of a window at rest, in s.', metavar='S')
+]
+Tolerance = Annotated[
+    str | None,
+    typer.Option(
+        '--tolerance', help='Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'
+    ),
+]
+
+
+def acceleration(text: str | None) -> float | None:
+    """
+    Read an acceleration with its unit [m/s^2]; None where none is given.
+
+    """
+    from ..unit.gravity import parse_acceleration
+
+    try:
+        return None if text is None else parse_acceleration(text)
+    except ValueError as mistake:
+        raise usage(f'--tolerance: {mistake}') from mistake
+
+
+def positive(value: float, name: str) -> float:
+    """
+    Refuse a number that is not positive and finite.
+
+    """
+    if not 0.0 < value < float('inf'):
+        raise usage(f'{name} must be positive, got {value:g}')
+    return value
 
 
 def topics_of(counts: str, imu: str, board: str, case: str) -> Topics:

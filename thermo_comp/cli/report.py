@@ -32,6 +32,8 @@ def report(
     gravity: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
+    window: options.Window = 60.0,
+    tolerance: options.Tolerance = None,
     serial: options.Serial = None,
     program: Annotated[
         str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
@@ -49,16 +51,17 @@ def report(
     Write the certificate of a unit: one HTML page, no network needed.
 
     Shows temperatures, regime, |g| before and after, the functions of
-    temperature with their uncertainty, and a verdict in words. The report
-    of a fit itself, with its candidates, comes from: fit --report.
+    temperature with their uncertainty, and the verdict of evaluate, with
+    its exit code. The report of a fit itself comes from: fit --report.
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
 
     """
     from ..files import PAGE, check_output
+    from ..judging import open_bag
     from ..replay import input_for
-    from ..report import evidence_of_bags, open_bag, write_report
+    from ..report import evidence_of_bags, write_report
     from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
@@ -67,6 +70,8 @@ def report(
     gravity = options.place(gravity, latitude, height)
     read = [*(bags or []), *([calibration] if calibration is not None else [])]
     check_output(output, PAGE, overwrite=force, others=read)
+    limit = options.acceleration(tolerance)
+    options.positive(window, '--window')
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
     paths = bags or []
     loaded = None if calibration is None else load_calibration(calibration)
@@ -77,22 +82,44 @@ def report(
         for number, path in enumerate(paths):
             tell = partial(_tell, done, number)
             opened.append(
-                open_bag(path, topics, kind, number=number, full_scale=full_scale, progress=tell)
+                open_bag(
+                    path,
+                    topics,
+                    kind,
+                    number=number,
+                    window_s=window,
+                    full_scale=full_scale,
+                    progress=tell,
+                )
             )
     try:
         evidence = evidence_of_bags(
-            opened, loaded, gravity=gravity, serial=serial, program=program
+            opened,
+            loaded,
+            gravity=gravity,
+            window_s=window,
+            tolerance=limit,
+            serial=serial,
+            program=program,
         )
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
     is_torn = out.torn(bag.info for bag in opened)
-    verdict = write_report(evidence, output, figures=figures, overwrite=force)
-    out.line(f'{output}: {verdict.headline}')
-    for reservation in verdict.reservations:
-        out.line(f'- {reservation}')
-    out.json({'output': output, 'verdict': verdict})
-    if verdict.level == 'poor':
-        raise typer.Exit(1)
+    write_report(evidence, output, figures=figures, overwrite=force)
+    for finding in evidence.findings:
+        out.line(f'- {finding}')
+    judgement = evidence.judgement
+    out.line(f'{output}: {evidence.headline}')
+    out.json(
+        {
+            'output': output,
+            'headline': evidence.headline,
+            'findings': evidence.findings,
+            **({} if judgement is None else judgement.facts()),
+        }
+    )
+    if judgement is not None and judgement.exit_code:
+        raise typer.Exit(judgement.exit_code)
     out.end(is_torn=is_torn)
 
 

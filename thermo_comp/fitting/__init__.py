@@ -5,7 +5,6 @@ Owns the fit: bags of a thermal test -> still positions -> regression -> calibra
 
 """
 
-from .assessment import Assessment, AssessmentRow, AxisShift, assess
 from .evidence import PositionReport, ResidualRow
 from .fit import FitResult, fit, fit_bags, reduce_bag
 from .gravity import normal_gravity, resolve_gravity
@@ -18,9 +17,6 @@ from .verdict import Finding
 
 __all__ = [
     'ArrayBlock',
-    'Assessment',
-    'AssessmentRow',
-    'AxisShift',
     'Candidate',
     'Finding',
     'FitOptions',
@@ -31,7 +27,6 @@ __all__ = [
     'ReducedBag',
     'ResidualRow',
     'SourceBlock',
-    'assess',
     'fit',
     'fit_bags',
     'normal_gravity',

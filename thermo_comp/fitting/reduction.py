@@ -4,10 +4,10 @@
 Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
 
 One pass over the blocks, in bounded memory: samples become cells of about half a second (see
-`stillness`), the cells of a still interval become windows of some ten seconds. Within a window
-every thermal regressor is linear in time to far below the noise, so the window's mean is a
-sufficient statistic; its noise is what the regression finds, because a charge-balancing
-converter makes means better than the scatter of its samples says.
+`stillness`), the cells of a still interval become windows of ten seconds, each exactly as long but
+for the last one. Within a window every thermal regressor is linear in time to far below the
+noise, so the window's mean is a sufficient statistic; its noise is what the regression finds,
+because a charge-balancing converter makes means better than the scatter of its samples says.
 
 """
 
@@ -24,6 +24,7 @@ from .sources import FitSource
 # Faster readings are averaged to this interval: no thermometer of this kind is that fast, and the
 # thermometers' recursion runs in Python.
 _SHORTEST_READING_INTERVAL_S = 0.2
+_LEAST_FILLED = 0.9
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,12 @@ class StillInterval:
         Number of the bag in the order given.
     start_ns, end_ns : int
         Stamps of its first and last cell's middle.
+    begin_s : float
+        Where its first window begins, since the bag's first sample [s]; the others follow on.
+    n_whole : int
+        Windows of the full length; one that is shorter may come after them.
     time : ndarray, shape (n,)
-        Window times since the bag's first sample [s].
+        Mean time of each window's samples since the bag's first sample [s].
     count : ndarray, shape (n,)
         Samples per window.
     mean : ndarray, shape (n, 3)
@@ -72,6 +77,8 @@ class StillInterval:
     bag: int
     start_ns: int
     end_ns: int
+    begin_s: float
+    n_whole: int
     time: Floats
     count: Floats
     mean: Floats
@@ -97,6 +104,8 @@ class ReducedBag:
         Samples read; not finite or out of order; at the full scale.
     n_cells, n_still_cells : int
         Length of the bag, and of its still intervals, in cells.
+    window_s : float
+        Length of a window: as asked, or a multiple of it where the samples are slow [s].
     cycle_s : float
         Typical interval between samples.
     is_integer : bool
@@ -115,6 +124,7 @@ class ReducedBag:
     n_saturated: int
     n_cells: int
     n_still_cells: int
+    window_s: float
     cycle_s: float
     is_integer: bool
 
@@ -150,7 +160,7 @@ def reduce_source(
         The reduced bag.
 
     """
-    cells = CellAccumulator(cell_s, full_scale)
+    cells = CellAccumulator(cell_s, full_scale, window_s)
     board, case = _ReadingCollector(), _ReadingCollector()
     n_samples = 0
     for block in source.blocks():
@@ -160,11 +170,12 @@ def reduce_source(
         n_samples += len(block.accel_stamp_ns)
     found = cells.finish()
     ranges = still_intervals(found, min_still_s)
+    per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
     return ReducedBag(
         source=source,
         start_ns=found.start_ns,
         end_ns=found.start_ns + (round(found.time[-1] * 1e9) if len(found.time) else 0),
-        intervals=tuple(_windows(found, bag, lower, upper, window_s) for lower, upper in ranges),
+        intervals=tuple(_windows(found, bag, lower, upper, per_window) for lower, upper in ranges),
         board=board.finish(),
         case=case.finish(),
         n_samples=n_samples,
@@ -172,24 +183,30 @@ def reduce_source(
         n_saturated=found.n_saturated,
         n_cells=len(found.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
+        window_s=round(per_window * found.cell_s, 6),
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
         is_integer=found.is_integer,
     )
 
 
-def _windows(cells: Cells, bag: int, lower: int, upper: int, window_s: float) -> StillInterval:
-    per_window = max(1, round(window_s / cells.cell_s))
-    n_windows = max(1, round((upper - lower) / per_window))
-    first = lower + np.round(np.arange(n_windows) * (upper - lower) / n_windows).astype(np.int64)
-    rows = slice(lower, upper)
-    offsets = first - lower
+def _windows(cells: Cells, bag: int, lower: int, upper: int, per_window: int) -> StillInterval:
+    n_whole, rest = divmod(upper - lower, per_window)
+    # Less than half a window weighs too little to be one.
+    end = upper - rest if n_whole and 2 * rest < per_window else upper
+    rows = slice(lower, end)
+    offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
+    # Where the bag ends within a cell, its window does not last as long.
+    if n_whole and total[n_whole - 1] < _LEAST_FILLED * np.median(total):
+        n_whole -= 1
     mean = np.add.reduceat(cells.mean[rows] * count[:, None], offsets, axis=0) / total[:, None]
     return StillInterval(
         bag=bag,
         start_ns=cells.start_ns + round(cells.time[lower] * 1e9),
         end_ns=cells.start_ns + round(cells.time[upper - 1] * 1e9),
+        begin_s=float(cells.index[lower]) * cells.cell_s,
+        n_whole=n_whole,
         time=np.add.reduceat(cells.time[rows] * count, offsets) / total,
         count=total,
         mean=mean,

@@ -10,7 +10,7 @@ Owns fleets: hundreds of units, each fitted where a worker is free, and what the
 
 from __future__ import annotations
 
-from .row import COLUMNS, FITTED, Column, Row
+from .row import COLUMNS, Column, Row, is_fitted
 from .run import FleetResult, fit_fleet
 from .summary import Summary, summarise
 from .table import read_parquet
@@ -18,13 +18,13 @@ from .unit import FleetOptions
 
 __all__ = [
     'COLUMNS',
-    'FITTED',
     'Column',
     'FleetOptions',
     'FleetResult',
     'Row',
     'Summary',
     'fit_fleet',
+    'is_fitted',
     'read_parquet',
     'summarise',
 ]

@@ -23,7 +23,7 @@ from ..errors import FleetError
 from ..files import CALIBRATION as CALIBRATION_FILE
 from ..files import PAGE, RECORD, write_atomically
 from .discovery import FoundUnit
-from .row import FITTED, Cell, empty_row
+from .row import Cell, empty_row, is_fitted
 from .unit import FleetOptions, UnitOutcome
 
 _FORMAT = 1
@@ -207,7 +207,7 @@ def _is_whole(folder: Path, row: dict[str, Cell], options: FleetOptions) -> bool
     Whether the files that belong to a result are there as they were written.
 
     """
-    if row['verdict'] not in FITTED:
+    if not is_fitted(row):
         return True
     if options.certificates and not (folder / CERTIFICATE).is_file():
         return False

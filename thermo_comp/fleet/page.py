@@ -18,7 +18,7 @@ from .. import __version__
 from ..report.html import document, figure, table
 from ..report.text import number
 from .plates import fleet_plates
-from .row import FITTED, Cell, Row
+from .row import Cell, Row, is_fitted, is_valid
 from .summary import Summary
 
 # A list longer than this is for the table's readers.
@@ -47,7 +47,7 @@ def render_fleet(
         The HTML document.
 
     """
-    fitted = [row for row in rows if row['verdict'] in FITTED]
+    fitted = [row for row in rows if is_fitted(row)]
     plates = fleet_plates(fitted, summary)
     return document(
         'Fleet report',
@@ -69,7 +69,7 @@ def render_fleet(
 
 
 def _box(rows: Sequence[Row], summary: Summary) -> str:
-    n_fitted = sum(summary.verdicts.get(verdict, 0) for verdict in FITTED)
+    n_fitted = sum(map(is_fitted, rows))
     headline = f'{n_fitted} of {len(rows)} tests gave a calibration.'
     facts = [
         ', '.join(f'{n} {verdict}' for verdict, n in sorted(summary.verdicts.items())) + '.',
@@ -92,7 +92,7 @@ def _box(rows: Sequence[Row], summary: Summary) -> str:
     n_left_out = sum(int(row['n_left_out'] or 0) for row in rows)
     if n_left_out:
         facts.append(f'{n_left_out} bags were left out.')
-    level = 'good' if n_fitted == len(rows) else 'reserved' if n_fitted else 'poor'
+    level = 'good' if all(map(is_valid, rows)) else 'reserved' if n_fitted else 'poor'
     return (
         f'<section class="verdict {level}" aria-label="Summary">'
         f'<p><strong>{escape(headline)}</strong></p>'
@@ -106,7 +106,7 @@ def _said(n: int, one: str, several: str, rest: str) -> str:
 
 
 def _refused(rows: Sequence[Row], summary: Summary) -> str:
-    without = [row for row in rows if row['verdict'] not in FITTED]
+    without = [row for row in rows if not is_fitted(row)]
     if not without:
         return ''
     reasons = ''
@@ -224,7 +224,7 @@ def _spreads(summary: Summary) -> str:
 def _units(rows: Sequence[Row], certificate_of: Callable[[str], str] | None) -> str:
     columns = ('static_ug', 'dynamic_ug', 'peak_ug')
     links = [
-        certificate_of(str(row['name'])) if certificate_of and row['verdict'] in FITTED else ''
+        certificate_of(str(row['name'])) if certificate_of and is_fitted(row) else ''
         for row in rows
     ]
     return '<h2>All tests</h2>' + table(
@@ -243,7 +243,8 @@ def _units(rows: Sequence[Row], certificate_of: Callable[[str], str] | None) -> 
             for row in rows
         ],
         texts=5,
-        caption='|g| − g at rest in µg: RMS in the static and the dynamic regime, largest window; '
+        caption='|g| − g at rest in µg: RMS in the static and the dynamic regime, largest window, '
+        'on each unit’s own bags; '
         'calibrated board temperatures; still positions. All columns with all digits: '
         'fleet.parquet and fleet.csv.',
         links=[quote(link) for link in links],
@@ -270,6 +271,6 @@ def _footer() -> str:
     now = dt.datetime.now(dt.timezone.utc)
     return (
         f'<footer>Report made {now:%Y-%m-%d %H:%M} UTC by thermo_comp {escape(__version__)}. '
-        '1 µg = 9.80665·10⁻⁶ m/s². Residuals: |g| − g at rest over windows of ten seconds, on '
-        'each unit’s own bags.</footer>'
+        '1 µg = 9.80665·10⁻⁶ m/s². Residuals: |g| − g at rest, on each unit’s own bags, over '
+        'windows as long as the column window_s says, 60 s if nothing else.</footer>'
     )

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ..fitting import FitResult, predicted_sd
+from ..judging import Judgement, Verdict
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
 
@@ -22,9 +23,8 @@ Cell = str | int | float | None
 Row = Mapping[str, Cell]
 Kind = Literal['text', 'whole', 'number']
 
-#: What may stand in the column `verdict`: the certificate's words, and two for no calibration.
-FITTED = ('good', 'reserved', 'poor')
-REFUSED, FAILED = 'refused', 'failed'
+#: What stands in the column `verdict` where there is no verdict of the judge.
+REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ COLUMNS: tuple[Column, ...] = (
     Column('name', 'text', 'folder of the bags, or serial; the folder of the results'),
     Column('serial', 'text', "serial in the bags' metadata, else the folder's own name"),
     Column('lot', 'text', '`lot` in the metadata, else the folder above the unit'),
-    Column('verdict', 'text', 'good, reserved, poor; refused by the fit; failed'),
+    Column('verdict', 'text', 'that of evaluate on its own bags; refused by the fit; failed'),
+    Column('reason', 'text', 'the numbers of the verdict'),
     Column('problem', 'text', 'why there is no calibration'),
     Column('reservations', 'text', 'what the certificate holds against the calibration'),
     Column('left_out', 'text', 'bags that were left out, each with its reason'),
@@ -92,11 +93,13 @@ COLUMNS: tuple[Column, ...] = (
     Column('lag_1_s', 'number', 'first time constant of the thermal memory'),
     Column('lag_2_s', 'number', 'second time constant of the thermal memory'),
     Column('board_lag_s', 'number', 'time constant of the board behind the case'),
+    Column('window_s', 'number', 'length of the windows at rest'),
     Column('raw_ug', 'number', '|g| - g at rest, RMS, constants at T_ref only'),
     Column('static_ug', 'number', '|g| - g at rest, RMS, static regime'),
     Column('dynamic_ug', 'number', '|g| - g at rest, RMS, dynamic regime'),
     Column('all_ug', 'number', '|g| - g at rest, RMS'),
-    Column('peak_ug', 'number', '|g| - g at rest, largest window of ten seconds'),
+    Column('peak_ug', 'number', '|g| - g at rest, largest window'),
+    Column('claimed_ug', 'number', 'RMS of what the calibration claims for these windows'),
     Column('cpu_s', 'number', 'processor time of reading and fit'),
     Column('tool_version', 'text', 'version that fitted it'),
     Column('calibration_sha256', 'text', 'of calibration.yaml'),
@@ -144,7 +147,6 @@ def fitted_cells(result: FitResult) -> dict[str, Cell]:
 
     """
     calibration = result.calibration
-    residuals = {row.section: row for row in result.residuals}
     start_ns = min(bag.start_ns for bag in result.bags)
     cells: dict[str, Cell] = {
         'n_positions': len(result.positions),
@@ -154,14 +156,55 @@ def fitted_cells(result: FitResult) -> dict[str, Cell]:
             '%Y-%m-%dT%H:%M:%SZ'
         ),
         'hours': sum(bag.end_ns - bag.start_ns for bag in result.bags) * 1e-9 / 3600.0,
-        'raw_ug': residuals['all'].raw.micro_g.rms,
-        'peak_ug': residuals['all'].fitted.micro_g.peak,
         'tool_version': calibration.provenance.tool_version,
     }
-    for section in ('static', 'dynamic', 'all'):
-        if residuals[section].fitted.n:
-            cells[f'{section}_ug'] = residuals[section].fitted.micro_g.rms
     return cells | calibration_cells(calibration)
+
+
+def judged_cells(judgement: Judgement) -> dict[str, Cell]:
+    """
+    Take the cells of a unit's verdict.
+
+    Parameters
+    ----------
+    judgement : Judgement
+        On its own bags.
+
+    Returns
+    -------
+    dict of str to str, int, float or None
+        Cells by column.
+
+    """
+    whole = judgement.sections['all']
+    numbers = {
+        'window_s': judgement.windows.window_s,
+        'raw_ug': whole.raw_rms / MICRO_G,
+        'peak_ug': whole.peak / MICRO_G,
+        'claimed_ug': whole.claimed_rms / MICRO_G,
+        **{
+            f'{section}_ug': judgement.sections[section].rms / MICRO_G
+            for section in ('static', 'dynamic', 'all')
+        },
+    }
+    known = {name: value for name, value in numbers.items() if np.isfinite(value)}
+    return {'verdict': judgement.verdict, 'reason': judgement.reason, **known}
+
+
+def is_fitted(row: Row) -> bool:
+    """
+    Whether a unit has a calibration.
+
+    """
+    return row['verdict'] not in ('', REFUSED, FAILED)
+
+
+def is_valid(row: Row) -> bool:
+    """
+    Whether a unit's calibration was shown to be valid on its own bags.
+
+    """
+    return str(row['verdict']).startswith((Verdict.VALID.value, Verdict.WIDE.value))
 
 
 def calibration_cells(calibration: Calibration) -> dict[str, Cell]:

@@ -18,7 +18,7 @@ from ..files import write_atomically
 from .discovery import FoundUnit, find_units
 from .engine import Job, connected, n_tasks, require_libraries, run
 from .ledger import Ledger
-from .row import FITTED, Row
+from .row import Row, is_fitted, is_valid
 from .storage import Storage
 from .summary import Summary, summarise
 from .table import write_tables
@@ -59,15 +59,15 @@ class FleetResult:
         Units with a calibration.
 
         """
-        return sum(row['verdict'] in FITTED for row in self.rows)
+        return sum(is_fitted(row) for row in self.rows)
 
     @property
     def is_whole(self) -> bool:
         """
-        Whether every unit has a calibration, from all of its bags.
+        Whether every unit has a calibration that is valid on its bags, on all of them.
 
         """
-        return self.n_fitted == len(self.rows) and not any(
+        return all(is_valid(row) for row in self.rows) and not any(
             row['n_left_out'] or row['n_torn'] for row in self.rows
         )
 

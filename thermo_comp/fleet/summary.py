@@ -19,9 +19,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from ..judging import Verdict
 from ..typing import Floats
 from ..unit.calibration import AXES
-from .row import FITTED, Row
+from .row import Row, is_fitted
 
 _FALSE_ALARMS = 0.05
 # Fewer units have no spread to stand out of, fewer of a lot no middle.
@@ -281,7 +282,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         What there is to see.
 
     """
-    fitted = [row for row in rows if row['verdict'] in FITTED]
+    fitted = [row for row in rows if is_fitted(row)]
     spreads = tuple(spread for one in QUANTITIES if (spread := spread_of(one, fitted)) is not None)
     limit = outlier_limit(len(fitted), len(spreads))
     serials = {str(row['name']): str(row['serial']) for row in fitted}
@@ -295,14 +296,14 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
     latest = {str(row['serial']): row for row in sorted(fitted, key=lambda row: str(row['start']))}
     lots = Counter(str(row['lot']) for row in latest.values() if row['lot'])
     return Summary(
-        verdicts=dict(Counter(str(row['verdict']) for row in rows)),
+        verdicts=dict(Counter(_kind(str(row['verdict'])) for row in rows)),
         problems=tuple(
             Counter(_pattern(str(row['problem'])) for row in rows if row['problem']).most_common()
         ),
         spreads=spreads,
         limit=limit,
         outliers=tuple(sorted(outliers, key=lambda one: -abs(one.z))),
-        drifts=tuple(_drifts(fitted, [row for row in earlier if row['verdict'] in FITTED])),
+        drifts=tuple(_drifts(fitted, [row for row in earlier if is_fitted(row)])),
         lots=dict(sorted(lots.items())),
         lot_effects=tuple(_lot_effects(list(latest.values()), spreads)),
     )
@@ -443,6 +444,15 @@ def _normal_limit(n: int) -> float:
     from scipy.stats import norm
 
     return float(norm.isf(0.5 * _FALSE_ALARMS / n)) if n else float('inf')
+
+
+def _kind(verdict: str) -> str:
+    """
+    Leave the amount out of a verdict, so that like ones count together.
+
+    """
+    wide = Verdict.WIDE.value
+    return f'{wide} little' if verdict.startswith(wide) else verdict
 
 
 def _number(cell: object) -> float:

@@ -25,10 +25,10 @@ from ..recording import Input, Topics
 from ..unit.calibration_file import dump_calibration
 from .bag import BagStatistics, reduce_found
 from .discovery import FoundUnit
-from .row import FAILED, REFUSED, Cell, empty_row, fitted_cells
+from .row import FAILED, NOT_JUDGED, REFUSED, Cell, empty_row, fitted_cells, judged_cells
 
 if TYPE_CHECKING:
-    from ..report import Verdict
+    from ..report import Evidence
 
 #: Statistics of some bags of one unit, sorted by name.
 Statistics = tuple[BagStatistics, ...]
@@ -266,13 +266,17 @@ def _fitted(
     settings = _settings(good, unit, options.fit)
     result = fit_bags(numbered([one.reduced for one in good if one.reduced]), settings)
     calibration = dump_calibration(result.calibration).encode()
-    certificate, verdict = _certified(result, _losses(outcome, good), options.certificates)
+    certificate, evidence = _certified(result, _losses(outcome, good), options.certificates)
+    judgement = evidence.judgement
     outcome.row.update(
         fitted_cells(result),
-        verdict=verdict.level,
-        reservations='; '.join(verdict.reservations),
+        reservations='; '.join(evidence.findings),
         calibration_sha256=hashlib.sha256(calibration).hexdigest(),
     )
+    if judgement is None:
+        outcome.row.update(verdict=NOT_JUDGED)
+    else:
+        outcome.row.update(judged_cells(judgement))
     return replace(outcome, calibration=calibration, certificate=certificate)
 
 
@@ -322,16 +326,15 @@ def _losses(outcome: UnitOutcome, good: Sequence[BagStatistics]) -> list[str]:
     return lost
 
 
-def _certified(result: FitResult, losses: Sequence[str], with_page: bool) -> tuple[bytes, Verdict]:
+def _certified(
+    result: FitResult, losses: Sequence[str], with_page: bool
+) -> tuple[bytes, Evidence]:
     """
     Judge a fit, and make the page if it is wanted.
 
     """
-    from ..report import evidence_of_fit, judge, render_report
+    from ..report import evidence_of_fit, render_report
 
     evidence = evidence_of_fit(result, is_brief=not with_page)
     evidence = replace(evidence, findings=(*evidence.findings, *losses))
-    if not with_page:
-        return b'', judge(evidence)
-    page, verdict = render_report(evidence)
-    return zlib.compress(page.encode()), verdict
+    return zlib.compress(render_report(evidence).encode()) if with_page else b'', evidence

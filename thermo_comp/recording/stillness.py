@@ -19,12 +19,14 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# A cell's variance, of n >= 32 samples, exceeds 4 times its mean by chance with probability
-# below 1e-12; vibration worth cutting out is far above.
+# A cell's variance, of n >= 30 samples, exceeds 4 times its mean by chance with probability
+# below 1e-11; vibration worth cutting out is far above.
 _VARIANCE_RATIO = 4.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
 _QUANTUM_SAMPLES = 20000
+#: How many windows a cell lasts where the samples are slow.
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)
 # Noise below this many quanta leaves a sensor on one number for long.
 _STUCK = 0.3
 
@@ -79,16 +81,22 @@ class CellAccumulator:
     Parameters
     ----------
     cell_s : float
-        Shortest length of a cell [s]; cells are longer where it would hold fewer than 32 samples.
+        Shortest length of a cell [s]; cells are longer where it would hold fewer than 30 samples.
     full_scale : float or None
         Magnitude at which a sample is saturated.
+    window_s : float or None, optional
+        What a whole number of cells is to last [s]; where even one cell of that length would hold
+        too few samples, a cell lasts one of `STRETCHES` times as long.
 
     """
 
-    _MIN_SAMPLES = 32
+    _MIN_SAMPLES = 30
 
-    def __init__(self, cell_s: float, full_scale: float | None) -> None:
+    def __init__(
+        self, cell_s: float, full_scale: float | None, window_s: float | None = None
+    ) -> None:
         self._asked_cell_s = cell_s
+        self._window_s = window_s
         self._full_scale = full_scale
         self._cell_ns = 0
         self._start_ns = 0
@@ -173,7 +181,8 @@ class CellAccumulator:
 
     def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
         step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
-        self._cell_ns = int(max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0))
+        least = max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0)
+        self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
         self._quantum = _quantum_of(samples[:_QUANTUM_SAMPLES])
@@ -200,6 +209,18 @@ class CellAccumulator:
         if len(ids) > 1:
             self._ids.append(ids[:-1])
             self._sums.append(sums[:-1].copy())
+
+
+def _part_of(window_s: float, least: float) -> float:
+    """
+    Find the length of a cell of which a whole number fills the window, or some windows [ns].
+
+    """
+    for stretch in STRETCHES:
+        n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
+        if n_cells:
+            return stretch * window_s * 1e9 / n_cells
+    return least
 
 
 def _quantum_of(samples: Floats) -> Floats:

@@ -13,24 +13,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
 from ..fitting.reduction import Readings
+from ..judging import Judgement, Verdict, Windows
 from ..simulation import Cyclogram
-from ..typing import Bools, Floats, Ints
+from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
+from ..unit.metrics import norm_residual
 from .trace import ThermalTrace
 
-#: Names of the ladder's rungs, as figures and tables call them.
+#: What is set side by side: the constants at the reference temperature, and the calibration.
 RAW = 'raw'
-ONE_SET = 'one set'
-TWO_REGIMES = 'two regimes'
 CHOSEN = 'calibration'
-STATIC_ALONE = 'static set alone'
-
-SECTIONS = ('static', 'dynamic', 'all')
 
 
 @dataclass(frozen=True)
@@ -96,59 +93,6 @@ class ShownBag:
 
 
 @dataclass(frozen=True)
-class Windows:
-    """
-    Means over some ten seconds at rest, of all bags, sorted by position.
-
-    Parameters
-    ----------
-    bag, position : ndarray of int64, shape (n,)
-        Which bag, which still position.
-    time : ndarray, shape (n,)
-        Time since the bag's start [s].
-    mean : ndarray, shape (n, 3)
-        Raw samples.
-    board : ndarray, shape (n,)
-        Board temperature [degC].
-    is_dynamic : ndarray of bool, shape (n,)
-        Whether the dynamic set prevails.
-    forces : dict of {str: ndarray, shape (n, 3)}
-        Specific force that each rung of the ladder makes of it; the last is the one judged.
-
-    """
-
-    bag: Ints
-    position: Ints
-    time: Floats
-    mean: Floats
-    board: Floats
-    is_dynamic: Bools
-    forces: dict[str, Floats]
-
-    def __len__(self) -> int:
-        """
-        Count the windows.
-
-        """
-        return len(self.time)
-
-    @property
-    def judged(self) -> str | None:
-        """
-        Name of the best rung, None when there is no specific force at all.
-
-        """
-        return next(reversed(self.forces), None)
-
-    def breaks(self, rows: Bools | slice = slice(None)) -> Ints:
-        """
-        Rows, of those selected, at which another position begins.
-
-        """
-        return np.flatnonzero(np.diff(self.position[rows])) + 1
-
-
-@dataclass(frozen=True)
 class Position:
     """
     One still position.
@@ -160,7 +104,7 @@ class Position:
     bag : int
         Its bag.
     duration_s : float
-        How long it rested.
+        How long its windows last together.
     up : tuple of float
         Direction of the specific force in the output frame.
     residual_rms : dict of {str: float}
@@ -221,10 +165,12 @@ class Evidence:
         The bag of the time figures.
     windows : Windows or None
         At rest, of all bags.
+    judgement : Judgement or None
+        What they tell of the calibration.
     candidates : tuple of CandidateRow
         What the fit chose from.
     findings : tuple of str
-        What the fit itself warns of.
+        What speaks against calibration or bags.
     checks : tuple of str
         What the fit looked at and found good.
     is_fit : bool
@@ -239,35 +185,61 @@ class Evidence:
     bags: tuple[BagFacts, ...] = ()
     shown: ShownBag | None = None
     windows: Windows | None = None
+    judgement: Judgement | None = None
     candidates: tuple[CandidateRow, ...] = ()
     findings: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     is_fit: bool = False
 
+    @property
+    def headline(self) -> str:
+        """
+        The verdict with its numbers, or why there is none.
+
+        """
+        if self.judgement is not None:
+            return str(self.judgement)
+        if self.calibration is not None:
+            return 'the calibration as it stands: no recording was judged with it'
+        if not self.bags:
+            return 'nothing to show yet: no file could be read'
+        return 'a thermal record: no calibration was judged'
+
+    @property
+    def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
+        """
+        How the verdict is to be coloured: valid; with reservations; not; nothing was judged.
+
+        """
+        if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
+            return 'open'
+        if not self.judgement.is_valid:
+            return 'poor'
+        is_good = self.judgement.kind is Verdict.VALID and not self.findings
+        return 'good' if is_good else 'reserved'
+
+    @property
+    def forces(self) -> dict[str, Floats]:
+        """
+        Specific force over the windows by what corrected it; empty where nothing gave one.
+
+        """
+        windows = self.windows
+        if windows is None or not len(windows):
+            return {}
+        if self.calibration is not None:
+            return {RAW: windows.raw, CHOSEN: windows.force}
+        return {RAW: windows.force} if self.unit == 'm/s^2' else {}
+
     @cached_property
     def residuals(self) -> dict[str, Floats]:
         """
-        ``|f| - g`` of each rung over the windows [m/s^2]; empty without gravity.
+        ``|f| - g`` of each of `forces` [m/s^2]; empty without gravity.
 
         """
-        if self.windows is None or self.gravity is None:
+        if self.gravity is None:
             return {}
-        return {
-            name: norm_residual(force, self.gravity) for name, force in self.windows.forces.items()
-        }
-
-    @cached_property
-    def statistics(self) -> dict[str, dict[str, ResidualStatistics]]:
-        """
-        Statistics of `residuals` by rung and section.
-
-        """
-        if self.windows is None:
-            return {}
-        return {
-            name: statistics_by_regime(residual, self.windows.is_dynamic)
-            for name, residual in self.residuals.items()
-        }
+        return {name: norm_residual(force, self.gravity) for name, force in self.forces.items()}
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
@@ -276,21 +248,19 @@ class Evidence:
 
         """
         windows = self.windows
-        if windows is None or windows.judged is None:
+        if windows is None or not self.forces:
             return ()
-        force = windows.forces[windows.judged]
+        force = next(reversed(self.forces.values()))
         found = []
         for number, p in enumerate(np.unique(windows.position), 1):
             rows = windows.position == p
             mean = force[rows].mean(axis=0)
             x, y, z = (mean / np.linalg.norm(mean)).tolist()
-            time = windows.time[rows]
-            step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
             found.append(
                 Position(
                     number=number,
                     bag=int(windows.bag[rows][0]),
-                    duration_s=float(time[-1] - time[0]) + step,
+                    duration_s=windows.window_s * int(rows.sum()),
                     up=(x, y, z),
                     residual_rms={
                         name: float(np.sqrt(np.mean(residual[rows] ** 2)))
@@ -319,4 +289,4 @@ class Evidence:
         ups = np.array([position.up for position in self.positions]) * self.gravity
         _, place = np.unique(windows.position, return_inverse=True)
         true = ups[place]
-        return {name: force - true for name, force in windows.forces.items()}
+        return {name: force - true for name, force in self.forces.items()}

@@ -36,7 +36,7 @@ from .text import number
 
 def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
     """
-    Draw the residual of each axis for each rung of the ladder (the paper's Fig. 6).
+    Draw the residual of each axis, without and with the calibration (the paper's Fig. 6).
 
     """
     shown, facts = shown_bag(evidence)
@@ -88,9 +88,7 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
     rows = windows.bag == shown.index
     rungs = list(residuals)
     corrected = [rung for rung in rungs if rung != RAW]
-    sets = [[rungs[0], rungs[-1]] if corrected else rungs]
-    if len(corrected) > 1:
-        sets.append(corrected)
+    sets = [rungs, corrected] if corrected else [rungs]
     figure = new_figure(sheet, 0.4 + (2.1 if sheet.is_narrow else 1.6) * len(sets))
     panels = np.atleast_1d(figure.subplots(len(sets), sharex=True))
     for axes, drawn in zip(panels, sets, strict=True):
@@ -104,7 +102,7 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
         axes.set_ylabel('|g| − g, µg')
         _absolute_scale(axes, evidence.gravity)
         legend_above(axes, sheet)
-    if len(corrected) > 1:
+    if corrected:
         limit = _shared_limit([residuals[rung][rows][:, None] for rung in corrected])
         panels[-1].set_ylim(-limit, limit)
     panels[-1].set_xlabel(name)
@@ -114,7 +112,7 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
 
 def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
     """
-    Draw how the residuals are distributed: the judged rung by regime, and all rungs by size.
+    Draw how the residuals are distributed: the calibration's by regime, and all by size.
 
     """
     windows = evidence.windows

@@ -3,129 +3,32 @@
 """
 Owns the way from bags, with or without a calibration, to a report's evidence.
 
-Bags are read block by block and reduced to windows at rest, as the fit does; nothing of the size
-of a bag's samples stays in memory. Reading and judging are apart, so that a viewer reads a bag
-once and judges it anew whenever the calibration changes.
+Reading and judging are apart, so that a viewer reads a bag once and judges it anew whenever the
+calibration changes.
 
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 
-from ..errors import RecordingError
-from ..fitting import FitOptions, FitSource
-from ..fitting.fit_sources import digest
-from ..fitting.options import COUNTS_FULL_SCALE
-from ..fitting.reduction import ReducedBag, reduce_source
+from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector
-from ..recording import Block, Input, RecordingInfo, Topics, open_recording
+from ..judging import WINDOW_S, OpenedBag, judge_bags
+from ..judging.windows import raw_windows
 from ..replay import check_unit
 from ..simulation import CYCLOGRAM_NAMES, Cyclogram, cyclogram_preset, parse_cyclogram
-from ..thermal import tracker as thermal
-from ..thermal.settings import DetectorSettings
-from ..typing import Floats, Ints
 from ..unit.calibration import Calibration
-from ..unit.correction import Correction
-from ..unit.gravity import STANDARD_GRAVITY
-from .evidence import CHOSEN, RAW, STATIC_ALONE, BagFacts, Evidence, ShownBag, Windows
-from .trace import ThermalTrace, thermal_trace
-
-Progress = Callable[[float], None]
+from .evidence import BagFacts, Evidence, ShownBag
+from .trace import thermal_trace
 
 # A recorded program is text that somebody else wrote; no real one is longer.
 _LONGEST_PROGRAM = 4096
-_STANDARD = FitOptions(gravity=STANDARD_GRAVITY)
-
-
-@dataclass(frozen=True)
-class OpenedBag:
-    """
-    A bag that was read once.
-
-    Parameters
-    ----------
-    info : RecordingInfo
-        What it holds.
-    reduced : ReducedBag
-        Its windows at rest and its temperature readings.
-    span_ns : (int, int)
-        First and last stamp of samples and readings.
-
-    """
-
-    info: RecordingInfo
-    reduced: ReducedBag
-    span_ns: tuple[int, int]
-
-
-def open_bag(
-    path: str | Path,
-    topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
-    *,
-    number: int = 0,
-    full_scale: float | None = None,
-    progress: Progress | None = None,
-) -> OpenedBag:
-    """
-    Read one bag, in bounded memory.
-
-    Parameters
-    ----------
-    path : str or Path
-        The bag; it needs a board temperature, the rest may be missing.
-    topics : Topics or None, optional
-        Names of the inputs.
-    input : {'auto', 'counts', 'imu'}, optional
-        Which accelerometer topic is read.
-    number : int, optional
-        Its place among several.
-    full_scale : float or None, optional
-        Magnitude of a saturated sample; None takes 32767 for counts.
-    progress : callable or None, optional
-        Told the fraction read.
-
-    Returns
-    -------
-    OpenedBag
-        The bag.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be read or has no board temperature.
-
-    """
-    path = Path(path)
-    with open_recording(path, topics, input, require=['board']) as reader:
-        info = reader.info
-        if full_scale is None and info.input != 'imu':
-            full_scale = COUNTS_FULL_SCALE
-        name = reader.topics.get('accel')
-        total = info.topics[name][1] if name else 0
-        source = FitSource(
-            name=path.name,
-            blocks=lambda: _told(reader.blocks(), total, progress),
-            sha256=digest(path),
-            serial=info.metadata.get('serial'),
-        )
-        reduced = reduce_source(
-            source,
-            number,
-            window_s=_STANDARD.window_s,
-            cell_s=_STANDARD.cell_s,
-            min_still_s=_STANDARD.min_still_s,
-            full_scale=full_scale,
-        )
-    if not len(reduced.board.value):
-        raise RecordingError('no board temperature in it: nothing to report', path=str(path))
-    return OpenedBag(info, reduced, span_of(reduced))
+# A ramp slower than this says nothing of its direction.
+_SLOWEST_RAMP_K_MIN = 0.05
 
 
 def span_of(bag: ReducedBag) -> tuple[int, int]:
@@ -143,6 +46,8 @@ def evidence_of_bags(
     calibration: Calibration | None = None,
     *,
     gravity: float | None = None,
+    window_s: float = WINDOW_S,
+    tolerance: float | None = None,
     serial: str | None = None,
     program: str | None = None,
 ) -> Evidence:
@@ -158,6 +63,8 @@ def evidence_of_bags(
         unit that speaks m/s^2.
     gravity : float or None, optional
         Local gravity; the calibration's by default.
+    window_s, tolerance : float, optional
+        As for `judging.evaluate`.
     serial : str or None, optional
         Serial of the unit, instead of the bags'; empty accepts any calibration.
     program : str or None, optional
@@ -173,49 +80,88 @@ def evidence_of_bags(
     ------
     CalibrationError
         If the calibration is for another unit.
+    RecordingError
+        If a bag's samples are too slow for such windows.
     ValueError
         If `program` cannot be read.
 
     """
+    reduced = [bag.reduced for bag in bags]
+    judgement = None
+    unit = 'counts'
     if calibration is not None:
         for bag in bags:
             check_unit(calibration, bag.info, serial)
-        gravity = calibration.gravity_m_s2 if gravity is None else gravity
-    detector = (
-        learn_detector([bag.reduced for bag in bags])
-        if calibration is None
-        else calibration.detector
-    )
-    cyclogram = None if program is None else parse_cyclogram(program)
-    parts: list[tuple[ThermalTrace, _BagWindows]] = [
-        _judge(bag, number, calibration, detector) for number, bag in enumerate(bags)
-    ]
-    shown = None
-    if bags:
-        index = best_bag([bag.reduced for bag in bags])
-        bag = bags[index]
-        shown = ShownBag(
-            index=index,
-            start_ns=bag.span_ns[0],
-            board=bag.reduced.board,
-            case=bag.reduced.case,
-            trace=parts[index][0],
-            cyclogram=cyclogram or recorded_program(bag.info.metadata),
-        )
-    unit = 'counts'
-    if calibration is not None:
         unit = calibration.unit.input
-    elif any(bag.info.input == 'imu' for bag in bags):
-        unit = 'm/s^2'
+        gravity = calibration.gravity_m_s2 if gravity is None else gravity
+        judgement = judge_bags(
+            reduced, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
+        )
+        windows = None if judgement is None else judgement.windows
+    else:
+        if any(bag.info.input == 'imu' for bag in bags):
+            unit = 'm/s^2'
+        windows = raw_windows(reduced, np.nan if gravity is None else gravity, window_s)
     return Evidence(
         serial=_serial(bags, calibration, serial),
         unit=unit,
         gravity=gravity,
         calibration=calibration,
         bags=tuple(bag_facts(bag.reduced, bag.info.truncated) for bag in bags),
-        shown=shown,
-        windows=_join([part for _, part in parts], calibration, unit),
-        findings=_notes(calibration),
+        shown=shown_of(reduced, calibration, program, [bag.info.metadata for bag in bags]),
+        windows=windows,
+        judgement=judgement,
+        findings=() if calibration is None else of_calibration(calibration),
+    )
+
+
+def shown_of(
+    bags: Sequence[ReducedBag],
+    calibration: Calibration | None,
+    program: str | None,
+    metadata: Sequence[object] = (),
+) -> ShownBag | None:
+    """
+    Prepare the bag that the time figures show.
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        The bags.
+    calibration : Calibration or None
+        Gives the detector; without one it is learnt from the bags.
+    program : str or None
+        The chamber's program, as `simulation.parse_cyclogram` reads it.
+    metadata : sequence of mapping, optional
+        Of each bag; what simulated ones say of their program is used without `program`.
+
+    Returns
+    -------
+    ShownBag or None
+        None without bags.
+
+    Raises
+    ------
+    ValueError
+        If `program` cannot be read.
+
+    """
+    cyclogram = None if program is None else parse_cyclogram(program)
+    if not bags:
+        return None
+    detector = learn_detector(bags) if calibration is None else calibration.detector
+    index = best_bag(bags)
+    bag = bags[index]
+    span_ns = span_of(bag)
+    if cyclogram is None and index < len(metadata):
+        cyclogram = recorded_program(metadata[index])
+    return ShownBag(
+        index=index,
+        start_ns=span_ns[0],
+        board=bag.board,
+        case=bag.case,
+        trace=thermal_trace(bag.board, bag.case, span_ns, detector),
+        cyclogram=cyclogram,
     )
 
 
@@ -318,109 +264,21 @@ def recorded_program(metadata: object) -> Cyclogram | None:
         return None
 
 
-@dataclass(frozen=True)
-class _BagWindows:
-    number: int
-    position: Ints
-    time: Floats
-    mean: Floats
-    states: tuple[Floats, ...]
-
-
-def _judge(
-    bag: OpenedBag, number: int, calibration: Calibration | None, detector: DetectorSettings
-) -> tuple[ThermalTrace, _BagWindows]:
-    reduced = bag.reduced
-    intervals = reduced.intervals
-    time = np.concatenate([i.time for i in intervals]) if intervals else np.zeros(0)
-    start_ns = bag.span_ns[0]
-    trace, states = thermal_trace(
-        reduced.board,
-        reduced.case,
-        bag.span_ns,
-        detector,
-        memory_time_constants_s=() if calibration is None else calibration.memory_time_constants_s,
-        query_ns=start_ns + np.rint(time * 1e9).astype(np.int64),
-    )
-    counts = [len(interval.time) for interval in intervals]
-    return trace, _BagWindows(
-        number=number,
-        position=np.repeat(np.arange(len(intervals)), counts),
-        time=time,
-        mean=np.concatenate([i.mean for i in intervals]) if intervals else np.zeros((0, 3)),
-        states=states,
-    )
-
-
-def _join(parts: Sequence[_BagWindows], calibration: Calibration | None, unit: str) -> Windows:
-    first = 0
-    positions = []
-    for part in parts:
-        positions.append(part.position + first)
-        first += int(part.position[-1]) + 1 if len(part.position) else 0
-    if not parts:
-        return Windows(
-            *(np.zeros(0, np.int64),) * 2, *_EMPTY, np.zeros(0), np.zeros(0, np.bool_), {}
-        )
-    states = tuple(
-        np.concatenate(column) for column in zip(*(p.states for p in parts), strict=True)
-    )
-    mean = np.concatenate([part.mean for part in parts])
-    known = np.isfinite(states[thermal.BOARD])
-    states = tuple(column[known] for column in states)
-    mean = mean[known]
-    forces: dict[str, Floats] = {}
-    if calibration is not None:
-        forces = _ladder(calibration, mean, states)
-    elif unit == 'm/s^2':
-        forces = {RAW: mean}
-    return Windows(
-        bag=np.concatenate([np.full(len(p.time), p.number) for p in parts])[known],
-        position=np.concatenate(positions)[known],
-        time=np.concatenate([part.time for part in parts])[known],
-        mean=mean,
-        board=states[thermal.BOARD],
-        is_dynamic=np.asarray(states[thermal.WEIGHT] > 0.5),
-        forces=forces,
-    )
-
-
-_EMPTY = (np.zeros(0), np.zeros((0, 3)))
-
-
-def _ladder(
-    calibration: Calibration, mean: Floats, states: tuple[Floats, ...]
-) -> dict[str, Floats]:
+def of_calibration(calibration: Calibration) -> tuple[str, ...]:
     """
-    Specific force without temperature, with the static set alone, and as calibrated.
+    Give what speaks against a calibration by itself, but for its wish for more positions.
 
     """
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    bias = np.array([axis.bias for axis in axes])
-    K = np.array([axis.scale_factor for axis in axes])
-    M = np.array(calibration.misalignment)
-    correction = Correction(calibration)
-
-    def corrected(state: tuple[Floats, ...]) -> Floats:
-        columns = [(mean[:, i] - b) / s for i, (b, s) in enumerate(correction.bias_scale(state))]
-        return np.asarray(np.column_stack(columns) @ M.T)
-
-    blind = list(states)
-    blind[thermal.WEIGHT] = np.zeros(len(mean))
-    forces = {RAW: np.asarray((mean - bias) / K @ M.T)}
-    if calibration.static != calibration.dynamic:
-        forces[STATIC_ALONE] = corrected(tuple(blind))
-    forces[CHOSEN] = corrected(states)
-    return forces
-
-
-def _notes(calibration: Calibration | None) -> tuple[str, ...]:
-    """
-    Give what the fit had to say against the calibration, but for its wish for more positions.
-
-    """
-    notes = () if calibration is None else calibration.provenance.notes
-    return tuple(note for note in notes if not note.startswith('positions: '))
+    lower, upper = calibration.dynamic.rate_range_k_min
+    found = [
+        f'the dynamic set never saw {name}: its ramps are a guess there'
+        for name, rate in (('heating', upper), ('cooling', -lower))
+        if rate < _SLOWEST_RAMP_K_MIN
+    ]
+    if not calibration.has_uncertainty:
+        found.append('the calibration says nothing of its uncertainty')
+    found += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
+    return tuple(dict.fromkeys(found))
 
 
 def _serial(bags: Sequence[OpenedBag], calibration: Calibration | None, serial: str | None) -> str:
@@ -430,12 +288,3 @@ def _serial(bags: Sequence[OpenedBag], calibration: Calibration | None, serial: 
         {bag.info.metadata['serial'] for bag in bags if bag.info.metadata.get('serial')}
     )
     return serial or ', '.join(found) or 'unknown'
-
-
-def _told(blocks: Iterator[Block], total: int, progress: Progress | None) -> Iterator[Block]:
-    n_read = 0
-    for block in blocks:
-        yield block
-        n_read += len(block)
-        if progress is not None and total:
-            progress(min(n_read / total, 1.0))

@@ -24,14 +24,14 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ThermoCompError
+from ..judging import OpenedBag, open_bag
 from ..recording import Input, Topics
 from ..replay import input_for
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence
-from .gather import OpenedBag, evidence_of_bags, open_bag
+from .gather import evidence_of_bags
 from .page import render_page
 from .plates import DrawnPlate, drawn_plates
-from .verdict import Verdict, judge
 
 HOST = '127.0.0.1'
 _NAMES = ('127.0.0.1', 'localhost')
@@ -69,7 +69,6 @@ class LiveOptions:
 @dataclass(frozen=True)
 class _Made:
     evidence: Evidence
-    verdict: Verdict
     plates: list[DrawnPlate]
 
 
@@ -125,10 +124,9 @@ class LiveReport:
             if made is None:
                 # Nothing good was seen yet: a page with the reason, which goes on asking.
                 evidence = Evidence(serial=self._calibration.name, unit='counts')
-                made = _Made(evidence, Verdict('open', 'Nothing to show yet.', (), ()), [])
+                made = _Made(evidence, [])
             return render_page(
                 made.evidence,
-                made.verdict,
                 made.plates,
                 script=_SCRIPT % (version, _POLL_MS),
                 nonce=secrets.token_urlsafe(16),
@@ -139,7 +137,7 @@ class LiveReport:
         self._version = version
         try:
             evidence = self._evidence()
-            self._made = _Made(evidence, judge(evidence), drawn_plates(evidence))
+            self._made = _Made(evidence, drawn_plates(evidence))
             self._notice = ''
         except (ThermoCompError, OSError, ValueError) as error:
             older = '' if self._made is None else '\nThe page below is older.'

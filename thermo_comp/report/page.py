@@ -14,27 +14,22 @@ import datetime as dt
 from collections.abc import Sequence
 from html import escape
 
+import numpy as np
+
 from .. import __version__
+from ..judging import SECTIONS
+from ..thermal.regime import Regime
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
-from .evidence import CHOSEN, SECTIONS, Evidence
+from .evidence import CHOSEN, RAW, Evidence
 from .html import document, figure, table
 from .inertial import SCHULER_PEAK_PER_MICRO_G, TIMES_S, position_error, schuler_peak
 from .plates import DrawnPlate
 from .text import number
-from .verdict import Verdict
-
-_WORDS = {
-    'good': 'Verdict: holds',
-    'reserved': 'Verdict: holds, with reservations',
-    'poor': 'Verdict: does not hold',
-    'open': 'Verdict: open',
-}
 
 
 def render_page(
     evidence: Evidence,
-    verdict: Verdict,
     plates: Sequence[DrawnPlate],
     *,
     script: str = '',
@@ -48,8 +43,6 @@ def render_page(
     ----------
     evidence : Evidence
         What it is about.
-    verdict : Verdict
-        In words.
     plates : sequence of DrawnPlate
         The figures.
     script : str, optional
@@ -71,7 +64,7 @@ def render_page(
         f'<h1>{title}</h1>',
         f'<p class="under">Unit {escape(evidence.serial)}</p>',
         f'<p class="notice">{escape(notice)}</p>' if notice else '',
-        _verdict(verdict),
+        _verdict(evidence),
         _facts(evidence),
         _statistics(evidence),
         _inertial(evidence),
@@ -87,19 +80,64 @@ def render_page(
     return document(f'{evidence.serial}: {title}', parts, script=script, nonce=nonce)
 
 
-def _verdict(verdict: Verdict) -> str:
+def _verdict(evidence: Evidence) -> str:
     lists = ''.join(
         f'<p>{name}:</p><ul>{"".join(f"<li>{escape(text)}</li>" for text in texts)}</ul>'
-        for name, texts in (('Reservations', verdict.reservations), ('Checked', verdict.checks))
+        for name, texts in (('Reservations', evidence.findings), ('Checked', evidence.checks))
         if texts
     )
+    words, _, numbers = evidence.headline.partition(': ')
+    if evidence.judgement is not None:
+        words, numbers = evidence.judgement.verdict, evidence.judgement.reason
     return (
-        f'<section class="verdict {verdict.level}" aria-label="Verdict">'
-        f'<div class="under">{_WORDS[verdict.level]}</div>'
-        f'<p><strong>{escape(verdict.headline)}</strong></p>'
-        + ''.join(f'<p>{escape(text)}</p>' for text in verdict.sentences)
-        + f'{lists}</section>'
+        f'<section class="verdict {evidence.level}" aria-label="Verdict">'
+        '<div class="under">Verdict</div>'
+        f'<p><strong>{escape(_micro(words))}</strong></p><p>{escape(_micro(numbers))}</p>'
+        f'{_seen(evidence)}{lists}</section>'
     )
+
+
+def _micro(text: str) -> str:
+    return text.replace(' ug', ' µg')
+
+
+def _seen(evidence: Evidence) -> str:
+    """
+    Say which bags the verdict rests on, and what the flag marked in the one that is shown.
+
+    """
+    said = []
+    if evidence.judgement is not None:
+        board = evidence.judgement.windows.board
+        which = 'bags that the fit has not seen'
+        if evidence.is_fit or _are_sources(evidence):
+            which = 'bags of its own fit'
+        said.append(
+            f'{len(evidence.positions)} rests in {which}, '
+            f'{np.min(board):.1f} to {np.max(board):.1f} °C.'
+        )
+    shown = evidence.shown
+    known = [] if shown is None else [s for s in shown.trace.stretches if s.regime >= 0]
+    if shown is not None and not known:
+        said.append('The regime was never known: the bag is too short for the detector.')
+    elif shown is not None:
+        dynamic = [s for s in known if s.regime == Regime.DYNAMIC]
+        part = sum(s.stop - s.start for s in dynamic) / sum(s.stop - s.start for s in known)
+        said.append(
+            f'In bag {evidence.bags[shown.index].name} the flag marked {len(dynamic)} dynamic '
+            f'stretches, {100.0 * part:.0f} % of the time in which the regime was known.'
+        )
+    return ''.join(f'<p>{escape(text)}</p>' for text in said)
+
+
+def _are_sources(evidence: Evidence) -> bool:
+    """
+    Whether the calibration was fitted on one of these bags.
+
+    """
+    sources = () if evidence.calibration is None else evidence.calibration.provenance.sources
+    known = {source.sha256 for source in sources if source.sha256}
+    return any(bag.sha256 in known for bag in evidence.bags)
 
 
 def _facts(evidence: Evidence) -> str:
@@ -133,45 +171,50 @@ def _ranges(temperature: tuple[float, float], rate: tuple[float, float]) -> str:
 
 
 def _statistics(evidence: Evidence) -> str:
-    statistics = evidence.statistics
-    if not any(sections['all'].n for sections in statistics.values()):
+    judgement = evidence.judgement
+    if judgement is None:
         return ''
     rows, chosen = [], []
-    for section in SECTIONS:
-        for rung, sections in statistics.items():
-            one = sections[section].micro_g
-            if one.n:
-                rows.append(
-                    (section, rung, *map(number, (one.rms, one.peak, one.mean)), str(one.n))
-                )
-                chosen.append(rung == CHOSEN)
+    for name in SECTIONS:
+        one = judgement.sections[name]
+        if not one.n:
+            continue
+        ug = [
+            number(value / MICRO_G) if np.isfinite(value) else '–'
+            for value in (one.raw_rms, one.raw_peak, one.rms, one.peak, one.claimed_rms)
+        ]
+        ratio = f'{one.ratio:.2f}' if np.isfinite(one.ratio) else '–'
+        rows.append((name, RAW, *ug[:2], '–', '–', str(one.n)))
+        rows.append((name, CHOSEN, *ug[2:], ratio, str(one.n)))
+        chosen += [False, True]
     return '<h2>What is left of |g|</h2>' + table(
-        ('section', 'correction', 'RMS, µg', 'largest, µg', 'mean, µg', 'windows'),
+        ('section', 'correction', 'RMS, µg', 'largest, µg', 'claimed, µg', 'ratio', 'windows'),
         rows,
         texts=2,
-        caption='|g| − g at rest, means over 10 s. Raw: scale factor, bias and misalignment at '
-        'the reference temperature only.',
+        caption=f'|g| − g at rest, means over {judgement.windows.window_s:g} s. Raw: scale '
+        'factor, bias and misalignment at the reference temperature only. Claimed: RMS of the '
+        'standard deviations that the calibration gives for these windows. Outside: beyond the '
+        'calibrated ranges; it decides nothing.',
         chosen=chosen,
     )
 
 
 def _inertial(evidence: Evidence) -> str:
-    rows = []
-    for rung in list(dict.fromkeys([*list(evidence.statistics)[:1], CHOSEN])):
-        for section in ('static', 'dynamic'):
-            one = evidence.statistics.get(rung, {}).get(section)
-            if one is not None and one.n:
-                rows.append(
-                    (
-                        rung,
-                        section,
-                        number(one.micro_g.rms),
-                        *(number(position_error(one.rms, time)) for time in TIMES_S),
-                        number(schuler_peak(one.rms)),
-                    )
-                )
-    if not rows:
+    judgement = evidence.judgement
+    if judgement is None:
         return ''
+    rows = [
+        (
+            correction,
+            section,
+            number(rms / MICRO_G),
+            *(number(position_error(rms, time)) for time in TIMES_S),
+            number(schuler_peak(rms)),
+        )
+        for section in ('static', 'dynamic')
+        if (one := judgement.sections[section]).n
+        for correction, rms in ((RAW, one.raw_rms), (CHOSEN, one.rms))
+    ]
     return '<h2>What it means to an inertial navigator</h2>' + table(
         (
             'correction',

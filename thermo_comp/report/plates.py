@@ -152,8 +152,10 @@ def _temperatures(evidence: Evidence) -> str:
 
 def _dynamics(evidence: Evidence) -> str:
     sensor = 'case' if evidence.shown and evidence.shown.trace.is_case_leading else 'board'
+    window_s = 0.0 if evidence.windows is None else evidence.windows.window_s
     return (
-        '(a) change of each axis’ reading, means over 10 s at rest; (b) estimated rates of the '
+        f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
+        'rates of the '
         f'temperatures and, below, the second derivative of the {sensor} temperature, whose '
         'pulses open and close the dynamic state; (c) the state that follows, with its '
         f'direction; before the detector has seen enough it is unknown. {_GREY} '
@@ -164,8 +166,8 @@ def _dynamics(evidence: Evidence) -> str:
 def _residuals(evidence: Evidence) -> str:
     return (
         'Residual of each axis in the output frame. The attitude of a position is not known: '
-        'the mean direction seen there stands for it. The uppermost panel has a scale of its '
-        f'own, the others share one. {_GREY} {_bag(evidence)} After Fig. 6 of the paper.'
+        'the mean direction seen there stands for it. Each panel has a scale of its own. '
+        f'{_GREY} {_bag(evidence)} After Fig. 6 of the paper.'
     )
 
 
@@ -173,7 +175,7 @@ def _gravity(evidence: Evidence) -> str:
     return (
         f'|g| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
         'a unit at rest must show zero whatever the temperature does. Above: before and after '
-        f'the correction; below, if present: its steps in detail. {_GREY} {_bag(evidence)} '
+        f'the correction; below: after it, in detail. {_GREY} {_bag(evidence)} '
         'After Fig. 7 of the paper.'
     )
 
@@ -193,7 +195,7 @@ def _histograms(_evidence: Evidence) -> str:
     return (
         '|g| − g over all windows of all positions. Bars: by regime, with the normal '
         'distribution of the same mean and spread; where they follow the line, what is left '
-        'is noise. Steps: the size of the residual after each rung of the correction, on a '
+        'is noise. Steps: the size of the residual without and with the correction, on a '
         'logarithmic axis; the further left, the better.'
     )
 
@@ -229,7 +231,7 @@ PLATES = (
     ),
     Plate(
         'residuals',
-        'What does each step of the correction leave on each axis?',
+        'What does the correction leave on each axis?',
         _residuals,
         draw_residuals,
         lambda evidence: _has_windows_of_shown(evidence) and bool(evidence.residuals),

@@ -26,12 +26,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ..typing import Floats, Ints
 from .decimate import thin
-from .evidence import CHOSEN, ONE_SET, RAW, STATIC_ALONE, TWO_REGIMES
+from .evidence import CHOSEN, RAW
 
 Line = dict[str, Any]
 
 BLACK, BLUE, RED, GREEN, GREY = '#000000', '#0072B2', '#D55E00', '#007A5A', '#8A8A8A'
-_DASHED, _DOTTED, _DASH_DOT = (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2))
+_DASHED, _DOTTED = (0, (5, 2)), (0, (1.2, 1.6))
 
 AXIS_LINES: tuple[Line, ...] = (
     {'color': BLUE, 'linestyle': '-', 'linewidth': 1.1},
@@ -40,9 +40,6 @@ AXIS_LINES: tuple[Line, ...] = (
 )
 RUNG_LINES: dict[str, Line] = {
     RAW: {'color': GREY, 'linestyle': '-', 'linewidth': 0.9},
-    ONE_SET: {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.1},
-    STATIC_ALONE: {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.1},
-    TWO_REGIMES: {'color': BLUE, 'linestyle': _DASH_DOT, 'linewidth': 1.1},
     CHOSEN: {'color': BLACK, 'linestyle': '-', 'linewidth': 1.3},
 }
 BOARD_LINE: Line = {'color': BLACK, 'linestyle': '-', 'linewidth': 1.4}

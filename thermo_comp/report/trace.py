@@ -13,9 +13,9 @@ import numpy as np
 
 from ..fitting.reduction import Readings
 from ..thermal.regime import Regime
-from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..thermal.settings import DetectorSettings
 from ..thermal.tracker import ThermalTracker
-from ..typing import Floats, Ints
+from ..typing import Floats
 
 #: Grid points of a trace, whatever the bag's length; a line in a figure has fewer pixels.
 _N_GRID = 4000
@@ -73,17 +73,10 @@ class ThermalTrace:
 
 
 def thermal_trace(
-    board: Readings,
-    case: Readings,
-    span_ns: tuple[int, int],
-    detector: DetectorSettings,
-    *,
-    memory_time_constants_s: tuple[float, ...] = (),
-    config: ThermalConfig | None = None,
-    query_ns: Ints | None = None,
-) -> tuple[ThermalTrace, tuple[Floats, ...]]:
+    board: Readings, case: Readings, span_ns: tuple[int, int], detector: DetectorSettings
+) -> ThermalTrace:
     """
-    Run the thermal tracker over a bag's readings, as the node would.
+    Run the thermometers and the detector over a bag's readings, as the node would.
 
     Parameters
     ----------
@@ -93,52 +86,31 @@ def thermal_trace(
         First and last stamp of the bag; times count from the first.
     detector : DetectorSettings
         Thermometers and detector.
-    memory_time_constants_s : tuple of float, optional
-        Lags of the board temperature.
-    config : ThermalConfig, optional
-        Cross-over and time-outs.
-    query_ns : ndarray of int64, shape (m,), optional
-        Rising stamps at which the whole thermal state is wanted.
 
     Returns
     -------
-    trace : ThermalTrace
+    ThermalTrace
         For the figures.
-    states : tuple of ndarray, shape (m,)
-        In the layout of `ThermalTracker.sample`; NaN before the board's first reading.
 
     """
-    tracker = ThermalTracker(detector, memory_time_constants_s, config)
+    tracker = ThermalTracker(detector, ())
     start_ns, end_ns = span_ns
     step_ns = max(round(_SHORTEST_STEP_S * 1e9), (end_ns - start_ns) // _N_GRID)
     grid = np.arange(start_ns, end_ns + 1, step_ns, dtype=np.int64)
-    wanted = np.zeros(0, dtype=np.int64) if query_ns is None else query_ns
-    stops = np.concatenate((grid, wanted))
-    is_query = np.concatenate((np.zeros(len(grid), bool), np.ones(len(wanted), bool)))
-    order = np.argsort(stops, kind='stable')
     feed = _Feed(tracker, board, case)
     rows: list[tuple[float, ...]] = []
-    unknown = (np.nan,) * (7 + 2 * len(memory_time_constants_s))
-    states: list[tuple[float, ...]] = []
-    for stamp_ns, query in zip(stops[order].tolist(), is_query[order].tolist(), strict=True):
+    for stamp_ns in grid.tolist():
         feed.until(stamp_ns)
-        if query:
-            known = tracker.board.stamp_ns is not None
-            states.append(tracker.sample(stamp_ns) if known else unknown)
-        else:
-            rows.append(_row(tracker))
+        rows.append(_row(tracker))
     columns = np.array(rows).reshape(-1, 6).T
-    table = np.array(states).reshape(-1, len(unknown))
-    is_case_leading = bool(len(case.value))
-    trace = ThermalTrace(
+    return ThermalTrace(
         time=np.asarray((grid - start_ns) * 1e-9, dtype=np.float64),
         board_rate=_settled(columns[0], columns[1]),
         case_rate=_settled(columns[2], columns[3]),
         case_acceleration=_settled(columns[4], columns[5]),
         stretches=_stretches(feed.flags, start_ns, end_ns),
-        is_case_leading=is_case_leading,
+        is_case_leading=bool(len(case.value)),
     )
-    return trace, tuple(table.T.copy())
 
 
 def _row(tracker: ThermalTracker) -> tuple[float, ...]:

@@ -16,28 +16,14 @@ from .evidence import Evidence
 from .fitted import evidence_of_fit
 from .page import render_page
 from .plates import drawn_plates, png_files
-from .verdict import Verdict, judge
 
 
-def render_report(evidence: Evidence) -> tuple[str, Verdict]:
+def render_report(evidence: Evidence) -> str:
     """
-    Make a certificate for whoever writes it.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        What it is about.
-
-    Returns
-    -------
-    page : str
-        The HTML document.
-    verdict : Verdict
-        What it says.
+    Make a certificate for whoever writes it: the HTML document.
 
     """
-    verdict = judge(evidence)
-    return render_page(evidence, verdict, drawn_plates(evidence)), verdict
+    return render_page(evidence, drawn_plates(evidence))
 
 
 def write_report(
@@ -48,7 +34,7 @@ def write_report(
     paths: Sequence[str | Path] = (),
     program: str | None = None,
     overwrite: bool = True,
-) -> Verdict:
+) -> Evidence:
     """
     Write a certificate as one self-contained HTML page.
 
@@ -69,8 +55,8 @@ def write_report(
 
     Returns
     -------
-    Verdict
-        What the page says.
+    Evidence
+        What the page is made of.
 
     Raises
     ------
@@ -85,9 +71,9 @@ def write_report(
     evidence = subject
     if isinstance(evidence, FitResult):
         evidence = evidence_of_fit(evidence, paths=paths, program=program)
-    page, verdict = render_report(evidence)
+    page = render_report(evidence)
     if figures is not None:
         for name, content in png_files(evidence).items():
             write_atomically(Path(figures) / name, content, PICTURE, overwrite=overwrite)
     write_atomically(path, page.encode(), PAGE, overwrite=overwrite)
-    return verdict
+    return evidence

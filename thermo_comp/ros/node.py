@@ -39,10 +39,11 @@ from . import parameters
 from .conversions import SampleConverter
 from .diagnostics import Input, Snapshot, Traffic, build
 from .discovery import mismatch
-from .loading import LoadedCalibration, check, load, read
+from .loading import check, load
 from .middleware import use_profile
 from .parameters import NodeConfig, ParameterError
 from .raw import RawSubscription
+from .reader import LoadedCalibration, Reader, read
 from .relay import Relay
 from .requests import ParameterRequests
 from .signals import SignalWatch
@@ -79,6 +80,9 @@ example: thermo_comp_node --ros-args -p calibration_file:=unit42.yaml -r accel/c
 
 parameters:
 """
+
+#: What the launch file calls a parameter whose argument was not given.
+NOT_GIVEN = 'not_given.'
 
 _INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
 
@@ -132,6 +136,7 @@ class CompensationNode:
         self.node.add_pre_set_parameters_callback(parameters.coerce)
         self.node.add_on_set_parameters_callback(self._on_set)
         self.node.add_post_set_parameters_callback(self._post_set)
+        self._reader = Reader()
         self._requests = ParameterRequests(self.node, self._loop, self._prepare, self._set)
         self._loop.call_every(self._config.diagnostics_period, self._report)
         self._log = self.node.get_logger()
@@ -141,7 +146,7 @@ class CompensationNode:
         )
         for name in undeclared_overrides(self.node):
             # The input that is not open may be opened later, with these.
-            if not name.startswith(inputs):
+            if not name.startswith((*inputs, NOT_GIVEN)):
                 self._log.warning(f'there is no parameter `{name}`, it has no effect')
 
     def run(self) -> None:
@@ -164,6 +169,7 @@ class CompensationNode:
 
         """
         self._requests.close()
+        self._reader.close()
         self._loop.close()
         self.node.destroy_node()
 
@@ -174,12 +180,13 @@ class CompensationNode:
         """
         overridable, compensator = QoSOverridingOptions.with_default_policies(), self._compensator
         samples = self._open_samples(self._config)
+        self._thermometers = compensator.thermal.inputs
         temperatures = [
             (
                 self._subscribe(Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False),
                 partial(compensator.push, name),
             )
-            for name in compensator.thermal.inputs
+            for name in self._thermometers
         ]
         try:
             imu, flag, self._diagnostics = (
@@ -224,19 +231,22 @@ class CompensationNode:
             n_failures=self._loop.n_failures,
         )
         variances = None if last is None else (last[3], last[6], last[8])
-        samples, board, case = (self._look_at(one.subscription) for one in relay.inputs)
+        names = ('sample', *self._thermometers)
         return Snapshot(
             take_snapshot(self._compensator),
             traffic,
             variances,
             time.monotonic() - self._last_samples,
-            (samples, board, case),
+            tuple(
+                self._look_at(name, one.subscription)
+                for name, one in zip(names, relay.inputs, strict=True)
+            ),
         )
 
-    def _look_at(self, subscription: Subscription) -> Input:
+    def _look_at(self, name: str, subscription: Subscription) -> Input:
         n_publishers = subscription.get_publisher_count()
         reason = '' if n_publishers else mismatch(self.node, subscription)
-        return Input(subscription.topic_name, n_publishers, reason)
+        return Input(name, subscription.topic_name, n_publishers, reason)
 
     def _report(self) -> None:
         """
@@ -284,7 +294,7 @@ class CompensationNode:
         names = [one.value for one in changes if one.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
-        return read(names[-1], self._config.calibration_directory)
+        return self._reader.read(names[-1], self._config.calibration_directory)
 
     def _set(
         self, changes: list[Parameter], loaded: LoadedCalibration | None

@@ -27,7 +27,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
-from ..errors import RecordingError
+from ..errors import ThermoCompError
 from ..recording import BagWriter
 from .waitloop import WaitLoop
 
@@ -56,7 +56,7 @@ class Recorder:
 
     Raises
     ------
-    RecordingError
+    OutputError
         If the bag can't be written.
 
     """
@@ -75,7 +75,7 @@ class Recorder:
         self._overwrite = overwrite
         self._changed = threading.Condition()
         self._counts = dict.fromkeys(topics, 0)
-        self._failure: RecordingError | None = None
+        self._failure: ThermoCompError | None = None
         self._newest: dict[str, bytes] = {}
         self._newest_ns: int | None = None
         # What came before any stamp.
@@ -199,19 +199,23 @@ class Recorder:
         return True
 
     def _run(self) -> None:
-        try:
-            self._loop.run(self._take)
-            self._take()
-        except RecordingError as error:
-            with self._changed:
-                self._failure = error
-                self._changed.notify_all()
+        self._loop.run(self._take)
+        self._take()
 
     def _take(self) -> None:
         """
-        Write what has arrived.
+        Write what has arrived, until that fails.
 
         """
+        if self._failure is None:
+            try:
+                self._write()
+            except ThermoCompError as error:
+                with self._changed:
+                    self._failure = error
+                    self._changed.notify_all()
+
+    def _write(self) -> None:
         new: dict[str, int] = {}
         for name, subscription in self._subscriptions.items():
             fresh = subscription.drain()[0]
@@ -277,7 +281,7 @@ def record(
 
     Raises
     ------
-    RecordingError
+    OutputError
         If the bag can't be written.
 
     """

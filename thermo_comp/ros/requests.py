@@ -4,16 +4,15 @@
 Owns the services that set parameters: prepared beside the samples, applied between two of them.
 
 rclpy serves such a request in one go, in the thread of the samples, and a request that it cannot
-read ends the node. Here a thread of its own does what takes time, reading a file; what is left
-for the loop is to exchange one reference. Requests are answered in the order in which they came,
-whatever is wrong with them.
+read ends the node. Here a thread of its own waits for what takes time, the reading of a file; what
+is left for the loop is to exchange one reference. Requests are answered in the order in which they
+came, whatever is wrong with them.
 
 """
 
 from __future__ import annotations
 
 import queue
-import sys
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -31,13 +30,18 @@ from .waitloop import WaitLoop
 
 #: More requests than this that wait, or parameters in one of them, are refused.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
-#: While something is prepared the samples' thread waits no longer than this for its turn [s].
-SWITCH_S = 0.2e-3
 
 #: Runs beside the samples: what takes time about a change.
 Prepare = Callable[[list[Parameter]], Any]
 #: Runs between two samples: sets what was prepared.
 Apply = Callable[[list[Parameter], Any], SetParametersResult]
+
+
+class RequestError(ThermoCompError):
+    """
+    A request that cannot be taken, whatever it asks for.
+
+    """
 
 
 class ParameterRequests:
@@ -101,9 +105,9 @@ class ParameterRequests:
         n = sum(len(group) for group in groups)
         try:
             if n > PARAMETERS_LIMIT:
-                raise ThermoCompError(f'{n} parameters at once, at most {PARAMETERS_LIMIT}')
+                raise RequestError(f'{n} parameters at once, at most {PARAMETERS_LIMIT}')
             self._waiting.put_nowait(partial(self._work, groups, respond))
-        except (ThermoCompError, queue.Full) as error:
+        except (RequestError, queue.Full) as error:
             reason = str(error) or 'too many requests wait already, try again'
             respond([_refusal(reason) for _ in groups])
 
@@ -113,12 +117,7 @@ class ParameterRequests:
 
         """
         while (work := self._waiting.get()) is not None:
-            usual_s = sys.getswitchinterval()
-            sys.setswitchinterval(SWITCH_S)
-            try:
-                work()
-            finally:
-                sys.setswitchinterval(usual_s)
+            work()
 
     def _work(
         self,
@@ -128,7 +127,7 @@ class ParameterRequests:
         results: list[SetParametersResult] = []
         for group in groups:
             try:
-                changes = [_read(message) for message in group]
+                changes = [read_parameter(message) for message in group]
                 prepared = self._prepare(changes)
             except Exception as error:  # noqa: BLE001 - whatever it is, it is answered
                 changes, prepared = [], error
@@ -170,19 +169,33 @@ class ParameterRequests:
         )
 
 
-def _read(message: ParameterMessage) -> Parameter:
+def read_parameter(message: ParameterMessage) -> Parameter:
     """
     Read a parameter off the network.
+
+    Parameters
+    ----------
+    message : rcl_interfaces.msg.Parameter
+        As it came in.
+
+    Returns
+    -------
+    rclpy.parameter.Parameter
+
+    Raises
+    ------
+    RequestError
+        If it has no name, or a value of a type that there is not.
 
     """
     if not message.name:
         # rclpy takes it for declared.
-        raise ThermoCompError('a parameter without a name')
+        raise RequestError('a parameter without a name')
     try:
         return Parameter.from_parameter_msg(message)
     except (ValueError, TypeError) as error:
-        raise ThermoCompError(
-            f'parameter `{message.name:.60}` has no value that can be read '
+        raise RequestError(
+            f'parameter {message.name!r:.60} has no value that can be read '
             f'(type {message.value.type})'
         ) from error
 

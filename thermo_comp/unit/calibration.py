@@ -360,6 +360,18 @@ class Calibration:
         """
         return self.static, self.dynamic
 
+    @property
+    def has_uncertainty(self) -> bool:
+        """
+        Whether the calibration says anything of how well it is known; else it claims nothing.
+
+        """
+        return (
+            self.posterior is not None
+            or any(self.misalignment_sd)
+            or any(axis.residual_sd_m_s2 for part in self.regime_sets() for axis in part.axes())
+        )
+
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
     """

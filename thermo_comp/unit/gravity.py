@@ -1,13 +1,66 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns standard gravity, which defines the unit g and with it the micro-g.
+Owns standard gravity, which defines the unit g, and how accelerations are said and read in it.
 
 """
 
 from __future__ import annotations
 
+import math
+import re
+
 #: [m/s^2], exact by definition: 3rd General Conference on Weights and Measures, 1901.
 STANDARD_GRAVITY = 9.80665
 #: One micro-g, a unit of accelerometer errors [m/s^2].
 MICRO_G = 1e-6 * STANDARD_GRAVITY
+
+_UNITS = {
+    'ug': MICRO_G,
+    'µg': MICRO_G,
+    'mg': 1e-3 * STANDARD_GRAVITY,
+    'g': STANDARD_GRAVITY,
+    'm/s^2': 1.0,
+    'm/s²': 1.0,
+}
+
+
+def spoken(acceleration: float) -> str:
+    """
+    Say an error in ug, or from 1 mg on in mg, with two or three digits.
+
+    """
+    micro_g = acceleration / MICRO_G
+    if not abs(micro_g) >= 999.5:
+        return f'{micro_g:.2g} ug' if abs(micro_g) < 99.5 else f'{micro_g:.0f} ug'
+    milli_g = micro_g / 1e3
+    return f'{milli_g:.2g} mg' if abs(milli_g) < 99.5 else f'{milli_g:.0f} mg'
+
+
+def parse_acceleration(text: str) -> float:
+    """
+    Read an acceleration with its unit, like ``100ug``, ``0.5 mg`` or ``1e-3 m/s^2``.
+
+    Parameters
+    ----------
+    text : str
+        Number and unit.
+
+    Returns
+    -------
+    float
+        In m/s^2.
+
+    Raises
+    ------
+    ValueError
+        If it is not a positive number with a unit.
+
+    """
+    found = re.fullmatch(r'\s*(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)\s*(\S+)\s*', text)
+    value = float(found[1]) * _UNITS.get(found[2].replace('\u03bc', 'µ'), 0.0) if found else 0.0
+    if not 0.0 < value < math.inf:
+        raise ValueError(
+            f'expected a positive number with its unit, like 100ug or 1e-3m/s^2, got {text!r}'
+        )
+    return value

@@ -1,0 +1,406 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The judge: residuals known by hand, windows of the stated length, verdicts one by one.
+
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import GRAVITY, axis_set, calibration, regime_set
+
+from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.judging import Judgement, Verdict, Windows, evaluate, judge
+from thermo_comp.judging.table import COLUMNS, csv_of
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.recording import BagWriter, Topics, open_recording
+from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
+
+TOPICS = Topics()
+START_NS = 1_767_225_600_000_000_000
+K = 300.0
+SLOPE = 2.0  # counts per K on the z axis
+
+
+def resting(
+    path: Path,
+    temperature: float | tuple[float, float],
+    *,
+    minutes: float = 10.0,
+    rate_hz: float = 10.0,
+    noise: float = 0.0,
+    shaken_s: tuple[float, float] | None = None,
+    error: float = 0.0,
+    serial: str = '',
+) -> Path:
+    """
+    Write a unit at rest, z up, from one temperature to another, whose z axis drifts with it.
+
+    """
+    rng = np.random.default_rng(3)
+    begin, end = temperature if isinstance(temperature, tuple) else (temperature, temperature)
+    n = round(minutes * 60.0 * rate_hz)
+    seconds = (np.arange(n) + 1) / rate_hz
+    stamps = START_NS + np.rint(seconds * 1e9).astype(np.int64)
+    celsius = begin + (end - begin) * seconds / (minutes * 60.0)
+    counts = np.zeros((n, 3))
+    counts[:, 2] = K * GRAVITY + SLOPE * (celsius - 20.0) + error
+    counts += noise * rng.standard_normal((n, 3))
+    # What lives is never the same to the bit for long, and what is the same is not believed.
+    counts[::2, 0] += 1e-9
+    if shaken_s:
+        shaken = (seconds >= shaken_s[0]) & (seconds < shaken_s[1])
+        counts[shaken] += 300.0 * rng.standard_normal((int(shaken.sum()), 3))
+    with BagWriter(path, metadata={'serial': serial} if serial else None) as writer:
+        since = np.arange(round(minutes * 60.0))
+        readings = begin + (end - begin) * since / (minutes * 60.0) + 1e-7 * (since % 2)
+        for topic in (TOPICS.board, TOPICS.case):
+            writer.write_temperature(topic, START_NS + since * 10**9, readings)
+        writer.write_counts(TOPICS.counts, stamps, counts)
+    return path
+
+
+def corrected_by(slope: float, claim: float = 0.0, **changes: object) -> Calibration:
+    """
+    Correct the z axis by so much per K; claim so much [m/s^2].
+
+    """
+    parts = {name: axis_set(residual_sd_m_s2=claim) for name in 'xy'}
+    part = regime_set(**parts, z=axis_set((0.0, slope), residual_sd_m_s2=claim))
+    return dataclasses.replace(calibration(static=part, dynamic=part), **changes)
+
+
+def judged(bag: Path, one: Calibration, **keys: object) -> Judgement:
+    return evaluate([bag], [('it', one)], **keys).judgements['it']
+
+
+def made(
+    residual: float,
+    raw: float,
+    claimed: float,
+    n: int = 40,
+    dynamic: int = 10,
+    outside: int = 0,
+) -> Windows:
+    """
+    Make windows of one position, z up, whose figures are given in micro-g.
+
+    """
+    force, constant = np.zeros((n, 3)), np.zeros((n, 3))
+    force[:, 2] = GRAVITY + residual * MICRO_G
+    constant[:, 2] = GRAVITY + raw * MICRO_G
+    rows = np.arange(n)
+    return Windows(
+        window_s=60.0,
+        gravity=GRAVITY,
+        bag=np.zeros(n, np.int64),
+        position=np.zeros(n, np.int64),
+        start_ns=START_NS + rows * 60 * 10**9,
+        time=rows * 60.0 + 30.0,
+        count=np.full(n, 600.0),
+        mean=constant * K,
+        board=np.full(n, 20.0),
+        rate=np.zeros(n),
+        is_dynamic=rows < dynamic,
+        is_inside=rows >= outside,
+        raw=constant,
+        force=force,
+        claimed_sd=np.full(n, claimed * MICRO_G),
+        noise_sd=np.zeros(n),
+    )
+
+
+CLAIMING = corrected_by(SLOPE, 1e-5)
+
+
+class TestWindows:
+    def test_residuals_are_those_of_the_hand(self, tmp_path: Path) -> None:
+        # 10 K above the reference the z axis reads 20 counts too much: 20 / 300 m/s^2.
+        bag = resting(tmp_path / 'bag', 30.0)
+        models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
+        found = evaluate([bag], models).judgements
+        drift = SLOPE * 10.0 / K
+        # The thermometer's estimate of a steady reading is exact to 1e-7 K, 1e-9 m/s^2.
+        for name, expected in (('right', 0.0), ('half', drift / 2)):
+            windows = found[name].windows
+            np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
+            np.testing.assert_allclose(windows.residual, expected, atol=1e-9)
+            np.testing.assert_allclose(windows.board, 30.0, rtol=0.0, atol=1e-6)
+
+    def test_a_window_is_the_mean_of_what_the_node_publishes(self, tmp_path: Path) -> None:
+        # A ramp of 1 K/min, where a wrong time or a wrong reading would show.
+        bag = resting(tmp_path / 'bag', (15.0, 33.0), minutes=18.0, noise=0.2)
+        one = corrected_by(SLOPE)
+        windows = judged(bag, one).windows
+        compensator = Compensator(one)
+        with open_recording(bag) as reader:
+            blocks = [process_block(compensator, block) for block in reader.blocks()]
+        stamps = np.concatenate([block.stamp_ns for block in blocks])
+        force = np.concatenate([block.specific_force for block in blocks])
+        for start_ns, mean in zip(windows.start_ns, windows.force, strict=True):
+            inside = (stamps >= start_ns) & (stamps < start_ns + 60 * 10**9)
+            assert inside.sum() == 600
+            # The correction is a line over ten seconds: to a thousandth of a micro-g.
+            np.testing.assert_allclose(mean, force[inside].mean(axis=0), atol=1e-8)
+
+    @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
+    @pytest.mark.parametrize('window_s', [60.0, 120.0])
+    def test_windows_are_as_long_as_stated(
+        self, tmp_path: Path, rate_hz: float, window_s: float
+    ) -> None:
+        # WHY: 32 samples of 4 Hz are 8 s, and "ten seconds" were sixteen.
+        bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
+        windows = judged(bag, calibration(), window_s=window_s).windows
+        assert windows.window_s == window_s
+        np.testing.assert_array_equal(windows.count, rate_hz * window_s)
+        np.testing.assert_allclose(np.diff(windows.start_ns) * 1e-9, window_s, atol=1e-6)
+        # Whatever rests for so long is in one of them, but for the first board reading's time.
+        assert len(windows) >= int(20.5 * 60.0 / window_s) - 1
+
+    def test_samples_too_slow_for_a_window_are_refused(self, tmp_path: Path) -> None:
+        bag = resting(tmp_path / 'bag', 20.0, rate_hz=1.0)
+        with pytest.raises(RecordingError, match='too slow for windows of 10 s: 30 s or a mult'):
+            judged(bag, calibration(), window_s=10.0)
+
+    def test_only_windows_at_rest_are_judged(self, tmp_path: Path) -> None:
+        bag = resting(tmp_path / 'bag', 20.0, noise=0.3, shaken_s=(201.0, 222.0))
+        windows = judged(bag, calibration(), window_s=10.0).windows
+        inside = (windows.time > 196.0) & (windows.time < 227.0)
+        assert not inside.any()
+        assert len(windows) >= 55
+        assert np.unique(windows.position).tolist() == [0, 1]
+        # 0.3 counts of noise over 100 samples: 0.1 mm/s^2 per window.
+        assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
+
+    def test_noise_is_claimed_as_it_is(self, tmp_path: Path) -> None:
+        # White noise of sd 0.3 counts at 10 Hz, and a calibration that knows it.
+        density = 0.3 / K * np.sqrt(0.1)
+        unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
+        knows = calibration(unit=unit, noise_density_m_s2_sqrt_hz=(density,) * 3)
+        bag = resting(tmp_path / 'bag', 20.0, minutes=40.0, noise=0.3)
+        windows = judged(bag, knows, window_s=10.0).windows
+        ratio = windows.residual / windows.claimed_sd
+        # 240 windows: the RMS of a standard normal is 1 within 3 / sqrt(2 * 240).
+        assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.14)
+
+    def test_gravity_is_that_of_the_place(self, tmp_path: Path) -> None:
+        bag = resting(tmp_path / 'bag', 20.0)
+        found = judged(bag, calibration(), gravity=GRAVITY + 1e-3)
+        np.testing.assert_allclose(found.windows.residual, -1e-3, atol=1e-9)
+
+    def test_several_recordings_are_judged_as_one(self, tmp_path: Path) -> None:
+        bags = [
+            resting(tmp_path / name, at, error=error)
+            for name, at, error in (('one', 19.0, 0.3), ('two', 30.0, -0.3))
+        ]
+        found = evaluate(bags, [('it', CLAIMING)])
+        whole = found.judgements['it'].sections['all']
+        # +102 ug in the one, -102 ug in the other: nothing on average, 102 ug RMS.
+        assert whole.n == sum(judged(bag, CLAIMING).sections['all'].n for bag in bags)
+        assert whole.mean / MICRO_G == pytest.approx(0.0, abs=0.5)
+        assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)
+        assert found.notes == ()
+
+    def test_a_bag_that_never_rests_is_named(self, tmp_path: Path) -> None:
+        good = resting(tmp_path / 'good', 25.0)
+        short = resting(tmp_path / 'short', 25.0, minutes=0.5)
+        (note,) = evaluate([good, short], [('it', CLAIMING)]).notes
+        assert note.startswith(f'{short}: no window of 60 s at rest')
+
+    def test_refusals(self, tmp_path: Path) -> None:
+        bag = resting(tmp_path / 'bag', 20.0, minutes=1.0, serial='T-9')
+        with pytest.raises(ValueError, match='must hold at least one each'):
+            evaluate([bag], [])
+        with pytest.raises(ValueError, match='`window_s` must be positive, got 0'):
+            judged(bag, calibration(), window_s=0.0)
+        with pytest.raises(CalibrationError, match='is of unit T-1'):
+            judged(bag, calibration())
+        with pytest.raises(RecordingError, match='no window of 600 s at rest'):
+            judged(bag, calibration(), window_s=600.0, serial='')
+
+
+class TestVerdict:
+    @pytest.mark.parametrize(
+        ('residual', 'raw', 'claimed', 'verdict'),
+        [
+            (50.0, 1000.0, 60.0, 'valid'),
+            (119.0, 1000.0, 60.0, 'valid'),
+            (121.0, 1000.0, 60.0, 'recalibrate'),
+            (1100.0, 9000.0, 1500.0, 'valid, but it only claims 1.5 mg'),
+            (50.0, 100.0, 60.0, 'valid, but it only claims 60 ug'),
+            # However much is claimed, what is no better than raw is not valid.
+            (1100.0, 1000.0, 1500.0, 'no better than raw'),
+            (1000.0, 1000.0, 1500.0, 'no better than raw'),
+        ],
+    )
+    def test_by_its_own_claim(
+        self, residual: float, raw: float, claimed: float, verdict: str
+    ) -> None:
+        found = judge(made(residual, raw, claimed), CLAIMING)
+        assert found.verdict == verdict
+        assert found.is_valid == verdict.startswith('valid')
+        assert found.exit_code == (0 if found.is_valid else 1)
+        # Like beside like, over the same windows.
+        assert found.sections['all'].ratio == pytest.approx(residual / claimed)
+        for value in (residual, raw, claimed):
+            assert spoken(value * MICRO_G) in found.reason
+
+    @pytest.mark.parametrize(
+        ('residual', 'raw', 'claimed', 'verdict'),
+        [
+            (90.0, 1000.0, 10.0, 'valid'),  # nine times its claim, and yet good enough
+            (110.0, 1000.0, 200.0, 'recalibrate'),  # as claimed, and yet not good enough
+            (90.0, 1000.0, 200.0, 'valid, but it only claims 200 ug'),
+            (90.0, 80.0, 60.0, 'no better than raw'),
+        ],
+    )
+    def test_the_users_limit_decides(
+        self, residual: float, raw: float, claimed: float, verdict: str
+    ) -> None:
+        found = judge(made(residual, raw, claimed), CLAIMING, 100.0 * MICRO_G)
+        assert found.verdict == verdict
+        assert '100 ug tolerated' in found.reason
+
+    def test_no_uncertainty_makes_no_claim(self) -> None:
+        # WHY: an import that says nothing of itself was held to the noise and called wrong.
+        imported = corrected_by(SLOPE)
+        windows = made(50.0, 1000.0, 2.0)
+        found = judge(windows, imported)
+        assert found.verdict == 'no claim'
+        assert not found.is_valid
+        assert 'give a tolerance' in found.reason
+        assert np.isnan(found.sections['all'].claimed_rms)
+        assert judge(windows, imported, 60.0 * MICRO_G).verdict == 'valid'
+        assert judge(windows, imported, 40.0 * MICRO_G).verdict == 'recalibrate'
+        assert judge(made(50.0, 40.0, 2.0), imported).verdict == 'no better than raw'
+
+    def test_the_worse_regime_counts(self) -> None:
+        windows = made(50.0, 1000.0, 60.0)
+        worse = windows.force.copy()
+        worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
+        windows = dataclasses.replace(windows, force=worse)
+        # 84 ug in all of 60 claimed, but 150 in the dynamic regime.
+        found = judge(windows, CLAIMING)
+        assert found.sections['all'].ratio < 2.0
+        assert found.verdict == 'recalibrate'
+        assert judge(windows, CLAIMING, 100.0 * MICRO_G).verdict == 'recalibrate'
+
+    def test_what_is_outside_the_ranges_decides_nothing(self) -> None:
+        windows = made(50.0, 1000.0, 60.0, outside=10)
+        wild = windows.force.copy()
+        wild[:10, 2] = GRAVITY + 5000.0 * MICRO_G
+        found = judge(dataclasses.replace(windows, force=wild), CLAIMING)
+        assert found.verdict == 'valid'
+        assert found.sections['all'].n == 30
+        assert found.sections['outside'].n == 10
+        assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
+        # Nor can it make anything valid.
+        bad = windows.force.copy()
+        bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
+        found = judge(dataclasses.replace(windows, force=bad), CLAIMING)
+        assert found.verdict == 'recalibrate'
+        for tolerance in (None, 1.0):
+            found = judge(made(1.0, 1000.0, 60.0, outside=40), CLAIMING, tolerance)
+            assert found.verdict == 'outside the calibrated range: not judged'
+            assert not found.is_valid
+
+    def test_outside_is_told_from_a_bag(self, tmp_path: Path) -> None:
+        _, upper = CLAIMING.static.temperature_range_c
+        found = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
+        assert found.kind is Verdict.OUTSIDE
+        assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in found.reason
+        # The noise of the thermometer does not carry a soak at the range's end out of it.
+        edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
+        assert edge.sections['outside'].n == 0
+
+    def test_refusals(self) -> None:
+        windows = made(50.0, 1000.0, 60.0)
+        with pytest.raises(ValueError, match='`windows` must hold at least one'):
+            judge(windows.select(windows.time < 0.0), CLAIMING)
+        with pytest.raises(ValueError, match='`tolerance` must be positive, got -1'):
+            judge(windows, CLAIMING, -1.0)
+
+
+def around(
+    n: int, bias: tuple[float, ...], scale: tuple[float, ...], noise: float = 0.0
+) -> Windows:
+    """
+    Make windows of a unit in n positions whose axes have moved by so much [m/s^2], [1].
+
+    """
+    rng = np.random.default_rng(5)
+    faces = np.vstack((np.eye(3), -np.eye(3)))
+    others = rng.standard_normal((max(n - 6, 0), 3))
+    up = np.vstack((faces, others / np.linalg.norm(others, axis=1, keepdims=True)))[:n]
+    position = np.repeat(np.arange(n), 12)
+    force = up[position] * GRAVITY * (1.0 + np.array(scale)) + np.array(bias)
+    force += noise * rng.standard_normal(force.shape)
+    windows = made(0.0, 1000.0, 2.0, n=12 * n)
+    return dataclasses.replace(windows, position=position, force=force)
+
+
+class TestShifts:
+    @pytest.mark.parametrize('n', [6, 18])
+    def test_what_moved_is_named(self, n: int) -> None:
+        moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
+        # The noise of one window, half a micro-g, claims 2 ug: 12 of them in each position.
+        found = judge(moved, corrected_by(SLOPE, 1e-5), None)
+        assert found.n_positions >= min(n, 12)
+        assert found.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.0)
+        assert found.shifts[1].scale == pytest.approx(30e-6, abs=1.5e-6)
+        assert abs(found.shifts[2].bias) < 3.0 * found.shifts[2].bias_sd
+        assert [said.split(' +')[0] for said in found.moved] == ['x bias', 'y scale']
+        assert found.verdict == 'recalibrate'
+        assert '; moved: x bias +' in found.reason
+
+    def test_a_unit_as_it_was_has_not_moved(self) -> None:
+        found = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
+        assert (len(found.shifts), found.moved, found.verdict) == (3, (), 'valid')
+
+    def test_five_positions_tell_no_shifts(self) -> None:
+        found = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
+        assert (found.shifts, found.n_positions) == ((), 5)
+
+    def test_wander_is_about_the_mean_of_a_position(self) -> None:
+        windows = made(0.0, 1000.0, 60.0, n=40, dynamic=20)
+        force = windows.force.copy()
+        force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
+        found = judge(dataclasses.replace(windows, force=force), CLAIMING)
+        np.testing.assert_allclose(found.wander, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
+
+
+def test_windows_as_a_table() -> None:
+    windows = made(50.0, 1000.0, 60.0, outside=3)
+    first, *rows = csv.reader(io.StringIO(csv_of(windows, ['a,"b".mcap'])))
+    assert tuple(first) == COLUMNS
+    assert len(rows) == len(windows)
+    row = dict(zip(first, rows[0], strict=True))
+    assert (row['bag'], row['position'], row['start_ns']) == ('a,"b".mcap', '1', str(START_NS))
+    assert (row['regime'], row['is_inside'], rows[-1][8]) == ('dynamic', '0', 'static')
+    assert float(row['residual_ug']) == pytest.approx(50.0)
+    assert float(row['claimed_sd_ug']) == pytest.approx(60.0)
+
+
+@pytest.mark.parametrize(
+    ('text', 'micro_g'),
+    [('100ug', 100.0), ('100 µg', 100.0), ('0.5mg', 500.0), ('9.80665e-4m/s^2', 100.0)],
+)
+def test_accelerations_are_read_with_their_unit(text: str, micro_g: float) -> None:
+    assert parse_acceleration(text) / MICRO_G == pytest.approx(micro_g)
+
+
+@pytest.mark.parametrize(
+    'text', ['', '100', 'ug', '-1ug', '1 parsec', '1e999ug', '0mg', '1.2.3mg']
+)
+def test_accelerations_without_sense_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match='expected a positive number with its unit, like 100ug'):
+        parse_acceleration(text)

@@ -1,0 +1,305 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the judgement of a calibration on recordings: one verdict, with its numbers and exit code.
+
+At rest ``|f|`` is local gravity in any attitude, so no fixture is needed. Like is compared with
+like: the RMS of the residual with the RMS of what is claimed for the very same windows. What lies
+outside the calibrated ranges is told apart and decides nothing.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from ..typing import Bools, Floats
+from ..unit.calibration import Calibration
+from ..unit.gravity import MICRO_G, spoken
+from ..unit.metrics import residual_statistics
+from .shifts import AxisShift, axis_shifts, distinct_positions, wander, what_moved
+from .windows import Windows
+
+#: A calibration holds while its error is within this many times what it claims.
+LARGEST_RATIO = 2.0
+# A claim promises little if it is not below this part of the raw error, or above 1 mg.
+_WIDE_PART, _WIDE_CLAIM = 0.5, 1e3 * MICRO_G
+# Fewer windows of a regime are judged with the others only.
+_FEWEST = 6
+
+SECTIONS = ('static', 'dynamic', 'all', 'outside')
+
+
+class Verdict(Enum):
+    """
+    The verdicts; the value is the verdict's wording.
+
+    """
+
+    VALID = 'valid'
+    WIDE = 'valid, but it only claims'
+    RECALIBRATE = 'recalibrate'
+    NO_BETTER = 'no better than raw'
+    OUTSIDE = 'outside the calibrated range: not judged'
+    NO_CLAIM = 'no claim'
+
+    @property
+    def is_valid(self) -> bool:
+        """
+        Whether the calibration was shown to hold.
+
+        """
+        return self in (Verdict.VALID, Verdict.WIDE)
+
+
+@dataclass(frozen=True)
+class Section:
+    """
+    ``|f| - g`` of one section.
+
+    Parameters
+    ----------
+    n : int
+        Windows.
+    raw_rms, raw_peak : float
+        RMS and largest magnitude by the constants at the reference temperature [m/s^2].
+    rms, mean, peak : float
+        RMS, mean and largest magnitude by the calibration.
+    claimed_rms : float
+        RMS of what is claimed for the same windows; NaN where nothing is claimed.
+
+    """
+
+    n: int
+    raw_rms: float
+    raw_peak: float
+    rms: float
+    mean: float
+    peak: float
+    claimed_rms: float
+
+    @property
+    def ratio(self) -> float:
+        """
+        RMS over claimed RMS.
+
+        """
+        return self.rms / self.claimed_rms
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """
+    What recordings tell of a calibration.
+
+    Parameters
+    ----------
+    kind : Verdict
+        The verdict.
+    reason : str
+        One sentence of numbers.
+    sections : dict of {str: Section}
+        ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside`` them.
+    tolerance : float or None
+        The user's acceptance limit [m/s^2].
+    shifts : tuple of AxisShift
+        Per axis; empty with fewer than six distinct positions.
+    moved : tuple of str
+        The shifts that are sure, in words.
+    wander : ndarray, shape (2, 3)
+        See `shifts.wander`.
+    n_positions : int
+        Distinct positions.
+    windows : Windows
+        What it rests on.
+
+    """
+
+    kind: Verdict
+    reason: str
+    sections: dict[str, Section]
+    tolerance: float | None
+    shifts: tuple[AxisShift, ...]
+    moved: tuple[str, ...]
+    wander: Floats
+    n_positions: int
+    windows: Windows
+
+    @property
+    def is_valid(self) -> bool:
+        """
+        Whether the calibration was shown to hold.
+
+        """
+        return self.kind.is_valid
+
+    @property
+    def exit_code(self) -> int:
+        """
+        0 for a calibration that was shown to hold, else 1.
+
+        """
+        return 0 if self.is_valid else 1
+
+    @property
+    def verdict(self) -> str:
+        """
+        The verdict in words.
+
+        """
+        if self.kind is Verdict.WIDE:
+            return f'{self.kind.value} {spoken(self.sections["all"].claimed_rms)}'
+        return str(self.kind.value)
+
+    def __str__(self) -> str:
+        """
+        Give the verdict with its numbers, as every command prints it.
+
+        """
+        return f'{self.verdict}: {self.reason}'
+
+    def facts(self) -> dict[str, Any]:
+        """
+        Give everything but the windows, as every command's JSON holds it.
+
+        """
+        return {
+            'verdict': self.verdict,
+            'reason': self.reason,
+            'is_valid': self.is_valid,
+            'gravity_m_s2': self.windows.gravity,
+            'window_s': self.windows.window_s,
+            'tolerance_m_s2': self.tolerance,
+            'sections_m_s2': {
+                name: {**asdict(one), 'ratio': one.ratio} for name, one in self.sections.items()
+            },
+            'n_positions': self.n_positions,
+            'moved': self.moved,
+            'shifts': self.shifts,
+            'wander_m_s2': self.wander,
+        }
+
+
+def judge(windows: Windows, calibration: Calibration, tolerance: float | None = None) -> Judgement:
+    """
+    Judge a calibration by its windows.
+
+    Parameters
+    ----------
+    windows : Windows
+        At least one; see `corrected_windows`.
+    calibration : Calibration
+        The calibration.
+    tolerance : float or None, optional
+        The largest RMS that the user accepts in either regime [m/s^2]; it decides where given.
+
+    Returns
+    -------
+    Judgement
+        Verdict, numbers and evidence.
+
+    Raises
+    ------
+    ValueError
+        If there is no window, or `tolerance` is not positive.
+
+    """
+    if not len(windows):
+        raise ValueError('`windows` must hold at least one')
+    if tolerance is not None and not 0.0 < tolerance < np.inf:
+        raise ValueError(f'`tolerance` must be positive, got {tolerance:g}')
+    inside, dynamic = windows.is_inside, windows.is_dynamic
+    claims = calibration.has_uncertainty
+    sections = {
+        name: _section(windows, rows, claims)
+        for name, rows in zip(
+            SECTIONS, (inside & ~dynamic, inside & dynamic, inside, ~inside), strict=True
+        )
+    }
+    shifts = axis_shifts(windows.select(inside), calibration.misalignment_sd)
+    moved = what_moved(shifts) if claims else ()
+    kind, reason = _verdict(windows, sections, tolerance, moved, claims)
+    return Judgement(
+        kind=kind,
+        reason=reason,
+        sections=sections,
+        tolerance=tolerance,
+        shifts=shifts,
+        moved=moved,
+        wander=wander(windows),
+        n_positions=distinct_positions(windows),
+        windows=windows,
+    )
+
+
+def _section(windows: Windows, rows: Bools, claims: bool) -> Section:
+    raw = residual_statistics(windows.raw_residual[rows])
+    corrected = residual_statistics(windows.residual[rows])
+    claimed = residual_statistics(windows.claimed_sd[rows]).rms if claims else np.nan
+    return Section(
+        corrected.n, raw.rms, raw.peak, corrected.rms, corrected.mean, corrected.peak, claimed
+    )
+
+
+def _verdict(
+    windows: Windows,
+    sections: dict[str, Section],
+    tolerance: float | None,
+    moved: tuple[str, ...],
+    claims: bool,
+) -> tuple[Verdict, str]:
+    one, outside = sections['all'], sections['outside']
+    if not one.n:
+        reason = (
+            f'all {_windows(outside.n, windows)} lie there, {_span(windows)}; {_numbers(outside)}'
+        )
+        return Verdict.OUTSIDE, reason
+    judged = [s for s in (sections['static'], sections['dynamic']) if s.n >= _FEWEST] or [one]
+    worst = max((*judged, one), key=lambda s: s.rms)
+    ratio = max(s.ratio for s in (*judged, one))
+    # A NaN of no claim compares false.
+    is_wide = one.claimed_rms > (tolerance or min(_WIDE_PART * one.raw_rms, _WIDE_CLAIM))
+    if one.rms >= one.raw_rms:
+        kind = Verdict.NO_BETTER
+    elif tolerance is not None and worst.rms > tolerance:
+        kind = Verdict.RECALIBRATE
+    elif tolerance is None and not claims:
+        kind = Verdict.NO_CLAIM
+    elif tolerance is None and (ratio > LARGEST_RATIO or moved):
+        kind = Verdict.RECALIBRATE
+    else:
+        kind = Verdict.WIDE if is_wide else Verdict.VALID
+    said = [f'{_numbers(one)} over {_windows(one.n, windows)}']
+    if tolerance is not None:
+        said.append(f'{spoken(worst.rms)} in the worse regime, {spoken(tolerance)} tolerated')
+    elif claims:
+        said.append(f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}')
+    else:
+        said.append('the calibration says nothing of its uncertainty: give a tolerance')
+    if moved:
+        said.append('moved: ' + ', '.join(moved))
+    if outside.n:
+        said.append(
+            f'{_windows(outside.n, windows)} outside the calibrated ranges not judged: '
+            f'{spoken(outside.rms)}'
+        )
+    return kind, '; '.join(said)
+
+
+def _numbers(section: Section) -> str:
+    said = f'{spoken(section.rms)} RMS of |f| - g, {spoken(section.raw_rms)} raw'
+    if np.isfinite(section.claimed_rms):
+        said += f', {spoken(section.claimed_rms)} claimed'
+    return said
+
+
+def _windows(n: int, windows: Windows) -> str:
+    return f'{n} {"window" if n == 1 else "windows"} of {windows.window_s:g} s'
+
+
+def _span(windows: Windows) -> str:
+    return f'at {np.min(windows.board):.1f} to {np.max(windows.board):.1f} degC'

@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what has moved since a calibration: nine constants fitted once more to the corrected rests.
+
+In each position ``|f| = g`` whatever the attitude. What bias, scale and misalignment it takes to
+make it so for all positions is what the axes have moved by; a calibration that still holds takes
+none.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..typing import Floats
+from ..unit.gravity import MICRO_G
+from .windows import Windows
+
+#: Distinct positions that nine constants need; bias and scale of three axes are six of them.
+POSITIONS_NEEDED = 6
+# Directions closer than this are one position measured twice.
+_SAME_DIRECTION_DEG = 5.0
+# A shift must be this sure to be called one.
+_SURE_SDS = 3.0
+# Nobody knows a misalignment better than this [rad], nor the mean of a position [1].
+_SMALLEST_SKEW, _SMALLEST_MISS = 1e-5, 1e-8
+# What temperature leaves is alike in windows that follow each other, some so many.
+_ALIKE = 6.0
+
+
+@dataclass(frozen=True)
+class AxisShift:
+    """
+    What one axis differs by from the calibration.
+
+    Parameters
+    ----------
+    bias, bias_sd : float
+        Shift of the bias [m/s^2] and its standard deviation, what the calibration claims included.
+    scale, scale_sd : float
+        Relative shift of the scale, and its standard deviation.
+
+    """
+
+    bias: float
+    bias_sd: float
+    scale: float
+    scale_sd: float
+
+
+def distinct_positions(windows: Windows) -> int:
+    """
+    Count the directions that differ by more than five degrees.
+
+    """
+    kept: list[Floats] = []
+    limit = np.cos(np.radians(_SAME_DIRECTION_DEG))
+    for mean in _means(windows, windows.force):
+        direction = mean / np.linalg.norm(mean)
+        if all(float(direction @ other) < limit for other in kept):
+            kept.append(direction)
+    return len(kept)
+
+
+def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:
+    """
+    Fit nine constants to the positions' means of the corrected force.
+
+    Parameters
+    ----------
+    windows : Windows
+        The windows.
+    misalignment_sd : tuple of float
+        How well the calibration knows the three elements of M.
+
+    Returns
+    -------
+    tuple of AxisShift
+        Per axis; empty with fewer than six distinct positions.
+
+    """
+    from scipy.optimize import least_squares
+
+    if distinct_positions(windows) < POSITIONS_NEEDED:
+        return ()
+    gravity = windows.gravity
+    # Where a calibration claims little, as while its lags are unknown, it is asked little.
+    weight = 1.0 / np.maximum(windows.claimed_sd, _SMALLEST_MISS) ** 2
+    known = _means(windows, weight)
+    force = _means(windows, windows.force * weight[:, None]) / known[:, None] / gravity
+    residual = windows.residual
+    scatter = _means(windows, residual**2) - _means(windows, residual) ** 2
+    variance = 1.0 / known + scatter / np.maximum(_counts(windows) / _ALIKE, 1.0)
+    sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_MISS)
+    skew_sd = np.maximum(misalignment_sd, _SMALLEST_SKEW)
+
+    def misses(constants: Floats) -> Floats:
+        bias, scale, skew = constants.reshape(3, 3)
+        x, y, z = ((force - bias) / (1.0 + scale)).T
+        true = np.stack((x, y + skew[0] * x, z + skew[1] * x + skew[2] * y))
+        return np.concatenate(((np.linalg.norm(true, axis=0) - 1.0) / sd, skew / skew_sd))
+
+    found = least_squares(misses, np.zeros(9), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    # What the constants leave unexplained makes them less sure.
+    freedom = len(sd) - 6
+    excess = max(1.0, 2.0 * found.cost / freedom) if freedom > 0 else 1.0
+    jacobian = np.asarray(found.jac)
+    spread = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * excess)
+    return tuple(
+        AxisShift(
+            bias=float(found.x[i]) * gravity,
+            bias_sd=float(spread[i]) * gravity,
+            scale=float(found.x[3 + i]),
+            scale_sd=float(spread[3 + i]),
+        )
+        for i in range(3)
+    )
+
+
+def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
+    """
+    Name the shifts that are sure, as in ``z bias +12 +- 3 ug``.
+
+    """
+    said = []
+    for axis, shift in zip('xyz', shifts, strict=False):
+        for name, value, sd, unit in (
+            ('bias', shift.bias / MICRO_G, shift.bias_sd / MICRO_G, 'ug'),
+            ('scale', 1e6 * shift.scale, 1e6 * shift.scale_sd, 'ppm'),
+        ):
+            if abs(value) > _SURE_SDS * sd:
+                said.append(f'{axis} {name} {value:+.3g} +- {sd:.2g} {unit}')
+    return tuple(said)
+
+
+def wander(windows: Windows) -> Floats:
+    """
+    Tell what moves each axis at rest, to a constant, whatever the number of positions.
+
+    Parameters
+    ----------
+    windows : Windows
+        The windows.
+
+    Returns
+    -------
+    ndarray, shape (2, 3)
+        RMS of each axis about its mean in a position [m/s^2], static and dynamic; NaN without.
+
+    """
+    _, place = np.unique(windows.position, return_inverse=True)
+    about = windows.force - _means(windows, windows.force)[place]
+    return np.array(
+        [
+            np.sqrt(np.mean(about[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)
+            for rows in (~windows.is_dynamic, windows.is_dynamic)
+        ]
+    )
+
+
+def _counts(windows: Windows) -> Floats:
+    return np.unique(windows.position, return_counts=True)[1].astype(np.float64)
+
+
+def _means(windows: Windows, values: Floats) -> Floats:
+    """
+    Average by position.
+
+    """
+    found, place = np.unique(windows.position, return_inverse=True)
+    total = np.zeros((len(found), *values.shape[1:]))
+    np.add.at(total, place, values)
+    return np.asarray(total / _counts(windows).reshape(-1, *[1] * (values.ndim - 1)))

@@ -1,0 +1,399 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the windows that a judgement rests on: means at rest of exactly the stated length.
+
+A window is a run of whole sums of one still interval. Its mean goes through the compensator as a
+sample does, with the readings that came before it, so that force, covariance and regime are the
+node's; what is kept of a bag of any length is a row per window.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..errors import RecordingError
+from ..fitting.reduction import ReducedBag, StillInterval
+from ..online.compensator import Compensator
+from ..online.snapshot import take_snapshot
+from ..online.status import CompensatorConfig
+from ..typing import Bools, Floats, Ints, Stamps
+from ..unit.calibration import Calibration
+from ..unit.metrics import norm_residual
+
+#: Length of a window unless the user says otherwise [s].
+WINDOW_S = 60.0
+# The sums that windows are made of are no longer than this [s]: the thermal state moves little.
+_LONGEST_SUM_S = 10.0
+# Less than this beyond a calibrated range, in half ranges, is its edge: thermometers have noise.
+_EDGE = 0.02
+# A sum of fewer than this part of the usual samples does not last as long.
+_LEAST_FILLED = 0.9
+
+
+@dataclass(frozen=True)
+class Windows:
+    """
+    Windows at rest, of all bags, in order.
+
+    Parameters
+    ----------
+    window_s, gravity : float
+        Length of each [s], and local gravity where they were recorded.
+    bag, position : ndarray of int64, shape (n,)
+        Number of the bag, and of the still interval, counted through all bags.
+    start_ns : ndarray of int64, shape (n,)
+        Stamp at which the window begins.
+    time : ndarray, shape (n,)
+        Its middle since the bag's first sample [s].
+    count : ndarray, shape (n,)
+        Samples in it.
+    mean : ndarray, shape (n, 3)
+        Mean of the raw samples.
+    board, rate : ndarray, shape (n,)
+        Board temperature and its rate [K/s].
+    is_dynamic, is_inside : ndarray of bool, shape (n,)
+        Whether the dynamic set prevails; whether all of it lies inside the calibrated ranges.
+    raw, force : ndarray, shape (n, 3)
+        Specific force by the constants at the reference temperature, and by the calibration.
+    claimed_sd : ndarray, shape (n,)
+        Standard deviation claimed for the norm of `force`: the calibration's error and the white
+        noise of the mean.
+    noise_sd : ndarray, shape (n,)
+        The white noise alone.
+
+    """
+
+    window_s: float
+    gravity: float
+    bag: Ints
+    position: Ints
+    start_ns: Stamps
+    time: Floats
+    count: Floats
+    mean: Floats
+    board: Floats
+    rate: Floats
+    is_dynamic: Bools
+    is_inside: Bools
+    raw: Floats
+    force: Floats
+    claimed_sd: Floats
+    noise_sd: Floats
+
+    def __len__(self) -> int:
+        """
+        Count the windows.
+
+        """
+        return len(self.time)
+
+    def select(self, rows: Bools) -> Windows:
+        """
+        Keep some of the windows.
+
+        """
+        kept = {
+            one.name: getattr(self, one.name)[rows]
+            for one in fields(self)
+            if one.name not in ('window_s', 'gravity')
+        }
+        return replace(self, **kept)
+
+    @cached_property
+    def raw_residual(self) -> Floats:
+        """
+        ``|f| - g`` by the constants alone, shape (n,).
+
+        """
+        return norm_residual(self.raw, self.gravity)
+
+    @cached_property
+    def residual(self) -> Floats:
+        """
+        ``|f| - g`` by the calibration, shape (n,).
+
+        """
+        return norm_residual(self.force, self.gravity)
+
+
+def sum_length(window_s: float) -> float:
+    """
+    Choose the length of the sums that windows are put together from.
+
+    Parameters
+    ----------
+    window_s : float
+        Length of a window [s].
+
+    Returns
+    -------
+    float
+        The longest part of it up to ten seconds, for `fitting.reduction`.
+
+    Raises
+    ------
+    ValueError
+        If `window_s` is not positive.
+
+    """
+    if not 0.0 < window_s < np.inf:
+        raise ValueError(f'`window_s` must be positive, got {window_s:g}')
+    return window_s / float(np.ceil(window_s / _LONGEST_SUM_S))
+
+
+def usual_window(bags: Sequence[ReducedBag]) -> float:
+    """
+    Choose the length of the windows of bags that were not read for a length in particular [s].
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        At least one.
+
+    Returns
+    -------
+    float
+        60 s, or what is next to it where the bags' sums do not fill that.
+
+    """
+    longest = max(bag.window_s for bag in bags)
+    return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
+
+
+def corrected_windows(
+    bags: Sequence[ReducedBag],
+    calibration: Calibration,
+    *,
+    gravity: float | None = None,
+    window_s: float = WINDOW_S,
+    config: CompensatorConfig | None = None,
+) -> Windows:
+    """
+    Correct the windows of bags.
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        Bags of the calibration's unit.
+    calibration : Calibration
+        The calibration.
+    gravity : float or None, optional
+        Local gravity where they were recorded; the calibration's by default.
+    window_s : float, optional
+        Length of a window [s].
+    config : CompensatorConfig or None, optional
+        The node's settings.
+
+    Returns
+    -------
+    Windows
+        Empty where nothing rests for as long with a temperature.
+
+    Raises
+    ------
+    RecordingError
+        If the samples of a bag are too slow for such windows.
+
+    """
+    # A window's mean is no sample: what looks for stuck or too large ones would misread it.
+    config = replace(
+        config or CompensatorConfig(), stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
+    )
+
+    def correct(bag: ReducedBag, sums: Floats) -> None:
+        _correct(Compensator(calibration, config), bag, sums)
+
+    table = _table(bags, window_s, correct)
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    K = np.array([axis.scale_factor for axis in axes])
+    bias = np.array([axis.bias for axis in axes])
+    M = np.array(calibration.misalignment)
+    along = table[:, _FORCE] / np.linalg.norm(table[:, _FORCE], axis=1, keepdims=True) @ M
+    white = along**2 @ np.array(Compensator(calibration, config).thermal.correction.noise)
+    mean_white = white / table[:, _COUNT]
+    return _windows(
+        bags,
+        table,
+        window_s,
+        calibration.gravity_m_s2 if gravity is None else gravity,
+        raw=np.asarray((table[:, _MEAN] - bias) / K @ M.T),
+        claimed_sd=np.sqrt(np.maximum(table[:, _VARIANCE] - white, 0.0) + mean_white),
+        noise_sd=np.sqrt(mean_white),
+    )
+
+
+def raw_windows(bags: Sequence[ReducedBag], gravity: float, window_s: float) -> Windows:
+    """
+    Take the windows of bags as they are: static all of them, inside any range, without a claim.
+
+    Parameters
+    ----------
+    bags : sequence of ReducedBag
+        Bags with a board temperature.
+    gravity : float
+        Local gravity; NaN where nobody knows it.
+    window_s : float
+        Length of a window [s].
+
+    Returns
+    -------
+    Windows
+        Its forces are the means of the samples.
+
+    Raises
+    ------
+    RecordingError
+        If the samples of a bag are too slow for such windows.
+
+    """
+
+    def keep(bag: ReducedBag, sums: Floats) -> None:
+        since = (bag.board.stamp_ns - bag.start_ns) * 1e-9
+        sums[:, _BOARD] = np.interp(sums[:, _TIME], since, bag.board.value)
+        sums[:, _FORCE] = sums[:, _MEAN]
+        sums[:, [_RATE, _WEIGHT, _EXCESS, _VARIANCE]] = 0.0
+
+    table = _table(bags, window_s, keep)
+    nothing = np.full(len(table), np.nan)
+    return _windows(
+        bags, table, window_s, gravity, table[:, _MEAN], claimed_sd=nothing, noise_sd=nothing
+    )
+
+
+# Columns of a sum and of a window. Averaged over a window's sums are all from the time on.
+_BAG, _POSITION, _START, _COUNT, _EXCESS, _TIME, _BOARD, _RATE, _WEIGHT, _VARIANCE = range(10)
+_MEAN, _FORCE, _WIDTH = slice(10, 13), slice(13, 16), 16
+
+
+def _table(
+    bags: Sequence[ReducedBag], window_s: float, correct: Callable[[ReducedBag, Floats], None]
+) -> Floats:
+    """
+    Put the sums of bags together to windows, a row each.
+
+    """
+    parts = [np.zeros((0, _WIDTH))]
+    first_position = 0
+    for number, bag in enumerate(bags):
+        per = max(1, round(window_s / bag.window_s))
+        if abs(per * bag.window_s - window_s) > 1e-6 * window_s:
+            raise RecordingError(
+                f'its samples are too slow for windows of {window_s:g} s: {bag.window_s:g} s or '
+                'a multiple of it are needed',
+                path=bag.source.name,
+            )
+        sums = [
+            _sums(interval, bag.window_s, interval.n_whole // per * per)
+            for interval in bag.intervals
+        ]
+        for place, one in enumerate(sums):
+            one[:, _BAG], one[:, _POSITION] = number, first_position + place
+        first_position += len(sums)
+        if any(map(len, sums)):
+            whole = np.concatenate(sums)
+            correct(bag, whole)
+            # Messages were lost, or the bag ends within it.
+            usual = np.median(whole[:, _COUNT])
+            whole[whole[:, _COUNT] < _LEAST_FILLED * usual, _EXCESS] = np.nan
+            parts.append(_joined(whole, per))
+    return np.concatenate(parts)
+
+
+def _sums(interval: StillInterval, sum_s: float, n: int) -> Floats:
+    sums = np.full((n, _WIDTH), np.nan)
+    sums[:, _START] = interval.begin_s + sum_s * np.arange(n)
+    sums[:, _COUNT] = interval.count[:n]
+    sums[:, _TIME] = interval.time[:n]
+    sums[:, _MEAN] = interval.mean[:n]
+    return sums
+
+
+def _joined(sums: Floats, per: int) -> Floats:
+    """
+    Join so many sums to a window each; out are those that were not corrected as a whole.
+
+    """
+    grouped = sums.reshape(-1, per, _WIDTH)
+    count = grouped[:, :, _COUNT]
+    result = np.array(grouped[:, 0])
+    result[:, _COUNT] = count.sum(axis=1)
+    result[:, _EXCESS] = grouped[:, :, _EXCESS].max(axis=1)
+    share = count / count.sum(axis=1, keepdims=True)
+    result[:, _TIME:] = np.einsum('nk,nkc->nc', share, grouped[:, :, _TIME:])
+    return np.asarray(result[np.isfinite(result[:, _EXCESS])])
+
+
+def _windows(
+    bags: Sequence[ReducedBag],
+    table: Floats,
+    window_s: float,
+    gravity: float,
+    raw: Floats,
+    claimed_sd: Floats,
+    noise_sd: Floats,
+) -> Windows:
+    bag = table[:, _BAG].astype(np.int64)
+    origin = np.array([one.start_ns for one in bags], dtype=np.int64)
+    return Windows(
+        window_s=window_s,
+        gravity=gravity,
+        bag=bag,
+        position=table[:, _POSITION].astype(np.int64),
+        start_ns=np.rint(table[:, _START] * 1e9).astype(np.int64) + origin[bag],
+        time=table[:, _TIME],
+        count=table[:, _COUNT],
+        mean=table[:, _MEAN],
+        board=table[:, _BOARD],
+        rate=table[:, _RATE],
+        is_dynamic=table[:, _WEIGHT] > 0.5,
+        is_inside=table[:, _EXCESS] <= _EDGE,
+        raw=raw,
+        force=table[:, _FORCE],
+        claimed_sd=claimed_sd,
+        noise_sd=noise_sd,
+    )
+
+
+def _correct(compensator: Compensator, bag: ReducedBag, sums: Floats) -> None:
+    """
+    Run sums through the compensator, with the readings that came before each.
+
+    """
+    stamps = np.concatenate((bag.board.stamp_ns, bag.case.stamp_ns))
+    order = np.argsort(stamps, kind='stable')
+    values = np.concatenate((bag.board.value, bag.case.value))[order].tolist()
+    is_case = (order >= len(bag.board.value)).tolist()
+    readings = zip(stamps[order].tolist(), values, is_case, strict=True)
+    reading = next(readings, None)
+    for row in sums:
+        stamp_ns = bag.start_ns + round(float(row[_TIME]) * 1e9)
+        while reading is not None and reading[0] <= stamp_ns:
+            compensator.push('case' if reading[2] else 'board', *reading[:2])
+            compensator.flush(reading[0])
+            reading = next(readings, None)
+        corrected = compensator.process(stamp_ns, *row[_MEAN].tolist())
+        status = take_snapshot(compensator)
+        if corrected is None or status.state is None:
+            continue
+        row[_FORCE] = corrected[:3]
+        row[_VARIANCE] = _along(corrected[:3], corrected[3:])
+        row[_EXCESS] = status.relative_excess
+        state = status.state
+        row[_BOARD], row[_RATE], row[_WEIGHT] = state.board, state.rate, state.weight
+
+
+def _along(force: Sequence[float], covariance: Sequence[float]) -> float:
+    """
+    Project a covariance xx, xy, xz, yy, yz, zz on the direction of a force.
+
+    """
+    x, y, z = force
+    xx, xy, xz, yy, yz, zz = covariance
+    square = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)
+    return square / (x * x + y * y + z * z)

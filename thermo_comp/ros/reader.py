@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the reading of calibrations beside the samples, in a process of its own.
+
+A parser holds the interpreter for milliseconds at a time, which no thread can help; and whatever
+a file makes of its reader, the node only hears that it has ended.
+
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, cast
+
+from ..errors import CalibrationError
+from ..files import read_bounded
+from ..unit.calibration import Calibration
+from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
+
+#: Added to the niceness of the process: the samples go first.
+NICENESS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedCalibration:
+    """
+    A calibration and the file it stands for.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    path : str
+        As the user gave it.
+    sha256 : str
+        Of the very bytes that were parsed.
+
+    """
+
+    calibration: Calibration
+    path: str
+    sha256: str
+
+
+def read(name: str, directory: str = '') -> LoadedCalibration:
+    """
+    Read a calibration, for whichever unit.
+
+    Parameters
+    ----------
+    name : str
+        Path of the file.
+    directory : str, optional
+        Where it must lie, symbolic links followed; anywhere if empty.
+
+    Returns
+    -------
+    LoadedCalibration
+        Parsed and validated.
+
+    Raises
+    ------
+    CalibrationError
+        If it is not a valid calibration; names the path as given and the rule, and quotes nothing
+        of a file that is no calibration.
+
+    """
+    try:
+        content = read_bounded(_allowed(name, directory), SIZE_LIMIT)
+        calibration = parse_calibration(content, name)
+    except CalibrationError as error:
+        if error.rule is None:
+            raise
+        raise CalibrationError(error.rule, name) from error
+    except Exception as error:
+        # RuntimeError: the home folder of a user that there is not. Whatever else it may be, a
+        # file does not end the node.
+        is_told = isinstance(error, OSError) or type(error) is ValueError
+        reason = getattr(error, 'strerror', None) or (is_told and str(error))
+        raise CalibrationError(
+            f'cannot be read: {reason or type(error).__name__}', name
+        ) from error
+    return LoadedCalibration(calibration, name, hashlib.sha256(content).hexdigest())
+
+
+def _allowed(name: str, directory: str) -> Path:
+    """
+    Resolve a path, symbolic links included; CalibrationError where it leads out of the directory.
+
+    """
+    path = Path(name).expanduser()
+    if not directory:
+        return path
+    path, root = path.resolve(), Path(directory).expanduser().resolve()
+    if not path.is_relative_to(root):
+        raise CalibrationError(
+            'must be in the folder that the parameter `calibration_directory` names', name
+        )
+    return path
+
+
+class Reader:
+    """
+    A process that reads calibrations, begun when the first is asked for.
+
+    """
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def read(self, name: str, directory: str) -> LoadedCalibration:
+        """
+        Do what the function `read` does, there.
+
+        """
+        process = self._process = self._process or _start()
+        questions, answers = cast('IO[bytes]', process.stdin), cast('IO[bytes]', process.stdout)
+        try:
+            pickle.dump((name, directory), questions)
+            questions.flush()
+            # From our own process: its own classes and nothing else.
+            answer: LoadedCalibration | CalibrationError = pickle.load(answers)  # noqa: S301
+        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            self.close()
+            raise CalibrationError(
+                'cannot be read: the process that reads it ended', name
+            ) from error
+        if isinstance(answer, CalibrationError):
+            raise answer
+        return answer
+
+    def close(self) -> None:
+        """
+        End the process.
+
+        """
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            # What is left to be asked may find nobody any more.
+            with suppress(BrokenPipeError), process:
+                pass
+
+
+def serve() -> None:
+    """
+    Read what the process is asked for, until nobody can ask any more.
+
+    """
+    os.nice(NICENESS)
+    with suppress(EOFError, BrokenPipeError):
+        while True:
+            name, directory = pickle.load(sys.stdin.buffer)  # noqa: S301 - from the node
+            try:
+                answer: LoadedCalibration | CalibrationError = read(name, directory)
+            except CalibrationError as error:
+                answer = error
+            pickle.dump(answer, sys.stdout.buffer)
+            sys.stdout.buffer.flush()
+
+
+def _start() -> subprocess.Popen[bytes]:
+    # The very package that runs here; a Ctrl-C is for the node, with whom this ends.
+    code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()'
+    return subprocess.Popen(  # noqa: S603 - our own interpreter and words
+        [sys.executable, '-c', code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
