@@ -17,6 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import files
 import lz4.frame
 import zstandard
 
@@ -302,4 +303,24 @@ def targets() -> dict[str, Target]:
         'mcap': Target(check_mcap, [_bag(''), _bag('zstd'), _bag('lz4')], 4096),
         'cdr': Target(check_cdr, _messages(), 340),
         'parameters': Target(check_parameters, [b'\4~nobody/unit.yaml', b'\4imu', b'\x4d'], 340),
+        **file_targets(),
+    }
+
+
+def file_targets() -> dict[str, Target]:
+    """
+    Return the targets that need a file of their own.
+
+    """
+    messages = [
+        (topic, kind, START_NS + k, cdr(START_NS + k, *range(k, k + width)))
+        for topic, kind, width in _KINDS
+        for k in range(3)
+    ]
+    text, table = files.tables(START_NS)
+    return {
+        'db3': Target(files.check_database, [files.database(messages)], 16384),
+        'zstd': Target(files.check_compressed, [files.compressed(_bag(''))], 4096),
+        'csv': Target(files.check_csv, [text], 1024),
+        'parquet': Target(files.check_parquet, [table], 8192),
     }

@@ -25,6 +25,7 @@ class Told:
 
 
 _OUTPUTS, _TEXT = 'test_files.py', 'test_text.py'
+_PROMISES = 'test_recording_promises.py'
 _PROCESS, _FILES = 'test_fault_process.py', 'test_fault_files.py'
 _BAD_FILE = (
     'the calibration that was read runs on; setting it again is refused with path and reason'
@@ -250,5 +251,55 @@ TOLD = [
         'every command reads it up to its last whole message, does its work, and ends with 1',
         'one line: the bag, the byte of the cut and what it cut',
         'test_recording_damage.py::test_cut_at_every_byte_of_the_last_chunk',
+    ),
+    Told(
+        'rows are missing in a database',
+        'deleted from a .db3 of which metadata.yaml promises 400',
+        'every command does its work with what is there, and ends with 1',
+        'one line: the topic, how many of how many messages are there',
+        f'{_PROMISES}::test_rows_deleted_from_a_database_are_missed',
+    ),
+    Told(
+        'a compressed file is damaged',
+        'a .mcap.zstd cut off, and wiped in the middle',
+        'read up to there, and what came is held against metadata.yaml; ends with 1',
+        'one line: the file, the byte, how many of how many messages are there',
+        f'{_PROMISES}::test_a_compressed_file_is_read_up_to_its_damage',
+    ),
+    Told(
+        'a compressed file is a bomb',
+        'zeros that expand a thousandfold, in a file and in a message',
+        'refused at the limit that chunks have; what was expanded is removed',
+        'one line: the file, and how much it holds',
+        f'{_PROMISES}::test_a_compressed_file_expands_within_limits_and_leaves_nothing',
+    ),
+    Told(
+        'a FIFO or a device in a bag',
+        'as metadata.yaml, as its file, beside its files',
+        'refused, or passed over; never waited for',
+        'one line: not a regular file',
+        f'{_PROMISES}::test_a_fifo_or_a_device_is_never_waited_for',
+    ),
+    Told(
+        'the clock of a recording jumps by a year',
+        'forward (1970, then NTP) or back, in the middle',
+        'for whatever walks its time the jump is an hour: below 300 MB; stamps that jump all the '
+        'time are refused',
+        '`info`: gaps, and the longest',
+        'test_recording_clock.py::test_a_jump_becomes_an_hour_and_the_rest_stays',
+    ),
+    Told(
+        'stamps that no ROS message can hold in a table',
+        'before 1970, after January 2038, beyond 64 bits; as CSV and Parquet',
+        'those rows are left out and counted; refused where all are',
+        'how many rows, and which lines',
+        'test_convert.py::test_stamps_that_ros_cannot_hold',
+    ),
+    Told(
+        'degenerate recordings',
+        'equal, reversed or single stamps, values near 1e308, all zeros, names that are no UTF-8',
+        'every command ends within a minute, below 300 MB, without a traceback',
+        'one line, or the result',
+        'test_degenerate.py::test_it_ends_with_a_sentence_in_bounded_memory',
     ),
 ]

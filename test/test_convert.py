@@ -427,3 +427,49 @@ class TestFreezer:
         columns = load_column_map(tmp_path / 'map.yaml')
         with pytest.raises(RecordingError, match='looks like g'):
             write_log(table_log(path, columns), tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('suffix', ['csv', 'parquet'])
+@pytest.mark.parametrize('unit', ['s', 'ns'])
+def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> None:
+    """
+    WHY: an integer stamp of 2e10 s wrapped to 600 s, and 1e30 put all rows on one stamp.
+
+    WHAT: a row is in the bag at its own stamp, or it is left out and counted.
+
+    """
+    scale = 10**9 if unit == 's' else 1
+    good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]
+    bad = [-1, 2**31, 2 * 10**10, 2**62, 2**63] if unit == 's' else [-1, 2**31 * 10**9, 2**63]
+    rows = good + bad
+
+    def written(stamps: list[int]) -> Path:
+        path = tmp_path / f'log.{suffix}'
+        if suffix == 'csv':
+            path.write_text('\n'.join(['t,x', *(f'{stamp},5.66' for stamp in stamps)]))
+            return path
+        pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        kind = pa.int64() if min(stamps) < 0 else pa.uint64()
+        stored = [min(stamp, 2**62) if min(stamps) < 0 else stamp for stamp in stamps]
+        columns = {'t': pa.array(stored, kind), 'x': [5.66] * len(stamps)}
+        pq.write_table(pa.table(columns), path)
+        return path
+
+    chart = ColumnMap.model_validate(
+        {
+            'stamp': {'column': 't', 'unit': unit},
+            'accel': {'columns': ('x', 'x', 'x'), 'unit': 'm/s^2', 'output': 'imu'},
+        }
+    )
+    for stamps in (rows, good + bad[1:]):
+        report = write_log(table_log(written(stamps), chart), tmp_path / 'bag.mcap', force=True)
+        left_out = report.out_of_range.count + report.non_numeric.count
+        assert (report.accel_messages, left_out) == (40, len(stamps) - 40)
+        bag = read_recording(tmp_path / 'bag.mcap', input='imu', require=('accel',))
+        found = bag.columns.accel_stamp_ns
+        assert found.tolist() == [stamp * scale for stamp in good]
+    with pytest.raises(RecordingError, match=r'before 1970 or after January 2038|holds numbers'):
+        write_log(table_log(written(bad[1:]), chart), tmp_path / 'none.mcap')

@@ -84,12 +84,7 @@ def judged(bag: Path, one: Calibration, **keys: object) -> Judgement:
 
 
 def made(
-    residual: float,
-    raw: float,
-    claimed: float,
-    n: int = 40,
-    dynamic: int = 10,
-    outside: int = 0,
+    residual: float, raw: float, claimed: float, n: int = 40, dynamic: int = 10, outside: int = 0
 ) -> Windows:
     """
     Make windows of one position, z up, whose figures are given in micro-g.
@@ -365,8 +360,7 @@ class TestShifts:
     def test_a_unit_as_it_was_has_not_moved(self) -> None:
         found = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
         assert (len(found.shifts), found.moved, found.verdict) == (3, (), 'valid')
-
-    def test_five_positions_tell_no_shifts(self) -> None:
+        # Five positions tell no shifts.
         found = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
         assert (found.shifts, found.n_positions) == ((), 5)
 

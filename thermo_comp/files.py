@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from .errors import OutputError
 
@@ -111,27 +112,62 @@ def bag_kind(path: str | Path, others: str = '') -> Kind:
     return BAG
 
 
-def read_bounded(path: str | Path, limit: int) -> bytes:
+def shown_name(path: str | Path) -> str:
     """
-    Read a regular file of at most `limit` bytes.
+    Give the last part of a path as text that can be written anywhere, even where it is no UTF-8.
+
+    """
+    return os.fsencode(Path(path).name).decode('utf-8', 'replace')
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """
+    Open a regular file for reading.
 
     A directory, a FIFO or a device is refused before anything is read, so a reader never blocks.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    BinaryIO
+        Open, at its beginning.
 
     Raises
     ------
     OSError
-        If it cannot be opened or read.
-    ValueError
-        If it is not a regular file or is larger than `limit`.
+        If it cannot be opened or is not a regular file.
 
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    with os.fdopen(descriptor, 'rb') as file:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise ValueError('not a regular file')
-        if status.st_size > limit:
-            raise ValueError(f'{status.st_size} bytes, at most {limit} are accepted')
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, 'not a regular file', str(path))
+        return os.fdopen(descriptor, 'rb')
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_bounded(path: str | Path, limit: int) -> bytes:
+    """
+    Read a regular file of at most `limit` bytes.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened or read, or is not a regular file.
+    ValueError
+        If it is larger than `limit`.
+
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise ValueError(f'{size} bytes, at most {limit} are accepted')
         content = file.read(limit + 1)
     if len(content) > limit:
         raise ValueError(f'more than {limit} bytes')

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from . import __version__
 from .errors import CalibrationError, OutputError
+from .files import shown_name
 from .online.batch import process_block
 from .online.blocks import CompensatedBlock
 from .online.compensator import Compensator
@@ -235,7 +236,7 @@ def replay(
         check_unit(calibration, reader.info, serial)
         metadata = {
             'serial': calibration.unit.serial,
-            'corrected_from': Path(path).name,
+            'corrected_from': shown_name(path),
             'corrected_by': f'thermo_comp {__version__}',
         }
         total = reader.info.topics[reader.topics['accel']][1]

@@ -173,6 +173,7 @@ def say(out: Output, report: ConversionReport) -> None:
     out.line(f'unit: {report.unit}; {report.believed}')
     _say_finding(out, 'rows left out, too short', report.short_rows)
     _say_finding(out, 'rows left out, no number', report.non_numeric)
+    _say_finding(out, 'rows left out, stamp before 1970 or after 2038', report.out_of_range)
     _say_finding(out, 'rows clipped, kept', report.clipped)
     _say_finding(out, 'rows whose time goes back, kept', report.backwards)
     _say_finding(out, 'rows whose time stands still, kept', report.repeated)

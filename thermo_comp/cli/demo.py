@@ -218,7 +218,8 @@ def _say(out: Output, result: Evaluation, model: str) -> None:
         parts = [result.judgements[name].sections[section] for name in _MODELS]
         if not parts[0].n:
             continue
-        pairs = [(parts[0].raw_rms, parts[0].raw_peak), *((one.rms, one.peak) for one in parts)]
+        raw = result.judgements['node'].sections[section]
+        pairs = [(raw.raw_rms, raw.raw_peak), *((one.rms, one.peak) for one in parts)]
         cells = [
             f'{micro_g(rms / MICRO_G):>4} / {micro_g(peak / MICRO_G):>4}' for rms, peak in pairs
         ]

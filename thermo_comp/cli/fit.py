@@ -84,9 +84,6 @@ def fit(
         check_output(report, PAGE, overwrite=force, others=[*bags, output])
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
     sources, kind = fit_sources(bags, topics, input_.value, serial)
-    torn = [source for source in sources if source.truncated]
-    for source in torn:
-        out.note(f'{source.name}: {source.truncated}')
     try:
         settings = FitOptions(
             gravity=resolve_gravity(gravity, None, None),
@@ -102,6 +99,9 @@ def fit(
         raise options.usage(str(mistake)) from mistake
     with out.progress('fitting', total=1.0) as done:
         result = run(sources, settings, lambda _stage, part: done(part))
+    losses = [f'{source.name}: {loss}' for source in sources if (loss := source.missing())]
+    for loss in losses:
+        out.note(loss)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
         from ..report import write_report
@@ -110,7 +110,7 @@ def fit(
     _say(out, result, output, verbose)
     if report is not None:
         out.line(f'{report}: certificate')
-    out.end(is_torn=bool(torn))
+    out.end(is_torn=bool(losses))
 
 
 def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:

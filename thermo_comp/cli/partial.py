@@ -76,12 +76,15 @@ def partial(
             topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
             input=input_.value,
         )
+    if result.missing:
+        out.note(f'{bag}: {result.missing}')
     if result.pose is not None:
         _say_pose(out, result, result.pose)
     elif result.triad is not None:
         _say_triad(out, result, result.triad)
     if result.pose is not None and not any(fit.model for fit in result.fits):
         raise typer.Exit(1)
+    out.end(is_torn=bool(result.missing))
 
 
 def _say_pose(out: Output, result: Partial, pose: Pose) -> None:

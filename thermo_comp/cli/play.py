@@ -73,6 +73,8 @@ def play(
         out.note(f'nobody listened to {topic}')
     for topic in report.lossy:
         out.note(f'{topic} has a best-effort subscriber, which can lose messages')
+    if report.missing:
+        out.note(f'{bag}: {report.missing}')
     out.table(('topic', 'messages'), sorted(report.n_messages.items()))
     out.line(f'played in {report.duration_s:.1f} s')
     out.json(
@@ -83,6 +85,7 @@ def play(
             'lossy': report.lossy,
         }
     )
+    out.end(is_torn=bool(report.missing))
 
 
 def require_ros() -> None:

@@ -108,7 +108,7 @@ def _say(out: Output, result: ReplayResult) -> None:
     from ..online.status import DROPPED
 
     counters = result.counters
-    is_torn = out.torn([result.info])
+    is_bad = out.torn([result.info]) or not counters.n_out
     dropped = {
         name.removeprefix('n_').replace('_', ' '): n
         for name, n in asdict(counters).items()
@@ -136,4 +136,4 @@ def _say(out: Output, result: ReplayResult) -> None:
             'truncated': result.info.truncated,
         }
     )
-    out.end(is_torn=is_torn)
+    out.end(is_torn=is_bad)

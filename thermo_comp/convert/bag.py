@@ -19,6 +19,7 @@ import numpy as np
 
 from .. import __version__
 from ..errors import RecordingError
+from ..files import shown_name
 from ..fitting.fit_sources import digest
 from ..recording import Topics, inspect_recording, read_recording
 from ..recording.columns import Role
@@ -90,7 +91,7 @@ def bag_log(
         serial=serial or '',
         metadata={
             **{f'topic_{role}': name for role, name in found.items() if name},
-            'converted_from': path.name,
+            'converted_from': shown_name(path),
             'converted_from_sha256': digest(path),
             'converted_by': f'thermo_comp {__version__}',
             **({'serial': serial} if serial else {}),

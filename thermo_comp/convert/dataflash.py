@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
+from ..files import open_regular
 from ..typing import Bools, Floats, Ints
 from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
 from .log import ForeignLog, Readings
@@ -112,7 +113,7 @@ def read_dataflash(path: str | Path) -> tuple[AutopilotLog, dict[str, float]]:
             "an ArduPilot log needs pymavlink: pip install 'thermo_comp[ardupilot]'", path=path
         ) from failure
     path = Path(path)
-    with path.open('rb') as file:
+    with open_regular(path) as file:
         magic = file.read(2)
     if magic != b'\xa3\x95':
         raise RecordingError('not a DataFlash log: it does not begin with a3 95', path=path)

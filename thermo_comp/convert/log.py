@@ -10,14 +10,14 @@ A reader of a format makes a `ForeignLog`; `write_log` does the rest, the same f
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from ..errors import RecordingError
-from ..recording import BagWriter, ImuColumns, Topics
+from ..recording import STAMP_END_NS, BagWriter, ImuColumns, Topics
 from ..text import valid_serial
 from ..typing import Bools, Floats, Ints
 from .table import NO_STAMP
@@ -28,6 +28,7 @@ _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 # Messages are written in runs of this many rows: bounded memory in the writer.
 _RUN_ROWS = 100_000
 _EXAMPLES = 5
+_OUT_OF_RANGE = 'before 1970 or after January 2038, which no ROS message can hold'
 
 
 @dataclass(frozen=True)
@@ -139,9 +140,9 @@ class ConversionReport:
         What the accelerometer's messages are.
     rate_hz, duration_s : float
         Median rate and length of the log.
-    short_rows, non_numeric, backwards, repeated, clipped : Finding
-        Rows left out because they are too short or hold no numbers; rows kept whose time goes
-        back, stands still, or whose reading is clipped.
+    short_rows, non_numeric, out_of_range, backwards, repeated, clipped : Finding
+        Rows left out because they are too short, hold no numbers or a stamp that ROS has not; rows
+        kept whose time goes back, stands still, or whose reading is clipped.
     unit, believed : str
         The unit stated, and what the readings at rest speak for.
     stillness : Stillness
@@ -162,6 +163,7 @@ class ConversionReport:
     duration_s: float
     short_rows: Finding
     non_numeric: Finding
+    out_of_range: Finding
     backwards: Finding
     repeated: Finding
     clipped: Finding
@@ -249,7 +251,11 @@ def write_log(
             valid_serial(log.serial)
         except ValueError as mistake:
             raise RecordingError(str(mistake), path=log.path) from mistake
-    usable = _usable(log)
+    log = replace(log, board=_stampable(log.board), case=_stampable(log.case))
+    holds_numbers = _usable(log)
+    usable = holds_numbers & _is_in_range(log.stamp_ns)
+    if holds_numbers.any() and not usable.any():
+        raise RecordingError(f'all its stamps are {_OUT_OF_RANGE}', path=log.path)
     stamp_ns, accel, line = log.stamp_ns[usable], log.accel[usable], log.line[usable]
     if not len(stamp_ns):
         raise RecordingError(
@@ -280,7 +286,8 @@ def write_log(
         rate_hz=1e9 / float(np.median(steps)) if len(steps) else float('nan'),
         duration_s=float(newest[-1] - stamp_ns[0]) * 1e-9,
         short_rows=Finding(log.n_short, ()),
-        non_numeric=_finding(~usable, log.line),
+        non_numeric=_finding(~holds_numbers, log.line),
+        out_of_range=_finding(holds_numbers & ~usable, log.line),
         backwards=_finding(back, line),
         repeated=_finding(repeat, line),
         clipped=_finding(clipped, line),
@@ -298,6 +305,17 @@ def _usable(log: ForeignLog) -> Bools:
     if log.gyro is not None:
         usable &= np.isfinite(log.gyro).all(axis=1)
     return usable
+
+
+def _is_in_range(stamp_ns: Ints) -> Bools:
+    return np.asarray((stamp_ns >= 0) & (stamp_ns < STAMP_END_NS))
+
+
+def _stampable(readings: Readings | None) -> Readings | None:
+    if readings is None:
+        return None
+    use = _is_in_range(readings.stamp_ns)
+    return Readings(readings.stamp_ns[use], readings.celsius[use])
 
 
 def _finding(rows: Bools, line: Ints) -> Finding:

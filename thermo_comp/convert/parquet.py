@@ -7,6 +7,7 @@ Owns Parquet tables, behind the extra ``parquet``.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
+from ..files import open_regular
 from ..typing import Floats, Ints
 from .table import NO_STAMP, Column, Table, place
+
+#: What packs numbers more tightly holds no measurement.
+_MOST_ROWS_PER_BYTE = 1000
+_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 
 def read_parquet(
@@ -48,18 +54,23 @@ def read_parquet(
 
     """
     try:
-        from pyarrow import ArrowException
         from pyarrow import parquet as pq
     except ImportError as failure:
         raise RecordingError(
             "a Parquet file needs pyarrow: pip install 'thermo_comp[parquet]'", path=path
         ) from failure
     try:
-        headings = list(pq.read_schema(path).names)
-        names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
-        places = {name: place(path, name, headings, len(headings)) for name in names}
-        table = pq.read_table(path, columns=[headings[i] for i in sorted(set(places.values()))])
-    except (ArrowException, OSError) as failure:
+        with open_regular(path) as file:
+            found = pq.ParquetFile(file)
+            if found.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
+                raise RecordingError(f'it claims {found.metadata.num_rows} rows', path=path)
+            headings = list(found.schema_arrow.names)
+            names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
+            places = {name: place(path, name, headings, len(headings)) for name in names}
+            table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
+    except RecordingError:
+        raise
+    except Exception as failure:  # a damaged file surfaces there as nearly any exception type
         reason = ' '.join(str(failure).split())
         raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
     if not table.num_rows:
@@ -98,15 +109,17 @@ def _stamps(path: Path, name: str, column: Any, exponent: int) -> Ints:
 
     known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)
     if pa.types.is_timestamp(column.type):
-        whole = column.cast(pa.timestamp('ns')).cast(pa.int64())
-        exponent = 0
-    elif pa.types.is_integer(column.type):
-        whole = column.cast(pa.int64())
+        exponent = _EXPONENTS[column.type.unit]
+        column = column.cast(pa.int64())
+    if pa.types.is_integer(column.type):
+        values = column.fill_null(0).to_numpy()
+        limit = (2**63 - 1) // 10**exponent
+        known &= (values <= limit) & (values >= -limit if values.dtype.kind == 'i' else True)
+        factor = 10**exponent
     else:
-        values = _floats(path, name, column)
-        known &= np.isfinite(values)
-        stamps = np.full(len(values), NO_STAMP, dtype=np.int64)
-        stamps[known] = np.rint(values[known] * 10.0**exponent).astype(np.int64)
-        return stamps
-    integers = np.asarray(whole.fill_null(0).to_numpy(), dtype=np.int64)
-    return np.where(known, integers * 10**exponent, NO_STAMP)
+        factor = 1
+        values = np.rint(_floats(path, name, column) * 10.0**exponent)
+        known &= np.abs(values) < 2.0**63
+    stamps = np.full(len(values), NO_STAMP, dtype=np.int64)
+    stamps[known] = values[known].astype(np.int64) * factor
+    return stamps

@@ -15,12 +15,14 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from io import TextIOWrapper
 from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import RecordingError
+from ..files import open_regular
 from ..typing import Floats, Ints
 
 Column = str | int
@@ -98,7 +100,9 @@ def read_text(
 
     """
     try:
-        with path.open(encoding='utf-8-sig', errors='replace', newline='') as file:
+        with TextIOWrapper(
+            open_regular(path), encoding='utf-8-sig', errors='replace', newline=''
+        ) as file:
             head = file.read(_SNIFF_BYTES)
             if not head.strip():
                 raise RecordingError('the table is empty', path=path)

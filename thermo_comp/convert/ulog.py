@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
+from ..files import open_regular
 from ..typing import Floats, Ints
 from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
 from .log import ForeignLog, Readings
@@ -86,7 +87,7 @@ def read_ulog(path: str | Path) -> AutopilotLog:
         raise RecordingError(
             "a PX4 log needs pyulog: pip install 'thermo_comp[px4]'", path=path
         ) from failure
-    with Path(path).open('rb') as file, redirect_stdout(StringIO()):
+    with open_regular(path) as file, redirect_stdout(StringIO()):
         # Its own exception has no base but Exception, and a torn file makes it raise others: none
         # of them says more than that this is not a whole ULog.
         try:

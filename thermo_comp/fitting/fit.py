@@ -305,9 +305,19 @@ def _fit_table(
     facts = UnitFacts(
         _unit(bags, options), noise_density(table, bags, chosen), board_lag(table), slow
     )
-    calibration = build_calibration(
-        chosen, table, bags, detector, facts, options.reference_temperature, residuals, findings
-    )
+    try:
+        calibration = build_calibration(
+            chosen,
+            table,
+            bags,
+            detector,
+            facts,
+            options.reference_temperature,
+            residuals,
+            findings,
+        )
+    except ValueError as error:
+        raise FitError(f'these data give no calibration that can be used: {error}') from error
     return FitResult(
         calibration=calibration,
         solution=chosen.solution,

@@ -8,12 +8,16 @@ Owns the way from bags to what the fit reads.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ..errors import FitError
-from ..recording import Block, Input, Topics, open_recording
+from ..files import shown_name
+from ..recording import Block, Input, RecordingInfo, Role, Topics, open_recording
 from . import FitSource
+
+_SAMPLES: tuple[Role, ...] = ('accel',)
 
 
 def fit_sources(
@@ -59,20 +63,11 @@ def fit_sources(
     kinds: dict[str, str] = {}
     serials: dict[str, str] = {}
     for path in map(Path, paths):
-        with open_recording(path, topics, input, require=('accel', 'board')) as reader:
-            info = reader.info
+        source, info = recording_source(path, topics, input, require=('accel', 'board'))
         kinds[info.input or 'counts'] = str(path)
         if info.metadata.get('serial'):
             serials[info.metadata['serial']] = str(path)
-        sources.append(
-            FitSource(
-                name=path.name,
-                blocks=_Blocks(path, topics, input),
-                sha256=digest(path) if hashed else None,
-                serial=info.metadata.get('serial'),
-                truncated=info.truncated,
-            )
-        )
+        sources.append(replace(source, sha256=digest(path)) if hashed else source)
     if len(kinds) > 1:
         raise FitError(
             f'{kinds["counts"]} holds counts, {kinds["imu"]} Imu messages: choose one with --input'
@@ -83,23 +78,51 @@ def fit_sources(
     return sources, 'imu' if 'imu' in kinds else 'counts'
 
 
-class _Blocks:
+def recording_source(
+    path: str | Path,
+    topics: Topics | None = None,
+    input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    *,
+    require: Collection[Role] = _SAMPLES,
+) -> tuple[FitSource, RecordingInfo]:
     """
-    Opens a recording anew for each pass.
+    Make a source of a recording: looked at now, and opened anew for each pass.
+
+    Parameters
+    ----------
+    path, topics, input, require
+        As for `recording.open_recording`.
+
+    Returns
+    -------
+    source : FitSource
+        Its `missing` tells what did not come, too, once it has been read.
+    info : RecordingInfo
+        What the recording says of itself.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read or lacks a topic.
 
     """
+    path = Path(path)
+    with open_recording(path, topics, input, require=require) as reader:
+        info = latest = reader.info
 
-    def __init__(self, path: Path, topics: Topics | None, kind: Input) -> None:
-        self._path, self._topics, self._input = path, topics, kind
+    def blocks() -> Iterator[Block]:
+        nonlocal latest
+        with open_recording(path, topics, input, require=require) as again:
+            yield from again.blocks_on_one_clock()
+            latest = again.info
 
-    def __call__(self) -> Iterable[Block]:
-        return self._read()
-
-    def _read(self) -> Iterator[Block]:
-        with open_recording(
-            self._path, self._topics, self._input, require=('accel', 'board')
-        ) as reader:
-            yield from reader.blocks()
+    source = FitSource(
+        shown_name(path),
+        blocks,
+        serial=info.metadata.get('serial'),
+        missing=lambda: latest.truncated,
+    )
+    return source, info
 
 
 def digest(path: Path) -> str:

@@ -10,15 +10,14 @@ give bias, scale and misalignment as they were that day. Neither is written as a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import FitError
-from ..recording import Block, Input, Topics, open_recording
-from ..recording.columns import Role
+from ..recording import Input, Topics
+from .fit_sources import recording_source
 from .one_pose import (
     BranchFit,
     Pose,
@@ -29,7 +28,6 @@ from .one_pose import (
 )
 from .reduction import ReducedBag, reduce_source
 from .rests import ONE_ATTITUDE_DEG, attitudes_apart
-from .sources import FitSource
 from .triad import TriadFit, fit_triad
 
 # A hand holds still for seconds only.
@@ -45,6 +43,8 @@ class Partial:
     ----------
     source : str
         The recording.
+    missing : str or None
+        What of it could not be read.
     pose : Pose or None
         One attitude: the reduced recording, with its jumps.
     fits : tuple of BranchFit
@@ -57,53 +57,11 @@ class Partial:
     """
 
     source: str
+    missing: str | None
     pose: Pose | None
     fits: tuple[BranchFit, ...]
     triad: TriadFit | None
     bag: ReducedBag
-
-
-def recording_source(
-    path: str | Path,
-    topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
-) -> tuple[FitSource, Input]:
-    """
-    Make a source of a recording that need not have a temperature.
-
-    Parameters
-    ----------
-    path : str or Path
-        The recording.
-    topics : Topics or None, optional
-        Names of the inputs.
-    input : {'auto', 'counts', 'imu'}, optional
-        What is read.
-
-    Returns
-    -------
-    source : FitSource
-        Opened anew for each pass.
-    input : {'counts', 'imu'}
-        What it holds.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be read or has no accelerometer.
-
-    """
-    path = Path(path)
-    needed: tuple[Role, ...] = ('accel',)
-    with open_recording(path, topics, input, require=needed) as reader:
-        info = reader.info
-
-    def blocks() -> Iterator[Block]:
-        with open_recording(path, topics, input, require=needed) as again:
-            yield from again.blocks()
-
-    kind: Input = 'imu' if info.input == 'imu' else 'counts'
-    return FitSource(path.name, blocks, serial=info.metadata.get('serial')), kind
 
 
 def tell(
@@ -143,8 +101,8 @@ def tell(
         If it tells nothing, with the reason.
 
     """
-    source, kind = recording_source(path, topics, input)
-    options = replace(options, input='m/s^2' if kind == 'imu' else 'counts')
+    source, info = recording_source(path, topics, input)
+    options = replace(options, input='m/s^2' if info.input == 'imu' else 'counts')
     bag = reduce_source(
         source,
         0,
@@ -160,14 +118,16 @@ def tell(
                 f'{source.name}: it rests in attitudes {apart:.0f} deg apart; bias '
                 'and scale need local gravity: give `--gravity`, or `--latitude` and `--height`'
             )
-        return Partial(source.name, None, (), fit_triad(bag.intervals, options.gravity), bag)
+        return Partial(
+            source.name, source.missing(), None, (), fit_triad(bag.intervals, options.gravity), bag
+        )
     pose = read_pose(source, options)
     if by_branch:
         fits = fit_branches(pose)
     else:
         model = fit_whole(pose)
         fits = (BranchFit(pose.branches[0], model, ''),)
-    return Partial(source.name, pose, fits, None, pose.bag)
+    return Partial(source.name, source.missing(), pose, fits, None, pose.bag)
 
 
 def temperature_span(bag: ReducedBag) -> float:

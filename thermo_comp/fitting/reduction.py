@@ -25,6 +25,8 @@ from .sources import FitSource
 # thermometers' recursion runs in Python.
 _SHORTEST_READING_INTERVAL_S = 0.2
 _LEAST_FILLED = 0.9
+# Nothing that is read outside these is a temperature of a part [degC].
+_COLDEST, _HOTTEST = -273.15, 1e4
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,7 @@ def _windows(cells: Cells, bag: int, lower: int, upper: int, per_window: int) ->
 
 class _ReadingCollector:
     """
-    Gathers one thermometer's readings: finite, in rising order, averaged when very fast.
+    Gathers one thermometer's readings: possible ones, in rising order, averaged when very fast.
 
     """
 
@@ -233,7 +235,7 @@ class _ReadingCollector:
         value = np.asarray(value, dtype=np.float64)
         self._n_read += len(stamp_ns)
         before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
-        use = np.isfinite(value)
+        use = (value > _COLDEST) & (value < _HOTTEST)
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
         stamp_ns, value = stamp_ns[use], value[use]
         if not len(stamp_ns):

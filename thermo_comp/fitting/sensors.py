@@ -56,7 +56,7 @@ class Course:
 
         """
         moving = np.abs(self.rate) > max(0.2 * self.fastest, _CLEAR * self.rate_sd)
-        near = np.convolve(moving, np.ones(61), mode='same') > 0.5
+        near = np.convolve(moving, np.ones(61))[30:-30] > 0.5
         return np.asarray(~near)
 
     @property

@@ -92,6 +92,10 @@ class ArrayBlock:
     case: Floats
 
 
+def _nothing() -> str | None:
+    return None
+
+
 @dataclass(frozen=True)
 class FitSource:
     """
@@ -107,8 +111,8 @@ class FitSource:
         Hash of the content, for the provenance.
     serial : str or None, optional
         Unit serial found in the source's metadata.
-    truncated : str or None, optional
-        Where the bag was cut off, if it was.
+    missing : callable, optional
+        Tells what of the bag is missing, as far as it has been read; None where nothing is.
 
     """
 
@@ -116,4 +120,4 @@ class FitSource:
     blocks: Callable[[], Iterable[SourceBlock]]
     sha256: str | None = None
     serial: str | None = None
-    truncated: str | None = None
+    missing: Callable[[], str | None] = _nothing

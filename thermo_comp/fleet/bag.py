@@ -288,10 +288,11 @@ def _reduced(
             unit: Literal['counts', 'm/s^2'] = 'm/s^2' if info.input == 'imu' else 'counts'
             source = FitSource(
                 name=PurePosixPath(bag.name).name,
-                blocks=reader.blocks,
+                blocks=reader.blocks_on_one_clock,
                 serial=info.metadata.get('serial'),
             )
             reduced = reduce_bag(source, 0, replace(options, input=unit))
+            info = reader.info
     except RecordingError as error:
         is_passing = isinstance(error.__cause__, OSError)
         return replace(empty, problem=_short(error, bag.name), is_passing=is_passing)

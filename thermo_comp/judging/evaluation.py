@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import RecordingError
+from ..files import shown_name
 from ..fitting.fit_sources import digest
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
@@ -128,8 +129,8 @@ def open_bag(
         name = reader.topics.get('accel')
         total = info.topics[name][1] if name else 0
         source = FitSource(
-            name=path.name,
-            blocks=lambda: _told(reader.blocks(), total, progress),
+            name=shown_name(path),
+            blocks=lambda: _told(reader.blocks_on_one_clock(), total, progress),
             sha256=digest(path) if is_hashed else None,
             serial=info.metadata.get('serial'),
         )
@@ -141,6 +142,7 @@ def open_bag(
             min_still_s=_MIN_STILL_S,
             full_scale=full_scale,
         )
+        info = reader.info
     if not len(reduced.board.value):
         raise RecordingError('no board temperature in it', path=str(path))
     return OpenedBag(info, reduced)

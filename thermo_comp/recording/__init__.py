@@ -29,10 +29,11 @@ from .reader import (
     open_recording,
     read_recording,
 )
-from .writer import BagWriter
+from .writer import STAMP_END_NS, BagWriter
 
 __all__ = [
     'ROLES',
+    'STAMP_END_NS',
     'BagWriter',
     'Block',
     'ImuColumns',

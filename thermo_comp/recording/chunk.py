@@ -21,7 +21,7 @@ from ..typing import Bytes
 from . import mcap_records as mcap
 from .mcap_records import ChunkSpan, DamagedError
 from .random_access import RandomAccess
-from .unpack import Region, Stream, open_stream, unpack
+from .unpack import Region, Stream, growth_limit, open_stream, unpack
 from .walk import (
     ENDS_EARLY,
     OTHER_RECORD,
@@ -40,8 +40,6 @@ WINDOW_BYTES = 1 << 22
 HEAD_BYTES = 160
 
 _PIECE_BYTES = 1 << 16
-#: A chunk that claims to grow by more than this is not believed.
-_MAX_GROWTH = 1024
 _LOOSE = frozenset({mcap.MESSAGE, mcap.SCHEMA, mcap.CHANNEL})
 
 
@@ -265,8 +263,7 @@ class Windows:
             return Region(self._handle, span.position, span.end), None, 0
         head = self._handle.read_at(span.position, HEAD_BYTES)
         chunk, data_at, checksum = mcap.parse_chunk_head(head, span.position)
-        limit = chunk.compressed_size * _MAX_GROWTH + MAX_CHUNK_BYTES
-        if chunk.size > limit and not span.is_torn:
+        if chunk.size > growth_limit(chunk.compressed_size) and not span.is_torn:
             raise DamagedError(f'{chunk.compressed_size} bytes claim to hold {chunk.size}')
         region = Region(self._handle, span.position + data_at, span.end)
         return open_stream(chunk.compression, region), chunk.size, checksum

@@ -1,19 +1,20 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns every storage that is not plain MCAP: sqlite3, ROS 1 and compressed files, through rosbags.
+Owns every storage that is not plain MCAP: sqlite3, ROS 1 and packed messages, through rosbags.
 
-`rosbags` finds the messages; their bytes are laid side by side and decoded many at a time.
-What it raises on a damaged bag is translated here.
+`rosbags` finds the messages, file by file; their bytes are laid side by side and decoded many at a
+time. What it raises on a damaged bag is translated here.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +22,8 @@ from ..errors import RecordingError
 from .assemble import Part
 from .columns import RawMessages, Role
 from .decode import Decoder, Feed
+from .unpack import unpack_message
 from .wire import Encoding
-
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
 
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES = 1 << 23
@@ -32,14 +31,18 @@ _BATCH_BYTES = 1 << 23
 
 class ForeignSource:
     """
-    A bag that `rosbags` reads.
+    Files that `rosbags` reads, one after the other.
 
     Parameters
     ----------
-    path : Path
-        A rosbag2 directory, a bare storage file, or a ROS 1 ``.bag``.
+    files : sequence of Path
+        ``.db3``, ``.mcap`` or one ROS 1 ``.bag``.
+    metadata : mapping of str to str, optional
+        Key-value pairs that stand beside the files.
     note : str or None, optional
-        What is missing beside it.
+        What is missing beside them.
+    is_packed : bool, optional
+        Whether rosbag2 has compressed message by message.
 
     Raises
     ------
@@ -48,39 +51,59 @@ class ForeignSource:
 
     """
 
-    def __init__(self, path: Path, note: str | None = None) -> None:
+    def __init__(
+        self,
+        files: Sequence[Path],
+        metadata: Mapping[str, str] | None = None,
+        note: str | None = None,
+        *,
+        is_packed: bool = False,
+    ) -> None:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
 
-        self.path = path
+        suffix = files[0].suffix
+        self._encoding: Encoding = 'ros1' if suffix == '.bag' else 'cdr'
+        self.storage: str = {'.bag': 'ros1', '.mcap': 'mcap'}.get(suffix, 'sqlite3')
+        self.metadata: Mapping[str, str] = dict(metadata or {})
         self.truncated = note
-        self._encoding: Encoding = 'ros1' if path.suffix == '.bag' else 'cdr'
-        with _translated(path):
-            self._reader: Any = Reader1(path) if self._encoding == 'ros1' else Reader2(path)
-            self._reader.open()
-        self._connections: list[Connection] = list(self._reader.connections)
-        self.storage: str = 'ros1' if self._encoding == 'ros1' else _storage(self._reader)
-        topics: dict[str, tuple[str, int]] = {}
+        self._path = files[0]
+        self._is_packed = is_packed
+        self._readers: list[tuple[Path, Any]] = []
+        types: dict[str, list[str]] = {}
+        counts: Counter[str] = Counter()
         definitions: dict[str, tuple[str, str]] = {}
-        for connection in self._connections:
-            kind, count = topics.get(connection.topic, (connection.msgtype, 0))
-            if connection.msgtype not in kind.split(' | '):
-                kind = f'{kind} | {connection.msgtype}'
-            topics[connection.topic] = (kind, count + connection.msgcount)
-            if connection.msgdef.data and self._encoding == 'cdr':
-                definitions[connection.msgtype] = (
-                    f'ros2{connection.msgdef.format.name.lower()}',
-                    connection.msgdef.data,
-                )
-        self.topics: Mapping[str, tuple[str, int]] = topics
-        self.definitions: Mapping[str, tuple[str, str]] = definitions
-        has_messages = self._reader.message_count > 0
-        self.start_ns = int(self._reader.start_time) if has_messages else 0
-        self.end_ns = int(self._reader.end_time) - 1 if has_messages else 0
-        custom = getattr(getattr(self._reader, 'storage', None), 'metadata', None)
-        self.metadata: Mapping[str, str] = {
-            str(k): str(v) for k, v in (getattr(custom, 'custom', None) or {}).items()
+        spans: list[tuple[int, int]] = []
+        try:
+            for file in files:
+                with _translated(file):
+                    reader: Any = Reader1(file) if suffix == '.bag' else Reader2(file)
+                    reader.open()
+                    self._readers.append((file, reader))
+                    if reader.message_count:
+                        spans.append((int(reader.start_time), int(reader.end_time) - 1))
+                for connection in reader.connections:
+                    # A database holds whatever it was given, in any column.
+                    if not all(isinstance(c, str) for c in (connection.topic, connection.msgtype)):
+                        raise RecordingError('a topic has no name or no type', file)
+                    counts[connection.topic] += connection.msgcount
+                    known = types.setdefault(connection.topic, [])
+                    if connection.msgtype not in known:
+                        known.append(connection.msgtype)
+                    if connection.msgdef.data and suffix != '.bag':
+                        definitions[connection.msgtype] = (
+                            f'ros2{connection.msgdef.format.name.lower()}',
+                            connection.msgdef.data,
+                        )
+        except BaseException:
+            self.close()
+            raise
+        self.topics: Mapping[str, tuple[str, int]] = {
+            topic: (' | '.join(known), counts[topic]) for topic, known in types.items()
         }
+        self.definitions: Mapping[str, tuple[str, str]] = definitions
+        self.start_ns = min((start for start, _ in spans), default=0)
+        self.end_ns = max((end for _, end in spans), default=0)
 
     def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
         """
@@ -103,21 +126,28 @@ class ForeignSource:
             Damaged storage or messages.
 
         """
-        if self._reader is None:
-            raise RecordingError('the recording is closed', self.path)
+        if not self._readers:
+            raise RecordingError('the recording is closed', self._path)
         roles = {topic: role for role, topic in selection.items()}
-        chosen = [c for c in self._connections if c.topic in roles]
-        if not chosen:
-            return
-        feeds = {roles[c.topic]: Feed(c.topic, c.msgtype, self._encoding) for c in chosen}
+        feeds: dict[Role, Feed] = {}
+        for _, reader in self._readers:
+            for found in reader.connections:
+                if found.topic in roles:
+                    feed = Feed(found.topic, found.msgtype, self._encoding)
+                    feeds.setdefault(roles[found.topic], feed)
         batch = _Batch(Decoder(feeds, {}, raw), feeds)
-        with _translated(self.path):
-            for connection, log_ns, data in self._reader.messages(connections=chosen):
-                batch.add(roles[connection.topic], log_ns, data)
-                if batch.is_full:
+        for file, reader in self._readers:
+            chosen = [c for c in reader.connections if c.topic in roles]
+            if not chosen:
+                continue
+            with _translated(file):
+                for connection, log_ns, data in reader.messages(connections=chosen):
+                    message = unpack_message(data) if self._is_packed else data
+                    batch.add(roles[connection.topic], log_ns, message)
+                    if batch.is_full:
+                        yield batch.take()
+                if batch.n_messages:
                     yield batch.take()
-            if batch.n_messages:
-                yield batch.take()
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
         """
@@ -130,23 +160,24 @@ class ForeignSource:
 
         """
         if self._encoding != 'cdr':
-            raise RecordingError('its messages are those of ROS 1: convert the bag', self.path)
-        chosen = [c for c in self._connections if c.topic in topics]
-        with _translated(self.path):
-            for one, log_ns, data in self._reader.messages(connections=chosen) if chosen else ():
-                times, ends = (np.array([number], np.int64) for number in (log_ns, len(data)))
-                yield RawMessages(
-                    one.topic, one.msgtype, times, np.frombuffer(data, np.uint8), ends
-                )
+            raise RecordingError('its messages are those of ROS 1: convert the bag', self._path)
+        for file, reader in self._readers:
+            chosen = [c for c in reader.connections if c.topic in topics]
+            with _translated(file):
+                for one, log_ns, data in reader.messages(connections=chosen) if chosen else ():
+                    message = unpack_message(data) if self._is_packed else data
+                    times, ends = (np.array([n], np.int64) for n in (log_ns, len(message)))
+                    yield RawMessages(
+                        one.topic, one.msgtype, times, np.frombuffer(message, np.uint8), ends
+                    )
 
     def close(self) -> None:
         """
         Close the files.
 
         """
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
+        while self._readers:
+            self._readers.pop()[1].close()
 
 
 class _Batch:
@@ -201,15 +232,6 @@ class _Batch:
                 part[role] = self._decoder.rows(feed, role, data, start, size, log_ns, rank)
         self._clear()
         return part
-
-
-def _storage(reader: Any) -> str:
-    name = type(
-        reader.storage.storages[0]
-        if hasattr(reader.storage, 'storages') and reader.storage.storages
-        else reader.storage
-    ).__name__
-    return 'mcap' if name.startswith('Mcap') else 'sqlite3'
 
 
 @contextmanager

@@ -192,9 +192,8 @@ def survey_recording(
 
     """
     with open_recording(path, topics, require=()) as reader:
-        info = reader.info
         name = reader.topics.get('accel')
-        total = info.topics[name][1] if name else 0
+        total = reader.info.topics[name][1] if name else 0
         cells = CellAccumulator(_CELL_S, None)
         stamps = _Stamps()
         n_not_finite = 0
@@ -207,6 +206,7 @@ def survey_recording(
             case.add(block.case_stamp_ns, block.case)
             if progress is not None and total:
                 progress(stamps.n / total)
+        info = reader.info
     still: list[tuple[int, int]] = []
     still_s = 0.0
     if stamps.n > 1:
@@ -302,6 +302,7 @@ class _Readings:
         rates = np.diff(mean) / np.maximum(np.diff(mean_time), 1e-9) * 60.0
         steps = np.abs(np.diff(celsius))
         intervals = np.diff(stamp_ns)
+        intervals = intervals[intervals > 0]
         return ThermometerSurvey(
             n=len(celsius),
             rate_hz=1e9 / float(np.median(intervals)) if len(intervals) else float('nan'),

@@ -14,6 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
+from ..files import open_regular
+
 
 class RandomAccess(Protocol):
     """
@@ -63,28 +65,24 @@ class LocalFile:
     Raises
     ------
     OSError
-        If it cannot be opened.
+        If it cannot be opened, or is a FIFO or a device: these would never end.
 
     """
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_RDONLY)
-        try:
-            self.size = os.fstat(self._descriptor).st_size
-        except BaseException:
-            os.close(self._descriptor)
-            raise
+        self._file = open_regular(path)
+        self.size = os.fstat(self._file.fileno()).st_size
 
     def read_at(self, at: int, n_bytes: int) -> bytes:
         """
         Read up to so many bytes.
 
         """
-        return os.pread(self._descriptor, n_bytes, at)
+        return os.pread(self._file.fileno(), n_bytes, at)
 
     def close(self) -> None:
         """
         Close the file.
 
         """
-        os.close(self._descriptor)
+        self._file.close()

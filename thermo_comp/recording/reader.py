@@ -12,18 +12,22 @@ Reading order
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
 
 from ..errors import RecordingError
 from .assemble import Part, assemble, join_blocks
+from .clock import without_jumps
 from .columns import ROLES, Block, Input, RawMessages, Recording, RecordingInfo, Role, Topics
+from .expanded import ExpandedSource
 from .foreign import ForeignSource
 from .mcap_source import McapSource
 from .random_access import OpenFile
-from .rosbag2_metadata import read_metadata
-from .topics import select_topics
+from .rosbag2_metadata import Description, read_metadata
+from .topics import select_topics, shown
 
 
 class Source(Protocol):
@@ -69,6 +73,7 @@ class RecordingReader:
     Attributes
     ----------
     info : RecordingInfo
+        What the bag says of itself; once all blocks are read, `truncated` names what did not come.
     definitions : mapping of str to (str, str)
         Encoding and text of each message type's definition, where the bag carries it.
 
@@ -130,7 +135,45 @@ class RecordingReader:
         names = {role: (name, self.info.topics[name][0]) for role, name in self._selection.items()}
         parts = self._source.parts(self._selection, raw=raw)
         is_imu = self.info.input == 'imu'
-        yield from assemble(parts, is_imu=is_imu, names=names, n_messages=n_messages)
+        n_read = dict.fromkeys(names, 0)
+        for block in assemble(parts, is_imu=is_imu, names=names, n_messages=n_messages):
+            for role in names:
+                n_read[role] += len(getattr(block, f'{role}_stamp_ns'))
+            yield block
+        for role, (name, _) in names.items():
+            self._miss(name, n_read[role], self.info.topics[name][1])
+
+    def blocks_on_one_clock(self) -> Iterator[Block]:
+        """
+        Read the bag for whoever walks its time: jumps of its clock are taken out.
+
+        Yields
+        ------
+        Block
+            As `blocks` gives them; see `clock` for the stamps behind a jump.
+
+        Raises
+        ------
+        RecordingError
+            As for `blocks`, and stamps that are no clock.
+
+        """
+        try:
+            yield from without_jumps(self.blocks())
+        except RecordingError as error:
+            raise RecordingError(
+                error.message, error.path or self.info.path, error.topic
+            ) from error
+
+    def _miss(self, topic: str, n_read: int, n_promised: int) -> None:
+        """
+        Say so where fewer messages came than the bag had promised.
+
+        """
+        loss = _loss(topic, n_read, n_promised)
+        if loss and loss not in (self.info.truncated or ''):
+            told = '; '.join(filter(None, (self.info.truncated, loss)))
+            self.info = replace(self.info, truncated=told)
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
         """
@@ -290,7 +333,8 @@ def read_recording(
 
     """
     with open_recording(path, topics, input, require=require) as reader:
-        return Recording(reader.info, join_blocks(reader.blocks(), reader.info.input == 'imu'))
+        columns = join_blocks(reader.blocks(), reader.info.input == 'imu')
+        return Recording(reader.info, columns)
 
 
 def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
@@ -329,25 +373,53 @@ def _open_source(path: Path) -> Source:
     if path.suffix == '.mcap':
         return McapSource([path])
     if path.suffix in {'.db3', '.bag'}:
-        return ForeignSource(path)
+        return ForeignSource([path])
     raise RecordingError('not a bag: expected a directory, .mcap, .db3 or .bag', path)
 
 
 def _open_directory(path: Path) -> Source:
     description = read_metadata(path)
     if description is not None:
-        if description.storage == 'mcap' and not description.is_compressed:
-            return McapSource(description.files, description.custom)
-        return ForeignSource(path)
+        return _open_described(description)
     for suffix in ('.mcap', '.db3'):
-        files = in_split_order(file for file in path.iterdir() if file.suffix == suffix)
+        files = in_split_order(
+            file for file in path.iterdir() if file.suffix == suffix and file.is_file()
+        )
         if files:
             note = 'metadata.yaml is missing, the recording was not finished'
-            if suffix == '.mcap':
-                return McapSource(files, note=note)
-            if len(files) == 1:
-                return ForeignSource(files[0], note)
+            return (McapSource if suffix == '.mcap' else ForeignSource)(files, note=note)
     raise RecordingError('not a bag: the directory has no metadata.yaml', path)
+
+
+def _open_described(description: Description) -> Source:
+    """
+    Open the files that a metadata.yaml lists, and hold them against what it promises.
+
+    """
+    if description.compression == 'file':
+        return ExpandedSource(description.files, partial(_open_files, description))
+    return _open_files(description, description.files, None)
+
+
+def _open_files(description: Description, files: Sequence[Path], note: str | None) -> Source:
+    is_packed = description.compression == 'message'
+    source: Source
+    if description.storage == 'mcap' and not is_packed:
+        source = McapSource(files, description.custom, note)
+    else:
+        source = ForeignSource(files, description.custom, note, is_packed=is_packed)
+    losses = (
+        _loss(topic, source.topics.get(topic, ('', 0))[1], n_promised)
+        for topic, n_promised in description.counts.items()
+    )
+    source.truncated = '; '.join(filter(None, (source.truncated, *losses))) or None
+    return source
+
+
+def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
+    if n_read >= n_promised:
+        return None
+    return f'{shown(topic)}: {n_read} of the {n_promised} messages promised are there'
 
 
 def in_split_order(files: Iterable[Path]) -> list[Path]:

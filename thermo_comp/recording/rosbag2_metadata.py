@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -21,6 +21,11 @@ from .definitions import offered_qos
 
 _VERSION = 9
 _MAX_BYTES = 1 << 24
+_COMPRESSIONS: dict[str, Literal['', 'file', 'message']] = {
+    'none': '',
+    'file': 'file',
+    'message': 'message',
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,16 +144,19 @@ class Description:
         E.g. ``mcap``.
     files : tuple of Path
         In their order, each directly in the bag's directory.
-    is_compressed : bool
-        By rosbag2 itself, file by file or message by message.
+    compression : {'', 'file', 'message'}
+        What rosbag2 itself has compressed one by one.
     custom : dict of str to str
+    counts : dict of str to int
+        Messages per topic, as the recorder counted them.
 
     """
 
     storage: str
     files: tuple[Path, ...]
-    is_compressed: bool
+    compression: Literal['', 'file', 'message']
     custom: dict[str, str]
+    counts: dict[str, int]
 
 
 def read_metadata(directory: Path) -> Description | None:
@@ -188,8 +196,9 @@ def read_metadata(directory: Path) -> Description | None:
         description = Description(
             storage=str(content['storage_identifier']),
             files=files,
-            is_compressed=str(content.get('compression_mode') or 'none').lower() != 'none',
+            compression=_COMPRESSIONS[str(content.get('compression_mode') or 'none').lower()],
             custom={str(k): str(v) for k, v in (content.get('custom_data') or {}).items()},
+            counts=_counts(content),
         )
     except PlainYamlError as error:
         raise RecordingError('not valid YAML', path) from error
@@ -206,3 +215,11 @@ def _names(content: Any) -> list[Any]:
     if not isinstance(names, list) or not names:
         raise TypeError('no files')
     return names
+
+
+def _counts(content: Any) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for one in content.get('topics_with_message_count') or ():
+        name = str(one['topic_metadata']['name'])
+        counts[name] = counts.get(name, 0) + int(one['message_count'])
+    return counts

@@ -27,6 +27,10 @@ _STEP_SDS = 8.0
 _QUANTUM_SAMPLES = 20000
 #: How many windows a cell lasts where the samples are slow.
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)
+# Stamps may lie anywhere; no unit rests in one cell for a day.
+_LONGEST_CELL_NS = 86400e9
+# A sample beyond has a square that is no number; it is none itself.
+_LARGEST = 1e100
 # Noise below this many quanta leaves a sensor on one number for long.
 _STUCK = 0.3
 
@@ -127,7 +131,7 @@ class CellAccumulator:
         samples = np.asarray(samples, dtype=np.float64)
         if not len(stamp_ns):
             return
-        use = np.isfinite(samples).all(axis=1)
+        use = (np.abs(samples) < _LARGEST).all(axis=1)
         before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
         if self._full_scale is not None:
@@ -181,7 +185,7 @@ class CellAccumulator:
 
     def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
         step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
-        least = max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0)
+        least = min(max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0), _LONGEST_CELL_NS)
         self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
@@ -262,6 +266,8 @@ def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
     if not n:
         return []
     full = cells.count >= max(2.0, 0.5 * float(np.median(cells.count)))
+    if not full.any():
+        return []
     quiet = full & _is_quiet(cells, full)
     broken = ~_is_joined(cells, quiet)
     # A cell beside a moving one, or on either side of a step, holds the edge of the motion.

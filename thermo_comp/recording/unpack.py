@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import zlib
 from contextlib import suppress
+from pathlib import Path
 from typing import IO, Protocol, cast
 
 import lz4.frame
@@ -20,10 +21,89 @@ import zstandard
 
 from ..typing import Bytes
 from .mcap_records import DamagedError
-from .random_access import RandomAccess
+from .random_access import LocalFile, RandomAccess
 
+#: What claims to grow by more than this, beyond so many bytes, is not believed.
+_MAX_GROWTH = 1024
+_FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
 _READ_BYTES = 1 << 20
+#: Up to so much before a damage is lost with it.
+_STEP_BYTES = 1 << 16
+
+
+def growth_limit(n_packed: int) -> int:
+    """
+    Say how many bytes so many packed ones may hold at most.
+
+    """
+    return n_packed * _MAX_GROWTH + _FREE_GROWTH_BYTES
+
+
+def expand(packed: Path, target: Path) -> str | None:
+    """
+    Decompress a file that rosbag2 has compressed as a whole, as far as it can be read.
+
+    Parameters
+    ----------
+    packed : Path
+        The ``.zstd`` file.
+    target : Path
+        The file to write.
+
+    Returns
+    -------
+    str or None
+        Where its content ends too early, in words; None where it is whole.
+
+    Raises
+    ------
+    DamagedError
+        It holds more than it may, or nothing.
+    OSError
+        The disk is full or the like.
+
+    """
+    handle = LocalFile(packed)
+    limit = growth_limit(handle.size)
+    stream = open_stream('zstd', Region(handle, 0, handle.size))
+    n_bytes = 0
+    loss = None
+    try:
+        with target.open('wb') as file:
+            while data := stream.read(_STEP_BYTES):
+                n_bytes += len(data)
+                if n_bytes > limit:
+                    raise DamagedError(f'{handle.size} bytes hold more than {limit}')
+                file.write(data)
+    except _CompressionError as error:
+        loss = f'{packed.name} is unreadable behind {n_bytes} bytes of its content ({error})'
+    finally:
+        handle.close()
+    if not n_bytes:
+        raise DamagedError(loss or 'it holds nothing that can be decompressed')
+    return loss
+
+
+def unpack_message(packed: bytes) -> bytes:
+    """
+    Decompress one message that rosbag2 has compressed by itself.
+
+    Raises
+    ------
+    DamagedError
+        Damaged bytes, or more than a chunk may hold.
+
+    """
+    try:
+        size = zstandard.frame_content_size(packed)
+        if size > _FREE_GROWTH_BYTES:
+            raise DamagedError(f'a message of {size} bytes')
+        return zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).decompress(
+            packed, max_output_size=_FREE_GROWTH_BYTES
+        )
+    except zstandard.ZstdError as error:
+        raise DamagedError(f'zstd: {error}') from error
 
 
 def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
@@ -98,6 +178,13 @@ def _unpack_lz4(packed: Bytes, size: int) -> Bytes:
     except (RuntimeError, EOFError) as error:
         raise DamagedError(f'lz4: {error}') from error
     return np.frombuffer(data, np.uint8)
+
+
+class _CompressionError(DamagedError):
+    """
+    Bytes that do not decompress.
+
+    """
 
 
 class Stream(Protocol):
@@ -214,4 +301,4 @@ class _Guarded:
         try:
             return self._inner.read(n_bytes)
         except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-            raise DamagedError(f'decompression: {error}') from error
+            raise _CompressionError(f'decompression: {error}') from error

@@ -42,8 +42,9 @@ from .wire import N_NUMBERS
 
 Compression = Literal['none', 'lz4', 'zstd']
 
+#: The first stamp that no ROS message can hold; none is before 0 [ns].
+STAMP_END_NS = 2**31 * 10**9
 _AUTO_FLUSH_BYTES = 1 << 26
-_LAST_SECOND = 2**31
 
 
 class BagWriter:
@@ -457,7 +458,7 @@ class BagWriter:
 
 def _as_stamps(stamp_ns: ArrayLike) -> Ints:
     stamps = as_times('stamp_ns', stamp_ns)
-    if len(stamps) and int(np.max(stamps)) >= _LAST_SECOND * 1_000_000_000:
+    if len(stamps) and int(np.max(stamps)) >= STAMP_END_NS:
         raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))}')
     return stamps
 

@@ -192,6 +192,16 @@ class Evidence:
     is_fit: bool = False
 
     @property
+    def is_seen(self) -> bool:
+        """
+        Whether the calibration was fitted on one of these bags.
+
+        """
+        sources = () if self.calibration is None else self.calibration.provenance.sources
+        known = {source.sha256 for source in sources if source.sha256}
+        return self.is_fit or any(bag.sha256 in known for bag in self.bags)
+
+    @property
     def headline(self) -> str:
         """
         The verdict with its numbers, or why there is none.

@@ -109,9 +109,7 @@ def _seen(evidence: Evidence) -> str:
     said = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
-        which = 'bags that the fit has not seen'
-        if evidence.is_fit or _are_sources(evidence):
-            which = 'bags of its own fit'
+        which = 'bags of its own fit' if evidence.is_seen else 'bags that the fit has not seen'
         said.append(
             f'{len(evidence.positions)} rests in {which}, '
             f'{np.min(board):.1f} to {np.max(board):.1f} °C.'
@@ -128,16 +126,6 @@ def _seen(evidence: Evidence) -> str:
             f'stretches, {100.0 * part:.0f} % of the time in which the regime was known.'
         )
     return ''.join(f'<p>{escape(text)}</p>' for text in said)
-
-
-def _are_sources(evidence: Evidence) -> bool:
-    """
-    Whether the calibration was fitted on one of these bags.
-
-    """
-    sources = () if evidence.calibration is None else evidence.calibration.provenance.sources
-    known = {source.sha256 for source in sources if source.sha256}
-    return any(bag.sha256 in known for bag in evidence.bags)
 
 
 def _facts(evidence: Evidence) -> str:

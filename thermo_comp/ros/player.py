@@ -72,6 +72,8 @@ class PlayReport:
     unheard: list[str] = field(default_factory=list)
     #: Topics with a best-effort subscriber, which can lose messages.
     lossy: list[str] = field(default_factory=list)
+    #: What of the bag could not be read.
+    missing: str | None = None
 
 
 def play(
@@ -247,6 +249,7 @@ class _Player:
         for role in self._publishers:
             self._await_acknowledgement(role)
         self._report.duration_s = time.monotonic() - self._started
+        self._report.missing = self._reader.info.truncated
         for role, publisher in self._publishers.items():
             self._report.n_messages[publisher.topic_name] = self._n_sent[role]
         return self._report

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A clock that jumps: what a jump becomes, what it leaves alone, and what is no clock at all.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermo_comp.errors import RecordingError
+from thermo_comp.recording import BagWriter, Block, open_recording
+from thermo_comp.recording.clock import LONGEST_PAUSE_NS
+
+START_NS = 1_700_000_000_000_000_000
+YEAR_NS = 365 * 86400 * 10**9
+STEP_NS = 10_000_000
+
+
+def blocks_of(path: Path, stamp_ns: np.ndarray, reading_ns: np.ndarray) -> list[Block]:
+    """
+    Write samples and readings in this order, and read them on one clock.
+
+    """
+    n = len(stamp_ns)
+    log_ns = START_NS + STEP_NS * np.arange(n)
+    with BagWriter(path) as bag:
+        xyz = np.column_stack([np.arange(n)] * 3)
+        bag.write_counts('accel/counts', stamp_ns, xyz, log_ns=log_ns)
+        every = n // len(reading_ns)
+        for topic in ('temperature/board', 'temperature/case'):
+            bag.write_temperature(topic, reading_ns, 0.0 * reading_ns, log_ns=log_ns[::every])
+    with open_recording(path) as reader:
+        return list(reader.blocks_on_one_clock())
+
+
+def joined(blocks: list[Block], name: str) -> np.ndarray:
+    return np.concatenate([getattr(block, name) for block in blocks])
+
+
+@pytest.mark.parametrize('jump_ns', [YEAR_NS, -YEAR_NS, -START_NS + 5, 2 * LONGEST_PAUSE_NS])
+def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path: Path, jump_ns: int) -> None:
+    true_ns = START_NS + STEP_NS * np.arange(1000)
+    after = np.arange(1000) >= 500
+    blocks = blocks_of(
+        tmp_path / 'bag.mcap', true_ns + jump_ns * after, (true_ns + jump_ns * after)[::100]
+    )
+    # A reading stands before the sample of its log time: the jump is before reading 5.
+    hour = LONGEST_PAUSE_NS * after
+    found = joined(blocks, 'accel_stamp_ns') - true_ns
+    assert found[:500].tolist() == [0] * 500
+    steps = np.diff(joined(blocks, 'accel_stamp_ns'))
+    assert np.delete(steps, 499).tolist() == [STEP_NS] * 998
+    assert abs(int(steps[499]) - LONGEST_PAUSE_NS) <= STEP_NS
+    for role in ('board', 'case'):
+        moved = joined(blocks, f'{role}_stamp_ns') - true_ns[::100]
+        assert np.abs(moved - hour[::100]).max() <= STEP_NS
+
+
+def test_without_a_jump_nothing_is_touched(tmp_path: Path) -> None:
+    stamp_ns = START_NS + np.cumsum(np.tile([STEP_NS, 10**9, LONGEST_PAUSE_NS, -(10**9)], 50))
+    blocks = blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
+    assert joined(blocks, 'accel_stamp_ns').tolist() == stamp_ns.tolist()
+    assert joined(blocks, 'board_stamp_ns').tolist() == stamp_ns[::10].tolist()
+
+
+def test_what_jumps_all_the_time_is_no_clock(tmp_path: Path) -> None:
+    stamp_ns = START_NS + YEAR_NS * (np.arange(400) % 2)
+    with pytest.raises(RecordingError, match=r'bag\.mcap: .*more than 100 times'):
+        blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
+
+
+def test_a_message_an_hour_is_no_recording(tmp_path: Path) -> None:
+    stamp_ns = START_NS + LONGEST_PAUSE_NS * np.arange(400)
+    with pytest.raises(RecordingError, match=r'messages stamped over \d+ days'):
+        blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])

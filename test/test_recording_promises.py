@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a bag promises and what comes of it; what it may cost to open one.
+
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+import zstandard
+from conftest import Cli
+from recording_helpers import (
+    ACCEL,
+    BOARD,
+    CASE,
+    assert_columns,
+    regular_messages,
+    write_mcap,
+    write_rosbag2,
+)
+
+from thermo_comp.errors import RecordingError
+from thermo_comp.recording import inspect_recording, open_recording, read_recording
+
+
+def whole(folder: Path, storage: str = 'mcap', compression: str = '') -> Path:
+    write_rosbag2(folder / 'bag', regular_messages(400), storage=storage, compression=compression)
+    return folder / 'bag'
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('compression', ['', 'FILE', 'MESSAGE'])
+def test_every_storage_gives_the_same_messages(
+    tmp_path: Path, storage: str, compression: str
+) -> None:
+    recording = read_recording(whole(tmp_path, storage, compression))
+    assert_columns(recording.columns, regular_messages(400))
+    assert recording.info.truncated is None
+    assert recording.info.storage == storage
+
+
+def test_rows_deleted_from_a_database_are_missed(tmp_path: Path, cli: Cli) -> None:
+    bag = whole(tmp_path, 'sqlite3')
+    with sqlite3.connect(bag / 'bag.db3') as database:
+        (topic,) = database.execute('select id from topics where name = ?', (ACCEL,)).fetchone()
+        query = 'delete from messages where id > 100 and topic_id = ?'
+        n_left = 400 - database.execute(query, (topic,)).rowcount
+    told = f'{ACCEL}: {n_left} of the 400 messages promised are there'
+    assert inspect_recording(bag).truncated == told
+    assert told in cli('info', bag, code=1).stdout
+    calibration = Path(__file__).parent.parent / 'config' / 'calibration.example.yaml'
+    done = cli('replay', bag, '-c', calibration, '-o', tmp_path / 'o.mcap', '--serial', '', code=1)
+    assert told in done.stderr
+    assert (tmp_path / 'o.mcap').is_file()
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path: Path, storage: str) -> None:
+    bag = whole(tmp_path, storage)
+    path = bag / 'metadata.yaml'
+    content = yaml.safe_load(path.read_text())
+    topics = content['rosbag2_bagfile_information']['topics_with_message_count']
+    one = yaml.safe_load(yaml.safe_dump(topics[0]))
+    one['topic_metadata']['name'] = '/gone'
+    one['message_count'] = 7
+    topics.append(one)
+    path.write_text(yaml.safe_dump(content))
+    assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages promised are there'
+
+
+def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path: Path) -> None:
+    write_mcap(tmp_path / 'bag.mcap', regular_messages(40))
+    with open_recording(tmp_path / 'bag.mcap') as reader:
+        kind = reader.info.topics[ACCEL][0]
+        reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
+        for _ in range(2):  # told once, however often it is read
+            assert sum(map(len, reader.blocks())) == 40
+        assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages promised are there'
+
+
+def test_a_compressed_file_is_read_up_to_its_damage(tmp_path: Path) -> None:
+    write_rosbag2(tmp_path / 'bag', regular_messages(8000), compression='FILE')
+    bag = tmp_path / 'bag'
+    (packed,) = bag.glob('*.zstd')
+    data = packed.read_bytes()
+    half = len(data) // 2
+    for damaged in (data[:half], data[:half] + bytes(4096) + data[half + 4096 :]):
+        packed.write_bytes(damaged)
+        recording = read_recording(bag)
+        told = recording.info.truncated or ''
+        assert 0 < len(recording.columns) < 8000
+        for topic, n_all in ((ACCEL, 8000), (BOARD, 1000), (CASE, 1000)):
+            n_read = recording.info.topics[topic][1]
+            assert f'{topic}: {n_read} of the {n_all} messages' in told
+    assert f'{packed.name} is unreadable behind' in told
+    packed.write_bytes(data[:8])
+    with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: it holds nothing'):
+        read_recording(bag)
+
+
+def test_a_compressed_file_expands_within_limits_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = whole(tmp_path, 'mcap', 'FILE')
+    temporary = tmp_path / 'temporary'
+    temporary.mkdir()
+    monkeypatch.setattr('tempfile.tempdir', str(temporary))
+    read_recording(bag)
+    assert not list(temporary.iterdir())
+    (packed,) = bag.glob('*.zstd')
+    with packed.open('wb') as out, zstandard.ZstdCompressor(19).stream_writer(out) as writer:
+        for _ in range(128):
+            writer.write(bytes(1 << 20))
+    with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: \d+ bytes hold more than'):
+        read_recording(bag)
+    assert not list(temporary.iterdir())
+
+
+def test_a_compressed_message_expands_within_limits(tmp_path: Path) -> None:
+    bag = whole(tmp_path, 'sqlite3', 'MESSAGE')
+    with sqlite3.connect(bag / 'bag.db3') as database:
+        bomb = zstandard.compress(bytes(1 << 28))
+        database.execute('update messages set data = ? where id = 1', (bomb,))
+    with pytest.raises(RecordingError, match=r'bag\.db3: .*a message of 268435456 bytes'):
+        read_recording(bag)
+
+
+def test_a_fifo_or_a_device_is_never_waited_for(tmp_path: Path) -> None:
+    for name in ('bag.mcap', 'bag.db3', 'bag.bag'):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(RecordingError, match=r'neither a file nor a directory'):
+            inspect_recording(tmp_path / name)
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    os.mkfifo(folder / 'folder_0.mcap')
+    (folder / 'folder_1.db3').symlink_to('/dev/zero')
+    with pytest.raises(RecordingError, match=r'the directory has no metadata\.yaml'):
+        inspect_recording(folder)
+    os.mkfifo(folder / 'metadata.yaml')
+    with pytest.raises(RecordingError, match=r'metadata\.yaml: .*not a regular file'):
+        inspect_recording(folder)
+    whole_bag = whole(tmp_path)
+    os.mkfifo(whole_bag / 'beside.mcap')
+    assert len(read_recording(whole_bag).columns) == 400

@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns bags whose files rosbag2 has compressed as a whole: expanded beside, then read as any other.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from ..errors import RecordingError
+from .assemble import Part
+from .columns import RawMessages, Role
+from .mcap_records import DamagedError
+from .unpack import expand
+
+if TYPE_CHECKING:
+    from .reader import Source
+
+
+class ExpandedSource:
+    """
+    A bag of compressed files.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Its ``.zstd`` files, in the order in which they follow each other.
+    open_files : callable
+        Opens the expanded files, given what is missing of them.
+
+    Raises
+    ------
+    RecordingError
+        A file that holds more than it may, or what `open_files` raises.
+
+    """
+
+    def __init__(
+        self, files: Sequence[Path], open_files: Callable[[Sequence[Path], str | None], Source]
+    ) -> None:
+        self._files = {file.stem: file for file in files}
+        self._folder = TemporaryDirectory(prefix='thermo_comp-')
+        notes = []
+        expanded = []
+        try:
+            with self._named():
+                for name, file in self._files.items():
+                    expanded.append(Path(self._folder.name, name))
+                    try:
+                        notes.append(expand(file, expanded[-1]))
+                    except DamagedError as error:
+                        raise RecordingError(f'damaged: {error}', file) from error
+                self._source = open_files(expanded, '; '.join(filter(None, notes)) or None)
+        except BaseException:
+            self._folder.cleanup()
+            raise
+        self.storage = self._source.storage
+        self.topics = self._source.topics
+        self.definitions = self._source.definitions
+        self.start_ns, self.end_ns = self._source.start_ns, self._source.end_ns
+        self.truncated = self._source.truncated
+        self.metadata = self._source.metadata
+
+    def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
+        """
+        Decode the messages of the chosen topics, in reading order.
+
+        """
+        with self._named():
+            yield from self._source.parts(selection, raw=raw)
+
+    def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
+        """
+        Read topics as they are, about in order of log time.
+
+        """
+        with self._named():
+            yield from self._source.raw(topics)
+
+    def close(self) -> None:
+        """
+        Close the files and remove what was expanded.
+
+        """
+        self._source.close()
+        self._folder.cleanup()
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """
+        Name the file that the user has, not the expanded one.
+
+        """
+        try:
+            yield
+        except RecordingError as error:
+            path = None if error.path is None else Path(error.path)
+            if path is None or str(path.parent) != self._folder.name:
+                raise
+            raise RecordingError(error.message, self._files[path.name], error.topic) from error
