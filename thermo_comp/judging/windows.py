@@ -215,7 +215,10 @@ def corrected_windows(
     bias = np.array([axis.bias for axis in axes])
     M = np.array(calibration.misalignment)
     along = table[:, _FORCE] / np.linalg.norm(table[:, _FORCE], axis=1, keepdims=True) @ M
-    white = along**2 @ np.array(Compensator(calibration, config).thermal.correction.noise)
+    noise = along**2 @ np.array(Compensator(calibration, config).thermal.correction.noise)
+    # Of a message's noise the rounding is carried on to the next: a mean has none of it.
+    density = np.array(calibration.noise_density_m_s2_sqrt_hz)
+    white = along**2 @ density**2 / calibration.unit.cycle_time_s
     mean_white = white / table[:, _COUNT]
     return _windows(
         bags,
@@ -223,7 +226,7 @@ def corrected_windows(
         window_s,
         calibration.gravity_m_s2 if gravity is None else gravity,
         raw=np.asarray((table[:, _MEAN] - bias) / K @ M.T),
-        claimed_sd=np.sqrt(np.maximum(table[:, _VARIANCE] - white, 0.0) + mean_white),
+        claimed_sd=np.sqrt(np.maximum(table[:, _VARIANCE] - noise, 0.0) + mean_white),
         noise_sd=np.sqrt(mean_white),
     )
 
