@@ -211,15 +211,13 @@ def corrected_windows(
 
     table = _table(bags, window_s, correct)
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    K = np.array([axis.scale_factor for axis in axes])
-    bias = np.array([axis.bias for axis in axes])
+    K, bias = np.array([(axis.scale_factor, axis.bias) for axis in axes]).T
     M = np.array(calibration.misalignment)
     along = table[:, _FORCE] / np.linalg.norm(table[:, _FORCE], axis=1, keepdims=True) @ M
     noise = along**2 @ np.array(Compensator(calibration, config).thermal.correction.noise)
     # Of a message's noise the rounding is carried on to the next: a mean has none of it.
-    density = np.array(calibration.noise_density_m_s2_sqrt_hz)
-    white = along**2 @ density**2 / calibration.unit.cycle_time_s
-    mean_white = white / table[:, _COUNT]
+    white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
+    mean_white = white / (calibration.unit.cycle_time_s * table[:, _COUNT])
     return _windows(
         bags,
         table,
