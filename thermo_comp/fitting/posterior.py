@@ -457,6 +457,7 @@ class Regression:
 
         """
         n_columns = len(self.windows.groups)
+        # Eq. (7) with (8) and (9): bias, and scale times input.
         weight = state.on_bias[axis] + state.kappa[axis] * force * state.on_scale[axis]
         result = np.zeros(self._base.shape[1])
         result[0] = state.kappa[axis] * force + state.bias[axis] + state.offset[p, axis]
