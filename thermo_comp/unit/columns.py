@@ -67,9 +67,7 @@ class Column:
     """
 
     group: Annotated[
-        Literal[
-            'now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'
-        ],
+        Literal['now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'],
         'What evidence judges together.',
     ]
     kind: Annotated[
