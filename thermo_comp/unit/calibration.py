@@ -327,7 +327,7 @@ class Calibration:
                 f'got {list(names)}'
             )
         for k, term in enumerate(self.response):
-            if (term.is_of_gradient or term.kind == 'neighbour') and term.sensor not in names:
+            if term.kind in ('now', 'neighbour', 'even') and term.sensor not in names:
                 raise ValueError(
                     f'`response[{k}].sensor` must be one of sensors {list(names)}, '
                     f'got {term.sensor!r}'
@@ -367,7 +367,7 @@ class Calibration:
 
         """
         return (
-            bool(self.posterior)
+            self.posterior is not None
             or any(self.misalignment_sd)
             or any(axis.residual_sd_m_s2 for part in self.regime_sets() for axis in part.axes())
         )
