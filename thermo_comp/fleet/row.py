@@ -18,7 +18,7 @@ from ..fitting import FitResult
 from ..judging import Judgement, Verdict
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
-from ..unit.prediction import predicted_sd
+from ..unit.prediction import bias_and_scale, predicted_sd, ramp_states
 
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
@@ -234,7 +234,10 @@ def calibration_cells(calibration: Calibration) -> dict[str, Cell]:
             ('rate_range_k_min', 1, max),
         )
     )
-    sd = predicted_sd(calibration, np.array([calibration.reference_temperature_c]), 0.0)
+    reference = np.array([calibration.reference_temperature_c])
+    soak = ramp_states(calibration, reference, 0.0, 0.0)
+    bias, scale = bias_and_scale(calibration, soak)
+    sd = predicted_sd(calibration, reference, 0.0)
     cells: dict[str, Cell] = {
         'gravity_m_s2': calibration.gravity_m_s2,
         'reference_temperature_c': calibration.reference_temperature_c,
@@ -245,14 +248,13 @@ def calibration_cells(calibration: Calibration) -> dict[str, Cell]:
         'board_lag_s': calibration.board_lag_s,
     }
     for i, axis in enumerate(AXES):
-        reference = getattr(calibration.axes, axis)
         static = getattr(calibration.static, axis)
-        one_ug = reference.scale_factor * MICRO_G
+        one_ug = getattr(calibration.axes, axis).scale_factor * MICRO_G
         cells |= {
-            f'scale_{axis}': reference.scale_factor,
+            f'scale_{axis}': float(scale[0, i]),
             f'scale_sd_{axis}_ppm': float(sd.scale[0, i]) * 1e6,
             f'scale_slope_{axis}_ppm_k': static.scale_function.slope(0.0) * 1e6,
-            f'bias_{axis}_ug': (reference.bias + static.delta) / one_ug,
+            f'bias_{axis}_ug': float(bias[0, i]) / MICRO_G,
             f'bias_sd_{axis}_ug': float(sd.bias[0, i]) / MICRO_G,
             f'bias_slope_{axis}_ug_k': static.bias_function.slope(0.0) / one_ug,
             f'noise_{axis}_ug_sqrt_hz': calibration.noise_density_m_s2_sqrt_hz[i] / MICRO_G,

@@ -80,14 +80,15 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
                 axes.set_ylabel(f'change, {unit}')
             if part and (i == 2 or not sheet.is_narrow):
                 axes.set_xlabel('T board, °C')
-    panels[0, 0].legend(loc='lower left', bbox_to_anchor=(0.0, 1.14), ncols=3)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper left', ncols=1 if sheet.is_narrow else 3)
     return figure
 
 
 @dataclass(frozen=True)
 class Curve:
     """
-    Bias and scale over temperature in one thermal state, against the reference.
+    Bias and scale over temperature in one thermal state, against a soak at the reference.
 
     Parameters
     ----------
@@ -139,6 +140,8 @@ def curves(calibration: Calibration) -> list[Curve]:
             if rate:
                 name = f'{word} at {abs(rate):g} K/min'
                 looks.append((name, dynamic, rate / 60.0, line, hatch, marker))
+    reference = np.array([calibration.reference_temperature_c])
+    bias_0, scale_0 = bias_and_scale(calibration, ramp_states(calibration, reference, 0.0, 0.0))
     found = []
     for name, part, rate, line, hatch, marker in looks:
         lower, upper = part.temperature_range_c
@@ -155,9 +158,9 @@ def curves(calibration: Calibration) -> list[Curve]:
                 hatch,
                 marker,
                 temperature,
-                bias / MICRO_G,
+                (bias - bias_0) / MICRO_G,
                 sd.bias / MICRO_G,
-                scale * 1e6,
+                (scale / scale_0 - 1.0) * 1e6,
                 sd.scale * 1e6,
             )
         )
@@ -227,7 +230,7 @@ def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     since_s = np.append(minutes * 60.0, np.inf)
     states = step_states(calibration, calibration.reference_temperature_c, since_s)
     bias, scale = bias_and_scale(calibration, states)
-    return minutes, (bias[:-1] - bias[-1]) / MICRO_G, (scale[:-1] - scale[-1]) * 1e6
+    return minutes, (bias[:-1] - bias[-1]) / MICRO_G, (scale[:-1] / scale[-1] - 1.0) * 1e6
 
 
 def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:

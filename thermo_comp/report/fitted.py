@@ -85,7 +85,7 @@ def _is_reservation(finding: Finding) -> bool:
 
 def _left_out(result: FitResult) -> dict[int, float]:
     """
-    Number the fit's positions as `Windows.position` does: all rests of all bags.
+    Give what is left of each position without it, by `Windows.position`.
 
     """
     rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]

@@ -84,7 +84,7 @@ def sd_of_states(calibration: Calibration, states: Floats) -> PredictedSd:
 
 def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
     """
-    Evaluate how bias and scale differ from those at the reference.
+    Evaluate bias and scale.
 
     Parameters
     ----------
@@ -96,19 +96,17 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
     Returns
     -------
     bias : ndarray, shape (n, 3)
-        Less `axes.bias` [m/s^2].
+        Of each axis [m/s^2].
     scale : ndarray, shape (n, 3)
-        Relative to `axes.scale_factor`, less 1.
+        Of each axis [input units per m/s^2].
 
     """
-    axes = calibration.axes
     pairs = Correction(calibration).bias_scale([np.ascontiguousarray(c) for c in states.T])
     one = np.ones(len(states))
-    bias, scale = [], []
-    for axis, (of_bias, of_scale) in zip((axes.x, axes.y, axes.z), pairs, strict=True):
-        bias.append((of_bias - axis.bias) / axis.scale_factor * one)
-        scale.append((of_scale / axis.scale_factor - 1.0) * one)
-    return np.column_stack(bias), np.column_stack(scale)
+    bias, scale = (np.column_stack([pair[k] * one for pair in pairs]) for k in (0, 1))
+    axes = calibration.axes
+    K = [axis.scale_factor for axis in (axes.x, axes.y, axes.z)]
+    return bias / K, scale
 
 
 def ramp_states(
