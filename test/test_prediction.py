@@ -11,10 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import SECOND_NS, axis_set, calibration, regime_set, rich_calibration, term
+from builders import axis_set, calibration, regime_set, rich_calibration, term
 
-from thermo_comp.thermal.memory import MemorySpec
-from thermo_comp.thermal.memory import ThermalMemory
+from thermo_comp.thermal.memory import memory_on_grid
 from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
@@ -63,18 +62,24 @@ def test_what_is_known_has_no_sd():
 
 @pytest.mark.parametrize('rate', [0.01, -0.02])
 def test_ramp_is_what_the_memory_makes_of_one(rate):
-    # The second route: the memory is fed with a ramp out of a soak, reading by reading.
+    # The second route: the memory of the fit goes through a ramp out of a soak, second by second.
     one = replace(rich_calibration(), board_lag_s=100.0)
     spec = Correction(one).memory
-    lasted = 900
-    memory = ThermalMemory(MemorySpec(spec.sensors, spec.lags, spec.plays))
-    memory_state = fed(memory, spec, rate, 100.0 * rate, lasted)
-    (state,) = ramp_states(one, np.array([25.0]), rate, float(lasted))
-    assert state[[BOARD, RATE, WEIGHT]].tolist() == [25.0, rate, 1.0]
+    gradient = np.append(0.0, np.full(900, 100.0 * rate))
+    board = 25.0 + rate * np.arange(-900.0, 1.0)
+    lived = memory_on_grid(spec, 1.0, board, [gradient] * len(spec.sensors))[-1]
+    (state,) = ramp_states(one, board[-1:], rate, 900.0)
     layout = Layout(spec)
-    assert state[[*layout.lags.values()]] == pytest.approx(memory_state[0], rel=1e-6)
-    slow = [tau == 0.0 for tau, _ in spec.plays]
-    assert state[[*layout.plays.values()]][slow] == pytest.approx(memory_state[1][slow])
+    assert state[[BOARD, RATE, WEIGHT]].tolist() == [25.0, rate, 1.0]
+    assert state[list(layout.gradients.values())] == pytest.approx(100.0 * rate)
+    # A reading of the gradient is not there at once but within a second of the 900.
+    for lag, place in layout.lags.items():
+        assert state[place] == pytest.approx(lived[place - layout.first_lag], rel=2e-3), lag
+    for (tau, width), place in layout.plays.items():
+        # Half an hour would push the play on the lag to its end too.
+        if not tau:
+            assert state[place] == pytest.approx(-width * np.sign(rate))
+            assert state[place] == pytest.approx(lived[place - layout.first_lag])
 
 
 def test_step_is_forgotten_with_each_lags_own_time():
