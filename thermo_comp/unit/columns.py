@@ -16,7 +16,7 @@ neighbour  L_tau(g_s)                  parts between the thermometers
 square     (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a flow
            g_s^2 where tau is 0
 even       tanh((g_s / width)^2)       heat load whichever way the heat flows
-size       \|g_s\|                      the same, as a heat pump's
+size       abs(g_s)                    the same, as a heat pump's
 play       P_r(v) - v, v = t or        rate-independent hysteresis
            v = L_tau(t)
 =========  ==========================  ====================================================
@@ -49,7 +49,7 @@ UNBOUNDED: Final = (-1000.0, 1000.0)
 #: Time constants of the bank: from a few readings to the longest memory that bags can show [s].
 BANK_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 8).round(9).tolist())
 #: Widths of the even columns [K], half-widths of the plays [K], and the lag that some follow [s].
-EVEN_WIDTHS: Final = (0.75, 1.5, 3.0)
+EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2)
 PLAY_TAU: Final = 900.0
 
@@ -67,16 +67,13 @@ class Column:
     """
 
     group: Annotated[
-        Literal[
-            'now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'
-        ],
+        Literal['now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'],
         'What evidence judges together.',
     ]
     kind: Annotated[
         Literal['now', 'rate', 'board', 'neighbour', 'square', 'size', 'even', 'play'],
-        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without lag; '
-        '|g_s|; tanh((g_s / width)^2); '
-        'play of t minus t, where g_s = T_s - T_board.',
+        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without '
+        'lag; abs(g_s); tanh((g_s / width)^2); play of t minus t, where g_s = T_s - T_board.',
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
     tau_s: Annotated[
@@ -160,7 +157,7 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
         Column('even', kind, sensor, power=power, range=UNBOUNDED)
         for sensor in sensors
         for kind in ('size', 'square')
-        for power in (0, 1)
+        for power in (0, 1, 2)
     ]
     play = [
         Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
