@@ -113,6 +113,14 @@ def _columns(time: Floats, step_s: float, turns: float) -> Floats:
     return np.column_stack([np.interp(time, fine, column) for column in table.T])
 
 
+def widths(names: tuple[str, ...], sd: float) -> Floats:
+    """
+    Width of each column: 0 where it takes no part.
+
+    """
+    return np.where(np.isin(GROUPS, names), sd, 0.0)
+
+
 def prior_of(truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: object) -> Prior:
     """
     A wide prior with the true noises.
@@ -123,8 +131,8 @@ def prior_of(truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **change
         'bias_sd': np.full(3, 1.0),
         'scale_sd': 0.05,
         'skew_sd': 1e-2,
-        'groups': {('bias', group): 1e-2 for group in names}
-        | {('scale', group): 1e-3 for group in names},
+        'on_bias': widths(names, 1e-2),
+        'on_scale': widths(names, 1e-3),
         'offset_sd': max(truth.offset_sd, 1e-9),
         'sigma': truth.sigma,
         'rho': (truth.walk / truth.sigma) ** 2,

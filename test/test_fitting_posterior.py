@@ -101,9 +101,8 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             np.linalg.solve(np.linalg.cholesky(w.start_covariance), state.start.T).ravel(),
         ]
-        for (part, group), sd in prior.groups.items():
-            weights = state.on_bias if part == 'bias' else state.on_scale
-            parts.append(weights[:, np.array(w.groups) == group].ravel() / sd)
+        for weights, sd in ((state.on_bias, prior.on_bias), (state.on_scale, prior.on_scale)):
+            parts.append((weights[:, sd > 0.0] / sd[sd > 0.0]).ravel())
         return np.concatenate(parts)
 
     def jacobian(self, x: Floats) -> Floats:
@@ -280,6 +279,17 @@ def test_a_position_that_tells_what_no_other_does_is_not_left_out(
     np.testing.assert_allclose(np.sqrt(found.variance[found.layout.skew]), 1e-3, rtol=1e-3)
 
 
+def test_what_takes_no_part_any_more_is_gone(
+    solved: tuple[Regression, Prior, Posterior],
+) -> None:
+    regression, prior, found = solved
+    narrow = replace(prior, on_bias=prior.on_bias * [1, 1, 0, 0, 0, 0])
+    # Even where no step is made.
+    state = regression.solve(found.state, narrow, tolerance=np.inf).state
+    assert not state.on_bias[:, 2:4].any()
+    np.testing.assert_array_equal(state.on_scale, found.state.on_scale)
+
+
 def test_axes_may_be_renamed(rng: np.random.Generator) -> None:
     # Without misalignment nothing tells the axes apart: permuted data give permuted results.
     truth = Truth(skew=np.zeros(3))
@@ -372,7 +382,9 @@ def test_published_huygens_coefficients_come_back(rng: np.random.Generator) -> N
     )  # fmt: skip
     regression, state = begin(table, up)
     regression = Regression(table, GRAVITY, np.full(3, K0))
-    prior = prior_of(Truth(), ('curve',), sigma=np.full(3, 1e-6 * MICRO))
+    prior = prior_of(
+        Truth(), on_bias=np.full(4, 1e-2), on_scale=np.full(4, 1e-3), sigma=np.full(3, 1e-6 * MICRO)
+    )
     found = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-12).state
     for axis in range(3):
         relative = np.append(1.0, found.on_scale[axis] / regression.rms)
