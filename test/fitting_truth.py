@@ -121,7 +121,9 @@ def widths(names: tuple[str, ...], sd: float) -> Floats:
     return np.where(np.isin(GROUPS, names), sd, 0.0)
 
 
-def prior_of(truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: object) -> Prior:
+def prior_of(
+    truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: object
+) -> Prior:
     """
     A wide prior with the true noises.
 
@@ -148,7 +150,5 @@ def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
     regression = Regression(windows, GRAVITY, NOMINAL)
     turned = up + np.array([2e-3, -1e-3, 3e-3])
     turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-    state = initial_state(
-        windows, regression.n_bags, np.zeros(3), np.ones(3), np.zeros(3), turned
-    )
+    state = initial_state(windows, regression.n_bags, np.zeros(3), np.ones(3), np.zeros(3), turned)
     return regression, state

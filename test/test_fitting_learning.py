@@ -174,15 +174,17 @@ def test_outliers_do_not_pull() -> None:
     dirty = replace(clean, mean=clean.mean.copy())
     struck = rng.choice(len(clean.time), len(clean.time) // 50, replace=False)
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
-    biases, sd = [], np.zeros(3)
+    found = []
     for windows in (clean, dirty):
         regression, state = begin(windows, up)
-        found = learn(regression, state, wide(truth)).posterior
-        biases.append(found.state.bias)
-        sd = np.sqrt(found.variance[found.layout.bias])
+        found.append(learn(regression, state, wide(truth)))
+    one, other = found
+    sd = np.sqrt(one.posterior.variance[one.posterior.layout.bias])
     # 2 % of the windows, each worth 3 sd at most, shift by about one sd; unbridled, each is worth
-    # 100.
-    assert np.abs((biases[1] - biases[0]) / sd).max() < 2.0
+    # 100, and beside them the curve is not seen.
+    assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
+    np.testing.assert_allclose(other.prior.sigma, truth.sigma, rtol=0.2)
+    np.testing.assert_array_equal(other.prior.on_bias > 0.0, one.prior.on_bias > 0.0)
 
 
 def test_progress_is_told() -> None:

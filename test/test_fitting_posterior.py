@@ -42,7 +42,9 @@ STEPS = 12
 
 def flat(state: State) -> Floats:
     """All numbers of a state but the directions."""
-    return np.concatenate([getattr(state, f.name).ravel() for f in fields(State) if f.name != 'up'])
+    return np.concatenate(
+        [getattr(state, f.name).ravel() for f in fields(State) if f.name != 'up']
+    )
 
 
 class Dense:
@@ -383,7 +385,10 @@ def test_published_huygens_coefficients_come_back(rng: np.random.Generator) -> N
     regression, state = begin(table, up)
     regression = Regression(table, GRAVITY, np.full(3, K0))
     prior = prior_of(
-        Truth(), on_bias=np.full(4, 1e-2), on_scale=np.full(4, 1e-3), sigma=np.full(3, 1e-6 * MICRO)
+        Truth(),
+        on_bias=np.full(4, 1e-2),
+        on_scale=np.full(4, 1e-3),
+        sigma=np.full(3, 1e-6 * MICRO),
     )
     found = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-12).state
     for axis in range(3):
