@@ -125,7 +125,7 @@ def prior_of(
     truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: object
 ) -> Prior:
     """
-    A wide prior with the true noises.
+    Return a wide prior with the true noises.
 
     """
     known: dict[str, object] = {
@@ -144,7 +144,7 @@ def prior_of(
 
 def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
     """
-    A regression and a state a little beside the truth.
+    Return a regression and a state a little beside the truth.
 
     """
     regression = Regression(windows, GRAVITY, NOMINAL)
