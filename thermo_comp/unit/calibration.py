@@ -366,10 +366,10 @@ class Calibration:
         Whether the calibration says anything of how well it is known; else it claims nothing.
 
         """
-        return any(self.misalignment_sd) or any(
-            axis.covariance or axis.residual_sd_m_s2
-            for part in self.regime_sets()
-            for axis in part.axes()
+        return (
+            self.posterior is not None
+            or any(self.misalignment_sd)
+            or any(axis.residual_sd_m_s2 for part in self.regime_sets() for axis in part.axes())
         )
 
 
