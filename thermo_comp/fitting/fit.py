@@ -8,7 +8,7 @@ Owns the fit as a whole: sources in, calibration with its evidence out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from .evidence import PositionReport, ResidualRow, position_reports, residual_ro
 from .learning import Learnt, learn
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .posterior import Prior, Regression, initial_state
+from .priors import constants_of, known_of, prior_columns, prior_sets, state_of
 from .reduction import ReducedBag, reduce_source
 from .rests import judge_rests
 from .sensors import learn_detector
@@ -216,10 +217,14 @@ def fit_bags(
     _check_temperatures(bags)
     findings = list(enforce(judge_bags(bags, options), options))
     findings += enforce(judge_rests(bags, options), options)
-    detector = options.detector or learn_detector(bags)
+    known = options.prior
+    detector = options.detector or (known.detector if known else learn_detector(bags))
     tell('temperatures', 0.55)
-    sets = sets_of(options, bags)
-    columns = () if options.model == 'golovach' else bank()
+    if known is not None:
+        sets, columns = prior_sets(known), prior_columns(known)
+    else:
+        sets = sets_of(options, bags)
+        columns = () if options.model == 'golovach' else bank()
     windows = thermal_windows(
         bags,
         columns,
@@ -229,7 +234,7 @@ def fit_bags(
         options.reference_temperature,
         options.regression_window_s,
     )
-    start = first_guess(windows, options)
+    start = first_guess(windows, options) if known is None else constants_of(known)
     up = start.force(position_means(windows.data))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     has_case = all(len(bag.case.value) for bag in bags)
@@ -247,6 +252,15 @@ def fit_bags(
         up,
     )
     prior = _wide_prior(windows, start, up, options)
+    if known is not None:
+        state = state_of(known, regression, up)
+        told = known_of(known, regression, state, sets, options.ageing)
+        prior = replace(
+            prior,
+            on_bias=np.ones(len(windows.data.groups)),
+            on_scale=windows.data.in_scale.astype(np.float64),
+            known=told,
+        )
     forced = [
         options.model == 'golovach' or group == CURVE or group in options.forced
         for group in windows.data.groups

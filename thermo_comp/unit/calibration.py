@@ -7,8 +7,8 @@ The dataclasses mirror the calibration file key by key. One object is one unit; 
 so a running node swaps it by one reference.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
-(0..1), and phi_j the columns of the response (`columns`), common to both sets (eqs 6-9, and
-beyond the paper the response)::
+(0..1), and phi_j the columns of the response (`columns`), common to both sets (Eq. (6) to
+(9), and beyond the paper the response)::
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
