@@ -38,7 +38,7 @@ def findings_of(
 
 @pytest.fixture
 def good(rng: np.random.Generator) -> tuple[ThermalWindows, np.ndarray]:
-    """An hour and a half in each of 18 positions: up, down, and a soak at the end."""
+    """Spend an hour and a half in each of 18 positions: up, down, and a soak at the end."""
     data, up = table_of(Truth(), 18, rng)
     case = np.interp(data.time, [0.0, 1800.0, 3000.0, 3600.0], [5.0, 45.0, 5.0, 5.0])
     rate = np.interp(
