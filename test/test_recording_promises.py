@@ -20,6 +20,7 @@ from recording_helpers import (
     ACCEL,
     BOARD,
     CASE,
+    IMU_IN,
     assert_columns,
     regular_messages,
     write_mcap,
@@ -59,6 +60,16 @@ def test_rows_deleted_from_a_database_are_missed(tmp_path: Path, cli: Cli) -> No
     done = cli('replay', bag, '-c', calibration, '-o', tmp_path / 'o.mcap', '--serial', '', code=1)
     assert told in done.stderr
     assert (tmp_path / 'o.mcap').is_file()
+
+
+def test_a_conversion_tells_what_the_bag_lacks(tmp_path: Path, cli: Cli) -> None:
+    messages = regular_messages(400, accel=IMU_IN)
+    write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
+    with sqlite3.connect(tmp_path / 'bag' / 'bag.db3') as database:
+        database.execute('delete from messages where id > 400')
+    topics = ('--board-topic', BOARD, '--case-topic', CASE)
+    done = cli('convert', tmp_path / 'bag', '-o', tmp_path / 'o.mcap', *topics, code=1)
+    assert 'messages promised are there' in done.stderr
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])

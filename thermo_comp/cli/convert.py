@@ -102,6 +102,9 @@ def convert(
     with out.progress('converting', total=1.0) as done:
         report = write_log(read(), output, force, done)
     say(out, report)
+    if report.missing:
+        out.note(f'{log}: {report.missing}')
+    out.end(is_torn=bool(report.missing))
 
 
 def _refuse_for_bags(

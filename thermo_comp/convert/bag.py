@@ -89,6 +89,7 @@ def bag_log(
         line=np.arange(1, len(columns.accel_stamp_ns) + 1),
         frame_id=columns.frame_id,
         serial=serial or '',
+        missing=recording.info.truncated,
         metadata={
             **{f'topic_{role}': name for role, name in found.items() if name},
             'converted_from': shown_name(path),

@@ -84,6 +84,8 @@ class ForeignLog:
         Rows that were left out because they are too short.
     metadata : dict of {str: str}
         What the bag shall say about its origin.
+    missing : str or None
+        What of the log could not be read.
 
     """
 
@@ -103,6 +105,7 @@ class ForeignLog:
     serial: str = ''
     n_short: int = 0
     metadata: dict[str, str] = field(default_factory=dict)
+    missing: str | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,8 @@ class ConversionReport:
         Where the log rests and what it reads there.
     start_ns : int
         First stamp.
+    missing : str or None
+        What of the log could not be read.
 
     """
 
@@ -171,6 +176,7 @@ class ConversionReport:
     believed: str
     stillness: Stillness
     start_ns: int
+    missing: str | None
 
 
 def thin(
@@ -297,6 +303,7 @@ def write_log(
         else 'it never rests, so its unit was not checked',
         stillness=stillness,
         start_ns=int(stamp_ns[0]),
+        missing=log.missing,
     )
 
 

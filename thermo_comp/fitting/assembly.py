@@ -140,8 +140,8 @@ def build_calibration(
     n_sets = len(sets.levels())
     used = [
         k
-        for k, column in enumerate(columns)
-        if ('bias', column.group) in prior.groups or ('scale', column.group) in prior.groups
+        for k in range(len(columns))
+        if prior.on_bias[n_sets + k] > 0.0 or prior.on_scale[n_sets + k] > 0.0
     ]
     terms = tuple(
         ResponseTerm(
@@ -216,7 +216,7 @@ def build_calibration(
                 explains_m_s2=float(worth.explains),
                 effective_parameters=max(float(worth.effective), 0.0),
                 log_evidence_change=float(worth.evidence),
-                prior_sd=(float(worth.sd),),
+                prior_sd=worth.sd,
             )
             for worth in learnt.worth
         ),

@@ -128,15 +128,15 @@ def _with_only(regression: Regression, learnt: Learnt, groups: tuple[str, ...]) 
     Fit again with some groups only, as wide as they like to be.
 
     """
-    wide = {'bias': 0.05, 'scale': 0.005}
-    kept = {
-        (part, group): sd
-        for part, sd in wide.items()
-        for group in groups
-        if group in regression.windows.groups
-    }
+    only = np.array([group in groups for group in regression.windows.groups])
     # What such a model leaves is no noise of the windows; it counts for all of them alike.
-    prior = replace(learnt.prior, groups=kept, offset_sd=1e-7, rho=np.zeros(3))
+    prior = replace(
+        learnt.prior,
+        on_bias=np.where(only, 0.05, 0.0),
+        on_scale=np.where(only & regression.windows.in_scale, 0.005, 0.0),
+        offset_sd=1e-7,
+        rho=np.zeros(3),
+    )
     return regression.solve(learnt.posterior.state, prior).state
 
 

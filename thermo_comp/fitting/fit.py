@@ -18,13 +18,13 @@ from ..text import valid_serial
 from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..typing import Floats
 from ..unit.calibration import Calibration, Unit
-from ..unit.columns import Column, bank
+from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
 from .assembly import UnitFacts, build_calibration
 from .curves import sets_of
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
-from .learning import Key, Learnt, learn
-from .options import COUNTS_FULL_SCALE, GROUPS, FitOptions
+from .learning import Learnt, learn
+from .options import COUNTS_FULL_SCALE, FitOptions
 from .posterior import Prior, Regression, initial_state
 from .reduction import ReducedBag, reduce_source
 from .rests import judge_rests
@@ -40,7 +40,7 @@ from .verdict import (
     judge_result,
     judge_windows,
 )
-from .windows import CURVE, SET, ThermalWindows, thermal_windows
+from .windows import CURVE, ThermalWindows, thermal_windows
 
 Progress = Callable[[str, float], None]
 
@@ -50,8 +50,8 @@ _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 _USUAL_BOARD_LAG_S = 900.0
 # Built-in prior, wide for any triad: bias [m/s^2], relative scale, elements of M [rad].
 _BIAS_SD, _SCALE_SD, _SKEW_SD = 1.0, 0.05, 1e-3
-# Widths that the groups begin with and silent ones keep: what a cheap sensor does over a chamber.
-_GROUP_BIAS_SD, _GROUP_SCALE_SD = 1e-3, 1e-4
+# Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
+_COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
 # A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
 _OFFSET_SD, _SIGMA = 1e-6, 1e-5
 
@@ -246,15 +246,16 @@ def fit_bags(
         np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
         up,
     )
-    prior = _wide_prior(windows, start, up, columns, options)
-    forced = {(part, group) for group in options.forced for part in ('bias', 'scale')}
-    if options.model == 'golovach':
-        forced = set(prior.groups)
+    prior = _wide_prior(windows, start, up, options)
+    forced = [
+        options.model == 'golovach' or group == CURVE or group in options.forced
+        for group in windows.data.groups
+    ]
     learnt = learn(
         regression,
         state,
         prior,
-        frozenset(forced),
+        np.array(forced),
         lambda part: tell('regression', 0.7 + 0.25 * part),
     )
     residuals, left_out = residual_rows(windows, regression, learnt)
@@ -334,30 +335,26 @@ def _wide_prior(
     windows: ThermalWindows,
     start: ConstantCalibration,
     up: Floats,
-    columns: Sequence[Column],
     options: FitOptions,
 ) -> Prior:
     """
     What is known of any unit before its data are seen.
 
     """
-    names = [CURVE, SET, *dict.fromkeys(column.group for column in columns)]
-    if options.groups is not None:
-        names = [name for name in names if name in options.groups]
-    if not windows.has_temperature:
-        names = []
-    groups: dict[Key, float] = {('bias', name): _GROUP_BIAS_SD for name in names}
-    if len(distinct_directions(up)) >= POSITIONS_NEEDED:
-        groups |= {('scale', name): _GROUP_SCALE_SD for name in names if name != GROUPS[-1]}
-    elif CURVE in names:
-        # Too few attitudes to tell it from the bias: it stays where it is.
-        groups['scale', CURVE] = _GROUP_SCALE_SD
+    groups = windows.data.groups
+    allowed = np.array([options.groups is None or group in options.groups for group in groups])
+    allowed &= windows.has_temperature
+    in_scale = windows.data.in_scale & allowed
+    if len(distinct_directions(up)) < POSITIONS_NEEDED:
+        # Too few attitudes to tell it from the bias: the curve stays at its prior.
+        in_scale &= np.array([group == CURVE for group in groups])
     return Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, _BIAS_SD),
         scale_sd=_SCALE_SD,
         skew_sd=_SKEW_SD,
-        groups=groups,
+        on_bias=np.where(allowed, _COLUMN_BIAS_SD, 0.0),
+        on_scale=np.where(in_scale, _COLUMN_SCALE_SD, 0.0),
         offset_sd=_OFFSET_SD,
         sigma=np.full(3, _SIGMA),
         rho=np.zeros(3),

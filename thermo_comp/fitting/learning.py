@@ -1,16 +1,19 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the data teach the prior: widths of the groups, both noises, which groups earn a place.
+Owns what the data teach the prior: a width for each column, both noises, what earns a place.
 
-Widths and white noise follow MacKay's fixed point (``alpha = gamma / sum w^2``); the walk's share
-is found by a search along the log evidence of each axis; a group whose removal does not lower the
-log evidence (Savage-Dickey ratio) leaves.
+Each column has a width of its own, shared by the axes, bias and scale apart. Widths and white
+noise follow MacKay's fixed point (``alpha = gamma / sum w^2``); a column that the data do not need
+gets an ever smaller width and leaves. The walk's share is found by a search along the log evidence
+of each axis. At the end a column or group stays if the log evidence would fall without it
+(Savage-Dickey ratio).
 
 References
 ----------
 .. [1] D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992), eqs 4.8 to 4.10.
-.. [2] J. M. Dickey, The weighted likelihood ratio, linear hypotheses on normal location
+.. [2] M. E. Tipping, Sparse Bayesian learning and the relevance vector machine, JMLR 1 (2001).
+.. [3] J. M. Dickey, The weighted likelihood ratio, linear hypotheses on normal location
    parameters, Annals of Mathematical Statistics 42 (1971).
 
 """
@@ -22,17 +25,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..typing import Floats, Ints
+from ..typing import Bools, Floats, Ints
 from .posterior import Posterior, Prior, Regression, State
 
-Key = tuple[str, str]
-
-# A group whose effective parameters are below this, under a wide prior, is not seen by the data.
-_SILENT = 0.3
+# Of the three weights of a column, what the data must tell under a wide prior to be asked.
+_SILENT = 0.05
+# A column with fewer effective parameters than this leaves while the widths settle ...
+_IDLE = 0.1
+# ... once they have moved this often.
+_PATIENCE = 4
 # Widths settle within this many rounds, as a rule in half of them.
 _MOST_ROUNDS = 40
 # A round that moves no width by more than this part is the last.
-_SETTLED = 0.02
+_SETTLED = 0.03
+# What must be gained in log evidence to stay.
+_EARNED = 0.5
 # Windows this many sds off lose weight, after Huber.
 _HUBER_SDS = 3.0
 
@@ -40,7 +47,7 @@ _HUBER_SDS = 3.0
 @dataclass(frozen=True)
 class GroupWorth:
     """
-    What one group is worth.
+    What one group of columns is worth.
 
     Parameters
     ----------
@@ -52,8 +59,8 @@ class GroupWorth:
         Effective parameters, of all axes.
     evidence : float
         How much the log evidence falls without it.
-    sd : float
-        Prior sd of its weights, for columns of unit RMS ([m/s^2], relative).
+    sd : tuple of float
+        Prior sd of the weights of its columns, for columns of unit RMS ([m/s^2], relative).
 
     """
 
@@ -62,7 +69,7 @@ class GroupWorth:
     explains: float
     effective: float
     evidence: float
-    sd: float
+    sd: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -81,11 +88,11 @@ def learn(
     regression: Regression,
     state: State,
     prior: Prior,
-    forced: frozenset[Key] = frozenset(),
+    forced: Bools | None = None,
     tell: Callable[[float], None] | None = None,
 ) -> Learnt:
     """
-    Find widths, noises and groups by the evidence.
+    Find widths, noises and columns by the evidence.
 
     Parameters
     ----------
@@ -94,9 +101,9 @@ def learn(
     state : State
         Where to begin.
     prior : Prior
-        Wide: its widths are where those of silent groups stay.
-    forced : frozenset of (part, group), optional
-        Groups that stay whatever they earn.
+        Wide: its widths are where those of columns stay that the data do not see.
+    forced : ndarray of bool, shape (m,), optional
+        Columns that stay whatever they earn.
     tell : callable, optional
         Told how far it is, 0..1.
 
@@ -107,112 +114,145 @@ def learn(
 
     """
     tell = tell or (lambda _part: None)
-    silent = _silent(regression.solve(state, prior), regression, prior)
-    posterior, prior = _settle(regression, state, prior, silent, walks=False)
-    tell(0.3)
+    kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
+    silent = _silent(regression.solve(state, prior), prior)
+    fixed = _Fixed(silent, kept)
+    posterior, prior = _settle(regression, state, prior, fixed)
+    tell(0.4)
     _downweight(regression, posterior)
     prior = _walk(regression, posterior, prior)
-    posterior, prior = _settle(regression, posterior.state, prior, silent)
-    tell(0.6)
-    n_groups = len(prior.groups)
+    posterior, prior = _settle(regression, posterior.state, prior, fixed)
+    tell(0.7)
     while True:
-        worth = group_worth(regression, posterior, prior)
-        idle = [w for w in worth if w.evidence < 0.5 and (w.part, w.group) not in forced]
-        if not idle:
+        idle = {
+            part: [
+                column
+                for column in np.flatnonzero(_widths(prior, part) > 0.0)
+                if not kept[column]
+                and _earned(posterior, _places(posterior, part)[:, column], _widths(prior, part)[column])
+                < _EARNED
+            ]
+            for part in ('bias', 'scale')
+        }
+        if not any(idle.values()):
             break
-        # All that are as good as nothing leave at once, others one by one: the rest take over.
-        nothing = [w for w in idle if w.effective < 0.1] or [min(idle, key=lambda w: w.evidence)]
-        gone = {(w.part, w.group) for w in nothing}
-        prior = replace(
-            prior, groups={key: sd for key, sd in prior.groups.items() if key not in gone}
-        )
-        posterior, prior = _settle(regression, posterior.state, prior, silent, rounds=8)
-        tell(0.6 + 0.3 * (1.0 - len(prior.groups) / n_groups))
+        prior = _without(prior, idle)
+        posterior, prior = _settle(regression, posterior.state, prior, fixed, rounds=6)
+    tell(0.9)
     prior = _walk(regression, posterior, prior)
-    posterior, prior = _settle(regression, posterior.state, prior, silent)
+    posterior, prior = _settle(regression, posterior.state, prior, fixed)
     tell(1.0)
     return Learnt(posterior, prior, group_worth(regression, posterior, prior))
 
 
-def _silent(posterior: Posterior, regression: Regression, prior: Prior) -> frozenset[Key]:
+@dataclass(frozen=True)
+class _Fixed:
     """
-    Find the groups that the data do not see.
+    Columns whose width the data cannot tell, by part; and columns that may not leave.
 
     """
-    found = []
-    for key, places in _places(posterior, regression, prior).items():
-        if places.size:
-            seen = 1.0 - posterior.variance[places] / prior.groups[key] ** 2
-            if seen.sum() < _SILENT:
-                found.append(key)
-    return frozenset(found)
+
+    silent: dict[str, Bools]
+    kept: Bools
 
 
-def _places(
-    posterior: Posterior, regression: Regression, prior: Prior
-) -> dict[Key, Ints]:
-    layout = posterior.layout
-    names = np.array(regression.windows.groups)
-    result = {}
-    for part, group in prior.groups:
-        places = layout.on_bias if part == 'bias' else layout.on_scale
-        result[part, group] = places[:, (names == group) & (places[0] >= 0)].ravel()
-    return result
+def _widths(prior: Prior, part: str) -> Floats:
+    return prior.on_bias if part == 'bias' else prior.on_scale
+
+
+def _places(posterior: Posterior, part: str) -> Ints:
+    return posterior.layout.on_bias if part == 'bias' else posterior.layout.on_scale
+
+
+def _without(prior: Prior, gone: dict[str, list[int]]) -> Prior:
+    on_bias, on_scale = prior.on_bias.copy(), prior.on_scale.copy()
+    on_bias[gone['bias']] = 0.0
+    on_scale[gone['scale']] = 0.0
+    return replace(prior, on_bias=on_bias, on_scale=on_scale)
+
+
+def _told(posterior: Posterior, part: str) -> Floats:
+    """
+    Effective parameters of each column, of all axes; 0 for those that take no part, shape (m,).
+
+    """
+    places = _places(posterior, part)
+    learnt = np.append(1.0 - posterior.precision * posterior.variance, 0.0)
+    return np.asarray(np.where(places >= 0, learnt[places], 0.0).sum(axis=0))
+
+
+def _silent(posterior: Posterior, prior: Prior) -> dict[str, Bools]:
+    return {
+        part: (_told(posterior, part) < _SILENT) & (_widths(prior, part) > 0.0)
+        for part in ('bias', 'scale')
+    }
 
 
 def _settle(
     regression: Regression,
     state: State,
     prior: Prior,
-    silent: frozenset[Key],
+    fixed: _Fixed,
     *,
-    walks: bool = True,
     rounds: int = _MOST_ROUNDS,
 ) -> tuple[Posterior, Prior]:
     """
     Repeat the fixed point of widths and white noise until nothing moves.
 
     """
-    for _ in range(rounds):
+    for k in range(rounds):
         posterior = regression.solve(state, prior, n_steps=2)
         state = posterior.state
-        diagonal = posterior.variance
-        vector = regression.vector(state, posterior.layout)
-        groups, change = {}, 0.0
-        total = _effective_sum(regression, prior)
-        for key, places in _places(posterior, regression, prior).items():
-            sd = prior.groups[key]
-            groups[key] = sd
-            if key in silent or not places.size:
-                continue
-            gamma = max(float(np.sum(1.0 - diagonal[places] / sd**2)), 1e-6)
-            power = float(np.sum(vector[places] ** 2))
-            groups[key] = max(np.sqrt(power / gamma), 1e-4 * total[key[0]])
-            if gamma > 0.05:
-                change = max(change, abs(np.log(groups[key] / sd)))
-        places = posterior.layout.offset.ravel()
-        gamma = float(np.sum(1.0 - diagonal[places] / prior.offset_sd**2))
-        power = float(np.sum(vector[places] ** 2))
-        offset_sd = prior.offset_sd
-        if gamma > _SILENT:
-            offset_sd = max(np.sqrt(power / gamma), 0.03 * _position_sd(regression, prior))
-            if gamma > 1.0:
-                change = max(change, abs(np.log(offset_sd / prior.offset_sd)))
+        vector = np.append(regression.vector(state, posterior.layout), 0.0)
+        moved, change = {}, 0.0
+        gone: dict[str, list[int]] = {}
+        for part in ('bias', 'scale'):
+            sd = _widths(prior, part)
+            told = _told(posterior, part)
+            places = _places(posterior, part)
+            power = np.where(places >= 0, vector[places] ** 2, 0.0).sum(axis=0)
+            asked = (sd > 0.0) & ~fixed.silent[part]
+            new = np.where(asked, np.sqrt(power / np.maximum(told, 1e-9)), sd)
+            new = np.where(asked, np.maximum(new, 1e-3 * sd), sd)
+            lively = asked & (told > _IDLE)
+            if lively.any():
+                change = max(change, float(np.abs(np.log(new[lively] / sd[lively])).max()))
+            moved[part] = new
+            idle = asked & (told < _IDLE) & ~fixed.kept & (k >= _PATIENCE)
+            gone[part] = np.flatnonzero(idle).tolist()
+        offset_sd, skew_sd = prior.offset_sd, prior.skew_sd
+        told_offset, power = _told_of(posterior, vector, posterior.layout.offset)
+        if told_offset > 0.3:
+            offset_sd = max(np.sqrt(power / told_offset), 0.03 * _position_sd(regression, prior))
+            if told_offset > 1.0:
+                change = max(change, float(np.abs(np.log(offset_sd / prior.offset_sd))))
+        told_skew, power = _told_of(posterior, vector, posterior.layout.skew)
+        if told_skew > 1.0:
+            skew_sd = max(np.sqrt(power / told_skew), 1e-6)
         sigma = _sigma(posterior, prior)
         change = max(change, float(np.abs(np.log(sigma / prior.sigma)).max()))
-        prior = replace(prior, groups=groups, offset_sd=offset_sd, sigma=sigma)
-        if change < _SETTLED:
+        prior = replace(
+            prior,
+            on_bias=moved['bias'],
+            on_scale=moved['scale'],
+            offset_sd=float(offset_sd),
+            skew_sd=float(skew_sd),
+            sigma=sigma,
+        )
+        prior = _without(prior, gone)
+        if change < _SETTLED and not any(gone.values()):
             break
     return regression.solve(state, prior), prior
 
 
-def _effective_sum(regression: Regression, prior: Prior) -> dict[str, float]:
+def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float, float]:
     """
-    The smallest width that matters: a weight of it moves no window by more than the noise.
+    Effective parameters of some unknowns, and the sum of their squares.
 
     """
-    sigma = float(np.mean(prior.sigma)) / np.sqrt(len(regression.windows.time))
-    return {'bias': sigma, 'scale': sigma / regression.gravity}
+    where = places.ravel()
+    told = 1.0 - posterior.precision[where] * posterior.variance[where]
+    return float(told.sum()), float(np.sum(vector[where] ** 2))
 
 
 def _position_sd(regression: Regression, prior: Prior) -> float:
@@ -231,7 +271,7 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
     layout = posterior.layout
     own = learnt[layout.axis].sum(axis=1) + learnt[layout.offset].sum(axis=0)
     # Attitudes, misalignment and start states are told by all three.
-    shared = learnt[layout.skew].sum() + layout.up.size
+    shared = learnt[layout.skew].sum() + layout.up.size + learnt[layout.start].sum()
     spent = own + shared / 3.0
     return np.asarray(prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n)))
 
@@ -277,6 +317,39 @@ def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:
     return prior
 
 
+def _earned(posterior: Posterior, places: Ints, sd: float | Floats) -> float:
+    """
+    How much the log evidence falls when some weights are held at 0 (Savage-Dickey).
+
+    Parameters
+    ----------
+    posterior : Posterior
+        The posterior with them.
+    places : ndarray of int, shape (k,)
+        Their places.
+    sd : float or ndarray, shape (k,)
+        Their prior.
+
+    """
+    mode = _mode(posterior, places)
+    covariance = posterior.covariance[np.ix_(places, places)]
+    root = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
+    values = np.maximum(values, 1e-12)
+    along = vectors.T @ (mode / root)
+    determinant = float(np.log(values).sum() + 2.0 * np.log(root).sum())
+    known = float(np.sum(np.log(np.broadcast_to(sd, mode.shape))))
+    return 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant - known
+
+
+def _mode(posterior: Posterior, places: Ints) -> Floats:
+    layout, state = posterior.layout, posterior.state
+    vector = np.zeros(layout.n + 1)
+    vector[layout.on_bias] = state.on_bias
+    vector[layout.on_scale] = state.on_scale
+    return np.asarray(vector[places])
+
+
 def group_worth(
     regression: Regression, posterior: Posterior, prior: Prior
 ) -> tuple[GroupWorth, ...]:
@@ -295,37 +368,32 @@ def group_worth(
     Returns
     -------
     tuple of GroupWorth
-        In the order of the prior.
+        Bias, then scale, in the order of the columns.
 
     """
-    vector = regression.vector(posterior.state, posterior.layout)
     names = np.array(regression.windows.groups)
     columns = regression.windows.columns / regression.rms
     force = regression.gravity * posterior.state.up[regression.windows.position]
     result = []
-    for (part, group), places in _places(posterior, regression, prior).items():
-        sd = prior.groups[part, group]
-        covariance = posterior.covariance[np.ix_(places, places)]
-        root = np.sqrt(np.diag(covariance))
-        values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
-        values = np.maximum(values, 1e-12)
-        along = vectors.T @ (vector[places] / root)
-        determinant = float(np.log(values).sum() + 2.0 * np.log(root).sum())
-        earned = 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant
-        earned -= len(places) * np.log(sd)
-        state = posterior.state
-        weights = state.on_bias if part == 'bias' else state.on_scale
-        added = columns[:, names == group] @ weights[:, names == group].T
-        if part == 'scale':
-            added = added * force
-        result.append(
-            GroupWorth(
-                part,
-                group,
-                float(np.sqrt(np.mean(added**2))),
-                float(np.sum(1.0 - root**2 / sd**2)),
-                earned,
-                sd,
+    for part in ('bias', 'scale'):
+        weights = posterior.state.on_bias if part == 'bias' else posterior.state.on_scale
+        sd, told = _widths(prior, part), _told(posterior, part)
+        for group in dict.fromkeys(regression.windows.groups):
+            used = (names == group) & (sd > 0.0)
+            if not used.any():
+                continue
+            added = columns[:, used] @ weights[:, used].T
+            if part == 'scale':
+                added = added * force
+            places = _places(posterior, part)[:, used]
+            result.append(
+                GroupWorth(
+                    part,
+                    group,
+                    float(np.sqrt(np.mean(added**2))),
+                    float(told[used].sum()),
+                    _earned(posterior, places.ravel(), np.tile(sd[used], 3)),
+                    tuple(float(value) for value in sd[used]),
+                )
             )
-        )
     return tuple(result)

@@ -107,9 +107,9 @@ class Prior:
         Of kappa, about 1.
     skew_sd : float
         Of the elements of M [rad].
-    groups : dict
-        (part, group) -> sd of the weights of that group, part 'bias' [m/s^2] or 'scale'
-        (relative); a group that is absent takes no part.
+    on_bias, on_scale : ndarray, shape (m,)
+        Of the weights of each column, in units of its RMS ([m/s^2], relative); 0 for a column
+        that takes no part.
     offset_sd : float
         Of the offset of each position and axis [m/s^2].
     sigma : ndarray, shape (3,)
@@ -123,7 +123,8 @@ class Prior:
     bias_sd: Floats
     scale_sd: float
     skew_sd: float
-    groups: dict[tuple[str, str], float]
+    on_bias: Floats
+    on_scale: Floats
     offset_sd: float
     sigma: Floats
     rho: Floats
@@ -304,7 +305,7 @@ class Regression:
         Give every unknown its place, those of the unit first; -1 for columns that take no part.
 
         """
-        groups = self.windows.groups
+        n_columns = len(self.windows.groups)
         n = 0
 
         def take(*shape: int) -> Ints:
@@ -313,15 +314,11 @@ class Regression:
             n += size
             return np.arange(n - size, n).reshape(shape)
 
-        uses = {
-            part: np.array([(part, group) in prior.groups for group in groups])
-            for part in ('bias', 'scale')
-        }
-        uses['scale'] &= self.windows.in_scale
+        uses = {'bias': prior.on_bias > 0.0, 'scale': prior.on_scale > 0.0}
         n_axis = 2 + sum(int(used.sum()) for used in uses.values())
         axis = take(3, n_axis)
         n_bias = int(uses['bias'].sum())
-        on_bias, on_scale = np.full((2, 3, len(groups)), -1)
+        on_bias, on_scale = np.full((2, 3, n_columns), -1)
         on_bias[:, uses['bias']] = axis[:, 2 : 2 + n_bias]
         on_scale[:, uses['scale']] = axis[:, 2 + n_bias :]
         skew = take(3)
@@ -350,10 +347,9 @@ class Regression:
         result = np.zeros(layout.n + 1)
         result[layout.kappa] = prior.scale_sd**-2
         result[layout.bias] = prior.bias_sd**-2.0
-        for part, places in (('bias', layout.on_bias), ('scale', layout.on_scale)):
-            for column, group in enumerate(self.windows.groups):
-                if (part, group) in prior.groups:
-                    result[places[:, column]] = prior.groups[part, group] ** -2
+        for places, sd in ((layout.on_bias, prior.on_bias), (layout.on_scale, prior.on_scale)):
+            used = sd > 0.0
+            result[places[:, used]] = sd[used] ** -2.0
         result[layout.skew] = prior.skew_sd**-2
         result[layout.offset] = prior.offset_sd**-2
         return result[:-1]

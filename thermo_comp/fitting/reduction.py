@@ -185,7 +185,8 @@ def reduce_source(
         n_saturated=found.n_saturated,
         n_cells=len(found.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
-        window_s=round(per_window * found.cell_s, 6),
+        # A bag of which no sample counts has windows of the usual length, and none of them.
+        window_s=round(per_window * found.cell_s, 6) or window_s,
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
         is_integer=found.is_integer,
     )

@@ -117,8 +117,8 @@ def draw_shares(curves: Mapping[str, Floats], sheet: Sheet) -> Figure:
     for name, values in drawn.items():
         share = np.arange(1, len(values) + 1) / len(values) * 100.0
         axes.step(values, share, where='post', label=name, **_SECTION_LINES[name])
-    low = min(float(values[0]) for values in drawn.values())
-    high = max(float(values[-1]) for values in drawn.values())
+    low = min((float(values[0]) for values in drawn.values()), default=1.0)
+    high = max((float(values[-1]) for values in drawn.values()), default=1.0)
     log_axis(axes, low / 1.3, high * 1.3)
     axes.set_ylim(0.0, 103.0)
     axes.set_xlabel('|g| − g of a unit, RMS, µg')

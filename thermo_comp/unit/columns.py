@@ -49,7 +49,7 @@ UNBOUNDED: Final = (-1000.0, 1000.0)
 #: Time constants of the bank: from a few readings to the longest memory that bags can show [s].
 BANK_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 8).round(9).tolist())
 #: Widths of the even columns [K], half-widths of the plays [K], and the lag that some follow [s].
-EVEN_WIDTHS: Final = (0.75, 1.5, 3.0)
+EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2)
 PLAY_TAU: Final = 900.0
 
@@ -160,7 +160,7 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
         Column('even', kind, sensor, power=power, range=UNBOUNDED)
         for sensor in sensors
         for kind in ('size', 'square')
-        for power in (0, 1)
+        for power in (0, 1, 2)
     ]
     play = [
         Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
