@@ -14,7 +14,6 @@ import numpy as np
 
 from ..errors import FitError
 from ..text import valid_serial
-from ..text import valid_serial
 from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..typing import Floats
 from ..unit.calibration import Calibration, Unit
@@ -40,7 +39,7 @@ from .verdict import (
     judge_result,
     judge_windows,
 )
-from .windows import CURVE, ThermalWindows, thermal_windows
+from .windows import CURVE, FEWEST_WINDOWS, ThermalWindows, thermal_windows
 
 Progress = Callable[[str, float], None]
 
@@ -175,6 +174,7 @@ def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBa
         cell_s=options.cell_s,
         min_still_s=options.min_still_s,
         full_scale=full_scale,
+        fewest_windows=FEWEST_WINDOWS,
     )
     if not bag.n_samples:
         raise FitError(f'{source.name}: no accelerometer samples')
@@ -257,10 +257,11 @@ def fit_bags(
         prior,
         np.array(forced),
         lambda part: tell('regression', 0.7 + 0.25 * part),
+        (prior.on_scale > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
     )
     residuals, left_out = residual_rows(windows, regression, learnt)
     findings += judge_result(
-        learnt.posterior.state.kappa * nominal, residuals, learnt.prior.offset_sd, options
+        learnt.posterior.state.kappa * nominal, residuals, learnt.prior.offset_sd, options, windows.has_temperature
     )
     facts = UnitFacts(
         _unit(bags, options),
@@ -345,20 +346,33 @@ def _wide_prior(
     allowed = np.array([options.groups is None or group in options.groups for group in groups])
     allowed &= windows.has_temperature
     in_scale = windows.data.in_scale & allowed
+    wide = scale_wide = max(1.0, _drift(windows, start) / _COLUMN_BIAS_SD)
     if len(distinct_directions(up)) < POSITIONS_NEEDED:
         # Too few attitudes to tell it from the bias: the curve stays at its prior.
         in_scale &= np.array([group == CURVE for group in groups])
+        scale_wide = 1.0
     return Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, _BIAS_SD),
         scale_sd=_SCALE_SD,
         skew_sd=_SKEW_SD,
-        on_bias=np.where(allowed, _COLUMN_BIAS_SD, 0.0),
-        on_scale=np.where(in_scale, _COLUMN_SCALE_SD, 0.0),
+        on_bias=np.where(allowed, wide * _COLUMN_BIAS_SD, 0.0),
+        on_scale=np.where(in_scale, scale_wide * _COLUMN_SCALE_SD, 0.0),
         offset_sd=_OFFSET_SD,
         sigma=np.full(3, _SIGMA),
         rho=np.zeros(3),
     )
+
+
+def _drift(windows: ThermalWindows, start: ConstantCalibration) -> float:
+    """
+    RMS of what the readings do within the positions, largest axis [m/s^2].
+
+    """
+    data = windows.data
+    reading = data.mean / start.scale
+    own = np.array([reading[data.position == p].mean(axis=0) for p in range(data.n_positions)])
+    return float(np.sqrt(np.mean((reading - own[data.position]) ** 2, axis=0)).max())
 
 
 def board_lag(windows: ThermalWindows) -> float:

@@ -40,6 +40,8 @@ _MOST_ROUNDS = 40
 _SETTLED = 0.03
 # What must be gained in log evidence to stay.
 _EARNED = 0.5
+# No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
+_LEAST_SIGMA = 1e-8
 # Windows this many sds off lose weight, after Huber.
 _HUBER_SDS = 3.0
 
@@ -90,6 +92,7 @@ def learn(
     prior: Prior,
     forced: Bools | None = None,
     tell: Callable[[float], None] | None = None,
+    held: Bools | None = None,
 ) -> Learnt:
     """
     Find widths, noises and columns by the evidence.
@@ -106,6 +109,9 @@ def learn(
         Columns that stay whatever they earn.
     tell : callable, optional
         Told how far it is, 0..1.
+    held : ndarray of bool, shape (m,), optional
+        Columns of the scale that keep their width, and their place: the data cannot tell them
+        from those of the bias.
 
     Returns
     -------
@@ -115,7 +121,9 @@ def learn(
     """
     tell = tell or (lambda _part: None)
     kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
+    held = np.zeros(len(prior.on_bias), dtype=bool) if held is None else held
     silent = _silent(regression.solve(state, prior), prior)
+    silent['scale'] |= held
     fixed = _Fixed(silent, kept)
     posterior, prior = _settle(regression, state, prior, fixed)
     tell(0.4)
@@ -128,7 +136,7 @@ def learn(
             part: [
                 column
                 for column in np.flatnonzero(_widths(prior, part) > 0.0)
-                if not kept[column]
+                if not (kept[column] or (part == 'scale' and held[column]))
                 and _earned(posterior, _places(posterior, part)[:, column], _widths(prior, part)[column])
                 < _EARNED
             ]
@@ -273,7 +281,8 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
     # Attitudes, misalignment and start states are told by all three.
     shared = learnt[layout.skew].sum() + layout.up.size + learnt[layout.start].sum()
     spent = own + shared / 3.0
-    return np.asarray(prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n)))
+    sigma = prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n))
+    return np.asarray(np.maximum(sigma, _LEAST_SIGMA))
 
 
 def _downweight(regression: Regression, posterior: Posterior) -> None:
@@ -281,7 +290,7 @@ def _downweight(regression: Regression, posterior: Posterior) -> None:
     usual = 1.4826 * np.median(size, axis=0)
     size = size / np.maximum(usual, 1e-300)
     base = regression.windows.weight[:, None]
-    regression.reweight(base * np.where(size > _HUBER_SDS, _HUBER_SDS / size, 1.0))
+    regression.reweight(base * _HUBER_SDS / np.maximum(size, _HUBER_SDS))
 
 
 def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:
