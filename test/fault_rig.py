@@ -146,7 +146,7 @@ def truth(ramp_s: tuple[float, float] = RAMP_S, duration_s: float = DURATION_S) 
 
 
 def counts_of(force: np.ndarray, case: np.ndarray, board: np.ndarray, memory: np.ndarray) -> Any:
-    """Return what the converter gives for a specific force (method, eqs 6 to 9)."""
+    """Return what the converter gives for a specific force (Eq. (6) to (9))."""
     t = board - 20.0
     drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
     drift += BY_GRADIENT * (case - board) + BY_MEMORY * memory

@@ -74,7 +74,7 @@ def test_signed_counts_and_the_printed_equations():
     # method.md: offset = half sum, centred count = half difference, for signed counts.
     assert (plus + minus) / 2.0 == pytest.approx(offset)
     assert (plus - minus) / 2.0 == pytest.approx(K * GRAVITY)
-    # As printed (eqs 3 and 4) the two are exchanged: the "offset" would be the whole signal.
+    # As printed, Eq. (3) and (4), the two are exchanged: the "offset" would be the whole signal.
     assert (plus - minus) / 2.0 != pytest.approx(offset)
     compensator = Compensator(calibration(axes=Axes(*[AxisReference(K, offset)] * 3)))
     warm(compensator)

@@ -24,7 +24,7 @@ temperatures = st.floats(-15.0, 15.0)
 
 
 def test_polynomial_by_hand():
-    # 1 + 2*3 + 0.5*9 + 0.25*27: a4 t^4 is the fourth term of eq (10), not a4 t.
+    # 1 + 2*3 + 0.5*9 + 0.25*27: a4 t^4 is the fourth term of Eq. (10), not a4 t.
     assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 

@@ -299,7 +299,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> 
             samples.send(10)
         status = status_with(peer, diagnostics, '2 publishers on /temperature/board')
         assert status.level == DiagnosticStatus.ERROR
-        board = node._compensator.tracker.board
+        board = node._compensator.thermal.tracker.board
         assert board.temperature == pytest.approx(20.0, abs=1e-6)
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
 

@@ -8,7 +8,7 @@ Owns the way from a posterior to the Calibration that the compensator applies, a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 
@@ -36,7 +36,7 @@ from ..unit.functions import CubicSpline, Polynomial, TemperatureFunction
 from ..unit.posterior import posterior_of
 from .evidence import ResidualRow
 from .learning import Learnt
-from .posterior import Regression, inverse_misalignment
+from .posterior import Layout, Regression, State, inverse_misalignment
 from .reduction import ReducedBag
 from .verdict import Finding
 from .windows import Sets, ThermalWindows
@@ -165,7 +165,7 @@ def build_calibration(
     }
     matrix = np.linalg.inv(inverse_misalignment(state.skew))
     K = state.kappa * nominal
-    to_file = _to_file(regression, learnt, sets, nominal, n_sets, used)
+    to_file = file_parameters(regression, learnt.posterior.layout, state, sets, nominal, used)
     covariance = to_file @ learnt.posterior.covariance @ to_file.T
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     walk = prior.sigma * np.sqrt(prior.rho * 3600.0)
@@ -224,9 +224,7 @@ def build_calibration(
     )
 
 
-def _axis_set(
-    sets: Sets, weights: _Weights, axis: int, is_dynamic: bool, slow: float
-) -> AxisSet:
+def _axis_set(sets: Sets, weights: _Weights, axis: int, is_dynamic: bool, slow: float) -> AxisSet:
     """
     The curves of one axis in one regime.
 
@@ -268,19 +266,40 @@ def _shaped(
     return replace(family, constant=reference - math.fsum(values), amplitudes=values)
 
 
-def _to_file(
+def file_parameters(
     regression: Regression,
-    learnt: Learnt,
+    layout: Layout,
+    state: State,
     sets: Sets,
     nominal: Floats,
-    n_sets: int,
-    used: Sequence[int],
+    used: Iterable[int],
 ) -> Floats:
     """
     Derivative of the file's parameters, in its order, by the regression's.
 
+    Parameters
+    ----------
+    regression : Regression
+        Whose columns are in units of their RMS.
+    layout : Layout
+        Places of the regression's parameters.
+    state : State
+        Where to differentiate.
+    sets : Sets
+        The curves.
+    nominal : ndarray, shape (3,)
+        K0 [input units per m/s^2].
+    used : iterable of int
+        Columns of the response that the file has, by their number in the bank.
+
+    Returns
+    -------
+    ndarray, shape (n_parameters, n_unit)
+        See `unit.calibration.parameter_layout`.
+
     """
-    layout, state = learnt.posterior.layout, learnt.posterior.state
+    used = list(used)
+    n_sets = len(sets.levels())
     n, m = sets.static.n_free, sets.dynamic.n_free
     rows: list[Floats] = []
 
@@ -368,4 +387,3 @@ def _range(values: Floats, smallest_margin: float) -> tuple[float, float]:
     lower, upper = float(np.min(values)), float(np.max(values))
     margin = max(_EDGE_MARGIN * (upper - lower), smallest_margin)
     return lower - margin, upper + margin
-

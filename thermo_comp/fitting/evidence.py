@@ -136,6 +136,7 @@ def _with_only(regression: Regression, learnt: Learnt, groups: tuple[str, ...]) 
         on_scale=np.where(only & regression.windows.in_scale, 0.005, 0.0),
         offset_sd=1e-7,
         rho=np.zeros(3),
+        known=None,
     )
     return regression.solve(learnt.posterior.state, prior).state
 

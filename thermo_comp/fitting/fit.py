@@ -8,7 +8,7 @@ Owns the fit as a whole: sources in, calibration with its evidence out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from .evidence import PositionReport, ResidualRow, position_reports, residual_ro
 from .learning import Learnt, learn
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .posterior import Prior, Regression, initial_state
+from .priors import constants_of, known_of, prior_columns, prior_sets, state_of
 from .reduction import ReducedBag, reduce_source
 from .rests import judge_rests
 from .sensors import learn_detector
@@ -216,10 +217,14 @@ def fit_bags(
     _check_temperatures(bags)
     findings = list(enforce(judge_bags(bags, options), options))
     findings += enforce(judge_rests(bags, options), options)
-    detector = options.detector or learn_detector(bags)
+    known = options.prior
+    detector = options.detector or (known.detector if known else learn_detector(bags))
     tell('temperatures', 0.55)
-    sets = sets_of(options, bags)
-    columns = () if options.model == 'golovach' else bank()
+    if known is not None:
+        sets, columns = prior_sets(known), prior_columns(known)
+    else:
+        sets = sets_of(options, bags)
+        columns = () if options.model == 'golovach' else bank()
     windows = thermal_windows(
         bags,
         columns,
@@ -229,7 +234,7 @@ def fit_bags(
         options.reference_temperature,
         options.regression_window_s,
     )
-    start = first_guess(windows, options)
+    start = first_guess(windows, options) if known is None else constants_of(known)
     up = start.force(position_means(windows.data))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     has_case = all(len(bag.case.value) for bag in bags)
@@ -247,6 +252,15 @@ def fit_bags(
         up,
     )
     prior = _wide_prior(windows, start, up, options)
+    if known is not None:
+        state = state_of(known, regression, up)
+        told = known_of(known, regression, state, sets, options.ageing)
+        prior = replace(
+            prior,
+            on_bias=np.ones(len(windows.data.groups)),
+            on_scale=windows.data.in_scale.astype(np.float64),
+            known=told,
+        )
     forced = [
         options.model == 'golovach' or group == CURVE or group in options.forced
         for group in windows.data.groups
@@ -261,7 +275,11 @@ def fit_bags(
     )
     residuals, left_out = residual_rows(windows, regression, learnt)
     findings += judge_result(
-        learnt.posterior.state.kappa * nominal, residuals, learnt.prior.offset_sd, options, windows.has_temperature
+        learnt.posterior.state.kappa * nominal,
+        residuals,
+        learnt.prior.offset_sd,
+        options,
+        windows.has_temperature,
     )
     facts = UnitFacts(
         _unit(bags, options),
@@ -346,11 +364,14 @@ def _wide_prior(
     allowed = np.array([options.groups is None or group in options.groups for group in groups])
     allowed &= windows.has_temperature
     in_scale = windows.data.in_scale & allowed
-    wide = scale_wide = max(1.0, _drift(windows, start) / _COLUMN_BIAS_SD)
+    # What a sensor does, its curve does first: the others begin as those of a good one.
+    is_curve = np.array([group == CURVE for group in groups])
+    wide = np.where(is_curve, max(1.0, _drift(windows, start) / _COLUMN_BIAS_SD), 1.0)
+    scale_wide = wide
     if len(distinct_directions(up)) < POSITIONS_NEEDED:
         # Too few attitudes to tell it from the bias: the curve stays at its prior.
-        in_scale &= np.array([group == CURVE for group in groups])
-        scale_wide = 1.0
+        in_scale &= is_curve
+        scale_wide = np.ones(len(groups))
     return Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, _BIAS_SD),

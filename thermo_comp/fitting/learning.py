@@ -42,6 +42,8 @@ _SETTLED = 0.03
 _EARNED = 0.5
 # No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
 _LEAST_SIGMA = 1e-8
+# Of the noise of a window, what a column may add unseen before it counts.
+_OPEN = 1.0
 # Windows this many sds off lose weight, after Huber.
 _HUBER_SDS = 3.0
 
@@ -122,7 +124,13 @@ def learn(
     tell = tell or (lambda _part: None)
     kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
     held = np.zeros(len(prior.on_bias), dtype=bool) if held is None else held
-    silent = _silent(regression.solve(state, prior), prior)
+    allowed = prior
+    if prior.known is None:
+        silent = _silent(regression.solve(state, prior), prior)
+    else:
+        # Nothing is asked of a column whose weights are known beforehand.
+        kept = np.ones(len(prior.on_bias), dtype=bool)
+        silent = {part: _widths(prior, part) > 0.0 for part in ('bias', 'scale')}
     silent['scale'] |= held
     fixed = _Fixed(silent, kept)
     posterior, prior = _settle(regression, state, prior, fixed)
@@ -137,7 +145,9 @@ def learn(
                 column
                 for column in np.flatnonzero(_widths(prior, part) > 0.0)
                 if not (kept[column] or (part == 'scale' and held[column]))
-                and _earned(posterior, _places(posterior, part)[:, column], _widths(prior, part)[column])
+                and _earned(
+                    posterior, _places(posterior, part)[:, column], _widths(prior, part)[column]
+                )
                 < _EARNED
             ]
             for part in ('bias', 'scale')
@@ -149,8 +159,33 @@ def learn(
     tell(0.9)
     prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
+    if prior.known is None:
+        prior = _left_open(regression, posterior, prior, allowed)
+        posterior = regression.solve(posterior.state, prior)
     tell(1.0)
     return Learnt(posterior, prior, group_worth(regression, posterior, prior))
+
+
+def _left_open(
+    regression: Regression, posterior: Posterior, prior: Prior, allowed: Prior
+) -> Prior:
+    """
+    Take columns back that the data could not have seen, lest they be claimed to be 0.
+
+    A column that left was not needed; whether it is 0 the data tell to ``1 / sqrt(S)``, S what they
+    say of it beside the columns that stayed. Where that is more than the noise of a window it comes
+    back, with this width.
+
+    """
+    told = regression.told_of_absent(posterior.state, prior, allowed)
+    widths = {}
+    for part, unit in (('bias', 1.0), ('scale', 1.0 / regression.gravity)):
+        wide, S = _widths(allowed, part), told[part]
+        sd = np.minimum(1.0 / np.sqrt(np.maximum(S, 1e-300)), wide)
+        matters = (_widths(prior, part) == 0.0) & (wide > 0.0)
+        matters &= sd > _OPEN * float(np.mean(prior.sigma)) * unit
+        widths[part] = np.where(matters, sd, _widths(prior, part))
+    return replace(prior, on_bias=widths['bias'], on_scale=widths['scale'])
 
 
 @dataclass(frozen=True)
@@ -185,8 +220,8 @@ def _told(posterior: Posterior, part: str) -> Floats:
 
     """
     places = _places(posterior, part)
-    learnt = np.append(1.0 - posterior.precision * posterior.variance, 0.0)
-    return np.asarray(np.where(places >= 0, learnt[places], 0.0).sum(axis=0))
+    told = np.append(posterior.told, 0.0)
+    return np.asarray(np.where(places >= 0, told[places], 0.0).sum(axis=0))
 
 
 def _silent(posterior: Posterior, prior: Prior) -> dict[str, Bools]:
@@ -221,7 +256,7 @@ def _settle(
             power = np.where(places >= 0, vector[places] ** 2, 0.0).sum(axis=0)
             asked = (sd > 0.0) & ~fixed.silent[part]
             new = np.where(asked, np.sqrt(power / np.maximum(told, 1e-9)), sd)
-            new = np.where(asked, np.maximum(new, 1e-3 * sd), sd)
+            new = np.where(asked, np.maximum(new, _smallest(regression, prior, part)), sd)
             lively = asked & (told > _IDLE)
             if lively.any():
                 change = max(change, float(np.abs(np.log(new[lively] / sd[lively])).max()))
@@ -253,14 +288,22 @@ def _settle(
     return regression.solve(state, prior), prior
 
 
+def _smallest(regression: Regression, prior: Prior, part: str) -> float:
+    """
+    A width that the data cannot tell from 0: a column that stays all the same keeps it.
+
+    """
+    sd = 1e-2 * float(np.mean(prior.sigma)) / np.sqrt(len(regression.windows.time))
+    return sd if part == 'bias' else sd / regression.gravity
+
+
 def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float, float]:
     """
     Effective parameters of some unknowns, and the sum of their squares.
 
     """
     where = places.ravel()
-    told = 1.0 - posterior.precision[where] * posterior.variance[where]
-    return float(told.sum()), float(np.sum(vector[where] ** 2))
+    return float(posterior.told[where].sum()), float(np.sum(vector[where] ** 2))
 
 
 def _position_sd(regression: Regression, prior: Prior) -> float:
@@ -275,11 +318,10 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
     """
     n = len(posterior.whitened)
     square = np.sum(posterior.whitened**2, axis=0)
-    learnt = 1.0 - posterior.precision * posterior.variance
-    layout = posterior.layout
-    own = learnt[layout.axis].sum(axis=1) + learnt[layout.offset].sum(axis=0)
+    told, layout = posterior.told, posterior.layout
+    own = told[layout.axis].sum(axis=1) + told[layout.offset].sum(axis=0)
     # Attitudes, misalignment and start states are told by all three.
-    shared = learnt[layout.skew].sum() + layout.up.size + learnt[layout.start].sum()
+    shared = told[layout.skew].sum() + layout.up.size + told[layout.start].sum()
     spent = own + shared / 3.0
     sigma = prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n))
     return np.asarray(np.maximum(sigma, _LEAST_SIGMA))

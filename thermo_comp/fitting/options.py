@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ..thermal.settings import DetectorSettings
+from ..unit.calibration import Calibration
 
 #: The converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
@@ -21,6 +22,24 @@ CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
 GROUPS = (
     'curve', 'set', 'now', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play',
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Ageing:
+    """
+    What a unit has changed by since its last calibration.
+
+    Parameters
+    ----------
+    bias : float
+        Standard deviation of each bias [m/s^2].
+    scale : float
+        Of each relative scale factor.
+
+    """
+
+    bias: float = 0.0
+    scale: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +61,10 @@ class FitOptions:
         Groups of columns that may take part; None takes all.
     forced : tuple of str, optional
         Groups that stay whatever they earn.
+    prior : Calibration or None, optional
+        What is known beforehand: of the type of unit, or of this unit; its columns are the model.
+    ageing : Ageing, optional
+        What the prior's covariance has grown by since.
     serial : str or None, optional
         Unit serial; None takes the sources'.
     input : {'counts', 'm/s^2'}, optional
@@ -75,6 +98,8 @@ class FitOptions:
     dynamic_curve: str | None = None
     groups: tuple[str, ...] | None = None
     forced: tuple[str, ...] = ()
+    prior: Calibration | None = None
+    ageing: Ageing = Ageing()
     serial: str | None = None
     input: Literal['counts', 'm/s^2'] = 'counts'
     full_scale: float | None = None

@@ -20,7 +20,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -95,6 +95,24 @@ class Windows:
 
 
 @dataclass(frozen=True)
+class Known:
+    """
+    What is known of the unit's own parameters together, e.g. by an earlier calibration.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (n_unit,)
+        In the order of `Layout`: kappa, bias, weights of each axis, then the skew.
+    precision : ndarray, shape (n_unit, n_unit)
+        Inverse covariance.
+
+    """
+
+    mean: Floats
+    precision: Floats
+
+
+@dataclass(frozen=True)
 class Prior:
     """
     What is known beforehand; standard deviations, inf for nothing.
@@ -116,6 +134,9 @@ class Prior:
         White noise of a typical window [m/s^2].
     rho : ndarray, shape (3,)
         Variance per second of the walk over that of the white noise.
+    known : Known or None, optional
+        Takes the place of all widths of the unit's own parameters; these say only which columns
+        take part.
 
     """
 
@@ -128,6 +149,7 @@ class Prior:
     offset_sd: float
     sigma: Floats
     rho: Floats
+    known: Known | None = None
 
 
 @dataclass(frozen=True)
@@ -180,8 +202,8 @@ class Posterior:
         The mode.
     layout : Layout
         Places of its elements.
-    precision : ndarray, shape (n,)
-        Inverse variances of the prior.
+    told : ndarray, shape (n,)
+        What of each unknown the data told, not the prior, 0..1.
     covariance : ndarray, shape (n_unit, n_unit)
         Of what belongs to the unit.
     variance : ndarray, shape (n,)
@@ -197,7 +219,7 @@ class Posterior:
 
     state: State
     layout: Layout
-    precision: Floats
+    told: Floats
     covariance: Floats
     variance: Floats
     residual: Floats
@@ -300,6 +322,24 @@ class Regression:
             found = self._cache[axis] = _Whitened(rho, gains, base, grams, determinant)
         return found
 
+    def plain_prior(self) -> Prior:
+        """
+        A prior in which every column takes part, of widths that say nothing.
+
+        """
+        n = len(self.windows.groups)
+        return Prior(
+            bias_mean=np.zeros(3),
+            bias_sd=np.ones(3),
+            scale_sd=1.0,
+            skew_sd=1.0,
+            on_bias=np.ones(n),
+            on_scale=self.windows.in_scale.astype(np.float64),
+            offset_sd=1e-6,
+            sigma=np.full(3, 1e-5),
+            rho=np.zeros(3),
+        )
+
     def layout(self, prior: Prior) -> Layout:
         """
         Give every unknown its place, those of the unit first; -1 for columns that take no part.
@@ -336,12 +376,24 @@ class Regression:
                 up[p], offset[p] = take(2), take(3)
             start[bag] = take(n_lags)
             blocks.append(slice(first, n))
-        return Layout(axis[:, 0], axis[:, 1], on_bias, on_scale, skew, up, offset, start,
-                      axis, n_unit, tuple(blocks), n)
+        return Layout(
+            axis[:, 0],
+            axis[:, 1],
+            on_bias,
+            on_scale,
+            skew,
+            up,
+            offset,
+            start,
+            axis,
+            n_unit,
+            tuple(blocks),
+            n,
+        )
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """
-        Inverse variances of the prior, shape (n,); start states have a matrix of their own.
+        Inverse variances of the prior, shape (n,); where there is a matrix instead, 0.
 
         """
         result = np.zeros(layout.n + 1)
@@ -351,8 +403,23 @@ class Regression:
             used = sd > 0.0
             result[places[:, used]] = sd[used] ** -2.0
         result[layout.skew] = prior.skew_sd**-2
+        if prior.known is not None:
+            result[: layout.n_unit] = 0.0
         result[layout.offset] = prior.offset_sd**-2
         return result[:-1]
+
+    def _inform(self, prior: Prior, layout: Layout) -> list[tuple[slice, Floats]]:
+        """
+        What the prior has as matrices: where, and the inverse covariance.
+
+        """
+        result = []
+        if prior.known is not None:
+            result.append((slice(0, layout.n_unit), prior.known.precision))
+        for places in layout.start:
+            if len(places):
+                result.append((slice(places[0], places[-1] + 1), self._start_information))
+        return result
 
     def prior_mean(self, prior: Prior, layout: Layout) -> Floats:
         """
@@ -360,6 +427,9 @@ class Regression:
 
         """
         mean = np.zeros(layout.n)
+        if prior.known is not None:
+            mean[: layout.n_unit] = prior.known.mean
+            return mean
         mean[layout.kappa] = 1.0
         mean[layout.bias] = prior.bias_mean
         return mean
@@ -399,12 +469,15 @@ class Regression:
 
         """
         n_columns = len(self.windows.groups)
+        # Eq. (7) with (8) and (9): bias, and scale times input.
         weight = state.on_bias[axis] + state.kappa[axis] * force * state.on_scale[axis]
         result = np.zeros(self._base.shape[1])
         result[0] = state.kappa[axis] * force + state.bias[axis] + state.offset[p, axis]
         result[1 : n_columns + 1] = weight
         moved = self.moved
-        result[n_columns + 1 :] = weight[moved] * state.start[self._bags[p]][self.windows.lag[moved]]
+        result[n_columns + 1 :] = (
+            weight[moved] * state.start[self._bags[p]][self.windows.lag[moved]]
+        )
         return result
 
     def residual(self, state: State) -> Floats:
@@ -511,6 +584,60 @@ class Regression:
         )
         return other, G, g
 
+    def told_of_absent(self, state: State, prior: Prior, allowed: Prior) -> dict[str, Floats]:
+        """
+        What the data say of columns that take no part, beside those that do.
+
+        Parameters
+        ----------
+        state : State
+            The mode.
+        prior : Prior
+            Its prior.
+        allowed : Prior
+            The columns that could take part.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (m,)
+            'bias' and 'scale': inverse variance of a weight, mean over the axes; 0 for columns
+            that take part or may not.
+
+        """
+        everything = replace(
+            prior,
+            on_bias=np.maximum(prior.on_bias, allowed.on_bias),
+            on_scale=np.maximum(prior.on_scale, allowed.on_scale),
+        )
+        layout = self.layout(everything)
+        hessian = self._equations(state, everything, layout).hessian
+        absent = np.zeros(layout.n, dtype=bool)
+        parts = (
+            ('bias', layout.on_bias, prior.on_bias),
+            ('scale', layout.on_scale, prior.on_scale),
+        )
+        for _, places, sd in parts:
+            away = places[:, (sd == 0.0) & (places[0] >= 0)]
+            absent[away] = True
+        present = np.flatnonzero(~absent)
+        hessian[np.diag_indices(layout.n)] += self.precision(everything, layout)
+        for where, matrix in self._inform(prior, layout):
+            hessian[where, where] += matrix
+        kept = hessian[np.ix_(present, present)]
+        root = np.sqrt(np.diag(kept))
+        factor = cho_factor(kept / np.outer(root, root) + _JITTER * np.eye(len(root)))
+        cross = hessian[np.ix_(present, np.flatnonzero(absent))] / root[:, None]
+        told = np.zeros(layout.n + 1)
+        told[np.flatnonzero(absent)] = np.diag(hessian)[absent] - np.sum(
+            cross * cho_solve(factor, cross), axis=0
+        )
+        precision = np.append(self.precision(everything, layout), 0.0)
+        result = {}
+        for part, places, sd in parts:
+            data = np.where((places >= 0) & (sd == 0.0), told[places] - precision[places], 0.0)
+            result[part] = np.maximum(data.mean(axis=0), 0.0)
+        return result
+
     def without(self, posterior: Posterior, prior: Prior, p: int) -> State | None:
         """
         The mode that the other positions alone would give, to first order.
@@ -546,7 +673,7 @@ class Regression:
             hessian[np.ix_(where, where)] += G
             gradient[where] += g
         away = self.vector(posterior.state, layout)
-        known = np.diag(posterior.precision[local])
+        known = np.diag(self.precision(prior, layout)[local])
         if len(own[2]):
             known[-len(own[2]) :, -len(own[2]) :] += self._start_information
         gradient[n:] -= known @ away[local]
@@ -558,7 +685,9 @@ class Regression:
         # In coordinates of unit variance: what this position alone told is near 1, and stays within
         # what the others leave open.
         scale = np.sqrt(np.diag(posterior.covariance))
-        root = np.linalg.cholesky(posterior.covariance / np.outer(scale, scale) + _JITTER * np.eye(n))
+        root = np.linalg.cholesky(
+            posterior.covariance / np.outer(scale, scale) + _JITTER * np.eye(n)
+        )
         root *= scale[:, None]
         shares, directions = np.linalg.eigh(root.T @ told @ root)
         left = 1.0 - shares
@@ -602,16 +731,16 @@ class Regression:
         """
         layout = self.layout(prior)
         precision = self.precision(prior, layout)
+        matrices = self._inform(prior, layout)
         mean = self.prior_mean(prior, layout)
         for k in range(n_steps):
             equations = self._equations(state, prior, layout)
             hessian, away = equations.hessian, self.vector(state, layout) - mean
             pull = precision * away
             hessian[np.diag_indices(layout.n)] += precision
-            for places in layout.start:
-                if len(places):
-                    hessian[np.ix_(places, places)] += self._start_information
-                    pull[places] += self._start_information @ away[places]
+            for where, matrix in matrices:
+                hessian[where, where] += matrix
+                pull[where] += matrix @ away[where]
             factor = _Factor(hessian, layout)
             gradient = equations.gradient - pull
             step = factor.solve(gradient)
@@ -619,11 +748,8 @@ class Regression:
             if promised < tolerance or k == n_steps - 1:
                 break
             state = self._moved(state, step, layout)
-        known = precision[precision > 0.0]
-        determinant = float(np.log(known).sum())
-        if layout.start.shape[1]:
-            each = np.linalg.slogdet(self._start_information)[1]
-            determinant += len(layout.start) * float(each)
+        determinant = float(np.log(precision[precision > 0.0]).sum())
+        determinant += sum(float(np.linalg.slogdet(matrix)[1]) for _, matrix in matrices)
         evidence = -0.5 * (
             equations.size
             + float(away @ pull)
@@ -631,13 +757,23 @@ class Regression:
             + factor.log_determinant
             - determinant
         )
-        covariance, local = factor.covariances()
+        covariance, blocks = factor.covariances()
+        variance = np.concatenate([np.diag(block) for block in (covariance, *blocks)])
+        told = 1.0 - precision * variance
+        for where, matrix in matrices:
+            if where.start == 0:
+                block = covariance
+            else:
+                k = next(k for k, b in enumerate(layout.blocks) if b.start <= where.start < b.stop)
+                at = slice(where.start - layout.blocks[k].start, None)
+                block = blocks[k][at, at]
+            told[where] = 1.0 - np.einsum('ij,ji->i', matrix, block)
         return Posterior(
             state,
             layout,
-            precision,
+            told,
             covariance,
-            local,
+            variance,
             equations.residual,
             equations.white,
             evidence,
@@ -699,19 +835,19 @@ class _Factor:
             result[block] = cho_solve(factor, right[block]) - cross @ result[:n]
         return np.asarray(result / self._root)
 
-    def covariances(self) -> tuple[Floats, Floats]:
+    def covariances(self) -> tuple[Floats, list[Floats]]:
         """
-        Covariance of what belongs to the unit, and variances of all unknowns.
+        Covariance of what belongs to the unit, and of what belongs to each bag.
 
         """
         n, root = self._n, self._root
         unit = cho_solve(self._unit, np.eye(n))
-        variances = np.empty(len(root))
-        variances[:n] = np.diag(unit)
+        blocks = []
         for block, (factor, cross) in zip(self._blocks, self._locals, strict=True):
             alone = cho_solve(factor, np.eye(block.stop - block.start))
-            variances[block] = np.diag(alone) + np.sum((cross @ unit) * cross, axis=1)
-        return unit / np.outer(root[:n], root[:n]), variances / root**2
+            both = alone + cross @ unit @ cross.T
+            blocks.append(both / np.outer(root[block], root[block]))
+        return unit / np.outer(root[:n], root[:n]), blocks
 
 
 def initial_state(
@@ -732,4 +868,3 @@ def initial_state(
         offset=np.zeros((len(up), 3)),
         start=np.zeros((n_bags, len(windows.start_covariance))),
     )
-

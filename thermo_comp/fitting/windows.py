@@ -163,17 +163,13 @@ def thermal_windows(
         curves, groups = sets.columns(states[:, BOARD] - reference_temperature, states[:, WEIGHT])
         values = [*curves, *table.weighted(raw, states[:, BOARD], states[:, WEIGHT])]
         moved = _moved(columns, spec, raw, states, shares, reference_temperature)
-        whole = np.column_stack(
-            (states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved)
-        )
+        whole = np.column_stack((states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved))
         for interval in reduced.intervals:
             use = interval.time >= begin
             if not use.any():
                 continue
             time, count = interval.time[use], interval.count[use]
-            rows = np.column_stack(
-                [np.interp(time, grid, column) for column in whole.T]
-            )
+            rows = np.column_stack([np.interp(time, grid, column) for column in whole.T])
             merged = _merged(time, count, interval.mean[use], rows, window_s)
             n = len(merged[0])
             parts.append(merged)
@@ -235,8 +231,9 @@ def _states(
         ends = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
         return -1.0, ends, still, np.zeros((2, len(spec.lags)))
     tracker = ThermalTracker(detector, MemorySpec(spec.sensors), config)
-    shortest = min((float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1),
-                   default=1.0)
+    shortest = min(
+        (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
+    )
     step_s = max(shortest / 5.0, 0.1)
     start_s, states = thermal_states(bag, tracker, step_s)
     grid = start_s + step_s * np.arange(len(states))
@@ -265,9 +262,7 @@ def _moved(
     """
     t = states[:, BOARD] - reference_temperature
     result = np.zeros((len(states), len(columns)))
-    by_lag = {
-        column.lag: raw[k] for k, column in enumerate(columns) if column.kind == 'board'
-    }
+    by_lag = {column.lag: raw[k] for k, column in enumerate(columns) if column.kind == 'board'}
     for k, column in enumerate(columns):
         if column.lag is None or column.kind == 'play':
             continue

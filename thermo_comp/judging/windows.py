@@ -211,19 +211,20 @@ def corrected_windows(
 
     table = _table(bags, window_s, correct)
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    K = np.array([axis.scale_factor for axis in axes])
-    bias = np.array([axis.bias for axis in axes])
+    K, bias = np.array([(axis.scale_factor, axis.bias) for axis in axes]).T
     M = np.array(calibration.misalignment)
     along = table[:, _FORCE] / np.linalg.norm(table[:, _FORCE], axis=1, keepdims=True) @ M
-    white = along**2 @ np.array(Compensator(calibration, config).correction.noise)
-    mean_white = white / table[:, _COUNT]
+    noise = along**2 @ np.array(Compensator(calibration, config).thermal.correction.noise)
+    # Of a message's noise the rounding is carried on to the next: a mean has none of it.
+    white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
+    mean_white = white / (calibration.unit.cycle_time_s * table[:, _COUNT])
     return _windows(
         bags,
         table,
         window_s,
         calibration.gravity_m_s2 if gravity is None else gravity,
         raw=np.asarray((table[:, _MEAN] - bias) / K @ M.T),
-        claimed_sd=np.sqrt(np.maximum(table[:, _VARIANCE] - white, 0.0) + mean_white),
+        claimed_sd=np.sqrt(np.maximum(table[:, _VARIANCE] - noise, 0.0) + mean_white),
         noise_sd=np.sqrt(mean_white),
     )
 
@@ -374,7 +375,7 @@ def _correct(compensator: Compensator, bag: ReducedBag, sums: Floats) -> None:
     for row in sums:
         stamp_ns = bag.start_ns + round(float(row[_TIME]) * 1e9)
         while reading is not None and reading[0] <= stamp_ns:
-            (compensator.push_case if reading[2] else compensator.push_board)(*reading[:2])
+            compensator.push('case' if reading[2] else 'board', *reading[:2])
             compensator.flush(reading[0])
             reading = next(readings, None)
         corrected = compensator.process(stamp_ns, *row[_MEAN].tolist())

@@ -127,6 +127,7 @@ class Compensator:
             (yx, zx, zy, var_yx, var_zx, var_zy),
         ) = self._segment
         dt = (stamp_ns - start_ns) * 1e-9
+        # Eq. (7), solved for the input of each axis.
         x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
         y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
         z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)

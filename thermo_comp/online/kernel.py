@@ -81,6 +81,7 @@ class Lines:
         value: Floats = self.spread(bias_slope)
         value *= dt
         value += self.spread(bias)
+        # Eq. (7), solved for the input.
         np.subtract(raw, value, out=value)
         divisor = self.spread(scale_slope)
         divisor *= dt

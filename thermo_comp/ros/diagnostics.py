@@ -64,6 +64,8 @@ class Input:
 
     Attributes
     ----------
+    name : str
+        What comes in there.
     topic : str
         Its name, remapped.
     n_publishers : int
@@ -73,6 +75,7 @@ class Input:
 
     """
 
+    name: str
     topic: str
     n_publishers: int
     mismatch: str = ''
@@ -92,7 +95,7 @@ class Snapshot:
     silence_s : float
         For how long there have been no samples [s].
     inputs : tuple of Input
-        Samples, board and case.
+        The samples, the board, the further thermometers.
 
     """
 
@@ -100,7 +103,7 @@ class Snapshot:
     traffic: Traffic
     variances: tuple[float, float, float] | None
     silence_s: float
-    inputs: tuple[Input, Input, Input]
+    inputs: tuple[Input, ...]
 
 
 def build(
@@ -206,11 +209,12 @@ def _input_findings(now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
     """
     error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
     found: list[tuple[int, str]] = []
-    for one, level in zip(now.inputs, (error, error, warn), strict=True):
+    for k, one in enumerate(now.inputs):
         if one.n_publishers > 1:
             text = f'{one.n_publishers} publishers on {one.topic}'
             found.append((error, f'{text}, it is not used until one is left'))
         if one.mismatch:
+            level = error if k < 2 else warn
             found.append((level, f'no messages of a publisher on {one.topic}: {one.mismatch}'))
     n_contested = now.traffic.n_contested - before.traffic.n_contested
     if n_contested:
@@ -349,10 +353,7 @@ def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[
         (entry.name.removeprefix('n_').replace('_', ' '), str(getattr(now.traffic, entry.name)))
         for entry in fields(Traffic)
     ]
-    values += [
-        (f'{name} publishers', str(one.n_publishers))
-        for name, one in zip(('sample', 'board', 'case'), now.inputs, strict=True)
-    ]
+    values += [(f'{one.name} publishers', str(one.n_publishers)) for one in now.inputs]
     return [
         *values,
         ('sample stamp [ns]', 'none' if status.stamp_ns is None else str(status.stamp_ns)),

@@ -180,12 +180,13 @@ class CompensationNode:
         """
         overridable, compensator = QoSOverridingOptions.with_default_policies(), self._compensator
         samples = self._open_samples(self._config)
+        self._thermometers = compensator.thermal.inputs
         temperatures = [
             (
                 self._subscribe(Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False),
                 partial(compensator.push, name),
             )
-            for name in compensator.thermal.inputs
+            for name in self._thermometers
         ]
         try:
             imu, flag, self._diagnostics = (
@@ -230,19 +231,22 @@ class CompensationNode:
             n_failures=self._loop.n_failures,
         )
         variances = None if last is None else (last[3], last[6], last[8])
-        samples, board, case = (self._look_at(one.subscription) for one in relay.inputs)
+        names = ('sample', *self._thermometers)
         return Snapshot(
             take_snapshot(self._compensator),
             traffic,
             variances,
             time.monotonic() - self._last_samples,
-            (samples, board, case),
+            tuple(
+                self._look_at(name, one.subscription)
+                for name, one in zip(names, relay.inputs, strict=True)
+            ),
         )
 
-    def _look_at(self, subscription: Subscription) -> Input:
+    def _look_at(self, name: str, subscription: Subscription) -> Input:
         n_publishers = subscription.get_publisher_count()
         reason = '' if n_publishers else mismatch(self.node, subscription)
-        return Input(subscription.topic_name, n_publishers, reason)
+        return Input(name, subscription.topic_name, n_publishers, reason)
 
     def _report(self) -> None:
         """

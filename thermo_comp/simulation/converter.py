@@ -113,6 +113,7 @@ class Converter:
         counts = np.empty(charge.shape, dtype=np.int32)
         for first in range(0, len(charge), _ROWS):
             rows = charge[first : first + _ROWS]
+            # Eq. (1): whole counts; the fraction is carried on.
             whole = np.floor(rows)
             fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
             total = np.cumsum(fraction, axis=0) + remainder

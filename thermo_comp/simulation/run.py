@@ -274,6 +274,7 @@ class Chamber:
             truth = self._truth((cycle + 0.5).astype(np.float64) / rate, vibration)
             # Column by column: the sums of a matrix product may depend on the number of rows.
             s = sum(truth.specific_force[:, [j]] * to_axes[:, j] for j in range(3))
+            # Eq. (2), (8) and (9)
             charge = truth.bias + K * truth.scale * s
             for i in range(3):
                 charge[:, i] += noise_sd[i] * noise[i].standard_normal(len(cycle))

@@ -7,8 +7,8 @@ The dataclasses mirror the calibration file key by key. One object is one unit; 
 so a running node swaps it by one reference.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
-(0..1), and phi_j the columns of the response (`columns`), common to both sets (eqs 6-9, and
-beyond the paper the response)::
+(0..1), and phi_j the columns of the response (`columns`), common to both sets (Eq. (6) to
+(9), and beyond the paper the response)::
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
@@ -366,10 +366,10 @@ class Calibration:
         Whether the calibration says anything of how well it is known; else it claims nothing.
 
         """
-        return any(self.misalignment_sd) or any(
-            axis.covariance or axis.residual_sd_m_s2
-            for part in self.regime_sets()
-            for axis in part.axes()
+        return (
+            self.posterior is not None
+            or any(self.misalignment_sd)
+            or any(axis.residual_sd_m_s2 for part in self.regime_sets() for axis in part.axes())
         )
 
 

@@ -16,7 +16,7 @@ neighbour  L_tau(g_s)                  parts between the thermometers
 square     (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a flow
            g_s^2 where tau is 0
 even       tanh((g_s / width)^2)       heat load whichever way the heat flows
-size       \|g_s\|                      the same, as a heat pump's
+size       abs(g_s)                    the same, as a heat pump's
 play       P_r(v) - v, v = t or        rate-independent hysteresis
            v = L_tau(t)
 =========  ==========================  ====================================================
@@ -67,16 +67,13 @@ class Column:
     """
 
     group: Annotated[
-        Literal[
-            'now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'
-        ],
+        Literal['now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'],
         'What evidence judges together.',
     ]
     kind: Annotated[
         Literal['now', 'rate', 'board', 'neighbour', 'square', 'size', 'even', 'play'],
-        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without lag; '
-        '|g_s|; tanh((g_s / width)^2); '
-        'play of t minus t, where g_s = T_s - T_board.',
+        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without '
+        'lag; abs(g_s); tanh((g_s / width)^2); play of t minus t, where g_s = T_s - T_board.',
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
     tau_s: Annotated[

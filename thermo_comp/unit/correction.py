@@ -133,6 +133,7 @@ class Correction:
             bias, relative = self._weights[axis].add(
                 rest * bias_s + weight * bias_d, rest * scale_s + weight * scale_d, phi
             )
+            # Eq. (8): K at this temperature.
             result.append((bias, relative * self._K[axis]))
         return result
 

@@ -91,6 +91,7 @@ class SetCurves:
         result = []
         for level, one, other in zip(self._levels, self._sets, self._others, strict=True):
             bias = one.bias_function.value(held) + level
+            # Eq. (9)
             relative = one.scale_function.value(held)
             if goes_on:
                 of_bias, of_scale = other.bias_function, other.scale_function

@@ -6,7 +6,7 @@ Owns a function of temperature: polynomial, cubic spline or exponential, normali
 Every function takes ``t = T_board - T_ref`` [K], as one float or as an array, and gives the
 same bits for both: only ``+ - * /`` in a fixed order are used, and `math.exp` element by
 element. Each is linear in its free coefficients, so `basis` gives both the regressors of the
-fit and the derivatives that carry the parameter covariance (eqs 9 and 10 of the paper, which
+fit and the derivatives that carry the parameter covariance (Eq. (9) and (10) of the paper, which
 asks for polynomials, splines and exponentials).
 
 """
@@ -45,7 +45,7 @@ def hold(value: Number, lower: float, upper: float) -> Number:
 @dataclass(frozen=True)
 class Polynomial:
     """
-    ``c[0] + c[1] t + c[2] t^2 + ...`` (eq 10, with the leading constant where it belongs).
+    ``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10), with the leading constant where it belongs).
 
     Parameters
     ----------

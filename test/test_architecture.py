@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the pages on theory and architecture say of the source is what stands there.
+
+"""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from conftest import ROOT
+from test_layers import LAYERS
+
+from thermo_comp.unit.columns import bank
+
+DOCS = ROOT / 'docs'
+SOURCES = sorted((ROOT / 'thermo_comp').rglob('*.py'))
+
+
+def test_the_table_of_rooms_is_that_of_the_layers() -> None:
+    text = (DOCS / 'architecture.md').read_text()
+    rows = re.findall(r'^\| (\d) \| `(\w+)` \|', text, re.MULTILINE)
+    assert {room: int(layer) for layer, room in rows} == LAYERS
+    drawing = text.partition('```text')[2].partition('```')[0]
+    for line in drawing.strip().splitlines():
+        layer, _, rooms = line.strip().partition(' ')
+        shown = [word for word in re.findall(r'\w+', rooms) if word in LAYERS]
+        assert shown, line
+        assert {LAYERS[room] for room in shown} == {int(layer)}, line
+
+
+@pytest.mark.parametrize('page', ['architecture.md', 'theory.md'])
+def test_the_files_that_a_page_names_exist(page: str) -> None:
+    text = (DOCS / page).read_text()
+    for name in re.findall(r'[\w*/]+\.py\b', text):
+        places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
+        # A path, or a file beside the one that the sentence has named.
+        is_path = any(list(place.glob(name)) for place in places)
+        assert is_path or any(path.name == name for path in SOURCES), name
+
+
+def test_the_table_of_the_response_has_every_group() -> None:
+    text = (DOCS / 'theory.md').read_text()
+    shown = re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE)
+    assert shown == list(dict.fromkeys(column.group for column in bank()))
+
+
+# Not (3) to (5), which take signed counts at +I and -I apart: no command measures those.
+@pytest.mark.parametrize('number', [1, 2, 6, 7, 8, 9, 10])
+def test_an_equation_of_the_paper_is_found_by_its_number(number: int) -> None:
+    tag = re.compile(rf'\bEq\. [^\n]*\({number}\)')
+    assert any(tag.search(path.read_text()) for path in SOURCES)

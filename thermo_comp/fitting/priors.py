@@ -1,0 +1,383 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what is known of a unit before its bags: an earlier calibration of it, or those of siblings.
+
+Both are calibrations: a mean and a covariance of all parameters. What a type of unit has in common
+is the mean over units of the parameters relative to the scale factors, and their scatter; an
+earlier calibration of the unit itself has grown by its ageing. The fit takes either as the
+Gaussian prior of its regression, in the columns of that file.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+
+from .. import __version__
+from ..errors import FitError
+from ..typing import Floats
+from ..unit.calibration import (
+    Axes,
+    AxisReference,
+    Calibration,
+    Provenance,
+    ResponseTerm,
+    Source,
+    parameter_layout,
+)
+from ..unit.columns import Column
+from ..unit.posterior import posterior_of
+from .assembly import file_parameters
+from .options import Ageing
+from .posterior import Known, Regression, State
+from .start import ConstantCalibration
+from .windows import Sets
+
+#: A population needs so many units to have a scatter.
+UNITS_NEEDED = 3
+#: What siblings do not have in common may lie in other directions than those few units show: this
+#: part of the scatter counts for each parameter by itself.
+_ALONE = 0.5
+# Correlations are believed to this part of a variance.
+_EXACT = 1e-6
+
+
+def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
+    """
+    The response of a calibration as columns.
+
+    Raises
+    ------
+    FitError
+        If a column belongs to one regime alone, as in files of version 1.
+
+    """
+    for term in calibration.response:
+        if term.during != 'always':
+            raise FitError(
+                f'the prior has a response of the {term.during} regime alone: only columns of '
+                'both regimes can serve as a prior'
+            )
+    return tuple(
+        Column(**{field.name: getattr(term, field.name) for field in fields(Column)})
+        for term in calibration.response
+    )
+
+
+def prior_sets(calibration: Calibration) -> Sets:
+    """
+    The curves of a calibration: each regime has its own.
+
+    """
+    return Sets(
+        calibration.static.x.bias_function, calibration.dynamic.x.bias_function, is_shared=False
+    )
+
+
+def constants_of(calibration: Calibration) -> ConstantCalibration:
+    """
+    The nine constants of a calibration at its reference temperature.
+
+    """
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    return ConstantCalibration(
+        np.array([axis.bias for axis in axes]),
+        np.array([axis.scale_factor for axis in axes]),
+        np.array(calibration.misalignment),
+    )
+
+
+def state_of(calibration: Calibration, regression: Regression, up: Floats) -> State:
+    """
+    The regression's unknowns as a calibration has them; its nominal scale is the calibration's.
+
+    """
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    K = np.array([axis.scale_factor for axis in axes])
+    bias = np.array([axis.bias for axis in axes])
+    on_bias, on_scale = [], []
+    pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
+    for axis, (static, dynamic) in enumerate(pairs):
+        on_bias.append(
+            [
+                *static.bias_function.free_coefficients,
+                dynamic.delta - static.delta,
+                *dynamic.bias_function.free_coefficients,
+                *(term.bias[axis] for term in calibration.response),
+            ]
+        )
+        on_scale.append(
+            [
+                *static.scale_function.free_coefficients,
+                0.0,
+                *dynamic.scale_function.free_coefficients,
+                *(term.scale[axis] for term in calibration.response),
+            ]
+        )
+        bias[axis] += static.delta
+    inverse = np.linalg.inv(np.array(calibration.misalignment))
+    n_lags = len(regression.windows.start_covariance)
+    return State(
+        kappa=np.ones(3),
+        bias=bias / K,
+        on_bias=np.array(on_bias) / K[:, None] * regression.rms,
+        on_scale=np.array(on_scale) * regression.rms,
+        skew=np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
+        up=up,
+        offset=np.zeros((len(up), 3)),
+        start=np.zeros((regression.n_bags, n_lags)),
+    )
+
+
+def known_of(
+    calibration: Calibration, regression: Regression, state: State, sets: Sets, ageing: Ageing
+) -> Known:
+    """
+    Turn a calibration into the prior of a regression on its columns.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The earlier one, with a posterior.
+    regression : Regression
+        On windows with the columns of the calibration and no others.
+    state : State
+        As `state_of` gives it.
+    sets : Sets
+        As `prior_sets` gives them.
+    ageing : Ageing
+        What has come to the covariance since.
+
+    Returns
+    -------
+    Known
+        The prior.
+
+    Raises
+    ------
+    FitError
+        If the calibration makes no claim.
+
+    """
+    if calibration.posterior is None:
+        raise FitError('the prior has no covariance: an import makes no claim to build on')
+    K = np.array(
+        [a.scale_factor for a in (calibration.axes.x, calibration.axes.y, calibration.axes.z)]
+    )
+    covariance = calibration.posterior.covariance()
+    places = parameter_layout(calibration)
+    for axis in range(3):
+        for block, sd in (
+            (places.bias[axis], ageing.bias * K[axis]),
+            (places.scale[axis], ageing.scale),
+        ):
+            levels = [block.static, block.dynamic]
+            covariance[np.ix_(levels, levels)] += sd * sd
+    diagonal = np.diag(covariance)
+    floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
+    covariance[np.diag_indices_from(covariance)] += _EXACT * floor
+    prior = regression.plain_prior()
+    layout = regression.layout(prior)
+    to_file = file_parameters(regression, layout, state, sets, K, range(len(calibration.response)))
+    root = np.sqrt(np.diag(covariance))
+    scaled = to_file / root[:, None]
+    correlation = covariance / np.outer(root, root)
+    precision = scaled.T @ np.linalg.solve(correlation, scaled)
+    return Known(
+        regression.vector(state, layout)[: layout.n_unit], (precision + precision.T) / 2.0
+    )
+
+
+def population(calibrations: Sequence[Calibration]) -> Calibration:
+    """
+    Make the prior of a type of unit from the calibrations of some.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+        Of different units of one type, with curves of the same families.
+
+    Returns
+    -------
+    Calibration
+        The mean unit; its posterior is the scatter over the units.
+
+    Raises
+    ------
+    FitError
+        If the units are too few or their calibrations not alike.
+
+    """
+    if len(calibrations) < UNITS_NEEDED:
+        raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
+    first = calibrations[0]
+    serials = {one.unit.serial for one in calibrations}
+    if len(serials) < len(calibrations):
+        raise FitError('two of the calibrations are of one unit: a population needs one of each')
+    for one in calibrations:
+        alike = (one.unit.input, one.reference_temperature_c, one.sensors)
+        if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
+            raise FitError(
+                f'{one.unit.serial} differs from {first.unit.serial} in its input, reference '
+                'temperature or sensors: they are not of one type'
+            )
+        if _shape(one) != _shape(first):
+            raise FitError(
+                f'{one.unit.serial} has other curves than {first.unit.serial}: fit both with the '
+                'same model'
+            )
+    keys: dict[Column, list[tuple[float, float]]] = {}
+    for one in calibrations:
+        for column in prior_columns(one):
+            keys.setdefault(replace(column, range=(0.0, 1.0)), []).append(column.range)
+    columns = [
+        replace(key, range=(min(r[0] for r in ranges), max(r[1] for r in ranges)))
+        for key, ranges in keys.items()
+    ]
+    K = np.array([[a.scale_factor for a in (c.axes.x, c.axes.y, c.axes.z)] for c in calibrations])
+    mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
+    vectors = np.array([_vector(one, columns, mean_K) for one in calibrations])
+    mean = vectors.mean(axis=0)
+    away = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
+    scatter = (1.0 - _ALONE) * away.T @ away
+    scatter[np.diag_indices_from(scatter)] += _ALONE * np.sum(away**2, axis=0)
+    # Of the mean itself, too.
+    scatter *= 1.0 + 1.0 / len(vectors)
+    return _calibration(calibrations, columns, mean_K, mean, scatter)
+
+
+def _shape(calibration: Calibration) -> list[tuple[str, int]]:
+    return [
+        (function.kind, function.n_free)
+        for regime in calibration.regime_sets()
+        for axis in regime.axes()
+        for function in (axis.bias_function, axis.scale_function)
+    ]
+
+
+def _vector(calibration: Calibration, columns: Sequence[Column], mean_K: Floats) -> Floats:
+    """
+    The parameters of a unit in the order of the file, for a unit of the mean scale factors.
+
+    """
+    weights = {
+        replace(column, range=(0.0, 1.0)): term
+        for column, term in zip(prior_columns(calibration), calibration.response, strict=True)
+    }
+    terms = [weights.get(replace(column, range=(0.0, 1.0))) for column in columns]
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    result: list[float] = []
+    pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
+    for axis, (static, dynamic) in enumerate(pairs):
+        K = axes[axis].scale_factor
+        of_bias = [
+            axes[axis].bias + static.delta,
+            *static.bias_function.free_coefficients,
+            axes[axis].bias + dynamic.delta,
+            *dynamic.bias_function.free_coefficients,
+            *(term.bias[axis] if term else 0.0 for term in terms),
+        ]
+        level = float(np.log(K / mean_K[axis]))
+        result += [value * mean_K[axis] / K for value in of_bias]
+        result += [
+            level,
+            *static.scale_function.free_coefficients,
+            level,
+            *dynamic.scale_function.free_coefficients,
+            *(term.scale[axis] if term else 0.0 for term in terms),
+        ]
+    M = calibration.misalignment
+    return np.array([*result, M[1][0], M[2][0], M[2][1]])
+
+
+def _calibration(
+    calibrations: Sequence[Calibration],
+    columns: Sequence[Column],
+    mean_K: Floats,
+    mean: Floats,
+    scatter: Floats,
+) -> Calibration:
+    """
+    Write a mean and a scatter as a calibration like the first one.
+
+    """
+    first = calibrations[0]
+    static, dynamic = [], []
+    weights: list[tuple[Floats, Floats]] = []
+    references = []
+    at = 0
+    pairs = zip(first.static.axes(), first.dynamic.axes(), strict=True)
+    for axis, sets in enumerate(pairs):
+        parts = []
+        for name in ('bias_function', 'scale_function'):
+            n, m = (getattr(one, name).n_free for one in sets)
+            size = 2 + n + m + len(columns)
+            parts.append(np.split(mean[at : at + size], [1, 1 + n, 2 + n, 2 + n + m]))
+            at += size
+        (level,), of_static, (moved,), of_dynamic, on_bias = parts[0]
+        references.append(AxisReference(float(mean_K[axis]), float(level)))
+        for made, one, bias, scale, delta in (
+            (static, sets[0], of_static, parts[1][1], 0.0),
+            (dynamic, sets[1], of_dynamic, parts[1][3], float(moved - level)),
+        ):
+            made.append(
+                replace(
+                    one,
+                    bias_function=one.bias_function.with_free(tuple(bias.tolist())),
+                    scale_function=one.scale_function.with_free(tuple(scale.tolist())),
+                    delta=delta,
+                    residual_sd_m_s2=_median(calibrations, axis),
+                )
+            )
+        weights.append((on_bias, parts[1][4]))
+    a, b, c = mean[-3:].tolist()
+    regimes = []
+    for name, made in (('static', static), ('dynamic', dynamic)):
+        ranges = [getattr(one, name) for one in calibrations]
+        regimes.append(
+            replace(
+                ranges[0],
+                temperature_range_c=_union([r.temperature_range_c for r in ranges]),
+                rate_range_k_min=_union([r.rate_range_k_min for r in ranges]),
+                x=made[0],
+                y=made[1],
+                z=made[2],
+            )
+        )
+    sd = np.sqrt(np.diag(scatter)[-3:]).tolist()
+    return replace(
+        first,
+        unit=replace(first.unit, serial='population'),
+        axes=Axes(*references),
+        static=regimes[0],
+        dynamic=regimes[1],
+        misalignment=((1.0, 0.0, 0.0), (a, 1.0, 0.0), (b, c, 1.0)),
+        misalignment_sd=(sd[0], sd[1], sd[2]),
+        response=tuple(
+            ResponseTerm(
+                **{field.name: getattr(column, field.name) for field in fields(Column)},
+                bias=(float(weights[0][0][k]), float(weights[1][0][k]), float(weights[2][0][k])),
+                scale=(float(weights[0][1][k]), float(weights[1][1][k]), float(weights[2][1][k])),
+            )
+            for k, column in enumerate(columns)
+        ),
+        provenance=Provenance(
+            tool_version=__version__,
+            model='population',
+            sources=tuple(Source(one.unit.serial) for one in calibrations),
+        ),
+        evidence=(),
+        posterior=posterior_of(scatter),
+    )
+
+
+def _median(calibrations: Sequence[Calibration], axis: int) -> float:
+    return float(np.median([one.static.axes()[axis].residual_sd_m_s2 for one in calibrations]))
+
+
+def _union(ranges: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    return min(r[0] for r in ranges), max(r[1] for r in ranges)
