@@ -17,6 +17,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+import yaml
 
 import thermo_comp
 
@@ -134,6 +135,18 @@ def test_dependencies_of_the_manifest_are_those_of_setup() -> None:
             assert re.search(rf'pip install[^\n]*\b{name}', readme), name
         else:
             assert keys.get(name, f'python3-{name}') in KNOWN_KEYS
+
+
+def test_hosted_ci_does_what_the_readme_says() -> None:
+    jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yaml').read_text())['jobs']
+    lowest = re.search(r"python_requires='>=([\d.]+)'", (ROOT / 'setup.py').read_text())
+    assert lowest is not None
+    assert jobs['wheels']['strategy']['matrix']['python'][0] == lowest[1]
+    run = '\n'.join(step.get('run', '') for step in jobs['ros']['steps'])
+    readme = (ROOT / 'README.md').read_text()
+    for line in re.findall(r'^ *((?:rosdep|pip) install .*?) *(?:#.*)?$', run, re.MULTILINE):
+        assert line in readme, line
+    assert jobs['ros']['container'] == 'ros:jazzy'
 
 
 def test_scripts_land_where_ros2_run_looks() -> None:

@@ -1,0 +1,301 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the degenerate inputs: one recording or table, spoilt in as many ways as there are names.
+
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from damaged_files import bomb, cut, damaged, delete_rows, flip, flip_message, wipe
+from pyarrow import parquet
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from thermo_comp.recording import BagWriter
+
+SECOND, YEAR = 10**9, 366 * 86400 * 10**9
+START_NS = 1_767_225_600 * SECOND
+RATE_HZ, POSITIONS, POSITION_S = 20, 10, 40
+
+
+@dataclass
+class Columns:
+    """
+    A thermal test in one recording: positions at rest, one after the other, in a ramp.
+
+    """
+
+    stamp_ns: np.ndarray
+    counts: np.ndarray
+    reading_ns: np.ndarray
+    board: np.ndarray
+    topic: str = 'accel/counts'
+    frame_id: str = 'imu'
+    serial: str = 'T-1'
+
+
+def whole() -> Columns:
+    """
+    Make the recording that the others are spoilt from.
+
+    """
+    rng = np.random.default_rng(20)
+    n = RATE_HZ * POSITIONS * POSITION_S
+    row = np.arange(n)
+    up = rng.normal(size=(POSITIONS, 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    counts = np.rint(2900.0 * up[row // (RATE_HZ * POSITION_S)] + rng.normal(size=(n, 3)))
+    stamp_ns = START_NS + row * (SECOND // RATE_HZ)
+    reading_ns = stamp_ns[:: RATE_HZ // 2]
+    board = 10.0 + 30.0 * np.arange(len(reading_ns)) / len(reading_ns)
+    return Columns(stamp_ns, counts, reading_ns, board)
+
+
+def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = False) -> Path:
+    """
+    Write a bag; with `log`, its log times rise whatever the stamps do.
+
+    """
+    path = folder / name
+    rising = START_NS + np.arange(len(columns.stamp_ns)) * (SECOND // RATE_HZ) if log else None
+    slow = None if rising is None else rising[:: RATE_HZ // 2][: len(columns.reading_ns)]
+    with BagWriter(path, metadata={'serial': columns.serial}) as bag:
+        bag.write_counts(
+            columns.topic, columns.stamp_ns, columns.counts, columns.frame_id, log_ns=rising
+        )
+        for topic, offset in (('temperature/board', 0.0), ('temperature/case', 0.5)):
+            bag.write_temperature(topic, columns.reading_ns, columns.board + offset, log_ns=slow)
+    return path
+
+
+def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]:
+    """
+    Spoil the stamps.
+
+    """
+
+    def make(folder: Path) -> Path:
+        columns = whole()
+        columns.stamp_ns = change(columns.stamp_ns).astype(np.int64)
+        columns.reading_ns = change(columns.reading_ns).astype(np.int64)
+        return write(folder, columns, log=True)
+
+    return make
+
+
+def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
+    """
+    Spoil anything else.
+
+    """
+
+    def make(folder: Path) -> Path:
+        columns = whole()
+        change(columns)
+        return write(folder, columns)
+
+    return make
+
+
+def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
+    """
+    Let the clock jump in the middle, or after every so many stamps.
+
+    """
+
+    def change(stamp_ns: np.ndarray) -> np.ndarray:
+        row = np.arange(len(stamp_ns))
+        jumps = row // every if every else (row >= len(row) // 2).astype(np.int64)
+        return stamp_ns + size_ns * jumps
+
+    return change
+
+
+def rosbag2(storage: StoragePlugin, mode: CompressionMode | None) -> Callable[[Path], Path]:
+    """
+    Write the whole recording as another storage.
+
+    """
+
+    def make(folder: Path) -> Path:
+        bare = write(folder, whole())
+        writer = Writer2(folder / 'bag', version=9, storage_plugin=storage)
+        if mode is not None:
+            writer.set_compression(mode, CompressionFormat.ZSTD)
+        with Reader2(bare) as reader, writer:
+            typestore = get_typestore(Stores.ROS2_JAZZY)
+            made = {
+                c.id: writer.add_connection(c.topic, c.msgtype, typestore=typestore)
+                for c in reader.connections
+            }
+            for connection, log_ns, data in reader.messages():
+                writer.write(made[connection.id], log_ns, data)
+        bare.unlink()
+        return folder / 'bag'
+
+    return make
+
+
+DB3 = rosbag2(StoragePlugin.SQLITE3, None)
+ZSTD = rosbag2(StoragePlugin.MCAP, CompressionMode.FILE)
+
+
+def with_pipe(folder: Path) -> Path:
+    """
+    Put a FIFO beside the files of a bag, and one in the place of its metadata.
+
+    """
+    bag = DB3(folder)
+    (bag / 'metadata.yaml').unlink()
+    os.mkfifo(bag / 'metadata.yaml')
+    os.mkfifo(bag / 'other.mcap')
+    return bag
+
+
+def pipe_as_file(folder: Path) -> Path:
+    """
+    Make a folder whose only file is a FIFO.
+
+    """
+    bag = folder / 'bag'
+    bag.mkdir()
+    os.mkfifo(bag / 'bag_0.mcap')
+    return bag
+
+
+def device_as_file(folder: Path) -> Path:
+    """
+    Let the file of a bag lead to an endless device.
+
+    """
+    bag = folder / 'bag'
+    bag.mkdir()
+    (bag / 'bag_0.db3').symlink_to('/dev/zero')
+    return bag
+
+
+def other_name(folder: Path) -> Path:
+    """
+    Give a bag a name that is no UTF-8.
+
+    """
+    path = Path(os.fsdecode(os.fsencode(folder) + b'/b\xe9\xff.mcap'))
+    return write(folder, whole()).rename(path)
+
+
+def table(change: Callable[[np.ndarray], np.ndarray], kind: str) -> Callable[[Path], Path]:
+    """
+    Write a table with spoilt stamps.
+
+    """
+
+    def make(folder: Path) -> Path:
+        columns = whole()
+        stamp = change(columns.stamp_ns)
+        celsius = np.interp(columns.stamp_ns, columns.reading_ns, columns.board)
+        if kind == 'csv':
+            path = folder / 'log.csv'
+            rows = zip(stamp.tolist(), columns.counts.tolist(), celsius.tolist(), strict=True)
+            text = (f'{s},{c[0]},{c[1]},{c[2]},{t},{t}\n' for s, c, t in rows)
+            path.write_text(''.join(text), encoding='ascii')
+            return path
+        path = folder / 'log.parquet'
+        values = [stamp, *columns.counts.T, celsius, celsius]
+        named = {f'c{i}': pa.array(v) for i, v in enumerate(values)}
+        parquet.write_table(pa.table(named), path)
+        return path
+
+    return make
+
+
+def _set(name: str, value: object) -> Callable[[Columns], object]:
+    return lambda columns: setattr(columns, name, value)
+
+
+def _value(columns: Columns, value: float) -> None:
+    columns.counts[len(columns.counts) // 3] = value
+
+
+def _readings(columns: Columns, n: int) -> None:
+    columns.reading_ns, columns.board = columns.reading_ns[:n], columns.board[:n]
+
+
+def _at_one_stamp(columns: Columns) -> None:
+    columns.reading_ns = np.full_like(columns.reading_ns, START_NS)
+
+
+def _samples(columns: Columns, n: int) -> None:
+    columns.stamp_ns, columns.counts = columns.stamp_ns[:n], columns.counts[:n]
+
+
+@dataclass(frozen=True)
+class Input:
+    """
+    One degenerate input; `is_lost` = something of it cannot be read, so nobody may say 0.
+
+    """
+
+    make: Callable[[Path], Path]
+    is_lost: bool = False
+
+
+INPUTS: dict[str, Input] = {
+    'whole': Input(spoilt(lambda _: None)),
+    'jump of a year': Input(stamps(_later(YEAR))),
+    'jump from 1970': Input(
+        stamps(lambda s: np.where(s < s[len(s) // 2], s - START_NS + SECOND, s))
+    ),
+    'jump back by a year': Input(stamps(_later(-YEAR))),
+    'a day between samples': Input(stamps(lambda s: START_NS + (s - START_NS) * 17280 // 500)),
+    'an hour after every ten samples': Input(stamps(_later(3600 * SECOND, 10))),
+    'reversed stamps': Input(stamps(lambda s: s[::-1])),
+    'equal stamps': Input(stamps(np.zeros_like)),
+    'stamps of the limits': Input(stamps(lambda s: np.where(s < s[50], 0, (2**31 - 1) * SECOND))),
+    'one sample': Input(spoilt(lambda c: _samples(c, 1))),
+    'no sample': Input(spoilt(lambda c: _samples(c, 0))),
+    'one reading': Input(spoilt(lambda c: _readings(c, 1))),
+    'readings of one stamp': Input(spoilt(_at_one_stamp)),
+    'a value of 1e308': Input(spoilt(lambda c: _value(c, 1e308))),
+    'all values 1e308': Input(spoilt(lambda c: _set('counts', c.counts * 0 + 1e308)(c))),
+    'a reading of 1e308': Input(spoilt(lambda c: c.board.__setitem__(9, 1e308))),
+    'all NaN': Input(spoilt(lambda c: _set('counts', c.counts * np.nan)(c))),
+    'all zeros': Input(spoilt(lambda c: _set('counts', c.counts * 0)(c))),
+    'a span of 1 K': Input(spoilt(lambda c: _set('board', 20 + c.board / 30)(c))),
+    'Cyrillic serial': Input(spoilt(_set('serial', 'блок 7'))),
+    'name not UTF-8': Input(other_name),
+    'db3': Input(DB3),
+    'db3 with a flipped bit': Input(damaged(DB3, '*.db3', flip), is_lost=True),
+    'db3 without some rows': Input(damaged(DB3, '*.db3', delete_rows), is_lost=True),
+    'db3 with a topic gone': Input(damaged(DB3, '*.db3', flip_message), is_lost=True),
+    'db3 cut off': Input(damaged(DB3, '*.db3', cut), is_lost=True),
+    'mcap.zstd': Input(ZSTD),
+    'mcap.zstd wiped in the middle': Input(damaged(ZSTD, '*.zstd', wipe), is_lost=True),
+    'mcap.zstd cut off': Input(damaged(ZSTD, '*.zstd', cut), is_lost=True),
+    'mcap.zstd of 8 GB': Input(damaged(ZSTD, '*.zstd', bomb), is_lost=True),
+    'FIFOs in a bag': Input(with_pipe, is_lost=True),
+    'a FIFO as a bag': Input(pipe_as_file, is_lost=True),
+    'a device as a bag': Input(device_as_file, is_lost=True),
+    'csv': Input(table(lambda s: s, 'csv')),
+    'csv before 1901': Input(table(lambda s: s - 130 * YEAR, 'csv'), is_lost=True),
+    'csv after 2038': Input(table(lambda s: s + 40 * YEAR, 'csv'), is_lost=True),
+    'csv of 1e30': Input(table(lambda s: s * 1e30, 'csv'), is_lost=True),
+    'parquet of uint64': Input(table(lambda s: s.astype(np.uint64), 'parquet')),
+    'parquet of large uint64': Input(
+        table(lambda s: s.astype(np.uint64) + np.uint64(1 << 63), 'parquet'), is_lost=True
+    ),
+    'parquet of the year 3000': Input(
+        table(lambda s: (s // SECOND).astype('M8[s]') + np.timedelta64(974 * 366, 'D'), 'parquet'),
+        is_lost=True,
+    ),
+    'parquet of 1e30': Input(table(lambda s: s * 1e30, 'parquet'), is_lost=True),
+}
