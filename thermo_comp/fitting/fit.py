@@ -40,7 +40,7 @@ from .verdict import (
     judge_result,
     judge_windows,
 )
-from .windows import CURVE, FEWEST_WINDOWS, ThermalWindows, thermal_windows
+from .windows import CURVE, FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
 
 Progress = Callable[[str, float], None]
 
@@ -271,7 +271,9 @@ def fit_bags(
         prior,
         np.array(forced),
         lambda part: tell('regression', 0.7 + 0.25 * part),
-        (prior.on_scale > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
+        held=(prior.on_scale > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
+        # What the sets alone leave is a response, and no noise.
+        walks=bool(columns) and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
     )
     residuals, left_out = residual_rows(windows, regression, learnt)
     findings += judge_result(

@@ -95,6 +95,7 @@ def learn(
     forced: Bools | None = None,
     tell: Callable[[float], None] | None = None,
     held: Bools | None = None,
+    walks: bool = True,
 ) -> Learnt:
     """
     Find widths, noises and columns by the evidence.
@@ -114,6 +115,8 @@ def learn(
     held : ndarray of bool, shape (m,), optional
         Columns of the scale that keep their width, and their place: the data cannot tell them
         from those of the bias.
+    walks : bool, optional
+        Whether slow noise is looked for.
 
     Returns
     -------
@@ -136,7 +139,8 @@ def learn(
     posterior, prior = _settle(regression, state, prior, fixed)
     tell(0.4)
     _downweight(regression, posterior)
-    prior = _walk(regression, posterior, prior)
+    if walks:
+        prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
     tell(0.7)
     while True:
@@ -157,7 +161,8 @@ def learn(
         prior = _without(prior, idle)
         posterior, prior = _settle(regression, posterior.state, prior, fixed, rounds=6)
     tell(0.9)
-    prior = _walk(regression, posterior, prior)
+    if walks:
+        prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
     if prior.known is None:
         prior = _left_open(regression, posterior, prior, allowed)
