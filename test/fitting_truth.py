@@ -1,90 +1,50 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns window tables with known truth for the tests of the fit, without samples or simulation.
+Owns window tables with known truth for the tests of the regression, without samples or sensors.
 
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache
 
 import numpy as np
 
-from thermo_comp.fitting.history import ThermalHistory
-from thermo_comp.fitting.table import WindowTable
+from thermo_comp.fitting.posterior import Prior, Regression, State, Windows, initial_state
 from thermo_comp.simulation import positions
 from thermo_comp.typing import Floats
 
 GRAVITY = 9.81
-#: Chamber program: up, down and back, an hour's soak at each end.
-PROGRAM_S = np.array([0.0, 1200.0, 3000.0, 5400.0, 9000.0, 11400.0, 12600.0])
-PROGRAM_C = np.array([20.0, 20.0, 35.0, 35.0, 5.0, 5.0, 20.0])
+NOMINAL = np.array([1000.0, 1010.0, 990.0])
+#: Groups of the table's columns: a curve t, t^2; two lags; two columns that nothing needs.
+GROUPS = ('curve', 'curve', 'board', 'board', 'idle', 'idle')
+TAUS = np.array([400.0, 2500.0])
+START = np.array([[0.25, 0.1], [0.1, 1.0]])
+MICRO = 1e-6 * GRAVITY
 
 
 @dataclass(frozen=True)
 class Truth:
     """
-    One unit: ``counts = bias + g K scale (A u) + noise`` with functions of t and of the memory.
+    One unit, in m/s^2 of the nominal scale factor; weights per physical unit of the columns.
 
     """
 
-    bias: Floats = field(default_factory=lambda: np.array([5.0, -8.0, 2.0]))
-    scale: Floats = field(default_factory=lambda: np.array([1000.0, 1010.0, 990.0]))
-    #: Per axis: t, t^2.
-    bias_curve: Floats = field(default_factory=lambda: np.outer([1.0, -0.5, 2.0], [2e-2, 1e-4]))
-    scale_curve: Floats = field(default_factory=lambda: np.outer([1.0, 1.2, 0.8], [5e-5, 3e-7]))
-    #: A[1, 0], A[2, 0], A[2, 1].
-    skew: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
-    time_constants_s: Floats = field(default_factory=lambda: np.array([400.0, 2500.0]))
-    bias_memory: Floats = field(default_factory=lambda: np.outer([1.0, -2.0, 1.5], [2e-2, 1e-2]))
-    scale_memory: Floats = field(default_factory=lambda: np.outer([1.0, 0.7, 1.3], [1e-5, 4e-6]))
-    noise_sd: float = 0.01
-
-
-@cache
-def history(step_s: float = 2.0, board_lag_s: float = 600.0) -> ThermalHistory:
-    """
-    One bag's thermal state: the board follows the program's air with one lag.
-
-    """
-    time = np.arange(0.0, PROGRAM_S[-1] + step_s, step_s)
-    case = np.interp(time, PROGRAM_S, PROGRAM_C)
-    board = lagged(case, step_s, board_lag_s)
-    rate = (case - board) / board_lag_s
-    return ThermalHistory(
-        start_s=0.0,
-        step_s=step_s,
-        board=board,
-        var_board=np.full(len(time), 1e-6),
-        rate=rate,
-        gradient=case - board,
-        weight=(np.abs(rate) * 60.0 > 0.05).astype(float),
-        is_unknown=np.zeros(len(time), dtype=bool),
+    kappa: Floats = field(default_factory=lambda: np.array([1.0003, 0.9996, 1.0005]))
+    bias: Floats = field(default_factory=lambda: np.array([5e-3, -8e-3, 2e-3]))
+    on_bias: Floats = field(
+        default_factory=lambda: np.outer([1.0, -2.0, 1.5], [2e-5, 1e-7, 2e-5, 1e-5, 0.0, 0.0])
     )
-
-
-def lagged(temperature: Floats, step_s: float, tau_s: float) -> Floats:
-    """
-    First-order lag by fine Euler steps: the slow road, on purpose not the fit's formula.
-
-    """
-    return np.array(_lagged(tuple(temperature.tolist()), step_s, tau_s))
-
-
-@cache
-def _lagged(temperature: tuple[float, ...], step_s: float, tau_s: float) -> list[float]:
-    n = 20
-    result = []
-    state = temperature[0]
-    result.append(state)
-    for i in range(1, len(temperature)):
-        for k in range(n):
-            drive = temperature[i - 1] + (temperature[i] - temperature[i - 1]) * (k + 0.5) / n
-            state += (drive - state) * step_s / n / tau_s
-        result.append(state)
-    return result
+    on_scale: Floats = field(
+        default_factory=lambda: np.outer([1.0, 0.7, 1.3], [5e-6, 3e-8, 1e-6, 4e-7, 0.0, 0.0])
+    )
+    skew: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
+    start_sd: float = 0.0
+    sigma: Floats = field(default_factory=lambda: np.full(3, 2.0 * MICRO))
+    #: Random walk of the bias, m/s^2 per root second.
+    walk: float = 0.0
+    offset_sd: float = 0.0
 
 
 def table_of(
@@ -92,62 +52,103 @@ def table_of(
     n_positions: int,
     rng: np.random.Generator,
     *,
-    window_s: float = 60.0,
-    thermal: ThermalHistory | None = None,
+    n_windows: int = 40,
+    step_s: float = 120.0,
     up: Floats | None = None,
-) -> tuple[WindowTable, Floats]:
+) -> tuple[Windows, Floats]:
     """
     Draw a table of windows, one bag per position; also return the true directions.
 
     """
-    thermal = thermal or history()
     up = positions(n_positions, 3) if up is None else up
-    time = np.arange(window_s / 2.0, thermal.time[-1], window_s)
-    n = len(time)
-    t = np.interp(time, thermal.time, thermal.board) - 20.0
-    powers = np.column_stack((t, t * t))
-    memory = np.column_stack(
-        [
-            np.interp(
-                time, thermal.time, thermal.board - lagged(thermal.board, thermal.step_s, tau)
-            )
-            for tau in truth.time_constants_s
-        ]
-        or [np.zeros((n, 0))]
-    )
+    time = step_s * (np.arange(n_windows) + 0.5)
+    # Once up and down in each bag, each time a little otherwise.
+    shapes = [_columns(time, step_s, 0.7 + 0.05 * p) for p in range(n_positions)]
+    share = np.zeros((n_windows, len(GROUPS)))
+    share[:, 2:4] = np.exp(-time[:, None] / TAUS)
     A = np.eye(3)
     A[1, 0], A[2, 0], A[2, 1] = truth.skew
-    bias = truth.bias + powers @ truth.bias_curve.T + memory @ truth.bias_memory.T
-    scale = truth.scale * (1.0 + powers @ truth.scale_curve.T + memory @ truth.scale_memory.T)
-    means = [
-        bias + scale * (GRAVITY * A @ u) + truth.noise_sd * rng.standard_normal((n, 3)) for u in up
-    ]
-    number = np.repeat(np.arange(n_positions), n)
-    sections = thermal.sections()[np.searchsorted(thermal.time, time)]
-    return (
-        WindowTable(
-            position=number,
-            bag=number,
-            section=np.tile(sections, n_positions),
-            time=np.tile(time, n_positions),
-            count=np.full(n * n_positions, 100.0 * window_s),
-            mean=np.concatenate(means),
-            t=np.tile(t, n_positions),
-            gradient=np.tile(np.interp(time, thermal.time, thermal.gradient), n_positions),
-            rate=np.tile(np.interp(time, thermal.time, thermal.rate), n_positions),
-            weight=np.tile(np.interp(time, thermal.time, thermal.weight), n_positions),
-            histories=(thermal,) * n_positions,
-        ),
-        up,
+    means = []
+    for columns, direction in zip(shapes, up, strict=True):
+        moved = columns.copy()
+        moved[:, 2:4] += share[:, 2:4] * (truth.start_sd * rng.standard_normal(2))
+        force = GRAVITY * A @ direction
+        clean = truth.kappa * force * (1.0 + moved @ truth.on_scale.T)
+        clean = clean + truth.bias + moved @ truth.on_bias.T
+        clean += truth.offset_sd * rng.standard_normal(3)
+        steps = rng.standard_normal((n_windows, 3)) * truth.walk * np.sqrt(step_s)
+        steps[0] = 0.0
+        white = rng.standard_normal((n_windows, 3)) * truth.sigma
+        means.append(NOMINAL * (clean + np.cumsum(steps, axis=0) + white))
+    number = np.repeat(np.arange(n_positions), n_windows)
+    windows = Windows(
+        position=number,
+        bag=number,
+        time=np.tile(time, n_positions),
+        weight=np.ones(len(number)),
+        mean=np.concatenate(means),
+        columns=np.concatenate(shapes),
+        groups=GROUPS,
+        lag=np.array([-1, -1, 0, 1, -1, -1]),
+        start=np.tile(share, (n_positions, 1)),
+        start_covariance=START,
+        in_scale=np.ones(len(GROUPS), dtype=bool),
     )
+    return windows, up
 
 
-def without_memory(truth: Truth) -> Truth:
+def _columns(time: Floats, step_s: float, turns: float) -> Floats:
+    end = time[-1] + 0.5 * step_s
+    fine = np.linspace(0.0, end, 2000)
+    t = 15.0 * np.sin(2.0 * np.pi * turns * fine / end)
+    behind = []
+    for tau in TAUS:
+        state, lagged = t[0], []
+        for value in t.tolist():
+            state += (value - state) * (fine[1] / tau)
+            lagged.append(state)
+        behind.append(t - np.array(lagged))
+    idle = [np.cos(17.0 * turns * fine / end), np.sin(29.0 * turns * fine / end)]
+    table = np.column_stack((t, t * t, *behind, *idle))
+    return np.column_stack([np.interp(time, fine, column) for column in table.T])
+
+
+def widths(names: tuple[str, ...], sd: float) -> Floats:
     """
-    Return the same unit without thermal memory.
+    Width of each column: 0 where it takes no part.
 
     """
-    return Truth(
-        truth.bias, truth.scale, truth.bias_curve, truth.scale_curve, truth.skew,
-        np.zeros(0), np.zeros((3, 0)), np.zeros((3, 0)), truth.noise_sd,
-    )  # fmt: skip
+    return np.where(np.isin(GROUPS, names), sd, 0.0)
+
+
+def prior_of(
+    truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: object
+) -> Prior:
+    """
+    Return a wide prior with the true noises.
+
+    """
+    known: dict[str, object] = {
+        'bias_mean': np.zeros(3),
+        'bias_sd': np.full(3, 1.0),
+        'scale_sd': 0.05,
+        'skew_sd': 1e-2,
+        'on_bias': widths(names, 1e-2),
+        'on_scale': widths(names, 1e-3),
+        'offset_sd': max(truth.offset_sd, 1e-9),
+        'sigma': truth.sigma,
+        'rho': (truth.walk / truth.sigma) ** 2,
+    }
+    return Prior(**(known | changes))  # type: ignore[arg-type]
+
+
+def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
+    """
+    Return a regression and a state a little beside the truth.
+
+    """
+    regression = Regression(windows, GRAVITY, NOMINAL)
+    turned = up + np.array([2e-3, -1e-3, 3e-3])
+    turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    state = initial_state(windows, regression.n_bags, np.zeros(3), np.ones(3), np.zeros(3), turned)
+    return regression, state

@@ -20,8 +20,8 @@ from thermo_comp.simulation import unit_preset as preset
 
 #: Half an hour over 36 K; the ramps of a freezer, not of a chamber.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
-#: One set: the smallest fit that there is, for tests that are about everything around it.
-OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='quadratic'), certificates=False)
+#: The two sets alone: the smallest fit that there is, for tests that are about everything around it.
+OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
 
 
 def write_unit(

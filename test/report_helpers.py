@@ -69,7 +69,7 @@ def fitted() -> FitResult:
                 serial='thermostatted-0001',
             )
         )
-    return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, model='golovach'))
+    return fit(sources, FitOptions(gravity=STANDARD_GRAVITY))
 
 
 @cache

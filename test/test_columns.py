@@ -41,10 +41,12 @@ def by_group(columns):
 def test_the_bank():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
     assert by_group(bank()) == {
-        'now': 1, 'board': 8, 'neighbour': 8, 'product': 17, 'even': 9, 'play': 8
+        'now': 1, 'board': 8, 'neighbour': 8, 'product': 8, 'mixed': 9, 'square': 8, 'even': 13,
+        'play': 8,
     }  # fmt: skip
     assert by_group(bank(('case', 'tip'))) == {
-        'now': 2, 'board': 8, 'neighbour': 16, 'product': 26, 'even': 18, 'play': 8
+        'now': 2, 'board': 8, 'neighbour': 16, 'product': 8, 'mixed': 18, 'square': 8, 'even': 26,
+        'play': 8,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
 
@@ -73,6 +75,10 @@ def test_each_value_by_hand():
         Column('board', 'board', tau_s=60.0, range=(-0.25, 0.25)),
         Column('board', 'board', tau_s=60.0, during='static', **WIDE),
         Column('board', 'board', tau_s=60.0, during='dynamic', power=3, **WIDE),
+        Column('square', 'square', tau_s=60.0, **WIDE),
+        Column('even', 'square', 'tip', power=1, **WIDE),
+        Column('even', 'size', 'tip', **WIDE),
+        Column('even', 'size', 'tip', power=1, range=(0.0, 0.5)),
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = Layout(spec)
@@ -81,7 +87,8 @@ def test_each_value_by_hand():
     assert layout.width == len(state)
     found = values(columns, state, 20.0, spec)
     expected = [
-        -0.7, 0.01, 0.5, -0.3, -0.9, math.tanh(0.64) * 9.0, 0.1, 0.25, 0.375, 0.125 * 27.0
+        -0.7, 0.01, 0.5, -0.3, -0.9, math.tanh(0.64) * 9.0, 0.1, 0.25, 0.375, 0.125 * 27.0,
+        0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0,
     ]  # fmt: skip
     assert found == pytest.approx(expected)
     # t is held at the edge of the calibrated temperatures, the lag itself is not.

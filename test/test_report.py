@@ -28,8 +28,9 @@ from thermo_comp.report import (
     evidence_of_fit,
     write_report,
 )
+from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.plates import PLATES, png_files
-from thermo_comp.simulation import ideal_regime, parse_cyclogram
+from thermo_comp.simulation import STANDARD_GRAVITY, ideal_regime, parse_cyclogram
 from thermo_comp.thermal.regime import Regime
 
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
@@ -101,13 +102,31 @@ def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
         '9.80665 m/s²',
         f'{1:064x}',
         f'{9:064x}',
-        'golovach (chosen)',
+        'What each step of the model leaves',
+        'What each part of the model explains',
+        'parts that lag the board',
         'after 600 s, m',
         '12.7 m per µg',
     ):
         assert fact in page.text
     for plate in PLATES:
         assert plate.question in page.text
+
+
+def test_certificate_says_what_the_other_positions_say_of_each(tmp_path):
+    # One micro-g for the first position, two for the next and so on; the last cannot do without.
+    rms = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(len(fitted().positions))]
+    rms[-1] = np.nan
+    positions = tuple(
+        replace(one, left_out_rms=value)
+        for one, value in zip(fitted().positions, rms, strict=True)
+    )
+    found = evidence_of_fit(replace(fitted(), positions=positions))
+    shown = [one.residual_rms.get(LEFT_OUT) for one in found.positions]
+    assert shown == [*rms[:-1], None]
+    page = page_of(found, tmp_path)
+    assert 'left out, µg RMS' in page.text
+    assert 'Left out: with what the other positions say' in page.text
 
 
 def test_page_needs_no_network_and_runs_nothing(page):
@@ -251,7 +270,7 @@ def test_figures_as_png(tmp_path):
     assert all(content.startswith(b'\x89PNG') for content in files.values())
     folder = tmp_path / 'new' / 'figures'
     write_report(bare(), tmp_path / 'page.html', figures=folder)
-    assert [path.name for path in folder.iterdir()] == ['1_functions.png']
+    assert [path.name for path in sorted(folder.iterdir())] == ['1_functions.png', '2_step.png']
 
 
 def test_page_is_written_atomically(tmp_path):

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from builders import axis_set
+from builders import axis_set, calibration, regime_set, term
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.artist import Artist
@@ -24,11 +24,12 @@ from thermo_comp.report.decimate import thin
 from thermo_comp.report.figures_residual import draw_gravity, draw_histograms, draw_residuals
 from thermo_comp.report.figures_thermal import draw_dynamics, draw_temperatures
 from thermo_comp.report.figures_unit import (
-    bias_curve,
+    curves,
     draw_functions,
     draw_positions,
+    draw_step,
     equal_area,
-    scale_curve,
+    step_answer,
 )
 from thermo_comp.report.inertial import position_error, schuler_peak
 from thermo_comp.report.plates import PLATES
@@ -37,7 +38,6 @@ from thermo_comp.report.text import label_text, number
 from thermo_comp.report.trace import thermal_trace
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
-from thermo_comp.unit.calibration import AxisReference
 from thermo_comp.unit.gravity import MICRO_G
 
 
@@ -75,26 +75,32 @@ def test_thinning_keeps_gaps_and_refuses_no_bins():
 
 
 def test_bias_and_scale_curves_by_hand():
-    # Two counts of level, 0.3 counts/K and 0.01 counts/K^2 at t = 10 K: 3 + 1 counts over delta
-    # 0.5; scale 300 counts per m/s^2. Variances 4, 0.01, 1e-6 give sqrt(4 + 1 + 0.01) counts.
-    rows = []
-    variances = [4.0, 0.01, 1e-6, 0.0, 0.0, 1e-12, 4e-14, 0.0, 0.0]
-    for i, variance in enumerate(variances):
-        rows.append((0.0,) * i + (variance,))
-    one = axis_set((0.0, 0.3, 0.01), (1.0, 7e-5), delta=0.5, covariance=tuple(rows))
-    t = np.array([0.0, 10.0])
-    value, sd = bias_curve(one, AxisReference(300.0, 7.0), t)
+    # 3 counts per 10 K in a soak; while it heats at 1 K/min for 10 min, a lag of 600 s is
+    # 10 (1 - exp(-1)) K behind, and weighs 0.3 counts per K; 300 counts per m/s^2.
+    static, dynamic = (
+        regime_set(*[axis_set((0.0, 0.3), (1.0, 7e-5), delta=delta)] * 3, rate_range_k_min=(0, 2))
+        for delta in (0.0, 0.5)
+    )
+    one = calibration(
+        static=static,
+        dynamic=dynamic,
+        response=(term('board', (0.3, 0.0, 0.0), (0.0, 1e-6, 0.0), tau_s=600.0),),
+    )
+    soak, heating = curves(one)
+    assert (soak.name, heating.name) == ('soak', 'heating at 1 K/min')
     count = 1.0 / 300.0 / MICRO_G
-    assert value == pytest.approx([0.5 * count, 4.5 * count])
-    assert sd == pytest.approx([2.0 * count, np.sqrt(5.01) * count])
-    value, sd = scale_curve(one, t)
-    assert value == pytest.approx([0.0, 700.0])
-    # sqrt(1e-12 + 100 * 4e-14) is 2.236e-6.
-    assert sd == pytest.approx([1.0, np.sqrt(5.0)])
-    # A negative scale factor turns the sign of what a bias in counts means.
-    turned, _ = bias_curve(one, AxisReference(-300.0, 7.0), t)
-    assert turned == pytest.approx([-0.5 * count, -4.5 * count])
-    assert bias_curve(axis_set((0.0, 0.3)), AxisReference(300.0, 7.0), t)[1] is None
+    t = soak.temperature - 20.0
+    assert soak.bias == pytest.approx(np.outer(0.3 * count * t, np.ones(3)))
+    assert soak.scale == pytest.approx(np.outer(70.0 * t, np.ones(3)))
+    behind = 10.0 * (1.0 - np.exp(-(heating.temperature - heating.temperature[0]) / 10.0))
+    assert heating.bias[:, 0] == pytest.approx((0.3 * t + 0.5 + 0.3 * behind) * count)
+    assert heating.bias[:, 2] == pytest.approx((0.3 * t + 0.5) * count)
+    assert heating.scale[:, 1] == pytest.approx(70.0 * t + behind)
+    minutes, bias, scale = step_answer(one)
+    left = np.exp(-minutes / 10.0)
+    assert bias[:, 0] == pytest.approx(0.3 * left * count)
+    assert scale[:, 1] == pytest.approx(left, abs=1e-9)
+    assert not bias[:, 1:].any()
 
 
 def test_metres_of_a_navigator_by_hand():
@@ -162,6 +168,7 @@ def look(line: Artist) -> tuple[object, ...]:
         draw_histograms,
         draw_functions,
         draw_positions,
+        draw_step,
     ],
 )
 def test_figures_are_legible_in_black_and_white(draw, sheet):

@@ -58,8 +58,8 @@ def fit(
         typer.Option(help='fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
     ] = None,
     model: Annotated[
-        str, typer.Option(help='auto, golovach (the paper), quadratic (one set), or a candidate.')
-    ] = 'auto',
+        str, typer.Option(help='response, or golovach (the paper).')
+    ] = 'response',
     full_scale: Annotated[
         float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
     ] = None,

@@ -44,8 +44,8 @@ _EARNED = 0.5
 _LEAST_SIGMA = 1e-8
 # Of the noise of a window, what a column may add unseen before it counts.
 _OPEN = 1.0
-# Windows this many sds off lose weight, after Huber.
-_HUBER_SDS = 3.0
+# Windows more sds off than this lose weight.
+_FAR_SDS = 3.0
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,10 @@ def learn(
         silent = {part: _widths(prior, part) > 0.0 for part in ('bias', 'scale')}
     silent['scale'] |= held
     fixed = _Fixed(silent, kept)
-    posterior, prior = _settle(regression, state, prior, fixed)
+    # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
+    posterior, prior = _settle(regression, state, prior, fixed, rounds=_PATIENCE)
+    _downweight(regression, posterior)
+    posterior, prior = _settle(regression, posterior.state, prior, fixed)
     tell(0.4)
     _downweight(regression, posterior)
     if walks:
@@ -333,11 +336,15 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
 
 
 def _downweight(regression: Regression, posterior: Posterior) -> None:
-    size = np.abs(posterior.whitened)
+    """
+    Take windows that are far off for as noisy as they look.
+
+    """
+    base = regression.windows.weight[:, None]
+    size = np.abs(posterior.whitened) * np.sqrt(base / regression.weight)
     usual = 1.4826 * np.median(size, axis=0)
     size = size / np.maximum(usual, 1e-300)
-    base = regression.windows.weight[:, None]
-    regression.reweight(base * _HUBER_SDS / np.maximum(size, _HUBER_SDS))
+    regression.reweight(base * (_FAR_SDS / np.maximum(size, _FAR_SDS)) ** 2)
 
 
 def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:

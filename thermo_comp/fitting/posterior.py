@@ -733,6 +733,8 @@ class Regression:
         precision = self.precision(prior, layout)
         matrices = self._inform(prior, layout)
         mean = self.prior_mean(prior, layout)
+        # What takes no part any more is 0.
+        state = self._moved(state, np.zeros(layout.n), layout)
         for k in range(n_steps):
             equations = self._equations(state, prior, layout)
             hessian, away = equations.hessian, self.vector(state, layout) - mean

@@ -14,10 +14,11 @@ from typing import Literal
 
 import numpy as np
 
-from ..fitting import FitResult, predicted_sd
+from ..fitting import FitResult
 from ..judging import Judgement, Verdict
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
+from ..unit.prediction import bias_and_scale, predicted_sd, ramp_states
 
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
@@ -90,8 +91,6 @@ COLUMNS: tuple[Column, ...] = (
         for name, i, j in _SKEW
     ),
     *_by_axis('noise_{}_ug_sqrt_hz', 'white noise'),
-    Column('lag_1_s', 'number', 'first time constant of the thermal memory'),
-    Column('lag_2_s', 'number', 'second time constant of the thermal memory'),
     Column('board_lag_s', 'number', 'time constant of the board behind the case'),
     Column('window_s', 'number', 'length of the windows at rest'),
     Column('raw_ug', 'number', '|g| - g at rest, RMS, constants at T_ref only'),
@@ -99,6 +98,7 @@ COLUMNS: tuple[Column, ...] = (
     Column('dynamic_ug', 'number', '|g| - g at rest, RMS, dynamic regime'),
     Column('all_ug', 'number', '|g| - g at rest, RMS'),
     Column('peak_ug', 'number', '|g| - g at rest, largest window'),
+    Column('unseen_ug', 'number', '|g| - g of each position by what the others say, RMS'),
     Column('claimed_ug', 'number', 'RMS of what the calibration claims for these windows'),
     Column('cpu_s', 'number', 'processor time of reading and fit'),
     Column('tool_version', 'text', 'version that fitted it'),
@@ -158,6 +158,9 @@ def fitted_cells(result: FitResult) -> dict[str, Cell]:
         'hours': sum(bag.end_ns - bag.start_ns for bag in result.bags) * 1e-9 / 3600.0,
         'tool_version': calibration.provenance.tool_version,
     }
+    unseen = next(row.left_out for row in result.residuals if row.section == 'all')
+    if unseen.n:
+        cells['unseen_ug'] = unseen.micro_g.rms
     return cells | calibration_cells(calibration)
 
 
@@ -231,7 +234,10 @@ def calibration_cells(calibration: Calibration) -> dict[str, Cell]:
             ('rate_range_k_min', 1, max),
         )
     )
-    sd = predicted_sd(calibration, np.array([calibration.reference_temperature_c]), np.zeros(1))
+    reference = np.array([calibration.reference_temperature_c])
+    soak = ramp_states(calibration, reference, 0.0, 0.0)
+    bias, scale = bias_and_scale(calibration, soak)
+    sd = predicted_sd(calibration, reference, 0.0)
     cells: dict[str, Cell] = {
         'gravity_m_s2': calibration.gravity_m_s2,
         'reference_temperature_c': calibration.reference_temperature_c,
@@ -242,21 +248,18 @@ def calibration_cells(calibration: Calibration) -> dict[str, Cell]:
         'board_lag_s': calibration.board_lag_s,
     }
     for i, axis in enumerate(AXES):
-        reference = getattr(calibration.axes, axis)
         static = getattr(calibration.static, axis)
-        one_ug = reference.scale_factor * MICRO_G
+        one_ug = getattr(calibration.axes, axis).scale_factor * MICRO_G
         cells |= {
-            f'scale_{axis}': reference.scale_factor,
-            f'scale_sd_{axis}_ppm': float(sd.scale[0, 0, i]) * 1e6,
+            f'scale_{axis}': float(scale[0, i]),
+            f'scale_sd_{axis}_ppm': float(sd.scale[0, i]) * 1e6,
             f'scale_slope_{axis}_ppm_k': static.scale_function.slope(0.0) * 1e6,
-            f'bias_{axis}_ug': (reference.bias + static.delta) / one_ug,
-            f'bias_sd_{axis}_ug': float(sd.bias[0, 0, i]) / MICRO_G,
+            f'bias_{axis}_ug': float(bias[0, i]) / MICRO_G,
+            f'bias_sd_{axis}_ug': float(sd.bias[0, i]) / MICRO_G,
             f'bias_slope_{axis}_ug_k': static.bias_function.slope(0.0) / one_ug,
             f'noise_{axis}_ug_sqrt_hz': calibration.noise_density_m_s2_sqrt_hz[i] / MICRO_G,
         }
     for k, (name, i, j) in enumerate(_SKEW):
         cells[f'm_{name}_urad'] = calibration.misalignment[i][j] * 1e6
         cells[f'm_sd_{name}_urad'] = calibration.misalignment_sd[k] * 1e6
-    for k, lag_s in enumerate(calibration.memory_time_constants_s[:2], 1):
-        cells[f'lag_{k}_s'] = lag_s
     return {name: float(value) for name, value in cells.items() if value is not None}

@@ -11,12 +11,14 @@ page is left out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
+from ..fitting import ResidualRow
 from ..fitting.reduction import Readings
 from ..judging import Judgement, Verdict, Windows
 from ..simulation import Cyclogram
@@ -28,6 +30,8 @@ from .trace import ThermalTrace
 #: What is set side by side: the constants at the reference temperature, and the calibration.
 RAW = 'raw'
 CHOSEN = 'calibration'
+#: Beside them, of each position of a fit: the calibration that the other positions alone give.
+LEFT_OUT = 'left out'
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ class Position:
     up : tuple of float
         Direction of the specific force in the output frame.
     residual_rms : dict of {str: float}
-        Per rung, RMS of ``|f| - g`` [m/s^2].
+        Per rung, RMS of ``|f| - g`` [m/s^2]; `LEFT_OUT` where the fit could do without it.
 
     """
 
@@ -117,31 +121,6 @@ class Position:
     duration_s: float
     up: tuple[float, float, float]
     residual_rms: dict[str, float]
-
-
-@dataclass(frozen=True)
-class CandidateRow:
-    """
-    One candidate model of the fit.
-
-    Parameters
-    ----------
-    name : str
-        The model.
-    n_parameters : int
-        Its size.
-    fitted_rms, held_out_rms : float
-        RMS per axis on its own windows and on held-out sections [m/s^2].
-    is_chosen : bool
-        Whether it was taken.
-
-    """
-
-    name: str
-    n_parameters: int
-    fitted_rms: float
-    held_out_rms: float
-    is_chosen: bool
 
 
 @dataclass(frozen=True)
@@ -167,8 +146,11 @@ class Evidence:
         At rest, of all bags.
     judgement : Judgement or None
         What they tell of the calibration.
-    candidates : tuple of CandidateRow
-        What the fit chose from.
+    steps : tuple of ResidualRow
+        What each step of the model leaves on the windows of the fit.
+    left_out : dict of {int: float}
+        By `Windows.position`: RMS of ``|f| - g`` with what the other positions alone say of the
+        unit [m/s^2].
     findings : tuple of str
         What speaks against calibration or bags.
     checks : tuple of str
@@ -186,7 +168,8 @@ class Evidence:
     shown: ShownBag | None = None
     windows: Windows | None = None
     judgement: Judgement | None = None
-    candidates: tuple[CandidateRow, ...] = ()
+    steps: tuple[ResidualRow, ...] = ()
+    left_out: Mapping[int, float] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     is_fit: bool = False
@@ -266,16 +249,19 @@ class Evidence:
             rows = windows.position == p
             mean = force[rows].mean(axis=0)
             x, y, z = (mean / np.linalg.norm(mean)).tolist()
+            rms = {
+                name: float(np.sqrt(np.mean(residual[rows] ** 2)))
+                for name, residual in self.residuals.items()
+            }
+            if np.isfinite(self.left_out.get(int(p), np.nan)):
+                rms[LEFT_OUT] = self.left_out[int(p)]
             found.append(
                 Position(
                     number=number,
                     bag=int(windows.bag[rows][0]),
                     duration_s=windows.window_s * int(rows.sum()),
                     up=(x, y, z),
-                    residual_rms={
-                        name: float(np.sqrt(np.mean(residual[rows] ** 2)))
-                        for name, residual in self.residuals.items()
-                    },
+                    residual_rms=rms,
                 )
             )
         return tuple(found)

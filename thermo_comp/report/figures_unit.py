@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of the unit itself: bias and scale functions, and where its positions point.
+Owns the figures of the unit itself: bias, scale, answer to a step, and its positions.
 
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,12 +15,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..typing import Floats
-from ..unit.calibration import AXES, AxisReference, AxisSet, Calibration, RegimeSet
+from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
-from .evidence import RAW, Evidence, Position
+from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
+from .evidence import LEFT_OUT, RAW, Evidence, Position
 from .style import (
+    AXIS_LINES,
     DYNAMIC_LINE,
     GREY,
+    RED,
     STATIC_LINE,
     Line,
     Sheet,
@@ -31,149 +36,201 @@ from .text import number
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
 _N_CURVE = 61
+#: From a few readings to where the longest lag of the bank has forgotten.
+_STEP_MINUTES = (0.2, 500.0)
 # Number labels of a dot plot beyond this would overlap.
 _MOST_LABELS = 24
 
 
 def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
     """
-    Draw the bias and scale functions with their bands over the valid range, per regime.
+    Draw bias and scale over temperature in a soak and in ramps, with their bands.
 
     """
-    calibration = evidence.calibration
-    if calibration is None:
-        raise ValueError('`evidence` has no calibration')
+    calibration = _calibration(evidence)
     rows, columns = (6, 1) if sheet.is_narrow else (2, 3)
     figure = new_figure(sheet, 9.6 if sheet.is_narrow else 4.2)
     panels = np.array(figure.subplots(rows, columns, sharex=True)).reshape(2, 3)
-    widest: dict[Axes, float] = {}
-    references = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    for i, axis in enumerate(AXES):
-        for name, regime_set, line, hatch, marker in _sets(calibration):
-            temperature = np.linspace(*regime_set.temperature_range_c, _N_CURVE)
-            t = temperature - calibration.reference_temperature_c
-            for axes, (value, sd) in zip(
-                panels[:, i],
-                (
-                    bias_curve(regime_set.axes()[i], references[i], t),
-                    scale_curve(regime_set.axes()[i], t),
-                ),
-                strict=True,
-            ):
-                if sd is not None:
-                    _draw_band(axes, temperature, value, BAND_SDS * sd, line, hatch)
-                    widest[axes] = max(widest.get(axes, 0.0), BAND_SDS * float(np.max(sd)))
+    widest = np.zeros((2, 3))
+    for curve in curves(calibration):
+        for part, (value, sd) in enumerate(
+            ((curve.bias, curve.sd_bias), (curve.scale, curve.sd_scale))
+        ):
+            for i, axes in enumerate(panels[part]):
+                if calibration.posterior is not None:
+                    _draw_band(axes, curve, value[:, i], BAND_SDS * sd[:, i])
+                    widest[part, i] = max(widest[part, i], BAND_SDS * float(sd[:, i].max()))
                 # The ends of the valid range are marked; a range of a few K stays visible so.
-                ends = {'marker': marker, 'markersize': 3.5, 'markevery': [0, -1]}
-                axes.plot(temperature, value, label=name, **line, **ends)
-        for axes, name, unit in ((panels[0, i], 'bias', 'µg'), (panels[1, i], 'scale', 'ppm')):
-            band = f': ±{number(widest[axes], 2)} {unit} at most' if axes in widest else ''
-            axes.set_title(f'{name} {axis}{band}')
-    for axes in panels.ravel():
-        axes.axvline(calibration.reference_temperature_c, color=GREY, linewidth=0.8)
-        axes.yaxis.set_major_locator(MaxNLocator(5))
-    for axes in panels[0] if sheet.is_narrow else panels[0, :1]:
-        axes.set_ylabel('change, µg')
-    for axes in panels[1] if sheet.is_narrow else panels[1, :1]:
-        axes.set_ylabel('change, ppm')
-    bottom = panels[1, 2:] if sheet.is_narrow else panels[1]
-    for axes in bottom:
-        axes.set_xlabel('T board, °C')
-    first = panels[0, 0]
-    first.legend(loc='lower left', bbox_to_anchor=(0.0, 1.14), ncols=2)
+                axes.plot(
+                    curve.temperature,
+                    value[:, i],
+                    label=curve.name,
+                    markersize=3.5,
+                    markevery=[0, -1],
+                    marker=curve.marker,
+                    **curve.line,
+                )
+    for part, (name, unit) in enumerate((('bias', 'µg'), ('scale', 'ppm'))):
+        for i, axes in enumerate(panels[part]):
+            band = f': ±{number(widest[part, i], 2)} {unit} at most' if widest[part, i] else ''
+            axes.set_title(f'{name} {AXES[i]}{band}')
+            axes.axvline(calibration.reference_temperature_c, color=GREY, linewidth=0.8)
+            axes.yaxis.set_major_locator(MaxNLocator(5))
+            if sheet.is_narrow or not i:
+                axes.set_ylabel(f'change, {unit}')
+            if part and (i == 2 or not sheet.is_narrow):
+                axes.set_xlabel('T board, °C')
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper left', ncols=1 if sheet.is_narrow else 3)
     return figure
 
 
-def _sets(calibration: Calibration) -> list[tuple[str, RegimeSet, Line, str, str]]:
+@dataclass(frozen=True)
+class Curve:
+    """
+    Bias and scale over temperature in one thermal state, against a soak at the reference.
+
+    Parameters
+    ----------
+    name, line, hatch, marker : str, Line, str, str
+        How it is drawn.
+    temperature : ndarray, shape (n,)
+        Board temperature.
+    bias, sd_bias : ndarray, shape (n, 3)
+        Micro-g.
+    scale, sd_scale : ndarray, shape (n, 3)
+        Parts per million.
+
+    """
+
+    name: str
+    line: Line
+    hatch: str
+    marker: str
+    temperature: Floats
+    bias: Floats
+    sd_bias: Floats
+    scale: Floats
+    sd_scale: Floats
+
+
+def curves(calibration: Calibration) -> list[Curve]:
+    """
+    Evaluate a calibration in a soak, and in ramps through its range at half of the fastest rate.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The unit.
+
+    Returns
+    -------
+    list of Curve
+        The soak alone where ramps make no difference.
+
+    """
     static, dynamic = calibration.regime_sets()
-    if static == dynamic:
-        return [('both regimes, 95 % band', static, STATIC_LINE, '////', 'o')]
-    return [
-        ('static, 95 % band', static, STATIC_LINE, '////', 'o'),
-        ('dynamic, 95 % band', dynamic, DYNAMIC_LINE, '\\\\\\\\', 's'),
-    ]
+    looks = [('soak', static, 0.0, STATIC_LINE, '////', 'o')]
+    cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
+    if calibration.response or static != dynamic:
+        for word, rate, line, hatch, marker in (
+            ('heating', heating, DYNAMIC_LINE, '\\\\\\\\', '^'),
+            ('cooling', cooling, AXIS_LINES[2], '....', 'v'),
+        ):
+            if rate:
+                name = f'{word} at {abs(rate):g} K/min'
+                looks.append((name, dynamic, rate / 60.0, line, hatch, marker))
+    reference = np.array([calibration.reference_temperature_c])
+    bias_0, scale_0 = bias_and_scale(calibration, ramp_states(calibration, reference, 0.0, 0.0))
+    found = []
+    for name, part, rate, line, hatch, marker in looks:
+        lower, upper = part.temperature_range_c
+        temperature = np.linspace(lower, upper, _N_CURVE)
+        begun = lower if rate > 0.0 else upper
+        lasted_s = (temperature - begun) / rate if rate else 0.0
+        states = ramp_states(calibration, temperature, rate, lasted_s)
+        bias, scale = bias_and_scale(calibration, states)
+        sd = sd_of_states(calibration, states)
+        found.append(
+            Curve(
+                name,
+                line,
+                hatch,
+                marker,
+                temperature,
+                (bias - bias_0) / MICRO_G,
+                sd.bias / MICRO_G,
+                (scale / scale_0 - 1.0) * 1e6,
+                sd.scale * 1e6,
+            )
+        )
+    return found
 
 
-def _draw_band(
-    axes: Axes, temperature: Floats, value: Floats, half: Floats, line: Line, hatch: str
-) -> None:
+def _calibration(evidence: Evidence) -> Calibration:
+    if evidence.calibration is None:
+        raise ValueError('`evidence` has no calibration')
+    return evidence.calibration
+
+
+def _draw_band(axes: Axes, curve: Curve, value: Floats, half: Floats) -> None:
     axes.fill_between(
-        temperature,
+        curve.temperature,
         value - half,
         value + half,
-        facecolor=line['color'],
-        edgecolor=line['color'],
+        facecolor=curve.line['color'],
+        edgecolor=curve.line['color'],
         alpha=0.25,
-        hatch=hatch,
+        hatch=curve.hatch,
         linewidth=0,
     )
 
 
-def bias_curve(
-    axis_set: AxisSet, reference: AxisReference, t: Floats
-) -> tuple[Floats, Floats | None]:
+def draw_step(evidence: Evidence, sheet: Sheet) -> Figure:
     """
-    Bias of one set against the bias at the reference, at rest thermally.
+    Draw what a step of the temperature does to each axis over time.
+
+    """
+    calibration = _calibration(evidence)
+    minutes, bias, scale = step_answer(calibration)
+    figure = new_figure(sheet, 4.4 if sheet.is_narrow else 2.5)
+    panels = figure.subplots(*((2, 1) if sheet.is_narrow else (1, 2)))
+    for axes, value, unit in ((panels[0], bias, 'µg'), (panels[1], scale, 'ppm')):
+        for i, axis in enumerate(AXES):
+            axes.plot(minutes, value[:, i], label=axis, **AXIS_LINES[i])
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        log_axis(axes, float(minutes[0]), float(minutes[-1]))
+        axes.set_ylabel(f'per K, {unit}')
+        axes.set_xlabel('time since the step, min')
+        title = 'bias' if axes is panels[0] else 'scale'
+        legend_above(axes, sheet, share=0.5, title=title, alignment='left')
+    return figure
+
+
+def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
+    """
+    Evaluate what a step of board and case by 1 K, up to the reference, leaves to come.
 
     Parameters
     ----------
-    axis_set : AxisSet
-        One axis of one regime.
-    reference : AxisReference
-        The axis at the reference temperature.
-    t : ndarray, shape (n,)
-        ``T_board - T_ref`` [K].
+    calibration : Calibration
+        The unit.
 
     Returns
     -------
-    value : ndarray, shape (n,)
-        Micro-g.
-    sd : ndarray, shape (n,), or None
-        Its standard deviation from the parameter covariance; None when that is not known.
+    minutes : ndarray, shape (n,)
+        Time since the step.
+    bias : ndarray, shape (n, 3)
+        Bias less that of the soak at the end [micro-g].
+    scale : ndarray, shape (n, 3)
+        The same of the scale [ppm].
 
     """
-    per_micro_g = abs(reference.scale_factor) * MICRO_G
-    sign = np.sign(reference.scale_factor)
-    value = (axis_set.delta + axis_set.bias_function.value(t)) / per_micro_g * sign
-    columns = np.column_stack((np.ones(len(t)), *axis_set.bias_function.basis(t)))
-    sd = _sd(axis_set, columns, 0)
-    return value, None if sd is None else sd / per_micro_g
-
-
-def scale_curve(axis_set: AxisSet, t: Floats) -> tuple[Floats, Floats | None]:
-    """
-    Scale of one set against the scale at the reference, at rest thermally.
-
-    Parameters
-    ----------
-    axis_set : AxisSet
-        One axis of one regime.
-    t : ndarray, shape (n,)
-        ``T_board - T_ref`` [K].
-
-    Returns
-    -------
-    value : ndarray, shape (n,)
-        Parts per million.
-    sd : ndarray, shape (n,), or None
-        Its standard deviation; None when that is not known.
-
-    """
-    value = (axis_set.scale_function.value(t) - 1.0) * 1e6
-    columns = np.column_stack((np.ones(len(t)), *axis_set.scale_function.basis(t)))
-    sd = _sd(axis_set, columns, axis_set.n_bias_parameters)
-    return value, None if sd is None else sd * 1e6
-
-
-def _sd(axis_set: AxisSet, columns: Floats, first: int) -> Floats | None:
-    if not axis_set.covariance:
-        return None
-    n = columns.shape[1]
-    block = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            block[i, j] = block[j, i] = axis_set.covariance[first + i][first + j]
-    return np.asarray(np.sqrt(np.maximum(np.einsum('ni,ij,nj->n', columns, block, columns), 0.0)))
+    minutes = np.geomspace(*_STEP_MINUTES, _N_CURVE)
+    since_s = np.append(minutes * 60.0, np.inf)
+    states = step_states(calibration, calibration.reference_temperature_c, since_s)
+    bias, scale = bias_and_scale(calibration, states)
+    return minutes, (bias[:-1] - bias[-1]) / MICRO_G, (scale[:-1] / scale[-1] - 1.0) * 1e6
 
 
 def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:
@@ -265,6 +322,14 @@ def _draw_dots(axes: Axes, evidence: Evidence, sheet: Sheet) -> None:
         axes.plot(before, numbers, 'o', mfc='white', mec='black', ms=4.5, label='raw')
     axes.plot(after, numbers, 'o', color='black', ms=4.5, label=judged)
     both = np.concatenate((after, before)) if len(rungs) > 1 else after
+    without = [
+        (p.residual_rms[LEFT_OUT], p.number) for p in positions if LEFT_OUT in p.residual_rms
+    ]
+    if without:
+        left_out = np.array(without)[:, 0] / MICRO_G
+        style = {'mfc': 'none', 'mec': RED, 'ms': 5.5}
+        axes.plot(left_out, np.array(without)[:, 1], 'D', label=LEFT_OUT, **style)
+        both = np.concatenate((both, left_out))
     both = np.maximum(both, 1e-3)
     log_axis(axes, float(np.min(both)) / 1.4, float(np.max(both)) * 1.4)
     axes.set_ylim(len(positions) + 0.7, 0.3)

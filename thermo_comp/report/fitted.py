@@ -15,7 +15,7 @@ from ..fitting.verdict import Finding
 from ..judging import judge_bags
 from ..judging.windows import usual_window
 from ..recording import inspect_recording
-from .evidence import CandidateRow, Evidence
+from .evidence import Evidence
 from .gather import bag_facts, of_calibration, shown_of
 
 
@@ -70,7 +70,8 @@ def evidence_of_fit(
         shown=shown,
         windows=None if judgement is None else judgement.windows,
         judgement=judgement,
-        candidates=_candidates(result),
+        steps=result.residuals,
+        left_out=_left_out(result),
         findings=tuple(dict.fromkeys((*of_calibration(calibration), *against))),
         checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
         is_fit=True,
@@ -82,14 +83,11 @@ def _is_reservation(finding: Finding) -> bool:
     return finding.level == 'advice' and finding.name != 'positions'
 
 
-def _candidates(result: FitResult) -> tuple[CandidateRow, ...]:
-    return tuple(
-        CandidateRow(
-            name=one.name,
-            n_parameters=one.n_parameters,
-            fitted_rms=one.fitted_rms,
-            held_out_rms=one.held_out_rms,
-            is_chosen=one.is_chosen,
-        )
-        for one in result.candidates
-    )
+def _left_out(result: FitResult) -> dict[int, float]:
+    """
+    Give what is left of each position without it, by `Windows.position`.
+
+    """
+    rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
+    by_rest = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
+    return {k: by_rest[rest] for k, rest in enumerate(rests) if rest in by_rest}

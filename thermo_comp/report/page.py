@@ -21,11 +21,34 @@ from ..judging import SECTIONS
 from ..thermal.regime import Regime
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
-from .evidence import CHOSEN, RAW, Evidence
+from .evidence import CHOSEN, LEFT_OUT, RAW, Evidence
 from .html import document, figure, table
 from .inertial import SCHULER_PEAK_PER_MICRO_G, TIMES_S, position_error, schuler_peak
 from .plates import DrawnPlate
 from .text import number
+
+#: Steps of the model by their names in `fitting.ResidualRow`.
+_STEPS = {
+    'raw': 'raw',
+    'one_set': 'one set',
+    'two_sets': 'two sets',
+    'fitted': 'response',
+    'left_out': 'left out',
+}
+#: What the groups of `unit.columns` are, in words.
+GROUP_WORDS = {
+    'curve': 'curve over temperature',
+    'set': 'difference of the sets',
+    'now': 'heat flow (case − board)',
+    'rate': 'rate of the board',
+    'board': 'parts that lag the board',
+    'neighbour': 'parts between case and board',
+    'product': 'lags, changing with temperature',
+    'mixed': 'heat flow, changing with temperature',
+    'square': 'curves of parts that lag',
+    'even': 'size of the heat flow',
+    'play': 'hysteresis',
+}
 
 
 def render_page(
@@ -71,8 +94,8 @@ def render_page(
         '<h2>Figures</h2>' if plates else '',
         *(figure(plate) for plate in plates),
         _axes(evidence.calibration),
-        _terms(evidence.calibration),
-        _candidates(evidence),
+        _steps(evidence),
+        _groups(evidence.calibration),
         _positions(evidence),
         _bags(evidence),
         _footer(),
@@ -256,71 +279,54 @@ def _axes(calibration: Calibration | None) -> str:
     )
 
 
-def _terms(calibration: Calibration | None) -> str:
-    if calibration is None:
-        return ''
-    rows = []
-    parts = dict(zip(('static', 'dynamic'), calibration.regime_sets(), strict=True))
-    if calibration.static == calibration.dynamic:
-        parts = {'both': calibration.static}
-    for regime, part in parts.items():
-        for axis, one, reference in zip(
-            AXES,
-            part.axes(),
-            (calibration.axes.x, calibration.axes.y, calibration.axes.z),
-            strict=True,
-        ):
-            unit = reference.scale_factor * MICRO_G
-            terms = [
-                ('T case − T board, per K', one.gradient.bias, one.gradient.scale),
-                ('dT board/dt, per K/min', one.rate.bias / 60.0, one.rate.scale / 60.0),
-            ]
-            terms += [
-                (f'memory of {tau:.4g} s, per K', bias, scale)
-                for tau, bias, scale in zip(
-                    calibration.memory_time_constants_s,
-                    one.memory.bias,
-                    one.memory.scale,
-                    strict=False,
-                )
-            ]
-            rows += [
-                (regime, axis, name, number(bias / unit), number(scale * 1e6))
-                for name, bias, scale in terms
-                if bias or scale
-            ]
+def _steps(evidence: Evidence) -> str:
+    rows = [
+        (
+            one.section,
+            *(number(getattr(one, name).rms / MICRO_G) for name in _STEPS),
+            str(one.raw.n),
+        )
+        for one in evidence.steps
+        if one.raw.n
+    ]
     if not rows:
         return ''
-    return '<h2>Terms while the temperature changes</h2>' + table(
-        ('regime', 'axis', 'term', 'bias, µg', 'scale, ppm'), rows, texts=3
+    return '<h2>What each step of the model leaves</h2>' + table(
+        ('section', *(f'{words}, µg' for words in _STEPS.values()), 'windows'),
+        rows,
+        caption='RMS of |g| − g over the windows of the fit. One set: a curve over temperature, '
+        'blind to the regime; two sets: one for each regime, as the paper has it; response: all '
+        'of the model. Left out: each position with what the other positions say of the unit, '
+        'which is what a new attitude will see.',
     )
 
 
-def _candidates(evidence: Evidence) -> str:
-    if not evidence.candidates:
+def _groups(calibration: Calibration | None) -> str:
+    if calibration is None or not calibration.evidence:
         return ''
-    return '<h2>Candidate models</h2>' + table(
-        ('model', 'parameters', 'fitted, µg', 'held out, µg'),
+    return '<h2>What each part of the model explains</h2>' + table(
+        ('part', 'of the', 'explains, µg', 'parameters', 'log evidence'),
         [
             (
-                one.name + (' (chosen)' if one.is_chosen else ''),
-                str(one.n_parameters),
-                number(one.fitted_rms / MICRO_G),
-                number(one.held_out_rms / MICRO_G),
+                GROUP_WORDS.get(one.group, one.group),
+                one.part,
+                number(one.explains_m_s2 / MICRO_G),
+                f'{one.effective_parameters:.1f}',
+                f'{one.log_evidence_change:+.1f}'.replace('-', '−'),
             )
-            for one in evidence.candidates
+            for one in calibration.evidence
         ],
-        caption='RMS error per axis on the data that each was fitted on, and on whole stretches '
-        'between switches of the regime that it had not seen.',
-        chosen=[one.is_chosen for one in evidence.candidates],
+        texts=2,
+        caption='Explains: RMS of its share in the correction over the windows of the fit; shares '
+        'may cancel each other. Parameters: how many the data determine. Log evidence: by how '
+        'much it changes with this part; parts that lower it are dropped.',
     )
 
 
 def _positions(evidence: Evidence) -> str:
     if not evidence.positions:
         return ''
-    rungs = list(evidence.residuals)
-    shown = [rungs[0], rungs[-1]] if len(rungs) > 1 else rungs
+    shown = [*evidence.residuals, *([LEFT_OUT] if evidence.left_out else [])]
     return '<h2>Positions</h2>' + table(
         ('no.', 'bag', 'rest, min', 'up x', 'up y', 'up z', *(f'{r}, µg RMS' for r in shown)),
         [
@@ -329,12 +335,15 @@ def _positions(evidence: Evidence) -> str:
                 evidence.bags[one.bag].name,
                 f'{one.duration_s / 60.0:.1f}',
                 *(f'{value:+.4f}'.replace('-', '−') for value in one.up),
-                *(number(one.residual_rms[rung] / MICRO_G) for rung in shown),
+                *(number(one.residual_rms.get(rung, np.nan) / MICRO_G) for rung in shown),
             )
             for one in evidence.positions
         ],
         texts=2,
-        caption='Up: the direction of the specific force in the output frame.',
+        caption='Up: the direction of the specific force in the output frame. Left out: with what '
+        'the other positions say of the unit; – where it tells what no other does.'
+        if evidence.left_out
+        else 'Up: the direction of the specific force in the output frame.',
     )
 
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from .evidence import Evidence
 from .figures_residual import draw_gravity, draw_histograms, draw_residuals
 from .figures_thermal import draw_dynamics, draw_temperatures
-from .figures_unit import draw_functions, draw_positions
+from .figures_unit import draw_functions, draw_positions, draw_step
 from .style import NARROW, WIDE, Sheet, drawing, png, svg
 from .text import label_text
 
@@ -184,10 +184,18 @@ def _functions(evidence: Evidence) -> str:
     calibration = evidence.calibration
     reference = 20.0 if calibration is None else calibration.reference_temperature_c
     return (
-        f'Bias and scale factor against their values at {reference:g} °C (grey line), of a unit '
-        'at thermal rest, over the range in which each set is valid (marks at its ends); beyond '
-        'it the correction is held at its edge. Hatched: 95 % band of the fitted parameters. '
-        'Terms that act only while the temperature changes stand in the table below.'
+        f'Bias and scale factor against their values at {reference:g} °C (grey line): in a soak, '
+        'and in ramps through the whole range, which begin in a soak at its end. Hatched: 95 % '
+        'band of all that was fitted; where it is wider than the curves are apart, the bags do '
+        'not tell.'
+    )
+
+
+def _step(_evidence: Evidence) -> str:
+    return (
+        'What is still to come of the change of bias and scale when board and case have jumped '
+        'by 1 K together: what a line leaves, the curve over temperature does not know. Where '
+        'it meets zero, the unit has settled.'
     )
 
 
@@ -205,7 +213,8 @@ def _positions(_evidence: Evidence) -> str:
         'Direction of the specific force in the unit’s frame, position by position, in an '
         'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° of '
         'elevation. Beside it, where gravity is known, what is left in each position: one that '
-        'stands out was moved, or is not of this unit.'
+        'stands out was moved, or is not of this unit. Diamonds: what the other positions alone '
+        'leave on it.'
     )
 
 
@@ -249,6 +258,16 @@ PLATES = (
         _functions,
         draw_functions,
         lambda evidence: evidence.calibration is not None,
+    ),
+    Plate(
+        'step',
+        'For how long does the unit remember a change of temperature?',
+        _step,
+        draw_step,
+        lambda evidence: (
+            evidence.calibration is not None
+            and any(term.lag for term in evidence.calibration.response)
+        ),
     ),
     Plate(
         'histograms',

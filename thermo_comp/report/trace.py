@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..fitting.reduction import Readings
+from ..thermal.memory import BOARD_INPUT
 from ..thermal.regime import Regime
 from ..thermal.settings import DetectorSettings
 from ..thermal.tracker import ThermalTracker
@@ -93,7 +94,7 @@ def thermal_trace(
         For the figures.
 
     """
-    tracker = ThermalTracker(detector, ())
+    tracker = ThermalTracker(detector)
     start_ns, end_ns = span_ns
     step_ns = max(round(_SHORTEST_STEP_S * 1e9), (end_ns - start_ns) // _N_GRID)
     grid = np.arange(start_ns, end_ns + 1, step_ns, dtype=np.int64)
@@ -148,11 +149,11 @@ class _Feed:
     def __init__(self, tracker: ThermalTracker, board: Readings, case: Readings) -> None:
         stamps = np.concatenate((board.stamp_ns, case.stamp_ns))
         values = np.concatenate((board.value, case.value))
-        kinds = np.repeat((False, True), (len(board.value), len(case.value)))
+        names = np.repeat((BOARD_INPUT, 'case'), (len(board.value), len(case.value)))
         order = np.argsort(stamps, kind='stable')
         self._stamps: list[int] = stamps[order].tolist()
         self._values: list[float] = values[order].tolist()
-        self._is_case: list[bool] = kinds[order].tolist()
+        self._names: list[str] = names[order].tolist()
         self._next = 0
         self._tracker = tracker
         #: Stamp, regime and direction at each change.
@@ -167,8 +168,7 @@ class _Feed:
         detector = tracker.detector
         k = self._next
         while k < len(stamps) and stamps[k] <= stamp_ns:
-            take = tracker.case_reading if self._is_case[k] else tracker.board_reading
-            take(stamps[k], self._values[k])
+            tracker.read(self._names[k], stamps[k], self._values[k])
             now = (detector.regime, detector.direction)
             if not self.flags or self.flags[-1][1:] != now:
                 self.flags.append((stamps[k], *now))

@@ -327,7 +327,7 @@ class Calibration:
                 f'got {list(names)}'
             )
         for k, term in enumerate(self.response):
-            if (term.is_of_gradient or term.kind == 'neighbour') and term.sensor not in names:
+            if term.kind in ('now', 'neighbour', 'even') and term.sensor not in names:
                 raise ValueError(
                     f'`response[{k}].sensor` must be one of sensors {list(names)}, '
                     f'got {term.sensor!r}'

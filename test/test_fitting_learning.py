@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the evidence chooses: groups, widths and noises of tables whose truth is known.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, widths
+
+from thermo_comp.fitting.learning import Learnt, group_worth, learn
+from thermo_comp.fitting.posterior import Prior, Regression
+from thermo_comp.typing import Bools, Floats
+
+ALL = ('curve', 'board', 'idle')
+STEPS = 12
+
+
+def wide(truth: Truth) -> Prior:
+    """All groups as wide as the fit begins with, and noises that are wrong."""
+    return prior_of(
+        truth,
+        on_bias=widths(ALL, 1e-3),
+        on_scale=widths(ALL, 1e-4),
+        offset_sd=MICRO,
+        sigma=np.full(3, 5.0 * MICRO),
+        rho=np.zeros(3),
+    )
+
+
+def learnt_of(
+    truth: Truth, n_positions: int, seed: int, forced: Bools | None = None
+) -> tuple[Regression, Learnt]:
+    windows, up = table_of(truth, n_positions, np.random.default_rng(seed), n_windows=60)
+    regression, state = begin(windows, up)
+    return regression, learn(regression, state, wide(truth), forced)
+
+
+@pytest.fixture(scope='module')
+def noisy() -> tuple[Regression, Learnt, Truth]:
+    truth = Truth(
+        sigma=np.array([1.0, 2.0, 3.0]) * MICRO,
+        walk=0.1 * MICRO,
+        offset_sd=20.0 * MICRO,
+        start_sd=0.3,
+    )
+    regression, found = learnt_of(truth, 18, 3)
+    return regression, found, truth
+
+
+@pytest.fixture(scope='module')
+def calm() -> tuple[Regression, Learnt, Truth]:
+    truth = Truth()
+    regression, found = learnt_of(truth, 12, 4)
+    return regression, found, truth
+
+
+def test_what_explains_nothing_leaves(calm: tuple[Regression, Learnt, Truth]) -> None:
+    _, found, _ = calm
+    used = np.array(GROUPS) != 'idle'
+    np.testing.assert_array_equal(found.prior.on_bias > 0.0, used)
+    np.testing.assert_array_equal(found.prior.on_scale > 0.0, used)
+    assert {(worth.part, worth.group) for worth in found.worth} == {
+        (part, group) for part in ('bias', 'scale') for group in ('curve', 'board')
+    }
+    # Its weights are 0, not small.
+    idle = np.array(GROUPS) == 'idle'
+    assert not found.posterior.state.on_bias[:, idle].any()
+    assert not found.posterior.state.on_scale[:, idle].any()
+
+
+def test_what_is_forced_stays() -> None:
+    kept = np.array([False, False, False, False, True, False])
+    _, found = learnt_of(Truth(), 9, 4, kept)
+    assert (found.prior.on_bias > 0.0).tolist() == [True, True, True, True, True, False]
+    assert (found.prior.on_scale > 0.0).tolist() == [True, True, True, True, True, False]
+
+
+def test_noises_come_out(noisy: tuple[Regression, Learnt, Truth]) -> None:
+    _, found, truth = noisy
+    prior = found.prior
+    # 1080 windows per axis: white noise is known to 3 % and somewhat worse beside a walk.
+    np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
+    # A walk of 1 ug per root window beside 1, 2 and 3 ug of white noise: its square is known to
+    # 1 / sqrt of some 500 / 170 / 90 effective steps; the curve takes a part of it.
+    np.testing.assert_allclose(prior.sigma * np.sqrt(prior.rho), truth.walk, rtol=0.4)
+    # 18 positions x 3 axes, of which directions, scale, bias and M take 36 + 9: nine are left,
+    # a sd of 24 %.
+    assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
+
+
+def test_white_noise_is_not_taken_for_a_walk(calm: tuple[Regression, Learnt, Truth]) -> None:
+    _, found, truth = calm
+    np.testing.assert_allclose(found.prior.sigma, truth.sigma, rtol=0.12)
+    # At the end of two hours it would have gone no further than the noise of one window.
+    assert (found.prior.rho * 7200.0 < 1.0).all()
+
+
+def test_widths_are_those_of_the_weights(calm: tuple[Regression, Learnt, Truth]) -> None:
+    # The fixed point: sd^2 = sum of squares / effective parameters, three where all is seen.
+    regression, found, truth = calm
+    true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
+    np.testing.assert_allclose(found.prior.on_bias[:4], true[:4], rtol=0.15)
+    for worth in found.worth:
+        assert 0.0 < worth.effective <= 6.0 + 1e-9
+        assert len(worth.sd) == 2
+
+
+def test_truth_lies_within_the_claimed_sd(noisy: tuple[Regression, Learnt, Truth]) -> None:
+    regression, found, truth = noisy
+    posterior = found.posterior
+    sd = np.sqrt(posterior.variance)
+    pulls: list[Floats] = []
+    for name in ('kappa', 'bias', 'skew', 'on_bias'):
+        places = getattr(posterior.layout, name)
+        used = places >= 0
+        scale = regression.rms if name == 'on_bias' else 1.0
+        error = getattr(posterior.state, name) - getattr(truth, name) * scale
+        pulls.append((error[used] / sd[places[used]]).ravel())
+    every = np.concatenate(pulls)
+    # Some twenty numbers: their rms is known to 16 %, and learnt widths make it a little less so.
+    assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
+    assert np.abs(every).max() < 4.0
+
+
+def test_worth_is_the_fall_of_the_evidence_without_it() -> None:
+    # Savage-Dickey against brute force: solve without the group, the rest of the prior the same.
+    # Exact in a linear problem; that of the directions is linear to noise / g.
+    truth = Truth()
+    windows, up = table_of(truth, 12, np.random.default_rng(8))
+    # No start states: their product with the weights is not linear.
+    windows = replace(
+        windows, lag=np.full(len(GROUPS), -1), start=np.zeros_like(windows.start),
+        start_covariance=np.zeros((0, 0)),
+    )  # fmt: skip
+    regression, state = begin(windows, up)
+    prior = prior_of(truth, on_bias=widths(ALL, 3e-4), on_scale=widths(ALL, 3e-5))
+    posterior = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-9)
+    worths = group_worth(regression, posterior, prior)
+    assert [(worth.part, worth.group) for worth in worths] == [
+        (part, group) for part in ('bias', 'scale') for group in ALL
+    ]
+    for worth in worths:
+        name = f'on_{worth.part}'
+        rest = np.where(np.array(GROUPS) == worth.group, 0.0, getattr(prior, name))
+        without = regression.solve(
+            posterior.state, replace(prior, **{name: rest}), n_steps=STEPS, tolerance=1e-9
+        )
+        fall = posterior.log_evidence - without.log_evidence
+        assert worth.evidence == pytest.approx(fall, rel=0.01, abs=0.02), worth
+    told = {(worth.part, worth.group): worth for worth in worths}
+    assert told['bias', 'board'].evidence > 10.0
+    assert told['bias', 'idle'].evidence < 0.5
+
+
+def test_what_a_group_explains_is_what_it_adds(calm: tuple[Regression, Learnt, Truth]) -> None:
+    regression, found, truth = calm
+    columns = regression.windows.columns[:, 2:4]
+    told = {(worth.part, worth.group): worth for worth in found.worth}
+    expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
+    # Some 100 ug beside a noise of 2.
+    assert told['bias', 'board'].explains == pytest.approx(expected, rel=0.05)
+
+
+def test_outliers_do_not_pull() -> None:
+    truth = Truth()
+    rng = np.random.default_rng(6)
+    clean, up = table_of(truth, 12, rng)
+    dirty = replace(clean, mean=clean.mean.copy())
+    struck = rng.choice(len(clean.time), len(clean.time) // 50, replace=False)
+    dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
+    found = []
+    for windows in (clean, dirty):
+        regression, state = begin(windows, up)
+        found.append(learn(regression, state, wide(truth)))
+    one, other = found
+    sd = np.sqrt(one.posterior.variance[one.posterior.layout.bias])
+    # 2 % of the windows, each worth 3 sd at most, shift by about one sd; unbridled, each is worth
+    # 100, and beside them the curve is not seen.
+    assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
+    np.testing.assert_allclose(other.prior.sigma, truth.sigma, rtol=0.2)
+    np.testing.assert_array_equal(other.prior.on_bias > 0.0, one.prior.on_bias > 0.0)
+
+
+def test_progress_is_told() -> None:
+    windows, up = table_of(Truth(), 9, np.random.default_rng(2), n_windows=20)
+    regression, state = begin(windows, up)
+    told: list[float] = []
+    learn(regression, state, wide(Truth()), tell=told.append)
+    assert told == sorted(told)
+    assert told[-1] == 1.0

@@ -1,0 +1,430 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The regression: mode, covariance and evidence against dense linear algebra, bounds and symmetries.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from fitting_truth import (
+    GRAVITY,
+    GROUPS,
+    MICRO,
+    NOMINAL,
+    START,
+    Truth,
+    begin,
+    prior_of,
+    table_of,
+)
+from scipy.optimize import least_squares
+
+from thermo_comp.errors import FitError
+from thermo_comp.fitting.posterior import (
+    Posterior,
+    Prior,
+    Regression,
+    State,
+    Windows,
+    inverse_misalignment,
+    tangent_basis,
+)
+from thermo_comp.fitting.start import constant_calibration, position_means
+from thermo_comp.typing import Floats
+
+STEPS = 12
+
+
+def flat(state: State) -> Floats:
+    """All numbers of a state but the directions."""
+    return np.concatenate(
+        [getattr(state, f.name).ravel() for f in fields(State) if f.name != 'up']
+    )
+
+
+class Dense:
+    """
+    The same posterior the slow way: one vector, dense covariances, numerical derivatives.
+
+    """
+
+    def __init__(self, windows: Windows, prior: Prior, at: Posterior) -> None:
+        self.windows, self.prior, self.at = windows, prior, at
+        self.n = at.layout.n
+        first = np.array([windows.time[windows.position == p][0] for p in windows.position])
+        same = windows.position[:, None] == windows.position
+        since = windows.time - first
+        walk = np.where(same, np.minimum(since[:, None], since), 0.0)
+        self.roots, self.determinant = [], 0.0
+        for axis in range(3):
+            noise = walk * prior.rho[axis] + np.diag(1.0 / windows.weight)
+            root = np.linalg.cholesky(prior.sigma[axis] ** 2 * noise)
+            self.roots.append(np.linalg.inv(root))
+            self.determinant += 2.0 * np.log(np.diag(root)).sum()
+
+    def state(self, x: Floats) -> State:
+        """Move the mode of the fast way by x."""
+        layout, at = self.at.layout, self.at.state
+        padded = np.append(x, 0.0)
+        up = at.up + np.einsum('pij,pj->pi', tangent_basis(at.up), x[layout.up])
+        return State(
+            at.kappa + x[layout.kappa],
+            at.bias + x[layout.bias],
+            at.on_bias + padded[layout.on_bias],
+            at.on_scale + padded[layout.on_scale],
+            at.skew + x[layout.skew],
+            up / np.linalg.norm(up, axis=1, keepdims=True),
+            at.offset + x[layout.offset],
+            at.start + x[layout.start],
+        )
+
+    def residual(self, x: Floats) -> Floats:
+        """All residuals in sd, those of the prior behind those of the windows."""
+        w, prior, state = self.windows, self.prior, self.state(x)
+        rms = np.sqrt(np.mean(w.columns**2, axis=0))
+        moved = w.columns.copy()
+        for k in np.flatnonzero(w.lag >= 0):
+            moved[:, k] += w.start[:, k] * state.start[w.bag, w.lag[k]]
+        moved /= rms
+        force = GRAVITY * state.up[w.position] @ inverse_misalignment(state.skew).T
+        predicted = state.kappa * force * (1.0 + moved @ state.on_scale.T)
+        predicted += state.bias + moved @ state.on_bias.T + state.offset[w.position]
+        left = w.mean / NOMINAL - predicted
+        parts = [self.roots[axis] @ left[:, axis] for axis in range(3)]
+        parts += [
+            (state.kappa - 1.0) / prior.scale_sd,
+            (state.bias - prior.bias_mean) / prior.bias_sd,
+            state.skew / prior.skew_sd,
+            state.offset.ravel() / prior.offset_sd,
+            np.linalg.solve(np.linalg.cholesky(w.start_covariance), state.start.T).ravel(),
+        ]
+        for weights, sd in ((state.on_bias, prior.on_bias), (state.on_scale, prior.on_scale)):
+            parts.append((weights[:, sd > 0.0] / sd[sd > 0.0]).ravel())
+        return np.concatenate(parts)
+
+    def jacobian(self, x: Floats) -> Floats:
+        """By central differences of a tenth of each sd: linear to some 1e-9 there."""
+        sd = np.sqrt(self.at.variance)
+        columns = []
+        for k in range(self.n):
+            step = np.zeros(self.n)
+            step[k] = 0.1 * sd[k]
+            columns.append((self.residual(x + step) - self.residual(x - step)) / (2.0 * step[k]))
+        return np.column_stack(columns)
+
+
+@pytest.fixture(scope='module')
+def solved() -> tuple[Regression, Prior, Posterior]:
+    rng = np.random.default_rng(5)
+    truth = Truth(start_sd=0.5, walk=0.3 * MICRO, offset_sd=2.0 * MICRO)
+    windows, up = table_of(truth, 10, rng, n_windows=12, step_s=400.0)
+    windows = replace(windows, weight=rng.uniform(0.3, 1.0, len(windows.time)))
+    regression, state = begin(windows, up)
+    prior = prior_of(truth)
+    return regression, prior, regression.solve(state, prior, n_steps=STEPS, tolerance=1e-10)
+
+
+def test_the_mode_is_that_of_the_dense_problem(
+    solved: tuple[Regression, Prior, Posterior],
+) -> None:
+    regression, prior, found = solved
+    dense = Dense(regression.windows, prior, found)
+    at = dense.residual(np.zeros(dense.n))
+    gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(found.variance)
+    # In sds: Gauss-Newton stopped where a step promises 1e-10.
+    assert np.abs(gradient).max() < 1e-4
+    other = least_squares(
+        dense.residual, np.zeros(dense.n), x_scale=np.sqrt(found.variance), method='trf'
+    ).x
+    assert np.abs(other / np.sqrt(found.variance)).max() < 1e-3
+
+
+def test_covariance_and_evidence_are_those_of_the_dense_problem(
+    solved: tuple[Regression, Prior, Posterior],
+) -> None:
+    regression, prior, found = solved
+    dense = Dense(regression.windows, prior, found)
+    at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
+    hessian = jacobian.T @ jacobian
+    sd = np.sqrt(found.variance)
+    scaled = hessian * np.outer(sd, sd)
+    covariance = np.linalg.inv(scaled)
+    n = found.layout.n_unit
+    # Correlations of 0.999 lose three digits of the derivatives' eight.
+    np.testing.assert_allclose(np.diag(covariance), 1.0, rtol=1e-4)
+    np.testing.assert_allclose(
+        found.covariance / np.outer(sd[:n], sd[:n]), covariance[:n, :n], atol=1e-4
+    )
+    # Laplace: -2 ln Z = misfit + ln det of noise, of prior and of Hessian; directions are flat.
+    precision = regression.precision(prior, found.layout)
+    known = precision[precision > 0.0]
+    determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - np.log(known).sum()
+    determinants += regression.n_bags * np.linalg.slogdet(START)[1]
+    assert found.log_evidence == pytest.approx(-0.5 * (at @ at + determinants), abs=1e-3)
+
+
+def test_known_directions_make_it_linear_least_squares(rng: np.random.Generator) -> None:
+    # Without misalignment and thermal terms, what is left given the directions is a line per
+    # axis: N / K0 = kappa a + b. The posterior of many directions weighs them as it does.
+    truth = Truth(on_bias=np.zeros((3, 6)), on_scale=np.zeros((3, 6)), skew=np.zeros(3))
+    windows, up = table_of(truth, 14, rng)
+    prior = prior_of(truth, (), skew_sd=1e-12)
+    regression, state = begin(windows, up)
+    found = regression.solve(state, prior, n_steps=STEPS)
+    for axis in range(3):
+        force = GRAVITY * found.state.up[windows.position, axis]
+        design = np.column_stack((force, np.ones_like(force)))
+        line = np.linalg.lstsq(design, windows.mean[:, axis] / NOMINAL[axis], rcond=None)[0]
+        # At the joint mode each part is the best given the rest; priors pull by 1e-9 of it.
+        assert found.state.kappa[axis] == pytest.approx(line[0], abs=1e-9)
+        assert found.state.bias[axis] == pytest.approx(line[1], abs=1e-8)
+
+
+def test_truth_comes_out_without_noise(rng: np.random.Generator) -> None:
+    truth = Truth(sigma=np.full(3, 1e-9 * MICRO))
+    windows, up = table_of(truth, 12, rng)
+    regression, state = begin(windows, up)
+    prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
+    found = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-9).state
+    # The priors pull by some 1e-6 of the sd, which is of 1 ug.
+    np.testing.assert_allclose(found.kappa, truth.kappa, atol=1e-9)
+    np.testing.assert_allclose(found.bias, truth.bias, atol=1e-8)
+    np.testing.assert_allclose(found.skew, truth.skew, atol=1e-8)
+    np.testing.assert_allclose(found.up, up, atol=1e-8)
+    np.testing.assert_allclose(found.on_bias / regression.rms, truth.on_bias, atol=1e-8)
+    np.testing.assert_allclose(found.on_scale / regression.rms, truth.on_scale, atol=1e-9)
+    np.testing.assert_allclose(found.start, 0.0, atol=1e-2)
+    # As the compensator would: forward and back again.
+    force = regression.force(found)
+    np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
+
+
+def test_claimed_sd_is_the_scatter() -> None:
+    # Under the right priors the inverse Hessian is the Cramer-Rao bound: errors over claimed sd
+    # have an rms of 1. 100 units of 3 x 2 + 3 + 12 numbers, some of them correlated: the rms of
+    # each kind is known to 6 % at the worst.
+    rng = np.random.default_rng(11)
+    truth = Truth(walk=0.05 * MICRO, offset_sd=MICRO, start_sd=0.3)
+    pulls: dict[str, list[Floats]] = {name: [] for name in ('kappa', 'bias', 'skew', 'on_bias')}
+    for _ in range(100):
+        windows, up = table_of(truth, 12, rng, n_windows=15, step_s=320.0)
+        regression, state = begin(windows, up)
+        prior = prior_of(truth)
+        found = regression.solve(state, prior)
+        sd = np.sqrt(found.variance)
+        for name, values in pulls.items():
+            places = getattr(found.layout, name)
+            used = places >= 0
+            true = getattr(truth, name) * (regression.rms if name == 'on_bias' else 1.0)
+            error = getattr(found.state, name) - true
+            values.append((error[used] / sd[places[used]]).ravel())
+    for name, values in pulls.items():
+        assert 0.7 < np.sqrt(np.mean(np.square(values))) < 1.4, name
+    every = np.concatenate([np.ravel(values) for values in pulls.values()])
+    assert np.sqrt(np.mean(every**2)) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ('groups', 'tolerance'),
+    [
+        # Linear in all but directions, which are known to some urad: exact.
+        (('curve',), 0.002),
+        # First order: what it leaves is the product of two moves, the start's and the weight's.
+        (('curve', 'board'), 0.2),
+    ],
+)
+def test_leaving_a_position_out_is_a_fit_without_it(
+    rng: np.random.Generator, groups: tuple[str, ...], tolerance: float
+) -> None:
+    used = np.isin(GROUPS, groups)
+    truth = Truth(
+        on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used,
+        offset_sd=3.0 * MICRO, walk=0.05 * MICRO, start_sd=0.3,
+    )  # fmt: skip
+    windows, up = table_of(truth, 14, rng, n_windows=20, step_s=240.0)
+    regression, state = begin(windows, up)
+    prior = prior_of(truth, groups)
+    whole = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-9)
+    sd = np.sqrt(np.diag(whole.covariance))
+    n = whole.layout.n_unit
+    before = regression.vector(whole.state, whole.layout)[:n]
+    for p in (0, 6, 13):
+        found = regression.without(whole, prior, p)
+        assert found is not None
+        refit, _ = begin(windows, up)
+        # Windows that weigh nothing are not there.
+        refit.reweight(np.where(windows.position[:, None] == p, 1e-12, np.ones((1, 3))))
+        direct = refit.solve(whole.state, prior, n_steps=STEPS, tolerance=1e-9)
+        moved = regression.vector(found, whole.layout)[:n]
+        expected = refit.vector(direct.state, direct.layout)[:n]
+        size = np.linalg.norm((expected - before) / sd)
+        assert size > 0.5
+        assert np.linalg.norm((moved - expected) / sd) < tolerance * size
+
+
+def test_a_position_that_tells_what_no_other_does_is_not_left_out(
+    rng: np.random.Generator,
+) -> None:
+    # Six faces: without one of them nothing tells that axis' bias from its scale.
+    truth = Truth(skew=np.zeros(3))
+    windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
+    regression, state = begin(windows, up)
+    prior = prior_of(truth, skew_sd=1e-3)
+    found = regression.solve(state, prior, n_steps=STEPS)
+    assert all(regression.without(found, prior, p) is None for p in range(6))
+    # And M stays where it was, as widely known as before.
+    np.testing.assert_allclose(found.state.skew, 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.sqrt(found.variance[found.layout.skew]), 1e-3, rtol=1e-3)
+
+
+def test_what_takes_no_part_any_more_is_gone(
+    solved: tuple[Regression, Prior, Posterior],
+) -> None:
+    regression, prior, found = solved
+    narrow = replace(prior, on_bias=prior.on_bias * [1, 1, 0, 0, 0, 0])
+    # Even where no step is made.
+    state = regression.solve(found.state, narrow, tolerance=np.inf).state
+    assert not state.on_bias[:, 2:4].any()
+    np.testing.assert_array_equal(state.on_scale, found.state.on_scale)
+
+
+def test_axes_may_be_renamed(rng: np.random.Generator) -> None:
+    # Without misalignment nothing tells the axes apart: permuted data give permuted results.
+    truth = Truth(skew=np.zeros(3))
+    windows, up = table_of(truth, 10, rng)
+    prior = prior_of(truth, skew_sd=1e-12)
+    order = [2, 0, 1]
+    regression, state = begin(windows, up)
+    turned = Regression(replace(windows, mean=windows.mean[:, order]), GRAVITY, NOMINAL[order])
+    one = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-9)
+    other = turned.solve(
+        replace(state, up=state.up[:, order]), prior, n_steps=STEPS, tolerance=1e-9
+    )
+    for name in ('kappa', 'bias', 'on_bias', 'on_scale'):
+        places = getattr(one.layout, name)
+        sd = np.sqrt(one.variance[places])
+        difference = getattr(other.state, name) - getattr(one.state, name)[order]
+        assert np.abs(difference / sd).max() < 1e-3, name
+    assert other.log_evidence == pytest.approx(one.log_evidence, abs=1e-4)
+
+
+def test_the_order_of_the_bags_is_of_no_meaning(rng: np.random.Generator) -> None:
+    truth = Truth(start_sd=0.3, offset_sd=MICRO)
+    windows, up = table_of(truth, 10, rng)
+    n = len(windows.time) // 10
+    rows = np.arange(len(windows.time)).reshape(10, n)[::-1].ravel()
+    reverse = replace(
+        windows, mean=windows.mean[rows], columns=windows.columns[rows], start=windows.start[rows]
+    )
+    prior = prior_of(truth)
+    regression, state = begin(windows, up)
+    other, turned = begin(reverse, up[::-1])
+    one = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-9)
+    two = other.solve(turned, prior, n_steps=STEPS, tolerance=1e-9)
+    n_unit = one.layout.n_unit
+    sd = np.sqrt(np.diag(one.covariance))
+    difference = other.vector(two.state, two.layout) - regression.vector(one.state, one.layout)
+    assert np.abs(difference[:n_unit] / sd).max() < 1e-3
+    np.testing.assert_allclose(two.covariance, one.covariance, atol=1e-5 * np.outer(sd, sd).max())
+    assert two.log_evidence == pytest.approx(one.log_evidence, abs=1e-4)
+
+
+def test_nine_parameters_equal_a_direct_solution_of_the_imu_tk_cost(
+    rng: np.random.Generator,
+) -> None:
+    # imu_tk minimises sum (g - |M (a - b) / K|)^2 over static intervals. Without temperature
+    # effects and with equal noise on all axes the forward fit has the same minimum to first
+    # order in noise / g = 1e-6 relative, far below the noise itself.
+    truth = Truth(on_bias=np.zeros((3, 6)), on_scale=np.zeros((3, 6)))
+    windows, up = table_of(truth, 18, rng)
+    means = position_means(windows) / NOMINAL
+
+    def cost(p: Floats) -> Floats:
+        matrix = np.array([[1.0, 0.0, 0.0], [p[6], 1.0, 0.0], [p[7], p[8], 1.0]])
+        force = ((means - p[:3]) * (1.0 + p[3:6])) @ matrix.T
+        return np.asarray(GRAVITY - np.linalg.norm(force, axis=1))
+
+    direct = least_squares(cost, np.zeros(9), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale='jac').x
+    regression, state = begin(windows, up)
+    prior = prior_of(truth, (), skew_sd=1.0)
+    found = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-9).state
+    M = np.linalg.inv(inverse_misalignment(found.skew))
+    noise = truth.sigma[0] / np.sqrt(len(windows.time))
+    # A fiftieth of the noise of the whole.
+    np.testing.assert_allclose(found.bias, direct[:3], atol=0.02 * noise)
+    np.testing.assert_allclose(1.0 / found.kappa - 1.0, direct[3:6], atol=0.02 * noise / GRAVITY)
+    np.testing.assert_allclose(
+        [M[1, 0], M[2, 0], M[2, 1]], direct[6:], atol=0.02 * noise / GRAVITY
+    )
+
+
+def test_published_huygens_coefficients_come_back(rng: np.random.Generator) -> None:
+    # Huygens HASI accelerometer: sf = 1.30675e-3 - 1.35046e-7 T + 4.02821e-10 T^2 [A/g] and
+    # offset = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. Sampled on a chamber's
+    # program, fitted in our variables (t from 20 degC, counts of 1 pA), converted back.
+    sf, offset = (1.30675e-3, -1.35046e-7, 4.02821e-10), (-8.9642327e-4, 3.83652e-6, -7.61e-9)
+    counts_per_ampere = 1e9
+    windows, up = table_of(Truth(skew=np.zeros(3)), 12, rng)
+    t = windows.columns[:, 0]
+    kelvin = t + 293.15
+    polynomial = np.polynomial.polynomial
+    per_g = polynomial.polyval(kelvin, sf) * counts_per_ampere
+    zero = polynomial.polyval(kelvin, offset)
+    K0 = float(polynomial.polyval(293.15, sf)) * counts_per_ampere / GRAVITY
+    powers = np.column_stack([t**k for k in (1, 2, 3, 4)])
+    table = replace(
+        windows,
+        mean=per_g[:, None] * (up[windows.position] + zero[:, None]),
+        columns=powers, groups=('curve',) * 4, lag=np.full(4, -1), start=np.zeros_like(powers),
+        start_covariance=np.zeros((0, 0)), in_scale=np.ones(4, dtype=bool),
+    )  # fmt: skip
+    regression, state = begin(table, up)
+    regression = Regression(table, GRAVITY, np.full(3, K0))
+    prior = prior_of(
+        Truth(),
+        on_bias=np.full(4, 1e-2),
+        on_scale=np.full(4, 1e-3),
+        sigma=np.full(3, 1e-6 * MICRO),
+    )
+    found = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-12).state
+    for axis in range(3):
+        relative = np.append(1.0, found.on_scale[axis] / regression.rms)
+        scale = K0 * found.kappa[axis] * relative
+        shifted = np.polynomial.Polynomial([-293.15, 1.0])
+        got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
+        printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
+        assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
+        # The bias is in counts, sf times offset: the offset in g is their ratio.
+        bias = K0 * polynomial.polyval(
+            t[:40], np.append(found.bias[axis], found.on_bias[axis] / regression.rms)
+        )
+        ratio = bias / (polynomial.polyval(t[:40], scale) * GRAVITY)
+        got = np.polynomial.Polynomial.fit(kelvin[:40], ratio, 2).convert().coef
+        assert f'{got[0]:.7e}' == '-8.9642327e-04'
+        assert f'{got[1]:.5e}' == '3.83652e-06'
+        assert f'{got[2]:.2e}' == '-7.61e-09'
+
+
+def test_tangent_basis_is_orthonormal(rng: np.random.Generator) -> None:
+    up = rng.standard_normal((20, 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    up[0] = (1.0, 0.0, 0.0)
+    basis = np.concatenate((tangent_basis(up), up[:, :, None]), axis=2)
+    product = np.einsum('pij,pik->pjk', basis, basis)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-14)
+
+
+def test_a_dead_axis_is_refused() -> None:
+    means = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    with pytest.raises(FitError, match='reads the same in all positions'):
+        constant_calibration(means, GRAVITY, with_misalignment=False)
+
+
+def test_positions_in_motion_are_refused(rng: np.random.Generator) -> None:
+    with pytest.raises(FitError, match='no ellipsoid'):
+        constant_calibration(rng.standard_normal((30, 3)), GRAVITY, with_misalignment=False)
