@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import FitError
 from ..text import valid_serial
-from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..thermal.settings import ThermalConfig
 from ..typing import Floats
 from ..unit.calibration import Calibration, Unit
 from ..unit.columns import bank
@@ -24,13 +24,14 @@ from .curves import sets_of
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .learning import Learnt, learn
 from .options import COUNTS_FULL_SCALE, FitOptions
-from .posterior import Prior, Regression, initial_state
+from .posterior import Regression
 from .priors import constants_of, known_of, prior_columns, prior_sets, state_of
 from .reduction import ReducedBag, reduce_source
 from .rests import judge_rests
 from .sensors import learn_detector
 from .sources import FitSource
 from .start import ConstantCalibration, constant_calibration, position_means
+from .unknowns import Prior, initial_state
 from .verdict import (
     POSITIONS_NEEDED,
     Finding,
@@ -359,7 +360,7 @@ def _wide_prior(
     options: FitOptions,
 ) -> Prior:
     """
-    What is known of any unit before its data are seen.
+    Say what is known of any unit before its data are seen.
 
     """
     groups = windows.data.groups
@@ -370,7 +371,12 @@ def _wide_prior(
     is_curve = np.array([group == CURVE for group in groups])
     wide = np.where(is_curve, max(1.0, _drift(windows, start) / _COLUMN_BIAS_SD), 1.0)
     scale_wide = wide
-    if len(distinct_directions(up)) < POSITIONS_NEEDED:
+    n_directions = len(distinct_directions(up))
+    if n_directions == 1 and options.groups is None:
+        # In one attitude a lag looks like a tilt or a curve: the curve is what others can use.
+        allowed &= is_curve
+        in_scale &= is_curve
+    if n_directions < POSITIONS_NEEDED:
         # Too few attitudes to tell it from the bias: the curve stays at its prior.
         in_scale &= is_curve
         scale_wide = np.ones(len(groups))

@@ -23,8 +23,8 @@ from ..typing import Floats, Ints
 from ..unit.columns import Column, ColumnTable, memory_of
 from ..unit.functions import TemperatureFunction
 from .history import thermal_states
-from .posterior import Windows
 from .reduction import ReducedBag
+from .unknowns import Windows
 
 #: Groups of the sets themselves, beside those of the response.
 CURVE, SET = 'curve', 'set'
@@ -206,9 +206,12 @@ def thermal_windows(
     return ThermalWindows(
         data,
         tuple(bag.source.name for bag in bags),
-        *rows[:, :4].T,
-        rows[:, 4 : 4 + k],
-        float(np.median(count)),
+        temperature=rows[:, 0],
+        rate=rows[:, 1],
+        weight=rows[:, 2],
+        gradient=rows[:, 3],
+        raw=rows[:, 4 : 4 + k],
+        typical_count=float(np.median(count)),
     )
 
 
@@ -228,7 +231,7 @@ def _states(
         width = Layout(spec).width
         still = np.zeros((2, width))
         still[:, BOARD] = reference_temperature
-        ends = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
+        ends: Floats = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
         return -1.0, ends, still, np.zeros((2, len(spec.lags)))
     tracker = ThermalTracker(detector, MemorySpec(spec.sensors), config)
     shortest = min(
@@ -236,7 +239,7 @@ def _states(
     )
     step_s = max(shortest / 5.0, 0.1)
     start_s, states = thermal_states(bag, tracker, step_s)
-    grid = start_s + step_s * np.arange(len(states))
+    grid = np.asarray(start_s + step_s * np.arange(len(states)), dtype=np.float64)
     # The memory is the tracker's, on the grid at once: reading by reading it takes longer than all
     # the rest of a fit.
     gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
@@ -257,7 +260,7 @@ def _moved(
     reference_temperature: float,
 ) -> Floats:
     """
-    Derivative of each column by the start state of its lag, shape (n, k).
+    Differentiate each column by the start state of its lag, shape (n, k).
 
     """
     t = states[:, BOARD] - reference_temperature
