@@ -374,10 +374,10 @@ def judge_result(
     findings = []
     overall = rows[-1]
     raw, fitted = overall.raw.micro_g.rms, overall.fitted.micro_g.rms
-    left_out = overall.left_out.micro_g.rms
-    text = f'|g| error {raw:.1f} ug RMS raw, {fitted:.1f} ug in sample'
+    others = ''
     if overall.left_out.n:
-        text += f', {left_out:.1f} ug on positions left out'
+        others = f'{overall.left_out.micro_g.rms:.1f} ug on positions left out, '
+    text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     if has_temperature and slow / MICRO_G > max(0.3 * raw, 0.5 * fitted):
         why = ': temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
         findings.append(Finding('misfit', 'advice', text + why))
