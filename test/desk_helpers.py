@@ -60,6 +60,10 @@ class Desk:
         if name in ('unit42.yaml', 'unit.yaml'):
             fit = ('fit', *sorted((ROOT / 'bags' / 'fit').iterdir()), '--gravity', '9.80665')
             self._cli(*fit, '-o', path, '-q')
+        elif name in ('unit01.yaml', 'unit02.yaml', 'unit03.yaml'):
+            self._make('unit42.yaml')
+            text = (self._ready / 'unit42.yaml').read_text()
+            path.write_text(re.sub(r'serial: .*?([,}\n])', rf'serial: {path.stem}\1', text, count=1))
         elif name == 'autopilot.params':
             self._make('unit42.yaml')
             self._cli('export', self._ready / 'unit42.yaml', '--to', 'px4', '-o', path, '-q')

@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit
 from thermo_comp.fitting.options import Ageing
@@ -21,6 +22,7 @@ from thermo_comp.simulation import STANDARD_GRAVITY, arrays, positions, unit_pre
 from thermo_comp.simulation.campaign import Position, Record
 from thermo_comp.simulation.cyclogram import parse_cyclogram
 from thermo_comp.unit.calibration import Calibration, parameter_layout
+from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = unit_preset('products', 1)
@@ -150,3 +152,16 @@ def test_prior_without_claim_is_refused():
     few = [source(record) for record in test_of(9, 0, 6)]
     with pytest.raises(FitError, match='no covariance'):
         fit(few, FitOptions(STANDARD_GRAVITY, serial='unit-9', prior=prior))
+
+
+def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
+    files = []
+    for one in siblings():
+        files.append(tmp_path / f'{one.unit.serial}.yaml')
+        save_calibration(one, files[-1])
+    target = tmp_path / 'type.yaml'
+    assert run(['prior', *map(str, files), '-o', str(target)]) == 0
+    assert 'what 3 units have in common' in capsys.readouterr().out
+    assert load_calibration(target) == population(siblings())
+    assert run(['prior', *map(str, files[:2]), '-o', str(target), '--force']) == 1
+    assert 'need 3 for a population' in capsys.readouterr().err

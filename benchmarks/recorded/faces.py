@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from thermo_comp.errors import FitError
 from thermo_comp.fitting.partial import recording_source
 from thermo_comp.fitting.triad import TriadFit, fit_triad
+
+from thermo_comp.errors import FitError
 from thermo_comp.typing import Floats
 
 from .data import GRAVITY, faces_bag, still_bag

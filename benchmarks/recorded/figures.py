@@ -17,7 +17,6 @@ import numpy as np
 mpl.use('Agg')
 
 from matplotlib import pyplot as plt
-
 from thermo_comp.fitting.held_out import HeldOut
 
 from .freezer import COLD_C, HOT_C, TEST_S, TRAIN_S, Freezer, Tracked

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
-
 from thermo_comp.fitting.partial import recording_source
-from thermo_comp.fitting.reduction import StillInterval
 from thermo_comp.fitting.triad import TriadFit, fit_triad
+
+from thermo_comp.fitting.reduction import StillInterval
 from thermo_comp.typing import Floats
 from thermo_comp.unit.metrics import norm_residual
 

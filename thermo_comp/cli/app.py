@@ -27,6 +27,7 @@ from . import (
     info,
     output,
     play,
+    prior,
     replay,
     report,
     simulate,
@@ -71,6 +72,7 @@ def _top(
 
 
 app.command()(fit.fit)
+app.command()(prior.prior)
 app.add_typer(fleet.app)
 app.command()(evaluate.evaluate)
 app.command()(replay.replay)

@@ -38,6 +38,17 @@ def fit(
     force_groups: Annotated[
         str, typer.Option(help='Groups that stay whatever they earn.', metavar='A,B')
     ] = '',
+    prior: Annotated[
+        Path | None,
+        typer.Option(
+            help='Calibration to begin with: of the type, or an old one.', metavar='YAML'
+        ),
+    ] = None,
+    ageing_bias: options.AgeingBias = None,
+    ageing_scale: Annotated[
+        float,
+        typer.Option(help='What the scale may have changed by since, in ppm.', metavar='PPM'),
+    ] = 0.0,
     report: Annotated[
         Path | None, typer.Option(help='Certificate to write (HTML).', metavar='HTML')
     ] = None,
@@ -83,15 +94,17 @@ def fit(
     from ..fitting import FitOptions, resolve_gravity
     from ..fitting import fit as run
     from ..fitting.fit_sources import fit_sources
-    from ..unit.calibration_file import save_calibration
+    from ..fitting.options import Ageing
+    from ..unit.calibration_file import load_calibration, save_calibration
 
     out = Output(as_json, quiet)
     gravity = options.place(gravity, latitude, height)
     if gravity is None:
         raise options.usage('give --gravity, or --latitude and --height')
-    check_output(output, CALIBRATION, overwrite=force, others=bags)
+    inputs = bags if prior is None else [*bags, prior]
+    check_output(output, CALIBRATION, overwrite=force, others=inputs)
     if report is not None:
-        check_output(report, PAGE, overwrite=force, others=[*bags, output])
+        check_output(report, PAGE, overwrite=force, others=[*inputs, output])
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
     sources, kind = fit_sources(bags, topics, input_.value, serial)
     try:
@@ -102,6 +115,8 @@ def fit(
             dynamic_curve=dynamic_curve.value if dynamic_curve else None,
             groups=None if groups is None else _names(groups),
             forced=_names(force_groups),
+            prior=None if prior is None else load_calibration(prior),
+            ageing=Ageing(options.acceleration(ageing_bias) or 0.0, ageing_scale * 1e-6),
             serial=serial,
             input='counts' if kind == 'counts' else 'm/s^2',
             full_scale=full_scale,

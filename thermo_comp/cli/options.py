@@ -120,6 +120,11 @@ Tolerance = Annotated[
     ),
 ]
 
+AgeingBias = Annotated[
+    str | None,
+    typer.Option(help="What the biases may have changed by since the prior's: 50ug, 0.1mg."),
+]
+
 
 def acceleration(text: str | None) -> float | None:
     """

@@ -45,8 +45,5 @@ def prior(
     units = [load_calibration(path) for path in calibrations]
     found = population(units)
     save_calibration(found, output, overwrite=force)
-    out.facts(
-        {'prior': str(output), 'units': [one.unit.serial for one in units]},
-    )
     out.line(f'{output}: what {len(units)} units have in common, {len(found.response)} columns')
-    out.end()
+    out.json({'output': output, 'units': [one.unit.serial for one in units]})

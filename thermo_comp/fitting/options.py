@@ -41,6 +41,11 @@ class Ageing:
     bias: float = 0.0
     scale: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name in ('bias', 'scale'):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f'`{name}` must be 0 or positive, got {getattr(self, name)}')
+
 
 @dataclass(frozen=True)
 class FitOptions:
