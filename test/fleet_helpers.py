@@ -20,7 +20,7 @@ from thermo_comp.simulation import unit_preset as preset
 
 #: Half an hour over 36 K; the ramps of a freezer, not of a chamber.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
-#: The two sets alone: the smallest fit that there is, for tests that are about everything around it.
+#: The two sets alone: the smallest fit there is, for tests about everything around it.
 OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
 
 
