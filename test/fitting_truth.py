@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermo_comp.fitting.posterior import Prior, Regression, State, Windows, initial_state
+from thermo_comp.fitting.posterior import Regression
+from thermo_comp.fitting.unknowns import Prior, State, Windows, initial_state
 from thermo_comp.simulation import positions
 from thermo_comp.typing import Floats
 

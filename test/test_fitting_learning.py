@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, widths
 
-from thermo_comp.fitting.learning import Learnt, group_worth, learn
-from thermo_comp.fitting.posterior import Prior, Regression
+from thermo_comp.fitting.learning import Learnt, learn
+from thermo_comp.fitting.posterior import Regression
+from thermo_comp.fitting.unknowns import Prior
+from thermo_comp.fitting.worth import group_worth
 from thermo_comp.typing import Bools, Floats
 
 ALL = ('curve', 'board', 'idle')

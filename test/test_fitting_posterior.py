@@ -25,16 +25,9 @@ from fitting_truth import (
 from scipy.optimize import least_squares
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting.posterior import (
-    Posterior,
-    Prior,
-    Regression,
-    State,
-    Windows,
-    inverse_misalignment,
-    tangent_basis,
-)
+from thermo_comp.fitting.posterior import Posterior, Regression
 from thermo_comp.fitting.start import constant_calibration, position_means
+from thermo_comp.fitting.unknowns import Prior, State, Windows, inverse_misalignment, tangent_basis
 from thermo_comp.typing import Floats
 
 STEPS = 12

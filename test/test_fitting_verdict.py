@@ -12,15 +12,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fitting_truth import GRAVITY, Truth, table_of, without_memory
+from thermo_comp.fitting.model import ModelSpec, polynomial
+from thermo_comp.fitting.regression import Freedom
+from thermo_comp.fitting.selection import fit_model
+from thermo_comp.fitting.table import WindowTable
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fitting.evidence import residual_rows, slow_error
-from thermo_comp.fitting.model import ModelSpec, polynomial
-from thermo_comp.fitting.regression import Freedom
-from thermo_comp.fitting.selection import fit_model
 from thermo_comp.fitting.start import constant_calibration, position_means
-from thermo_comp.fitting.table import WindowTable
 from thermo_comp.fitting.verdict import (
     Finding,
     can_tell_misalignment,

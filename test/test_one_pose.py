@@ -10,8 +10,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pose_helpers import GRAVITY, MG, Rest
-
-from thermo_comp.errors import FitError
 from thermo_comp.fitting.held_out import held_out
 from thermo_comp.fitting.one_pose import (
     PoseOptions,
@@ -21,6 +19,8 @@ from thermo_comp.fitting.one_pose import (
     order_for,
     read_pose,
 )
+
+from thermo_comp.errors import FitError
 from thermo_comp.fitting.sources import ArrayBlock, FitSource
 
 OPTIONS = PoseOptions(gravity=GRAVITY)

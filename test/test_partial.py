@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pose_helpers import GRAVITY, MG, START_NS, Rest
+from thermo_comp.fitting.one_pose import PoseOptions
+from thermo_comp.fitting.partial import recording_source, tell
 
 from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError, RecordingError
-from thermo_comp.fitting.one_pose import PoseOptions
-from thermo_comp.fitting.partial import recording_source, tell
 from thermo_comp.recording import BagWriter
 from thermo_comp.simulation import positions
 

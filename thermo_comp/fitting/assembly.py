@@ -36,8 +36,9 @@ from ..unit.functions import CubicSpline, Polynomial, TemperatureFunction
 from ..unit.posterior import posterior_of
 from .evidence import ResidualRow
 from .learning import Learnt
-from .posterior import Layout, Regression, State, inverse_misalignment
+from .posterior import Regression
 from .reduction import ReducedBag
+from .unknowns import Layout, State, inverse_misalignment
 from .verdict import Finding
 from .windows import Sets, ThermalWindows
 
@@ -155,11 +156,9 @@ def build_calibration(
     slow = _slow_error(windows, learnt)
     regimes = {
         name: RegimeSet(
-            **_ranges(windows),
-            **{
-                axis: _axis_set(sets, weights, number, is_dynamic, float(slow[number]))
-                for number, axis in enumerate('xyz')
-            },
+            _range(windows.temperature, _UNSEEN_RANGE_C),
+            _widened(windows.rate * 60.0, _LINEAR_REACH, 0.01),
+            *(_axis_set(sets, weights, axis, is_dynamic, float(slow[axis])) for axis in range(3)),
         )
         for name, is_dynamic in (('static', False), ('dynamic', True))
     }
@@ -224,11 +223,9 @@ def build_calibration(
     )
 
 
-def _axis_set(
-    sets: Sets, weights: _Weights, axis: int, is_dynamic: bool, slow: float
-) -> AxisSet:
+def _axis_set(sets: Sets, weights: _Weights, axis: int, is_dynamic: bool, slow: float) -> AxisSet:
     """
-    The curves of one axis in one regime.
+    Make the curves of one axis in one regime.
 
     """
     n = sets.static.n_free
@@ -257,7 +254,7 @@ def _shaped(
     family: TemperatureFunction, reference: float, values: tuple[float, ...]
 ) -> TemperatureFunction:
     """
-    A function of a family with its value at the reference, and its free coefficients.
+    Make a function of a family with its value at the reference and its free coefficients.
 
     """
     if isinstance(family, Polynomial):
@@ -277,7 +274,7 @@ def file_parameters(
     used: Iterable[int],
 ) -> Floats:
     """
-    Derivative of the file's parameters, in its order, by the regression's.
+    Differentiate the file's parameters, in its order, by the regression's.
 
     Parameters
     ----------
@@ -341,7 +338,7 @@ def file_parameters(
 
 def _slow_error(windows: ThermalWindows, learnt: Learnt) -> Floats:
     """
-    What the bias does of itself: another one in each mounting, and a walk since the start [m/s^2].
+    Say what the bias does of itself: another one in each mounting, and a walk [m/s^2].
 
     The walk's mean square over a run as long as the bags is half of what it has at the end.
 
@@ -362,17 +359,6 @@ def _triple(values: Floats) -> tuple[float, float, float]:
     return a, b, c
 
 
-def _ranges(windows: ThermalWindows) -> dict[str, tuple[float, float]]:
-    """
-    Ranges of temperature and rate; what both sets share was fitted on all the windows.
-
-    """
-    return {
-        'temperature_range_c': _range(windows.temperature, _UNSEEN_RANGE_C),
-        'rate_range_k_min': _widened(windows.rate * 60.0, _LINEAR_REACH, 0.01),
-    }
-
-
 def _column_range(column: Column, values: Floats) -> tuple[float, float]:
     if column.kind == 'even':
         return column.range
@@ -389,4 +375,3 @@ def _range(values: Floats, smallest_margin: float) -> tuple[float, float]:
     lower, upper = float(np.min(values)), float(np.max(values))
     margin = max(_EDGE_MARGIN * (upper - lower), smallest_margin)
     return lower - margin, upper + margin
-

@@ -66,6 +66,5 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
         return Exponential(-float(len(_E_FOLDS_K)), (1.0,) * len(_E_FOLDS_K), _E_FOLDS_K)
     knots = np.linspace(lower, upper, _SPLINE_PIECES + 1)
     step = max((upper - lower) / _SPLINE_PIECES, 1.0)
-    knots = [float(k) for k in knots if abs(k) > _NEAR * step]
-    knots = sorted([*knots, 0.0])
-    return CubicSpline(tuple(knots), tuple(float(k != 0.0) for k in knots))
+    kept = sorted([0.0, *(float(k) for k in knots if abs(k) > _NEAR * step)])
+    return CubicSpline(tuple(kept), tuple(float(k != 0.0) for k in kept))

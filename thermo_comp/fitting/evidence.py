@@ -18,8 +18,9 @@ import numpy as np
 from ..typing import Floats
 from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from .learning import Learnt
-from .posterior import Regression, State
+from .posterior import Regression
 from .reduction import ReducedBag
+from .unknowns import State
 from .windows import CURVE, SET, ThermalWindows
 
 
@@ -107,9 +108,8 @@ def residual_rows(
     state = learnt.posterior.state
     nothing = np.zeros_like(state.on_bias)
     steps = [regression.force(replace(state, on_bias=nothing, on_scale=nothing))]
-    for groups in ((CURVE,), (CURVE, SET)):
-        steps.append(regression.force(_with_only(regression, learnt, groups)))
-    steps.append(regression.force(state))
+    rungs = (_with_only(regression, learnt, groups) for groups in ((CURVE,), (CURVE, SET)))
+    steps += [regression.force(step) for step in (*rungs, state)]
     residuals = [norm_residual(force, regression.gravity) for force in steps]
     left_out = left_out_residual(regression, learnt)
     is_dynamic = windows.weight > 0.5

@@ -14,8 +14,7 @@ import numpy as np
 
 from ..errors import FitError
 from ..text import valid_serial
-from ..text import valid_serial
-from ..thermal.settings import DetectorSettings, ThermalConfig
+from ..thermal.settings import ThermalConfig
 from ..typing import Floats
 from ..unit.calibration import Calibration, Unit
 from ..unit.columns import bank
@@ -25,13 +24,14 @@ from .curves import sets_of
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .learning import Learnt, learn
 from .options import COUNTS_FULL_SCALE, FitOptions
-from .posterior import Prior, Regression, initial_state
+from .posterior import Regression
 from .priors import constants_of, known_of, prior_columns, prior_sets, state_of
 from .reduction import ReducedBag, reduce_source
 from .rests import judge_rests
 from .sensors import learn_detector
 from .sources import FitSource
 from .start import ConstantCalibration, constant_calibration, position_means
+from .unknowns import Prior, initial_state
 from .verdict import (
     POSITIONS_NEEDED,
     Finding,
@@ -352,7 +352,7 @@ def _wide_prior(
     options: FitOptions,
 ) -> Prior:
     """
-    What is known of any unit before its data are seen.
+    Say what is known of any unit before its data are seen.
 
     """
     groups = windows.data.groups

@@ -14,6 +14,7 @@ from ..thermal.tracker import ThermalTracker
 from ..typing import Floats
 from .reduction import ReducedBag
 
+
 def thermal_states(
     bag: ReducedBag, tracker: ThermalTracker, step_s: float
 ) -> tuple[float, Floats]:

@@ -13,8 +13,6 @@ References
 ----------
 .. [1] D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992), eqs 4.8 to 4.10.
 .. [2] M. E. Tipping, Sparse Bayesian learning and the relevance vector machine, JMLR 1 (2001).
-.. [3] J. M. Dickey, The weighted likelihood ratio, linear hypotheses on normal location
-   parameters, Annals of Mathematical Statistics 42 (1971).
 
 """
 
@@ -26,7 +24,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
-from .posterior import Posterior, Prior, Regression, State
+from .posterior import Posterior, Regression
+from .unknowns import Prior, State
+from .worth import GroupWorth, earned, group_worth, places_of, told_of, widths_of
 
 # Of the three weights of a column, what the data must tell under a wide prior to be asked.
 _SILENT = 0.05
@@ -44,34 +44,6 @@ _EARNED = 0.5
 _OPEN = 1.0
 # Windows more sds off than this lose weight.
 _FAR_SDS = 3.0
-
-
-@dataclass(frozen=True)
-class GroupWorth:
-    """
-    What one group of columns is worth.
-
-    Parameters
-    ----------
-    part, group : str
-        'bias' or 'scale', and its name.
-    explains : float
-        RMS over windows and axes of what it adds to the prediction [m/s^2].
-    effective : float
-        Effective parameters, of all axes.
-    evidence : float
-        How much the log evidence falls without it.
-    sd : tuple of float
-        Prior sd of the weights of its columns, for columns of unit RMS ([m/s^2], relative).
-
-    """
-
-    part: str
-    group: str
-    explains: float
-    effective: float
-    evidence: float
-    sd: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -123,7 +95,7 @@ def learn(
     else:
         # Nothing is asked of a column whose weights are known beforehand.
         kept = np.ones(len(prior.on_bias), dtype=bool)
-        silent = {part: _widths(prior, part) > 0.0 for part in ('bias', 'scale')}
+        silent = {part: widths_of(prior, part) > 0.0 for part in ('bias', 'scale')}
     fixed = _Fixed(silent, kept)
     # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
     posterior, prior = _settle(regression, state, prior, fixed, rounds=_PATIENCE)
@@ -135,16 +107,7 @@ def learn(
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
     tell(0.7)
     while True:
-        idle = {
-            part: [
-                column
-                for column in np.flatnonzero(_widths(prior, part) > 0.0)
-                if not kept[column]
-                and _earned(posterior, _places(posterior, part)[:, column], _widths(prior, part)[column])
-                < _EARNED
-            ]
-            for part in ('bias', 'scale')
-        }
+        idle = {part: _idle(posterior, prior, part, kept) for part in ('bias', 'scale')}
         if not any(idle.values()):
             break
         prior = _without(prior, idle)
@@ -159,25 +122,38 @@ def learn(
     return Learnt(posterior, prior, group_worth(regression, posterior, prior))
 
 
+def _idle(posterior: Posterior, prior: Prior, part: str, kept: Bools) -> list[int]:
+    """
+    Find the columns that do not earn their place.
+
+    """
+    sd, places = widths_of(prior, part), places_of(posterior, part)
+    return [
+        column
+        for column in np.flatnonzero((sd > 0.0) & ~kept).tolist()
+        if earned(posterior, places[:, column], float(sd[column])) < _EARNED
+    ]
+
+
 def _left_open(
     regression: Regression, posterior: Posterior, prior: Prior, allowed: Prior
 ) -> Prior:
     """
     Take columns back that the data could not have seen, lest they be claimed to be 0.
 
-    A column that left was not needed; whether it is 0 the data tell to ``1 / sqrt(S)``, S what they
-    say of it beside the columns that stayed. Where that is more than the noise of a window it comes
-    back, with this width.
+    A column that left was not needed; whether it is 0 the data tell to ``1 / sqrt(S)``, S what
+    they say of it beside the columns that stayed. Where that is more than the noise of a window
+    it comes back, with this width.
 
     """
     told = regression.told_of_absent(posterior.state, prior, allowed)
     widths = {}
     for part, unit in (('bias', 1.0), ('scale', 1.0 / regression.gravity)):
-        wide, S = _widths(allowed, part), told[part]
+        wide, S = widths_of(allowed, part), told[part]
         sd = np.minimum(1.0 / np.sqrt(np.maximum(S, 1e-300)), wide)
-        matters = (_widths(prior, part) == 0.0) & (wide > 0.0)
+        matters = (widths_of(prior, part) == 0.0) & (wide > 0.0)
         matters &= sd > _OPEN * float(np.mean(prior.sigma)) * unit
-        widths[part] = np.where(matters, sd, _widths(prior, part))
+        widths[part] = np.where(matters, sd, widths_of(prior, part))
     return replace(prior, on_bias=widths['bias'], on_scale=widths['scale'])
 
 
@@ -192,14 +168,6 @@ class _Fixed:
     kept: Bools
 
 
-def _widths(prior: Prior, part: str) -> Floats:
-    return prior.on_bias if part == 'bias' else prior.on_scale
-
-
-def _places(posterior: Posterior, part: str) -> Ints:
-    return posterior.layout.on_bias if part == 'bias' else posterior.layout.on_scale
-
-
 def _without(prior: Prior, gone: dict[str, list[int]]) -> Prior:
     on_bias, on_scale = prior.on_bias.copy(), prior.on_scale.copy()
     on_bias[gone['bias']] = 0.0
@@ -207,19 +175,9 @@ def _without(prior: Prior, gone: dict[str, list[int]]) -> Prior:
     return replace(prior, on_bias=on_bias, on_scale=on_scale)
 
 
-def _told(posterior: Posterior, part: str) -> Floats:
-    """
-    Effective parameters of each column, of all axes; 0 for those that take no part, shape (m,).
-
-    """
-    places = _places(posterior, part)
-    told = np.append(posterior.told, 0.0)
-    return np.asarray(np.where(places >= 0, told[places], 0.0).sum(axis=0))
-
-
 def _silent(posterior: Posterior, prior: Prior) -> dict[str, Bools]:
     return {
-        part: (_told(posterior, part) < _SILENT) & (_widths(prior, part) > 0.0)
+        part: (told_of(posterior, part) < _SILENT) & (widths_of(prior, part) > 0.0)
         for part in ('bias', 'scale')
     }
 
@@ -243,9 +201,9 @@ def _settle(
         moved, change = {}, 0.0
         gone: dict[str, list[int]] = {}
         for part in ('bias', 'scale'):
-            sd = _widths(prior, part)
-            told = _told(posterior, part)
-            places = _places(posterior, part)
+            sd = widths_of(prior, part)
+            told = told_of(posterior, part)
+            places = places_of(posterior, part)
             power = np.where(places >= 0, vector[places] ** 2, 0.0).sum(axis=0)
             asked = (sd > 0.0) & ~fixed.silent[part]
             new = np.where(asked, np.sqrt(power / np.maximum(told, 1e-9)), sd)
@@ -283,10 +241,10 @@ def _settle(
 
 def _smallest(regression: Regression, prior: Prior, part: str) -> float:
     """
-    A width that the data cannot tell from 0: a column that stays all the same keeps it.
+    Return a width that the data cannot tell from 0; a column that stays all the same keeps it.
 
     """
-    sd = 1e-2 * float(np.mean(prior.sigma)) / np.sqrt(len(regression.windows.time))
+    sd = 1e-2 * float(np.mean(prior.sigma) / np.sqrt(len(regression.windows.time)))
     return sd if part == 'bias' else sd / regression.gravity
 
 
@@ -301,7 +259,7 @@ def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float,
 
 def _position_sd(regression: Regression, prior: Prior) -> float:
     n = len(regression.windows.time) / regression.windows.n_positions
-    return float(np.mean(prior.sigma)) / np.sqrt(n)
+    return float(np.mean(prior.sigma) / np.sqrt(n))
 
 
 def _sigma(posterior: Posterior, prior: Prior) -> Floats:
@@ -339,10 +297,10 @@ def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:
     rho = prior.rho.copy()
     for axis in range(3):
 
-        def evidence(value: float, axis: int = axis) -> tuple[float, Prior]:
-            trial = prior.rho.copy()
+        def evidence(value: float, axis: int = axis, before: Prior = prior) -> tuple[float, Prior]:
+            trial = before.rho.copy()
             trial[axis] = value
-            found = replace(prior, rho=trial)
+            found = replace(before, rho=trial)
             # The white noise gives way to the walk.
             fitted = regression.solve(posterior.state, found, n_steps=1)
             found = replace(found, sigma=_sigma(fitted, found))
@@ -362,85 +320,3 @@ def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:
             rho[axis] = grid[best] * 10.0 ** float(np.clip(move, -0.5, 0.5))
         prior = evidence(float(rho[axis]))[1]
     return prior
-
-
-def _earned(posterior: Posterior, places: Ints, sd: float | Floats) -> float:
-    """
-    How much the log evidence falls when some weights are held at 0 (Savage-Dickey).
-
-    Parameters
-    ----------
-    posterior : Posterior
-        The posterior with them.
-    places : ndarray of int, shape (k,)
-        Their places.
-    sd : float or ndarray, shape (k,)
-        Their prior.
-
-    """
-    mode = _mode(posterior, places)
-    covariance = posterior.covariance[np.ix_(places, places)]
-    root = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
-    values = np.maximum(values, 1e-12)
-    along = vectors.T @ (mode / root)
-    determinant = float(np.log(values).sum() + 2.0 * np.log(root).sum())
-    known = float(np.sum(np.log(np.broadcast_to(sd, mode.shape))))
-    return 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant - known
-
-
-def _mode(posterior: Posterior, places: Ints) -> Floats:
-    layout, state = posterior.layout, posterior.state
-    vector = np.zeros(layout.n + 1)
-    vector[layout.on_bias] = state.on_bias
-    vector[layout.on_scale] = state.on_scale
-    return np.asarray(vector[places])
-
-
-def group_worth(
-    regression: Regression, posterior: Posterior, prior: Prior
-) -> tuple[GroupWorth, ...]:
-    """
-    Say what each group explains, spends and earns.
-
-    Parameters
-    ----------
-    regression : Regression
-        The data.
-    posterior : Posterior
-        The mode under `prior`.
-    prior : Prior
-        The widths.
-
-    Returns
-    -------
-    tuple of GroupWorth
-        Bias, then scale, in the order of the columns.
-
-    """
-    names = np.array(regression.windows.groups)
-    columns = regression.windows.columns / regression.rms
-    force = regression.gravity * posterior.state.up[regression.windows.position]
-    result = []
-    for part in ('bias', 'scale'):
-        weights = posterior.state.on_bias if part == 'bias' else posterior.state.on_scale
-        sd, told = _widths(prior, part), _told(posterior, part)
-        for group in dict.fromkeys(regression.windows.groups):
-            used = (names == group) & (sd > 0.0)
-            if not used.any():
-                continue
-            added = columns[:, used] @ weights[:, used].T
-            if part == 'scale':
-                added = added * force
-            places = _places(posterior, part)[:, used]
-            result.append(
-                GroupWorth(
-                    part,
-                    group,
-                    float(np.sqrt(np.mean(added**2))),
-                    float(told[used].sum()),
-                    _earned(posterior, places.ravel(), np.tile(sd[used], 3)),
-                    tuple(float(value) for value in sd[used]),
-                )
-            )
-    return tuple(result)

@@ -21,174 +21,19 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from ..typing import Bools, Floats, Ints
+from ..typing import Floats, Ints
+from .factor import JITTER, Factor
+from .unknowns import Layout, Prior, State, Windows, inverse_misalignment, tangent_basis
 from .whitening import Whitener
 
-# Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
-_JITTER = 1e-13
 # Of what is known of a direction, the least that is left without one position.
 _LEAST_LEFT = 1e-5
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
-
-
-@dataclass(frozen=True)
-class Windows:
-    """
-    The data: windows sorted by position and time, with every column of the table.
-
-    Parameters
-    ----------
-    position, bag : ndarray of int, shape (n,)
-        Numbers from 0; a position lies in one bag.
-    time : ndarray, shape (n,)
-        Time since the bag's first sample [s].
-    weight : ndarray, shape (n,)
-        Samples of the window over those of a typical one.
-    mean : ndarray, shape (n, 3)
-        Mean raw samples, in input units.
-    columns : ndarray, shape (n, m)
-        Values of the columns, in their physical units, with start states at their prior mean.
-    groups : tuple of str
-        Group of each column.
-    lag : ndarray of int, shape (m,)
-        The lag whose start state moves a column; -1 for none.
-    start : ndarray, shape (n, m)
-        Derivative of each column by that state.
-    start_covariance : ndarray, shape (n_lags, n_lags)
-        Prior of the start states [K^2].
-    in_scale : ndarray of bool, shape (m,)
-        Which columns the scale may have as well as the bias.
-
-    """
-
-    position: Ints
-    bag: Ints
-    time: Floats
-    weight: Floats
-    mean: Floats
-    columns: Floats
-    groups: tuple[str, ...]
-    lag: Ints
-    start: Floats
-    start_covariance: Floats
-    in_scale: Bools
-
-    @property
-    def n_positions(self) -> int:
-        """
-        Number of positions.
-
-        """
-        return int(self.position[-1]) + 1
-
-    @property
-    def bag_of_position(self) -> Ints:
-        """
-        Bag of each position.
-
-        """
-        return self.bag[np.searchsorted(self.position, np.arange(self.n_positions))]
-
-
-@dataclass(frozen=True)
-class Known:
-    """
-    What is known of the unit's own parameters together, e.g. by an earlier calibration.
-
-    Parameters
-    ----------
-    mean : ndarray, shape (n_unit,)
-        In the order of `Layout`: kappa, bias, weights of each axis, then the skew.
-    precision : ndarray, shape (n_unit, n_unit)
-        Inverse covariance.
-
-    """
-
-    mean: Floats
-    precision: Floats
-
-
-@dataclass(frozen=True)
-class Prior:
-    """
-    What is known beforehand; standard deviations, inf for nothing.
-
-    Parameters
-    ----------
-    bias_mean, bias_sd : ndarray, shape (3,)
-        [m/s^2].
-    scale_sd : float
-        Of kappa, about 1.
-    skew_sd : float
-        Of the elements of M [rad].
-    on_bias, on_scale : ndarray, shape (m,)
-        Of the weights of each column, in units of its RMS ([m/s^2], relative); 0 for a column
-        that takes no part.
-    offset_sd : float
-        Of the offset of each position and axis [m/s^2].
-    sigma : ndarray, shape (3,)
-        White noise of a typical window [m/s^2].
-    rho : ndarray, shape (3,)
-        Variance per second of the walk over that of the white noise.
-    known : Known or None, optional
-        Takes the place of all widths of the unit's own parameters; these say only which columns
-        take part.
-
-    """
-
-    bias_mean: Floats
-    bias_sd: Floats
-    scale_sd: float
-    skew_sd: float
-    on_bias: Floats
-    on_scale: Floats
-    offset_sd: float
-    sigma: Floats
-    rho: Floats
-    known: Known | None = None
-
-
-@dataclass(frozen=True)
-class State:
-    """
-    The unknowns; weights are of columns in units of their RMS.
-
-    """
-
-    kappa: Floats
-    bias: Floats
-    on_bias: Floats
-    on_scale: Floats
-    skew: Floats
-    up: Floats
-    offset: Floats
-    start: Floats
-
-
-@dataclass(frozen=True)
-class Layout:
-    """
-    Places of the unknowns in the vector of parameters.
-
-    """
-
-    kappa: Ints
-    bias: Ints
-    on_bias: Ints
-    on_scale: Ints
-    skew: Ints
-    up: Ints
-    offset: Ints
-    start: Ints
-    #: All unknowns of each axis, shape (3, k); all of the unit; those of each bag.
-    axis: Ints
-    n_unit: int
-    blocks: tuple[slice, ...]
-    n: int
 
 
 @dataclass(frozen=True)
@@ -241,26 +86,19 @@ class _Whitened:
     determinant: float
 
 
-def tangent_basis(up: Floats) -> Floats:
+@dataclass(frozen=True)
+class _Equations:
     """
-    Two unit vectors across each given one, shape (n, 3, 2).
+    Of one linearisation: Hessian and gradient, residuals, whitened ones, minus twice the
+    log likelihood.
 
     """
-    helper = np.zeros_like(up)
-    helper[np.arange(len(up)), np.argmin(np.abs(up), axis=1)] = 1.0
-    first = np.cross(up, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack((first, np.cross(up, first)), axis=2)
 
-
-def inverse_misalignment(skew: Floats) -> Floats:
-    """
-    A = M^-1: from the frame to the sensitivity axes, lower triangular with a unit diagonal.
-
-    """
-    matrix = np.eye(3)
-    matrix[1, 0], matrix[2, 0], matrix[2, 1] = skew
-    return matrix
+    hessian: Floats
+    gradient: Floats
+    residual: Floats
+    white: Floats
+    size: float
 
 
 class Regression:
@@ -288,19 +126,19 @@ class Regression:
         self._whitener = Whitener(windows.position, windows.time)
         self._columns = windows.columns / self.rms
         # Start states move few distinct series: one per lag and power of t.
-        # What has died away is 0: numbers near the smallest that there are cost a hundred times more.
+        # What has died away is 0: numbers near the smallest that there are cost a hundred-fold.
         self._start = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
         self.moved = np.flatnonzero(windows.lag >= 0)
         self._base = np.hstack(
             (np.ones((len(windows.time), 1)), self._columns, self._start[:, self.moved])
         )
         edges = np.searchsorted(windows.position, np.arange(windows.n_positions + 1))
-        self._rows = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        self._rows = [slice(a, b) for a, b in pairwise(edges.tolist())]
         self._bags = windows.bag_of_position
         self.n_bags = int(windows.bag.max()) + 1
         n_lags = len(windows.start_covariance)
-        self._start_information = (
-            np.linalg.inv(windows.start_covariance) if n_lags else np.zeros((0, 0))
+        self._start_information: Floats = np.asarray(
+            np.linalg.inv(windows.start_covariance) if n_lags else np.zeros((0, 0)), np.float64
         )
         self._cache: list[_Whitened | None] = [None] * 3
 
@@ -324,7 +162,7 @@ class Regression:
 
     def plain_prior(self) -> Prior:
         """
-        A prior in which every column takes part, of widths that say nothing.
+        Make a prior in which every column takes part, of widths that say nothing.
 
         """
         n = len(self.windows.groups)
@@ -376,8 +214,20 @@ class Regression:
                 up[p], offset[p] = take(2), take(3)
             start[bag] = take(n_lags)
             blocks.append(slice(first, n))
-        return Layout(axis[:, 0], axis[:, 1], on_bias, on_scale, skew, up, offset, start,
-                      axis, n_unit, tuple(blocks), n)
+        return Layout(
+            axis[:, 0],
+            axis[:, 1],
+            on_bias,
+            on_scale,
+            skew,
+            up,
+            offset,
+            start,
+            axis,
+            n_unit,
+            tuple(blocks),
+            n,
+        )
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """
@@ -398,15 +248,17 @@ class Regression:
 
     def _inform(self, prior: Prior, layout: Layout) -> list[tuple[slice, Floats]]:
         """
-        What the prior has as matrices: where, and the inverse covariance.
+        Give what the prior has as matrices: where, and the inverse covariance.
 
         """
-        result = []
+        result: list[tuple[slice, Floats]] = []
         if prior.known is not None:
             result.append((slice(0, layout.n_unit), prior.known.precision))
-        for places in layout.start:
-            if len(places):
-                result.append((slice(places[0], places[-1] + 1), self._start_information))
+        result += [
+            (slice(places[0], places[-1] + 1), self._start_information)
+            for places in layout.start
+            if len(places)
+        ]
         return result
 
     def prior_mean(self, prior: Prior, layout: Layout) -> Floats:
@@ -424,7 +276,7 @@ class Regression:
 
     def vector(self, state: State, layout: Layout) -> Floats:
         """
-        The unknowns as a vector; attitudes as 0, they move in the tangent plane.
+        Give the unknowns as a vector; attitudes as 0, they move in the tangent plane.
 
         """
         result = np.zeros(layout.n + 1)
@@ -453,7 +305,7 @@ class Regression:
 
     def _combination(self, state: State, p: int, axis: int, force: float) -> Floats:
         """
-        The prediction of one position and axis, as a combination of the base columns.
+        Predict one position and axis, as a combination of the base columns.
 
         """
         n_columns = len(self.windows.groups)
@@ -463,7 +315,9 @@ class Regression:
         result[0] = state.kappa[axis] * force + state.bias[axis] + state.offset[p, axis]
         result[1 : n_columns + 1] = weight
         moved = self.moved
-        result[n_columns + 1 :] = weight[moved] * state.start[self._bags[p]][self.windows.lag[moved]]
+        result[n_columns + 1 :] = (
+            weight[moved] * state.start[self._bags[p]][self.windows.lag[moved]]
+        )
         return result
 
     def residual(self, state: State) -> Floats:
@@ -517,7 +371,7 @@ class Regression:
         self, state: State, prior: Prior, layout: Layout, p: int, axis: int, filtered: Floats
     ) -> tuple[Ints, Floats, Floats]:
         """
-        What one axis in one position says: places behind the axis' own, Hessian, gradient.
+        Say what one axis in one position tells: places behind its own, Hessian, gradient.
 
         """
         n_columns = len(self.windows.groups)
@@ -572,7 +426,7 @@ class Regression:
 
     def told_of_absent(self, state: State, prior: Prior, allowed: Prior) -> dict[str, Floats]:
         """
-        What the data say of columns that take no part, beside those that do.
+        Ask the data for columns that take no part, beside those that do.
 
         Parameters
         ----------
@@ -611,7 +465,7 @@ class Regression:
             hessian[where, where] += matrix
         kept = hessian[np.ix_(present, present)]
         root = np.sqrt(np.diag(kept))
-        factor = cho_factor(kept / np.outer(root, root) + _JITTER * np.eye(len(root)))
+        factor = cho_factor(kept / np.outer(root, root) + JITTER * np.eye(len(root)))
         cross = hessian[np.ix_(present, np.flatnonzero(absent))] / root[:, None]
         told = np.zeros(layout.n + 1)
         told[np.flatnonzero(absent)] = np.diag(hessian)[absent] - np.sum(
@@ -626,7 +480,7 @@ class Regression:
 
     def without(self, posterior: Posterior, prior: Prior, p: int) -> State | None:
         """
-        The mode that the other positions alone would give, to first order.
+        Find the mode that the other positions alone would give, to first order.
 
         Parameters
         ----------
@@ -668,10 +522,11 @@ class Regression:
         )
         told = hessian[:n, :n] - hessian[:n, n:] @ inner[:, :n]
         pull = gradient[:n] - hessian[:n, n:] @ inner[:, n]
-        # In coordinates of unit variance: what this position alone told is near 1, and stays within
-        # what the others leave open.
+        # In coordinates of unit variance: what this position alone told is near 1.
         scale = np.sqrt(np.diag(posterior.covariance))
-        root = np.linalg.cholesky(posterior.covariance / np.outer(scale, scale) + _JITTER * np.eye(n))
+        root = np.linalg.cholesky(
+            posterior.covariance / np.outer(scale, scale) + JITTER * np.eye(n)
+        )
         root *= scale[:, None]
         shares, directions = np.linalg.eigh(root.T @ told @ root)
         left = 1.0 - shares
@@ -727,7 +582,7 @@ class Regression:
             for where, matrix in matrices:
                 hessian[where, where] += matrix
                 pull[where] += matrix @ away[where]
-            factor = _Factor(hessian, layout)
+            factor = Factor(hessian, layout)
             gradient = equations.gradient - pull
             step = factor.solve(gradient)
             promised = 0.5 * float(step @ gradient)
@@ -764,94 +619,3 @@ class Regression:
             equations.white,
             evidence,
         )
-
-
-@dataclass(frozen=True)
-class _Equations:
-    """
-    Of one linearisation: Hessian and gradient, residuals, whitened ones, minus twice the
-    log likelihood.
-
-    """
-
-    hessian: Floats
-    gradient: Floats
-    residual: Floats
-    white: Floats
-    size: float
-
-
-class _Factor:
-    """
-    The Hessian, factored: what belongs to one bag alone is eliminated first.
-
-    """
-
-    def __init__(self, hessian: Floats, layout: Layout) -> None:
-        n = layout.n_unit
-        self._n, self._blocks = n, layout.blocks
-        root = np.sqrt(np.diag(hessian))
-        self._root = root
-        scaled = hessian / np.outer(root, root)
-        unit = scaled[:n, :n].copy()
-        self.log_determinant = 2.0 * float(np.log(root).sum())
-        self._locals = []
-        for block in layout.blocks:
-            factor = cho_factor(scaled[block, block] + _JITTER * np.eye(block.stop - block.start))
-            cross = cho_solve(factor, scaled[block, :n])
-            unit -= scaled[:n, block] @ cross
-            self._locals.append((factor, cross))
-            self.log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
-        self._unit = cho_factor(unit + _JITTER * np.eye(n))
-        self.log_determinant += 2.0 * float(np.log(np.diag(self._unit[0])).sum())
-
-    def solve(self, right: Floats) -> Floats:
-        """
-        Solve for one right side.
-
-        """
-        n = self._n
-        right = right / self._root
-        first = right[:n].copy()
-        for block, (_, cross) in zip(self._blocks, self._locals, strict=True):
-            first -= cross.T @ right[block]
-        result = np.empty_like(right)
-        result[:n] = cho_solve(self._unit, first)
-        for block, (factor, cross) in zip(self._blocks, self._locals, strict=True):
-            result[block] = cho_solve(factor, right[block]) - cross @ result[:n]
-        return np.asarray(result / self._root)
-
-    def covariances(self) -> tuple[Floats, list[Floats]]:
-        """
-        Covariance of what belongs to the unit, and of what belongs to each bag.
-
-        """
-        n, root = self._n, self._root
-        unit = cho_solve(self._unit, np.eye(n))
-        blocks = []
-        for block, (factor, cross) in zip(self._blocks, self._locals, strict=True):
-            alone = cho_solve(factor, np.eye(block.stop - block.start))
-            both = alone + cross @ unit @ cross.T
-            blocks.append(both / np.outer(root[block], root[block]))
-        return unit / np.outer(root[:n], root[:n]), blocks
-
-
-def initial_state(
-    windows: Windows, n_bags: int, bias: Floats, kappa: Floats, skew: Floats, up: Floats
-) -> State:
-    """
-    A state without any thermal term.
-
-    """
-    m = len(windows.groups)
-    return State(
-        kappa=kappa,
-        bias=bias,
-        on_bias=np.zeros((3, m)),
-        on_scale=np.zeros((3, m)),
-        skew=skew,
-        up=up,
-        offset=np.zeros((len(up), 3)),
-        start=np.zeros((n_bags, len(windows.start_covariance))),
-    )
-

@@ -23,6 +23,7 @@ from ..typing import Floats
 from ..unit.calibration import (
     Axes,
     AxisReference,
+    AxisSet,
     Calibration,
     Provenance,
     ResponseTerm,
@@ -33,8 +34,9 @@ from ..unit.columns import Column
 from ..unit.posterior import posterior_of
 from .assembly import file_parameters
 from .options import Ageing
-from .posterior import Known, Regression, State
+from .posterior import Regression
 from .start import ConstantCalibration
+from .unknowns import Known, State
 from .windows import Sets
 
 #: A population needs so many units to have a scatter.
@@ -48,7 +50,7 @@ _EXACT = 1e-6
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
     """
-    The response of a calibration as columns.
+    Return the response of a calibration as columns.
 
     Raises
     ------
@@ -70,7 +72,7 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
 
 def prior_sets(calibration: Calibration) -> Sets:
     """
-    The curves of a calibration: each regime has its own.
+    Return the curves of a calibration: each regime has its own.
 
     """
     return Sets(
@@ -80,7 +82,7 @@ def prior_sets(calibration: Calibration) -> Sets:
 
 def constants_of(calibration: Calibration) -> ConstantCalibration:
     """
-    The nine constants of a calibration at its reference temperature.
+    Return the nine constants of a calibration at its reference temperature.
 
     """
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
@@ -93,7 +95,7 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 def state_of(calibration: Calibration, regression: Regression, up: Floats) -> State:
     """
-    The regression's unknowns as a calibration has them; its nominal scale is the calibration's.
+    Return the regression's unknowns as a calibration has them, whose scale is nominal.
 
     """
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
@@ -165,7 +167,9 @@ def known_of(
     """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an import makes no claim to build on')
-    K = np.array([a.scale_factor for a in (calibration.axes.x, calibration.axes.y, calibration.axes.z)])
+    K = np.array(
+        [a.scale_factor for a in (calibration.axes.x, calibration.axes.y, calibration.axes.z)]
+    )
     covariance = calibration.posterior.covariance()
     places = parameter_layout(calibration)
     for axis in range(3):
@@ -180,9 +184,7 @@ def known_of(
     covariance[np.diag_indices_from(covariance)] += _EXACT * floor
     prior = regression.plain_prior()
     layout = regression.layout(prior)
-    to_file = file_parameters(
-        regression, layout, state, sets, K, range(len(calibration.response))
-    )
+    to_file = file_parameters(regression, layout, state, sets, K, range(len(calibration.response)))
     root = np.sqrt(np.diag(covariance))
     scaled = to_file / root[:, None]
     correlation = covariance / np.outer(root, root)
@@ -261,14 +263,12 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 
 def _vector(calibration: Calibration, columns: Sequence[Column], mean_K: Floats) -> Floats:
     """
-    The parameters of a unit in the order of the file, for a unit of the mean scale factors.
+    Return a unit's parameters in the order of the file, at the mean scale factors.
 
     """
     weights = {
         replace(column, range=(0.0, 1.0)): term
-        for column, term in zip(
-            prior_columns(calibration), calibration.response, strict=True
-        )
+        for column, term in zip(prior_columns(calibration), calibration.response, strict=True)
     }
     terms = [weights.get(replace(column, range=(0.0, 1.0))) for column in columns]
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
@@ -308,7 +308,8 @@ def _calibration(
 
     """
     first = calibrations[0]
-    static, dynamic = [], []
+    static: list[AxisSet] = []
+    dynamic: list[AxisSet] = []
     weights: list[tuple[Floats, Floats]] = []
     references = []
     at = 0

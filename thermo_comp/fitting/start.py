@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from ..errors import FitError
 from ..typing import Floats
-from .posterior import Windows
+from .unknowns import Windows
 
 # Even a cheap sensor that drifts over 60 K stays within this of an ellipsoid; motion does not.
 _LARGEST_RMS = 0.05

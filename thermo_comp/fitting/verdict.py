@@ -3,7 +3,8 @@
 """
 Owns the verdict: whether the bags can carry a calibration, with numbers and advice.
 
-Only contradictions are refused. A refusal stops the fit unless the user allows it by name; advice goes into the result.
+Only contradictions are refused. A refusal stops the fit unless the user allows it by name; advice
+goes into the result.
 
 """
 

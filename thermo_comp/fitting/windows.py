@@ -23,8 +23,8 @@ from ..typing import Floats, Ints
 from ..unit.columns import Column, ColumnTable, memory_of
 from ..unit.functions import TemperatureFunction
 from .history import thermal_states
-from .posterior import Windows
 from .reduction import ReducedBag
+from .unknowns import Windows
 
 #: Groups of the sets themselves, beside those of the response.
 CURVE, SET = 'curve', 'set'
@@ -161,17 +161,13 @@ def thermal_windows(
         curves, groups = sets.columns(states[:, BOARD] - reference_temperature, states[:, WEIGHT])
         values = [*curves, *table.weighted(raw, states[:, BOARD], states[:, WEIGHT])]
         moved = _moved(columns, spec, raw, states, shares, reference_temperature)
-        whole = np.column_stack(
-            (states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved)
-        )
+        whole = np.column_stack((states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved))
         for interval in reduced.intervals:
             use = interval.time >= begin
             if not use.any():
                 continue
             time, count = interval.time[use], interval.count[use]
-            rows = np.column_stack(
-                [np.interp(time, grid, column) for column in whole.T]
-            )
+            rows = np.column_stack([np.interp(time, grid, column) for column in whole.T])
             merged = _merged(time, count, interval.mean[use], rows, window_s)
             n = len(merged[0])
             parts.append(merged)
@@ -208,9 +204,12 @@ def thermal_windows(
     return ThermalWindows(
         data,
         tuple(bag.source.name for bag in bags),
-        *rows[:, :4].T,
-        rows[:, 4 : 4 + k],
-        float(np.median(count)),
+        temperature=rows[:, 0],
+        rate=rows[:, 1],
+        weight=rows[:, 2],
+        gradient=rows[:, 3],
+        raw=rows[:, 4 : 4 + k],
+        typical_count=float(np.median(count)),
     )
 
 
@@ -230,14 +229,15 @@ def _states(
         width = Layout(spec).width
         still = np.zeros((2, width))
         still[:, BOARD] = reference_temperature
-        ends = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
+        ends: Floats = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
         return -1.0, ends, still, np.zeros((2, len(spec.lags)))
     tracker = ThermalTracker(detector, MemorySpec(spec.sensors), config)
-    shortest = min((float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1),
-                   default=1.0)
+    shortest = min(
+        (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
+    )
     step_s = max(shortest / 5.0, 0.1)
     start_s, states = thermal_states(bag, tracker, step_s)
-    grid = start_s + step_s * np.arange(len(states))
+    grid = np.asarray(start_s + step_s * np.arange(len(states)), dtype=np.float64)
     # The memory is the tracker's, on the grid at once: reading by reading it takes longer than all
     # the rest of a fit.
     gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
@@ -258,14 +258,12 @@ def _moved(
     reference_temperature: float,
 ) -> Floats:
     """
-    Derivative of each column by the start state of its lag, shape (n, k).
+    Differentiate each column by the start state of its lag, shape (n, k).
 
     """
     t = states[:, BOARD] - reference_temperature
     result = np.zeros((len(states), len(columns)))
-    by_lag = {
-        column.lag: raw[k] for k, column in enumerate(columns) if column.kind == 'board'
-    }
+    by_lag = {column.lag: raw[k] for k, column in enumerate(columns) if column.kind == 'board'}
     for k, column in enumerate(columns):
         if column.lag is None or column.kind == 'play':
             continue

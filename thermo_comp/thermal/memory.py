@@ -411,7 +411,7 @@ def memory_on_grid(
     for tau, width in spec.plays:
         v = board - behind[tau] if tau else board
         columns.append(_play(v, width) - v)
-    return np.column_stack(columns) if columns else np.zeros((len(board), 0))
+    return np.column_stack(columns) if columns else np.zeros((len(board), 0), dtype=np.float64)
 
 
 def _recursion(decay: float, driven: Floats) -> Floats:
@@ -419,7 +419,7 @@ def _recursion(decay: float, driven: Floats) -> Floats:
     ``m[k] = decay m[k - 1] + driven[k]``, by doubling: stretches of 2^j steps at a time.
 
     """
-    result = driven.copy()
+    result: Floats = driven.copy()
     shift, factor = 1, decay
     while shift < len(result) and factor > _FADED:
         result[shift:] += factor * result[:-shift]

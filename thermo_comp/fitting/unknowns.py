@@ -1,0 +1,212 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what the regression works on: the windows, the prior, the unknowns and their places.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..typing import Bools, Floats, Ints
+
+
+@dataclass(frozen=True)
+class Windows:
+    """
+    The data: windows sorted by position and time, with every column of the table.
+
+    Parameters
+    ----------
+    position, bag : ndarray of int, shape (n,)
+        Numbers from 0; a position lies in one bag.
+    time : ndarray, shape (n,)
+        Time since the bag's first sample [s].
+    weight : ndarray, shape (n,)
+        Samples of the window over those of a typical one.
+    mean : ndarray, shape (n, 3)
+        Mean raw samples, in input units.
+    columns : ndarray, shape (n, m)
+        Values of the columns, in their physical units, with start states at their prior mean.
+    groups : tuple of str
+        Group of each column.
+    lag : ndarray of int, shape (m,)
+        The lag whose start state moves a column; -1 for none.
+    start : ndarray, shape (n, m)
+        Derivative of each column by that state.
+    start_covariance : ndarray, shape (n_lags, n_lags)
+        Prior of the start states [K^2].
+    in_scale : ndarray of bool, shape (m,)
+        Which columns the scale may have as well as the bias.
+
+    """
+
+    position: Ints
+    bag: Ints
+    time: Floats
+    weight: Floats
+    mean: Floats
+    columns: Floats
+    groups: tuple[str, ...]
+    lag: Ints
+    start: Floats
+    start_covariance: Floats
+    in_scale: Bools
+
+    @property
+    def n_positions(self) -> int:
+        """
+        Number of positions.
+
+        """
+        return int(self.position[-1]) + 1
+
+    @property
+    def bag_of_position(self) -> Ints:
+        """
+        Bag of each position.
+
+        """
+        return self.bag[np.searchsorted(self.position, np.arange(self.n_positions))]
+
+
+@dataclass(frozen=True)
+class Known:
+    """
+    What is known of the unit's own parameters together, e.g. by an earlier calibration.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (n_unit,)
+        In the order of `Layout`: kappa, bias, weights of each axis, then the skew.
+    precision : ndarray, shape (n_unit, n_unit)
+        Inverse covariance.
+
+    """
+
+    mean: Floats
+    precision: Floats
+
+
+@dataclass(frozen=True)
+class Prior:
+    """
+    What is known beforehand; standard deviations, inf for nothing.
+
+    Parameters
+    ----------
+    bias_mean, bias_sd : ndarray, shape (3,)
+        [m/s^2].
+    scale_sd : float
+        Of kappa, about 1.
+    skew_sd : float
+        Of the elements of M [rad].
+    on_bias, on_scale : ndarray, shape (m,)
+        Of the weights of each column, in units of its RMS ([m/s^2], relative); 0 for a column
+        that takes no part.
+    offset_sd : float
+        Of the offset of each position and axis [m/s^2].
+    sigma : ndarray, shape (3,)
+        White noise of a typical window [m/s^2].
+    rho : ndarray, shape (3,)
+        Variance per second of the walk over that of the white noise.
+    known : Known or None, optional
+        Takes the place of all widths of the unit's own parameters; these say only which columns
+        take part.
+
+    """
+
+    bias_mean: Floats
+    bias_sd: Floats
+    scale_sd: float
+    skew_sd: float
+    on_bias: Floats
+    on_scale: Floats
+    offset_sd: float
+    sigma: Floats
+    rho: Floats
+    known: Known | None = None
+
+
+@dataclass(frozen=True)
+class State:
+    """
+    The unknowns; weights are of columns in units of their RMS.
+
+    """
+
+    kappa: Floats
+    bias: Floats
+    on_bias: Floats
+    on_scale: Floats
+    skew: Floats
+    up: Floats
+    offset: Floats
+    start: Floats
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    Places of the unknowns in the vector of parameters.
+
+    """
+
+    kappa: Ints
+    bias: Ints
+    on_bias: Ints
+    on_scale: Ints
+    skew: Ints
+    up: Ints
+    offset: Ints
+    start: Ints
+    #: All unknowns of each axis, shape (3, k); all of the unit; those of each bag.
+    axis: Ints
+    n_unit: int
+    blocks: tuple[slice, ...]
+    n: int
+
+
+def tangent_basis(up: Floats) -> Floats:
+    """
+    Two unit vectors across each given one, shape (n, 3, 2).
+
+    """
+    helper = np.zeros_like(up)
+    helper[np.arange(len(up)), np.argmin(np.abs(up), axis=1)] = 1.0
+    first = np.cross(up, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((first, np.cross(up, first)), axis=2)
+
+
+def inverse_misalignment(skew: Floats) -> Floats:
+    """
+    Return A = M^-1: from the frame to the sensitivity axes, lower triangular, unit diagonal.
+
+    """
+    matrix = np.eye(3)
+    matrix[1, 0], matrix[2, 0], matrix[2, 1] = skew
+    return matrix
+
+
+def initial_state(
+    windows: Windows, n_bags: int, bias: Floats, kappa: Floats, skew: Floats, up: Floats
+) -> State:
+    """
+    Make a state without any thermal term.
+
+    """
+    m = len(windows.groups)
+    return State(
+        kappa=kappa,
+        bias=bias,
+        on_bias=np.zeros((3, m)),
+        on_scale=np.zeros((3, m)),
+        skew=skew,
+        up=up,
+        offset=np.zeros((len(up), 3)),
+        start=np.zeros((n_bags, len(windows.start_covariance))),
+    )

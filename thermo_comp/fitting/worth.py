@@ -1,0 +1,157 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what columns are worth: what they explain, what the data tell of them, what they earn.
+
+References
+----------
+.. [1] J. M. Dickey, The weighted likelihood ratio, linear hypotheses on normal location
+   parameters, Annals of Mathematical Statistics 42 (1971).
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..typing import Floats, Ints
+from .posterior import Posterior, Regression
+from .unknowns import Prior
+
+
+@dataclass(frozen=True)
+class GroupWorth:
+    """
+    What one group of columns is worth.
+
+    Parameters
+    ----------
+    part, group : str
+        'bias' or 'scale', and its name.
+    explains : float
+        RMS over windows and axes of what it adds to the prediction [m/s^2].
+    effective : float
+        Effective parameters, of all axes.
+    evidence : float
+        How much the log evidence falls without it.
+    sd : tuple of float
+        Prior sd of the weights of its columns, for columns of unit RMS ([m/s^2], relative).
+
+    """
+
+    part: str
+    group: str
+    explains: float
+    effective: float
+    evidence: float
+    sd: tuple[float, ...]
+
+
+def told_of(posterior: Posterior, part: str) -> Floats:
+    """
+    Effective parameters of each column, of all axes; 0 for those that take no part, shape (m,).
+
+    """
+    places = places_of(posterior, part)
+    told = np.append(posterior.told, 0.0)
+    return np.asarray(np.where(places >= 0, told[places], 0.0).sum(axis=0))
+
+
+def places_of(posterior: Posterior, part: str) -> Ints:
+    """
+    Return the places of the weights of a part, shape (3, m); -1 for columns that take no part.
+
+    """
+    return posterior.layout.on_bias if part == 'bias' else posterior.layout.on_scale
+
+
+def widths_of(prior: Prior, part: str) -> Floats:
+    """
+    Return the widths of a part, shape (m,).
+
+    """
+    return prior.on_bias if part == 'bias' else prior.on_scale
+
+
+def earned(posterior: Posterior, places: Ints, sd: float | Floats) -> float:
+    """
+    How much the log evidence falls when some weights are held at 0 (Savage-Dickey).
+
+    Parameters
+    ----------
+    posterior : Posterior
+        The posterior with them.
+    places : ndarray of int, shape (k,)
+        Their places.
+    sd : float or ndarray, shape (k,)
+        Their prior.
+
+    """
+    mode = _mode(posterior, places)
+    covariance = posterior.covariance[np.ix_(places, places)]
+    root = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
+    values = np.maximum(values, 1e-12)
+    along = vectors.T @ (mode / root)
+    determinant = float(np.log(values).sum() + 2.0 * np.log(root).sum())
+    known = float(np.sum(np.log(np.broadcast_to(sd, mode.shape))))
+    return 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant - known
+
+
+def _mode(posterior: Posterior, places: Ints) -> Floats:
+    layout, state = posterior.layout, posterior.state
+    vector = np.zeros(layout.n + 1)
+    vector[layout.on_bias] = state.on_bias
+    vector[layout.on_scale] = state.on_scale
+    return np.asarray(vector[places])
+
+
+def group_worth(
+    regression: Regression, posterior: Posterior, prior: Prior
+) -> tuple[GroupWorth, ...]:
+    """
+    Say what each group explains, spends and earns.
+
+    Parameters
+    ----------
+    regression : Regression
+        The data.
+    posterior : Posterior
+        The mode under `prior`.
+    prior : Prior
+        The widths.
+
+    Returns
+    -------
+    tuple of GroupWorth
+        Bias, then scale, in the order of the columns.
+
+    """
+    names = np.array(regression.windows.groups)
+    columns = regression.windows.columns / regression.rms
+    force = regression.gravity * posterior.state.up[regression.windows.position]
+    result = []
+    for part in ('bias', 'scale'):
+        weights = posterior.state.on_bias if part == 'bias' else posterior.state.on_scale
+        sd, told = widths_of(prior, part), told_of(posterior, part)
+        for group in dict.fromkeys(regression.windows.groups):
+            used = (names == group) & (sd > 0.0)
+            if not used.any():
+                continue
+            added = columns[:, used] @ weights[:, used].T
+            if part == 'scale':
+                added = added * force
+            places = places_of(posterior, part)[:, used]
+            result.append(
+                GroupWorth(
+                    part,
+                    group,
+                    float(np.sqrt(np.mean(added**2))),
+                    float(told[used].sum()),
+                    earned(posterior, places.ravel(), np.tile(sd[used], 3)),
+                    tuple(float(value) for value in sd[used]),
+                )
+            )
+    return tuple(result)
