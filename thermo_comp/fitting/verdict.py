@@ -368,11 +368,9 @@ def judge_result(
     findings = []
     overall = rows[-1]
     raw, fitted = overall.raw.micro_g.rms, overall.fitted.micro_g.rms
-    left_out = overall.left_out.micro_g.rms
-    text = (
-        f'|g| error {raw:.1f} ug RMS raw, {left_out:.1f} ug on positions left out, '
-        f'{fitted:.1f} ug in sample'
-    )
+    text = f'|g| error {raw:.1f} ug RMS raw, {fitted:.1f} ug in sample'
+    if overall.left_out.n:
+        text += f', {overall.left_out.micro_g.rms:.1f} ug on positions left out'
     if slow / MICRO_G > max(0.3 * raw, 0.5 * fitted):
         why = ': temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
         findings.append(Finding('misfit', 'advice', text + why))

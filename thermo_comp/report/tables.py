@@ -103,7 +103,7 @@ def steps_table(evidence: Evidence) -> str:
         caption='RMS of |g| − g over the windows of the fit. One set: a curve over temperature, '
         'blind to the regime; two sets: one for each regime, as the paper has it; response: all '
         'of the model. Left out: each position with what the other positions say of the unit, '
-        'which is what a new attitude will see.',
+        'which is what a new attitude will see; – where none can be done without.',
     )
 
 
@@ -129,7 +129,7 @@ def groups_table(calibration: Calibration | None) -> str:
         texts=2,
         caption='Explains: RMS of its share in the correction over the windows of the fit; shares '
         'may cancel each other. Parameters: how many the data determine. Log evidence: by how '
-        'much it changes with this part; parts that lower it are dropped.',
+        'much it falls without this part.',
     )
 
 
