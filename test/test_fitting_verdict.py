@@ -11,16 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fitting_truth import GRAVITY, Truth, table_of, without_memory
-from thermo_comp.fitting.model import ModelSpec, polynomial
-from thermo_comp.fitting.regression import Freedom
-from thermo_comp.fitting.selection import fit_model
-from thermo_comp.fitting.table import WindowTable
+from fitting_truth import Truth, table_of
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import FitOptions
-from thermo_comp.fitting.evidence import residual_rows, slow_error
-from thermo_comp.fitting.start import constant_calibration, position_means
+from thermo_comp.fitting import FitOptions, ResidualRow
 from thermo_comp.fitting.verdict import (
     Finding,
     can_tell_misalignment,
@@ -28,61 +22,88 @@ from thermo_comp.fitting.verdict import (
     enforce,
     geometry,
     judge_result,
-    judge_table,
+    judge_windows,
 )
+from thermo_comp.fitting.windows import ThermalWindows
 from thermo_comp.simulation import positions
 from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.metrics import residual_statistics
 
 
-def findings_of(table: WindowTable, up: np.ndarray, **options: bool) -> dict[str, Finding]:
-    wanted = {'with_misalignment': True, 'has_case': True, **options}
-    return {finding.name: finding for finding in judge_table(table, up, **wanted)}
+def findings_of(
+    windows: ThermalWindows, up: np.ndarray, *, has_case: bool = True
+) -> dict[str, Finding]:
+    return {finding.name: finding for finding in judge_windows(windows, up, has_case)}
 
 
 @pytest.fixture
-def good(rng: np.random.Generator) -> tuple[WindowTable, np.ndarray]:
-    return table_of(Truth(), 18, rng, window_s=300.0)
+def good(rng: np.random.Generator) -> tuple[ThermalWindows, np.ndarray]:
+    """Spend an hour and a half in each of 18 positions: up, down, and a soak at the end."""
+    data, up = table_of(Truth(), 18, rng)
+    case = np.interp(data.time, [0.0, 1800.0, 3000.0, 3600.0], [5.0, 45.0, 5.0, 5.0])
+    rate = np.interp(
+        data.time, [0.0, 1799.0, 1800.0, 3000.0, 3001.0], [1 / 45, 1 / 45, -1 / 30, -1 / 30, 0.0]
+    )
+    gradient = 600.0 * rate
+    windows = ThermalWindows(
+        data=data,
+        names=tuple(f'bag{k}' for k in range(18)),
+        temperature=case - gradient,
+        rate=rate,
+        weight=(rate != 0.0).astype(float),
+        gradient=gradient,
+        raw=np.zeros((len(case), 0)),
+        typical_count=100.0,
+    )
+    return windows, up
 
 
-def test_a_good_test_passes(good: tuple[WindowTable, np.ndarray]) -> None:
+def test_a_good_test_passes(good: tuple[ThermalWindows, np.ndarray]) -> None:
     found = findings_of(*good)
     assert {finding.level for finding in found.values()} == {'good'}
 
 
-def test_a_small_span_is_refused(good: tuple[WindowTable, np.ndarray]) -> None:
-    table, up = good
-    for factor, level in ((0.1, 'refusal'), (0.5, 'advice')):
-        finding = findings_of(replace(table, t=factor * table.t), up)['span']
-        assert finding.level == level
-        assert 'need 10 (25 advised)' in finding.message
+def test_a_small_span_is_said(good: tuple[ThermalWindows, np.ndarray]) -> None:
+    windows, up = good
+    finding = findings_of(replace(windows, temperature=0.1 * windows.temperature), up)['span']
+    assert finding.level == 'advice'
+    assert '(25 advised)' in finding.message
 
 
-def test_no_ramp_and_one_direction_are_seen(good: tuple[WindowTable, np.ndarray]) -> None:
-    table, up = good
-    assert findings_of(replace(table, rate=0.0 * table.rate), up)['ramps'].level == 'refusal'
-    heating = findings_of(replace(table, rate=np.abs(table.rate)), up)
+def test_no_temperature_is_said(good: tuple[ThermalWindows, np.ndarray]) -> None:
+    windows, up = good
+    found = findings_of(replace(windows, temperature=np.full_like(windows.temperature, 20.0)), up)
+    assert 'holds at the temperature of the test' in found['temperature'].message
+    assert set(found) == {'positions', 'temperature'}
+
+
+def test_no_ramp_and_one_direction_are_seen(good: tuple[ThermalWindows, np.ndarray]) -> None:
+    windows, up = good
+    assert 'no ramp' in findings_of(replace(windows, rate=0.0 * windows.rate), up)['ramps'].message
+    heating = findings_of(replace(windows, rate=np.abs(windows.rate)), up)
     assert 'only heating was seen' in heating['directions'].message
-    always = findings_of(replace(table, weight=np.ones_like(table.weight)), up)
+    always = findings_of(replace(windows, weight=np.ones_like(windows.weight)), up)
     assert 'only 0 % of the windows are static' in always['soak'].message
 
 
-def test_exchanged_sensors_are_seen(good: tuple[WindowTable, np.ndarray]) -> None:
-    table, up = good
-    finding = findings_of(replace(table, gradient=-table.gradient), up)['swapped']
+def test_exchanged_sensors_are_seen(good: tuple[ThermalWindows, np.ndarray]) -> None:
+    windows, up = good
+    finding = findings_of(replace(windows, gradient=-windows.gradient), up)['swapped']
     assert finding.level == 'refusal'
     assert 'are the two sensors exchanged?' in finding.message
 
 
-def test_a_missing_case_is_said(good: tuple[WindowTable, np.ndarray]) -> None:
+def test_a_missing_case_is_said(good: tuple[ThermalWindows, np.ndarray]) -> None:
     assert findings_of(*good, has_case=False)['case'].level == 'advice'
 
 
-def test_six_faces_tell_no_misalignment(good: tuple[WindowTable, np.ndarray]) -> None:
-    table, _ = good
+def test_six_faces_tell_no_misalignment(good: tuple[ThermalWindows, np.ndarray]) -> None:
+    windows, _ = good
     faces = np.vstack((np.eye(3), -np.eye(3)))
     assert not can_tell_misalignment(faces)
-    assert findings_of(table, faces)['misalignment'].level == 'refusal'
-    assert findings_of(table, faces, with_misalignment=False)['positions'].level == 'advice'
+    assert 'the misalignment stays at its prior' in (
+        findings_of(windows, faces)['misalignment'].message
+    )
     # The same face again, two degrees off, is no new position.
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
@@ -90,13 +111,13 @@ def test_six_faces_tell_no_misalignment(good: tuple[WindowTable, np.ndarray]) ->
     assert not can_tell_misalignment(np.vstack((faces, tilted)))
 
 
-def test_too_few_and_badly_spread_positions_are_refused(
-    good: tuple[WindowTable, np.ndarray],
+def test_few_and_badly_spread_positions_are_said(
+    good: tuple[ThermalWindows, np.ndarray],
 ) -> None:
-    table, up = good
-    assert '5 distinct positions, need 6' in findings_of(table, up[:5])['positions'].message
+    windows, up = good
+    assert '5 distinct positions: what tells' in findings_of(windows, up[:5])['positions'].message
     flat = np.column_stack((np.cos(np.arange(12.0)), np.sin(np.arange(12.0)), np.zeros(12)))
-    assert findings_of(table, flat)['geometry'].level == 'refusal'
+    assert 'misalignment' in findings_of(windows, flat)
     assert geometry(flat, with_misalignment=True) == np.inf
 
 
@@ -121,43 +142,39 @@ def test_refusals_stop_and_may_be_allowed() -> None:
     assert (allowed.level, allowed.message) == ('advice', 'allowed: temperature span 3.0 degC')
 
 
-def test_a_drift_that_temperature_does_not_explain_is_said(rng: np.random.Generator) -> None:
-    table, _ = table_of(without_memory(Truth()), 12, rng, window_s=60.0)
-    # A jump of the sensor at half time, in every bag, upwards or downwards.
-    jump = np.where(table.time > 6300.0, 5.0, 0.0) * (-1.0) ** table.bag
-    jumped = replace(table, mean=table.mean + jump[:, None])
-    constant = constant_calibration(position_means(jumped), GRAVITY, with_misalignment=True)
-    spec = ModelSpec('quadratic', polynomial(2))
-    outcome = fit_model(jumped, spec, GRAVITY, constant, Freedom())
-    rows = residual_rows(jumped, outcome.solution, outcome.solution)
-    options = FitOptions(gravity=GRAVITY)
-    found = judge_result(outcome.solution, rows, slow_error(jumped, outcome), options)
-    assert 'temperature does not explain' in next(f.message for f in found if f.name == 'misfit')
-    # The jump is some 500 ug; the statement holds its size.
-    assert slow_error(jumped, outcome).max() > 100.0 * MICRO_G
-
-
-def test_data_without_drift_look_compensated(rng: np.random.Generator) -> None:
-    truth = without_memory(Truth())
-    truth = replace(truth, bias_curve=np.zeros((3, 2)), scale_curve=np.zeros((3, 2)))
-    table, _ = table_of(truth, 12, rng, window_s=60.0)
-    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=True)
-    outcome = fit_model(table, ModelSpec('c', polynomial(0)), GRAVITY, constant, Freedom())
-    rows = residual_rows(table, outcome.solution, outcome.solution)
+def judged(raw: float, fitted: float, slow: float, left_out: float | None = None, **options: str):
+    """Judge residuals of so many ug RMS."""
+    steps = [
+        residual_statistics(np.full(0 if one is None else 9, (one or 0.0) * MICRO_G))
+        for one in (raw, raw, raw, fitted, left_out)
+    ]
     found = judge_result(
-        outcome.solution, rows, slow_error(table, outcome), FitOptions(gravity=GRAVITY)
-    )
-    assert any('already compensated?' in finding.message for finding in found)
+        np.full(3, 990.0), [ResidualRow('all', *steps)], slow * MICRO_G,
+        FitOptions(gravity=9.81, **options),
+    )  # fmt: skip
+    return {finding.name: finding for finding in found}
 
 
-def test_scale_factors_far_from_one_are_said(rng: np.random.Generator) -> None:
-    table, _ = table_of(without_memory(Truth()), 12, rng, window_s=300.0)
-    constant = constant_calibration(position_means(table), GRAVITY, with_misalignment=True)
-    outcome = fit_model(table, ModelSpec('q', polynomial(2)), GRAVITY, constant, Freedom())
-    rows = residual_rows(table, outcome.solution, outcome.solution)
-    options = FitOptions(gravity=GRAVITY, input='m/s^2')
-    found = judge_result(outcome.solution, rows, slow_error(table, outcome), options)
-    assert any(f.name == 'units' and 'expected near 1' in f.message for f in found)
+def test_what_the_fit_left_is_said() -> None:
+    good = judged(100.0, 1.0, 0.2, 1.5)
+    assert set(good) == {'residual'}
+    assert '100.0 ug RMS raw, 1.5 ug on positions left out, 1.0 ug' in good['residual'].message
+    # Where no position can be spared, there is no such number.
+    assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
+
+
+def test_a_drift_that_temperature_does_not_explain_is_said() -> None:
+    finding = judged(500.0, 400.0, 300.0, 500.0)['misfit']
+    assert 'temperature does not explain' in finding.message
+
+
+def test_data_without_drift_look_compensated() -> None:
+    assert 'already compensated?' in judged(1.1, 1.0, 0.1, 1.0)['compensated'].message
+
+
+def test_scale_factors_far_from_one_are_said() -> None:
+    assert 'expected near 1' in judged(100.0, 1.0, 0.2, 1.5, input='m/s^2')['units'].message
+    assert 'units' not in judged(100.0, 1.0, 0.2, 1.5)
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from .columns import RecordingInfo, Topics
 from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 
-# What a fit asks of one unit's bags together; below the first it refuses.
-HARD_SPAN_K, ADVISED_SPAN_K = 10.0, 25.0
+# What is advised for one unit's bags together.
+ADVISED_SPAN_K = 25.0
 # Rate of the board over two minutes that counts as a ramp: well above a soak's slow drift.
 _RAMP_K_MIN = 0.1
 _RAMP_WINDOW_S = 120.0
@@ -145,12 +145,7 @@ class Survey:
     @staticmethod
     def _thermal_findings(board: ThermometerSurvey) -> list[str]:
         found = []
-        if board.span < HARD_SPAN_K:
-            found.append(
-                f'board temperature spans {board.span:.1f} K: a fit needs {HARD_SPAN_K:g}, '
-                f'better {ADVISED_SPAN_K:g}'
-            )
-        elif board.span < ADVISED_SPAN_K:
+        if board.span < ADVISED_SPAN_K:
             found.append(
                 f'board temperature spans {board.span:.1f} K: {ADVISED_SPAN_K:g} are advised'
             )
