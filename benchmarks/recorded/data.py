@@ -8,13 +8,13 @@ Owns the way from the recordings' own files to bags and sources.
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from thermo_comp.convert import load_column_map, table_log, write_log
-from thermo_comp.convert.columns import ColumnMap
+from thermo_comp.convert.columns import Accel, ColumnMap, Stamp
 from thermo_comp.fitting.reduction import ReducedBag, reduce_source
 from thermo_comp.fitting.sources import FitSource
 from thermo_comp.typing import Floats
@@ -56,7 +56,7 @@ def handheld_bag(folder: Path, work: Path, unit: int) -> Path:
     """
     bag = work / f'handheld{unit}.mcap'
     columns = load_column_map(ROOT / 'config' / 'columns' / 'handheld.yaml')
-    columns = columns.model_copy(update={'serial': f'mpu9150-{unit}'})
+    columns = replace(columns, serial=f'mpu9150-{unit}')
     write_log(table_log(folder / HANDHELD.format(unit), columns), bag, force=True)
     return bag
 
@@ -67,17 +67,10 @@ def faces_bag(folder: Path, work: Path) -> Path:
 
     """
     bag = work / 'faces.mcap'
-    columns = ColumnMap.model_validate(
-        {
-            'serial': 'ferraris',
-            'stamp': {'rate_hz': FACES_RATE_HZ},
-            'accel': {
-                'columns': ('acc_x', 'acc_y', 'acc_z'),
-                'unit': 'counts',
-                'output': 'counts',
-                'counts_per_g': 2048.0,
-            },
-        }
+    columns = ColumnMap(
+        serial='ferraris',
+        stamp=Stamp(rate_hz=FACES_RATE_HZ),
+        accel=Accel(('acc_x', 'acc_y', 'acc_z'), 'counts', 'counts', counts_per_g=2048.0),
     )
     write_log(table_log(folder / FACES, columns), bag, force=True)
     return bag

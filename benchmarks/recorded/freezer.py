@@ -14,9 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-
-from thermo_comp.errors import FitError
-from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.held_out import HeldOut, held_out
 from thermo_comp.fitting.one_pose import (
     AlongGravity,
@@ -29,6 +26,9 @@ from thermo_comp.fitting.one_pose import (
     read_pose,
 )
 from thermo_comp.fitting.partial import recording_source
+
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import FitSource
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings

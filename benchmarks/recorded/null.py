@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from thermo_comp.fitting.one_pose import PoseOptions, fit_branches, read_pose
 from thermo_comp.fitting.partial import recording_source
 from thermo_comp.fitting.triad import TriadFit
+
 from thermo_comp.judging import Judgement, evaluate
 from thermo_comp.recording import BagWriter
 from thermo_comp.unit.calibration import (

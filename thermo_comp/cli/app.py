@@ -26,7 +26,6 @@ from . import (
     fleet,
     info,
     output,
-    partial,
     play,
     replay,
     report,
@@ -74,7 +73,6 @@ def _top(
 app.command()(fit.fit)
 app.add_typer(fleet.app)
 app.command()(evaluate.evaluate)
-app.command()(partial.partial)
 app.command()(replay.replay)
 app.command()(play.play)
 app.command()(info.info)

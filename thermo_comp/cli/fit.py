@@ -29,9 +29,15 @@ def fit(
     gravity: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
-    model: Annotated[
-        str, typer.Option(help='auto, golovach (the paper), quadratic (one set), or a candidate.')
-    ] = 'auto',
+    model: options.Model = options.ModelChoice.response,
+    static_curve: options.StaticCurve = None,
+    dynamic_curve: options.DynamicCurve = None,
+    groups: Annotated[
+        str | None, typer.Option(help='Groups that may take part, by commas.', metavar='A,B')
+    ] = None,
+    force_groups: Annotated[
+        str, typer.Option(help='Groups that stay whatever they earn.', metavar='A,B')
+    ] = '',
     report: Annotated[
         Path | None, typer.Option(help='Certificate to write (HTML).', metavar='HTML')
     ] = None,
@@ -61,9 +67,13 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    The unit rests in several unknown positions while the chamber goes
-    through its program: six faces give bias and scale, nine or more well
-    spread positions the misalignment, too. Local gravity is yours to give.
+    The unit rests in unknown positions while the chamber goes through its
+    program: six faces give bias and scale, nine or more well spread positions
+    the misalignment, too. What the bags do not show stays at its prior, with
+    the prior's uncertainty. Local gravity is yours to give.
+
+    Groups: curve, set, now, board, neighbour, product, mixed, square, even,
+    play. Those that the evidence does not want leave by themselves.
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
@@ -87,7 +97,11 @@ def fit(
     try:
         settings = FitOptions(
             gravity=resolve_gravity(gravity, None, None),
-            model=model,
+            model=model.value,
+            static_curve=static_curve.value if static_curve else None,
+            dynamic_curve=dynamic_curve.value if dynamic_curve else None,
+            groups=None if groups is None else _names(groups),
+            forced=_names(force_groups),
             serial=serial,
             input='counts' if kind == 'counts' else 'm/s^2',
             full_scale=full_scale,
@@ -113,33 +127,28 @@ def fit(
     out.end(is_torn=bool(losses))
 
 
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name for name in (part.strip() for part in text.split(',')) if name)
+
+
 def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
+    from ..unit.gravity import spoken
+
     calibration = result.calibration
     if verbose:
         _say_positions(out, result)
-    _say_candidates(out, result)
-    out.table(
-        ('section', 'windows', 'raw ug', 'one set ug', 'fitted ug', 'max ug'),
-        [
-            (
-                row.section,
-                row.fitted.n,
-                micro_g(row.raw.micro_g.rms),
-                micro_g(row.one_set.micro_g.rms),
-                micro_g(row.fitted.micro_g.rms),
-                micro_g(row.fitted.micro_g.peak),
-            )
-            for row in result.residuals
-            if row.fitted.n
-        ],
-        title='|f| - g at rest, RMS',
-    )
+    _say_groups(out, result)
+    _say_residuals(out, result)
     for finding in result.findings:
         if finding.level != 'good':
             out.line(f'- {finding.message}')
+    left_out = result.residuals[-1].left_out
+    n = len(result.positions)
+    headline = f'{n} position{"s" * (n != 1)}'
+    if left_out.n:
+        headline += f', {spoken(left_out.rms)} RMS of |f| - g on each by the others alone'
     out.line(
-        f'{output}: unit {calibration.unit.serial}, {calibration.provenance.model}, '
-        f'{len(result.positions)} positions'
+        f'{output}: unit {calibration.unit.serial}, {calibration.provenance.model}, {headline}'
     )
     out.json(
         {
@@ -147,9 +156,12 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
             'serial': calibration.unit.serial,
             'model': calibration.provenance.model,
             'gravity': calibration.gravity_m_s2,
+            'left_out_rms_m_s2': left_out.rms,
             'residuals_m_s2': result.residuals,
+            'evidence': calibration.evidence,
+            'noise_density_m_s2_sqrt_hz': calibration.noise_density_m_s2_sqrt_hz,
+            'slow_noise_m_s2_sqrt_h': calibration.slow_noise_m_s2_sqrt_h,
             'positions': result.positions,
-            'candidates': result.candidates,
             'findings': result.findings,
         }
     )
@@ -157,20 +169,21 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
 
 def _say_positions(out: Output, result: FitResult) -> None:
     """
-    Print every rest: where, when, how long, which way was up, what the fit leaves of |f| - g.
+    Print every rest: where, when, how long, which way was up, and |f| - g by the fit and without.
 
     """
     from ..unit.gravity import MICRO_G
 
     out.table(
-        ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', '|f| - g ug'),
+        ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
         [
             (
                 one.source,
                 f'{datetime.fromtimestamp(one.start_ns // 10**9, timezone.utc):%m-%d %H:%M:%S}',
                 f'{one.duration_s / 60.0:.1f}',
                 *(f'{component:+.3f}' for component in one.up),
-                micro_g(one.residual_rms / MICRO_G),
+                _ug(one.residual_rms / MICRO_G),
+                _ug(one.left_out_rms / MICRO_G),
             )
             for one in result.positions
         ],
@@ -178,25 +191,61 @@ def _say_positions(out: Output, result: FitResult) -> None:
     )
 
 
-def _say_candidates(out: Output, result: FitResult) -> None:
+def _say_groups(out: Output, result: FitResult) -> None:
     """
-    Print what each model left per axis; the held-out error decides, ties go to the simpler one.
+    Print what each group of the model earns, and the noise that is left.
 
     """
     from ..unit.gravity import MICRO_G
 
+    calibration = result.calibration
     out.table(
-        ('candidate', 'parameters', 'fitted ug', 'held out ug', 'BIC', ''),
+        ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
         [
             (
-                one.name,
-                one.n_parameters,
-                micro_g(one.fitted_rms / MICRO_G),
-                micro_g(one.held_out_rms / MICRO_G) if isfinite(one.held_out_rms) else '-',
-                f'{one.bic:.3g}',
-                'chosen' if one.is_chosen else '',
+                one.group,
+                one.part,
+                micro_g(one.explains_m_s2 / MICRO_G),
+                f'{one.effective_parameters:.1f}',
+                f'{one.log_evidence_change:.1f}',
             )
-            for one in result.candidates
+            for one in calibration.evidence
         ],
-        title='error of each axis, RMS',
+        title='what the data need; log evidence: how much it falls without the group',
     )
+    white, walk = (
+        ' '.join(micro_g(value / MICRO_G) for value in values)
+        for values in (
+            calibration.noise_density_m_s2_sqrt_hz,
+            calibration.slow_noise_m_s2_sqrt_h,
+        )
+    )
+    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
+
+
+def _say_residuals(out: Output, result: FitResult) -> None:
+    """
+    Print |f| - g by step of the model; the last column is what a new attitude will see.
+
+    """
+    response = result.calibration.provenance.model
+    out.table(
+        ('section', 'windows', 'raw', 'one set', 'two sets', response, 'left out'),
+        [
+            (
+                row.section,
+                row.fitted.n,
+                *(
+                    _ug(one.micro_g.rms)
+                    for one in (row.raw, row.one_set, row.two_sets, row.fitted, row.left_out)
+                ),
+            )
+            for row in result.residuals
+            if row.fitted.n
+        ],
+        title='|f| - g at rest, RMS in ug; left out: each position by the others',
+    )
+
+
+def _ug(value: float) -> str | None:
+    return micro_g(value) if isfinite(value) else None

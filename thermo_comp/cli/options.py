@@ -30,6 +30,29 @@ class InputChoice(str, Enum):
     imu = 'imu'
 
 
+class ModelChoice(str, Enum):
+    """
+    The models of a fit.
+
+    """
+
+    response = 'response'
+    golovach = 'golovach'
+
+
+class CurveChoice(str, Enum):
+    """
+    The families of curves over temperature.
+
+    """
+
+    linear = 'linear'
+    quadratic = 'quadratic'
+    cubic = 'cubic'
+    spline = 'spline'
+    exponential = 'exponential'
+
+
 def check_serial(serial: str | None) -> str | None:
     """
     Refuse what can be no serial; an empty one is for the command to judge.
@@ -43,6 +66,17 @@ def check_serial(serial: str | None) -> str | None:
     return serial
 
 
+Model = Annotated[
+    ModelChoice, typer.Option(help="The thermal response, or the paper's two sets alone.")
+]
+StaticCurve = Annotated[
+    CurveChoice | None,
+    typer.Option(help="Bias and scale over temperature; else the model's own.", metavar='CURVE'),
+]
+DynamicCurve = Annotated[
+    CurveChoice | None,
+    typer.Option(help='The same of the dynamic set, by itself.', metavar='CURVE'),
+]
 Json = Annotated[bool, typer.Option('--json', help='Print the result as one JSON object.')]
 Quiet = Annotated[bool, typer.Option('--quiet', '-q', help='Print nothing but errors.')]
 Force = Annotated[bool, typer.Option('--force', '-f', help='Overwrite one of the same kind.')]

@@ -41,7 +41,7 @@ from .verdict import (
     judge_result,
     judge_windows,
 )
-from .windows import CURVE, ThermalWindows, thermal_windows
+from .windows import CURVE, FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
 
 Progress = Callable[[str, float], None]
 
@@ -176,6 +176,7 @@ def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBa
         cell_s=options.cell_s,
         min_still_s=options.min_still_s,
         full_scale=full_scale,
+        fewest_windows=FEWEST_WINDOWS,
     )
     if not bag.n_samples:
         raise FitError(f'{source.name}: no accelerometer samples')
@@ -271,10 +272,17 @@ def fit_bags(
         prior,
         np.array(forced),
         lambda part: tell('regression', 0.7 + 0.25 * part),
+        held=(prior.on_scale > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
+        # What the sets alone leave is a response, and no noise.
+        walks=bool(columns) and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
     )
     residuals, left_out = residual_rows(windows, regression, learnt)
     findings += judge_result(
-        learnt.posterior.state.kappa * nominal, residuals, learnt.prior.offset_sd, options
+        learnt.posterior.state.kappa * nominal,
+        residuals,
+        learnt.prior.offset_sd,
+        options,
+        windows.has_temperature,
     )
     facts = UnitFacts(
         _unit(bags, options),
@@ -359,20 +367,41 @@ def _wide_prior(
     allowed = np.array([options.groups is None or group in options.groups for group in groups])
     allowed &= windows.has_temperature
     in_scale = windows.data.in_scale & allowed
-    if len(distinct_directions(up)) < POSITIONS_NEEDED:
+    # What a sensor does, its curve does first: the others begin as those of a good one.
+    is_curve = np.array([group == CURVE for group in groups])
+    wide = np.where(is_curve, max(1.0, _drift(windows, start) / _COLUMN_BIAS_SD), 1.0)
+    scale_wide = wide
+    n_directions = len(distinct_directions(up))
+    if n_directions == 1 and options.groups is None:
+        # In one attitude a lag looks like a tilt or a curve: the curve is what others can use.
+        allowed &= is_curve
+        in_scale &= is_curve
+    if n_directions < POSITIONS_NEEDED:
         # Too few attitudes to tell it from the bias: the curve stays at its prior.
-        in_scale &= np.array([group == CURVE for group in groups])
+        in_scale &= is_curve
+        scale_wide = np.ones(len(groups))
     return Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, _BIAS_SD),
         scale_sd=_SCALE_SD,
         skew_sd=_SKEW_SD,
-        on_bias=np.where(allowed, _COLUMN_BIAS_SD, 0.0),
-        on_scale=np.where(in_scale, _COLUMN_SCALE_SD, 0.0),
+        on_bias=np.where(allowed, wide * _COLUMN_BIAS_SD, 0.0),
+        on_scale=np.where(in_scale, scale_wide * _COLUMN_SCALE_SD, 0.0),
         offset_sd=_OFFSET_SD,
         sigma=np.full(3, _SIGMA),
         rho=np.zeros(3),
     )
+
+
+def _drift(windows: ThermalWindows, start: ConstantCalibration) -> float:
+    """
+    RMS of what the readings do within the positions, largest axis [m/s^2].
+
+    """
+    data = windows.data
+    reading = data.mean / start.scale
+    own = np.array([reading[data.position == p].mean(axis=0) for p in range(data.n_positions)])
+    return float(np.sqrt(np.mean((reading - own[data.position]) ** 2, axis=0)).max())
 
 
 def board_lag(windows: ThermalWindows) -> float:

@@ -63,7 +63,7 @@ def fit_sources(
     kinds: dict[str, str] = {}
     serials: dict[str, str] = {}
     for path in map(Path, paths):
-        source, info = recording_source(path, topics, input, require=('accel', 'board'))
+        source, info = recording_source(path, topics, input)
         kinds[info.input or 'counts'] = str(path)
         if info.metadata.get('serial'):
             serials[info.metadata['serial']] = str(path)

@@ -40,6 +40,8 @@ _MOST_ROUNDS = 40
 _SETTLED = 0.03
 # What must be gained in log evidence to stay.
 _EARNED = 0.5
+# No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
+_LEAST_SIGMA = 1e-8
 # Of the noise of a window, what a column may add unseen before it counts.
 _OPEN = 1.0
 # Windows more sds off than this lose weight.
@@ -64,6 +66,8 @@ def learn(
     prior: Prior,
     forced: Bools | None = None,
     tell: Callable[[float], None] | None = None,
+    held: Bools | None = None,
+    walks: bool = True,
 ) -> Learnt:
     """
     Find widths, noises and columns by the evidence.
@@ -80,6 +84,11 @@ def learn(
         Columns that stay whatever they earn.
     tell : callable, optional
         Told how far it is, 0..1.
+    held : ndarray of bool, shape (m,), optional
+        Columns of the scale that keep their width, and their place: the data cannot tell them
+        from those of the bias.
+    walks : bool, optional
+        Whether slow noise is looked for.
 
     Returns
     -------
@@ -89,6 +98,7 @@ def learn(
     """
     tell = tell or (lambda _part: None)
     kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
+    held = np.zeros(len(prior.on_bias), dtype=bool) if held is None else held
     allowed = prior
     if prior.known is None:
         silent = _silent(regression.solve(state, prior), prior)
@@ -96,6 +106,7 @@ def learn(
         # Nothing is asked of a column whose weights are known beforehand.
         kept = np.ones(len(prior.on_bias), dtype=bool)
         silent = {part: widths_of(prior, part) > 0.0 for part in ('bias', 'scale')}
+    silent['scale'] |= held
     fixed = _Fixed(silent, kept)
     # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
     posterior, prior = _settle(regression, state, prior, fixed, rounds=_PATIENCE)
@@ -103,17 +114,22 @@ def learn(
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
     tell(0.4)
     _downweight(regression, posterior)
-    prior = _walk(regression, posterior, prior)
+    if walks:
+        prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
     tell(0.7)
     while True:
-        idle = {part: _idle(posterior, prior, part, kept) for part in ('bias', 'scale')}
+        idle = {
+            part: _idle(posterior, prior, part, kept | held if part == 'scale' else kept)
+            for part in ('bias', 'scale')
+        }
         if not any(idle.values()):
             break
         prior = _without(prior, idle)
         posterior, prior = _settle(regression, posterior.state, prior, fixed, rounds=6)
     tell(0.9)
-    prior = _walk(regression, posterior, prior)
+    if walks:
+        prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
     if prior.known is None:
         prior = _left_open(regression, posterior, prior, allowed)
@@ -274,7 +290,8 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
     # Attitudes, misalignment and start states are told by all three.
     shared = told[layout.skew].sum() + layout.up.size + told[layout.start].sum()
     spent = own + shared / 3.0
-    return np.asarray(prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n)))
+    sigma = prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n))
+    return np.asarray(np.maximum(sigma, _LEAST_SIGMA))
 
 
 def _downweight(regression: Regression, posterior: Posterior) -> None:
@@ -286,7 +303,7 @@ def _downweight(regression: Regression, posterior: Posterior) -> None:
     size = np.abs(posterior.whitened) * np.sqrt(base / regression.weight)
     usual = 1.4826 * np.median(size, axis=0)
     size = size / np.maximum(usual, 1e-300)
-    regression.reweight(base * np.where(size > _FAR_SDS, (_FAR_SDS / size) ** 2, 1.0))
+    regression.reweight(base * (_FAR_SDS / np.maximum(size, _FAR_SDS)) ** 2)
 
 
 def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:

@@ -139,6 +139,7 @@ def reduce_source(
     cell_s: float,
     min_still_s: float,
     full_scale: float | None,
+    fewest_windows: int = 1,
 ) -> ReducedBag:
     """
     Stream one source and keep its sufficient statistics.
@@ -155,6 +156,8 @@ def reduce_source(
         Shortest still interval.
     full_scale : float or None
         Magnitude of a saturated sample.
+    fewest_windows : int, optional
+        A still interval too short for so many has shorter ones.
 
     Returns
     -------
@@ -177,7 +180,16 @@ def reduce_source(
         source=source,
         start_ns=found.start_ns,
         end_ns=found.start_ns + (round(found.time[-1] * 1e9) if len(found.time) else 0),
-        intervals=tuple(_windows(found, bag, lower, upper, per_window) for lower, upper in ranges),
+        intervals=tuple(
+            _windows(
+                found,
+                bag,
+                lower,
+                upper,
+                min(per_window, max(1, (upper - lower) // fewest_windows)),
+            )
+            for lower, upper in ranges
+        ),
         board=board.finish(),
         case=case.finish(),
         n_samples=n_samples,

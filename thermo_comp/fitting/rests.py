@@ -1,9 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the judgement of the rests: a sensor that jumped, and bags that show one attitude only.
-
-Both end in the same place where nobody looks for them: in residuals that no temperature explains.
+Owns the judgement of the rests: a sensor that jumped, which no temperature explains.
 
 """
 
@@ -21,31 +19,8 @@ from .options import FitOptions
 from .reduction import ReducedBag, StillInterval
 from .verdict import Finding
 
-#: One attitude: the directions of all still intervals lie this close together.
-ONE_ATTITUDE_DEG = 10.0
 # Neighbours this close in time and direction may be one rest with a step in it.
 _NEAR_S, _NEAR_DEG = 30.0, 10.0
-
-
-def attitudes_apart(bags: Sequence[ReducedBag]) -> float:
-    """
-    Largest angle between the longest still interval's direction and another's [deg].
-
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        With at least one still interval in all.
-
-    Returns
-    -------
-    float
-        In the sensor's own axes.
-
-    """
-    intervals = [interval for bag in bags for interval in bag.intervals]
-    up = _directions(intervals)
-    longest = int(np.argmax([interval.count.sum() for interval in intervals]))
-    return float(np.degrees(np.max(np.arccos(np.clip(up @ up[longest], -1.0, 1.0)))))
 
 
 def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
@@ -78,7 +53,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
 
 def judge_rests(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding]:
     """
-    Judge whether the sensor kept still where the unit did, and whether it was ever turned.
+    Judge whether the sensor kept still where the unit did.
 
     Parameters
     ----------
@@ -93,25 +68,12 @@ def judge_rests(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding
         Refusals.
 
     """
-    findings = []
     jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
-    if jumps:
-        per_mg = milli_g(bags, options.input)
-        said = '; '.join(f'{bag.source.name}: {describe(event, per_mg)}' for bag, event in jumps)
-        findings.append(
-            Finding('jump', 'refusal', f'{said}: leave out such a bag, or cut it at the jump')
-        )
-    apart = attitudes_apart(bags)
-    if apart <= ONE_ATTITUDE_DEG:
-        findings.append(
-            Finding(
-                'attitude',
-                'refusal',
-                f'one attitude only (all rests within {apart:.1f} deg): bias and scale of the '
-                'axes cannot be told apart; `thermo_comp partial` gives the drift along gravity',
-            )
-        )
-    return findings
+    if not jumps:
+        return []
+    per_mg = milli_g(bags, options.input)
+    said = '; '.join(f'{bag.source.name}: {describe(event, per_mg)}' for bag, event in jumps)
+    return [Finding('jump', 'refusal', f'{said}: leave out such a bag, or cut it at the jump')]
 
 
 def milli_g(bags: Sequence[ReducedBag], kind: str) -> float:

@@ -243,7 +243,7 @@ def _judge_order(windows: ThermalWindows) -> list[Finding]:
 
     """
     moving = np.abs(windows.rate) * 60.0 > _RAMP_K_MIN
-    if moving.sum() < 30:
+    if windows.data.weight[moving].sum() < 30.0 * windows.data.weight.max():
         return []
     gradient = windows.gradient - np.median(windows.gradient)
     correlation = float(np.corrcoef(gradient[moving], windows.rate[moving])[0, 1])
@@ -343,7 +343,11 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 
 def judge_result(
-    K: Floats, rows: Sequence[ResidualRow], slow: float, options: FitOptions
+    K: Floats,
+    rows: Sequence[ResidualRow],
+    slow: float,
+    options: FitOptions,
+    has_temperature: bool = True,
 ) -> list[Finding]:
     """
     Judge what the fit left.
@@ -358,6 +362,8 @@ def judge_result(
         RMS over the axes of what no temperature explains [m/s^2].
     options : FitOptions
         The unit of the samples.
+    has_temperature : bool, optional
+        Whether there was a temperature to explain anything.
 
     Returns
     -------
@@ -372,10 +378,10 @@ def judge_result(
     if overall.left_out.n:
         others = f'{overall.left_out.micro_g.rms:.1f} ug on positions left out, '
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
-    if slow / MICRO_G > max(0.3 * raw, 0.5 * fitted):
+    if has_temperature and slow / MICRO_G > max(0.3 * raw, 0.5 * fitted):
         why = ': temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
         findings.append(Finding('misfit', 'advice', text + why))
-    elif raw < 1.2 * fitted:
+    elif raw < 1.2 * fitted and has_temperature:
         why = ': no temperature drift above the noise; already compensated?'
         findings.append(Finding('compensated', 'advice', text + why))
     else:

@@ -28,6 +28,8 @@ from .unknowns import Windows
 
 #: Groups of the sets themselves, beside those of the response.
 CURVE, SET = 'curve', 'set'
+#: A short rest still has so many windows: from less, no noise is learnt.
+FEWEST_WINDOWS = 20
 
 
 @dataclass(frozen=True)
@@ -278,9 +280,10 @@ def _merged(
     time: Floats, count: Floats, mean: Floats, rows: Floats, window_s: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Count-weighted means of neighbouring windows up to a length.
+    Count-weighted means of neighbouring windows up to a length, or to a part of a short rest.
 
     """
+    window_s = min(window_s, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or window_s)
     slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))
     first = np.flatnonzero(np.r_[True, np.diff(slot) != 0])
     total = np.add.reduceat(count, first)

@@ -18,7 +18,7 @@ from .columns import RecordingInfo, Topics
 from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 
-# What a fit asks of one unit's bags together; below the first it refuses.
+# What is advised for one unit's bags together.
 ADVISED_SPAN_K = 25.0
 # Rate of the board over two minutes that counts as a ramp: well above a soak's slow drift.
 _RAMP_K_MIN = 0.1

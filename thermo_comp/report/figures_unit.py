@@ -327,7 +327,7 @@ def _draw_dots(axes: Axes, evidence: Evidence, sheet: Sheet) -> None:
     ]
     if without:
         left_out = np.array(without)[:, 0] / MICRO_G
-        style = {'mfc': 'none', 'mec': RED, 'ms': 5.5}
+        style: Line = {'mfc': 'none', 'mec': RED, 'ms': 5.5}
         axes.plot(left_out, np.array(without)[:, 1], 'D', label=LEFT_OUT, **style)
         both = np.concatenate((both, left_out))
     both = np.maximum(both, 1e-3)

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Holds what an earlier calibration and siblings are worth to a fit that has little else.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit
+from thermo_comp.fitting.options import Ageing
+from thermo_comp.fitting.priors import population
+from thermo_comp.simulation import STANDARD_GRAVITY, arrays, positions, unit_preset
+from thermo_comp.simulation.campaign import Position, Record
+from thermo_comp.simulation.cyclogram import parse_cyclogram
+from thermo_comp.unit.calibration import Calibration, parameter_layout
+
+PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
+KIND = unit_preset('products', 1)
+
+
+def source(record: Record) -> FitSource:
+    def stamps(time_s: np.ndarray) -> np.ndarray:
+        return np.rint(np.asarray(time_s) * 1e9).astype(np.int64) + 10**18
+
+    block = ArrayBlock(
+        stamps(record.time_s),
+        record.counts.astype(np.float64),
+        stamps(record.board_time_s),
+        record.board,
+        stamps(record.case_time_s),
+        record.case,
+    )
+    return FitSource(record.name, lambda: [block])
+
+
+@cache
+def test_of(number: int, first: int, last: int) -> tuple[Record, ...]:
+    """
+    Record some of twelve positions of one sibling.
+
+    """
+    ups = positions(12, number)[first:last]
+    stations = [Position(f'p{k}', PROGRAM, up) for k, up in enumerate(ups)]
+    return tuple(arrays(KIND.sibling(number, 0.15), stations, 100 * number + first))
+
+
+test_of.__test__ = False
+
+
+@cache
+def fitted(number: int) -> FitResult:
+    """
+    Fit a sibling on all its twelve positions.
+
+    """
+    options = FitOptions(STANDARD_GRAVITY, serial=f'unit-{number}')
+    return fit([source(record) for record in test_of(number, 0, 12)], options)
+
+
+def siblings() -> list[Calibration]:
+    return [fitted(number).calibration for number in (1, 2, 3)]
+
+
+def sd_of_levels(calibration: Calibration) -> np.ndarray:
+    assert calibration.posterior is not None
+    variance = np.diag(calibration.posterior.covariance())
+    places = [block.static for block in parameter_layout(calibration).bias]
+    K = [a.scale_factor for a in (calibration.axes.x, calibration.axes.y, calibration.axes.z)]
+    return np.sqrt(variance[places]) / np.abs(K)
+
+
+def test_population_is_the_mean_unit_and_its_scatter():
+    found = population(siblings())
+    K = np.array([[one.axes.x.scale_factor, one.axes.z.scale_factor] for one in siblings()])
+    assert found.axes.x.scale_factor == pytest.approx(np.exp(np.log(K[:, 0]).mean()))
+    slopes = [
+        one.static.x.bias_function.free_coefficients[0] / one.axes.x.scale_factor
+        for one in siblings()
+    ]
+    mean = found.static.x.bias_function.free_coefficients[0] / found.axes.x.scale_factor
+    assert mean == pytest.approx(np.mean(slopes))
+    assert found.posterior is not None
+    variance = np.diag(found.posterior.covariance())
+    at = parameter_layout(found).bias[0].static + 1
+    sd = np.sqrt(variance[at]) / found.axes.x.scale_factor
+    # The scatter of three units, and that of their mean.
+    assert sd == pytest.approx(np.std(slopes, ddof=1) * np.sqrt(4.0 / 3.0), rel=1e-3)
+
+
+def test_siblings_make_one_position_worth_more():
+    # WHY: a unit with one position in the chamber shows nothing of its scale over temperature.
+    # WHAT: with its siblings' prior it is better than alone, on positions it has not seen.
+    few = [source(record) for record in test_of(9, 0, 1)]
+    options = FitOptions(STANDARD_GRAVITY, serial='unit-9')
+    alone = fit(few, options).calibration
+    helped = fit(few, replace(options, prior=population(siblings()))).calibration
+    truth = KIND.sibling(9, 0.15)
+    errors = []
+    for one in (alone, helped):
+        relative = [axis.scale_factor for axis in (one.axes.x, one.axes.y, one.axes.z)]
+        errors.append(np.abs(np.array(relative) / truth.scale_factor - 1.0).max())
+        curve = one.static.z.scale_function
+        errors[-1] += abs(curve.value(10.0) - fitted_curve(9).value(10.0))
+    assert errors[1] < errors[0]
+
+
+def fitted_curve(number: int):
+    return fitted(number).calibration.static.z.scale_function
+
+
+def test_new_rests_make_an_old_calibration_better():
+    old = fitted(4).calibration
+    later = [source(record) for record in test_of(4, 3, 6)]
+    aged = Ageing(bias=1e-4, scale=2e-5)
+    options = FitOptions(STANDARD_GRAVITY, serial='unit-4', prior=old, ageing=aged)
+    new = fit(later, options).calibration
+    # Three positions measure three combinations of the six levels that have aged by 10 ug (bias)
+    # and 20 ug (scale): on average half of the variance that the ageing brought must be gone.
+    grown = np.mean(sd_of_levels(old) ** 2 + aged.bias**2)
+    assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
+    bias = [
+        (a.bias - b.bias) / a.scale_factor
+        for a, b in zip((new.axes.x, new.axes.y, new.axes.z),
+                        (old.axes.x, old.axes.y, old.axes.z), strict=True)
+    ]  # fmt: skip
+    assert np.all(np.abs(bias) < 4.0 * np.hypot(sd_of_levels(new), sd_of_levels(old)))
+
+
+def test_population_refuses_what_is_not_alike():
+    first, second, third = siblings()
+    with pytest.raises(FitError, match='need 3 for a population'):
+        population([first, second])
+    with pytest.raises(FitError, match='two of the calibrations are of one unit'):
+        population([first, second, second])
+    other = replace(third, reference_temperature_c=25.0)
+    with pytest.raises(FitError, match='not of one type'):
+        population([first, second, other])
+
+
+def test_prior_without_claim_is_refused():
+    prior = replace(fitted(1).calibration, posterior=None)
+    few = [source(record) for record in test_of(9, 0, 6)]
+    with pytest.raises(FitError, match='no covariance'):
+        fit(few, FitOptions(STANDARD_GRAVITY, serial='unit-9', prior=prior))
