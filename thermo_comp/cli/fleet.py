@@ -57,9 +57,7 @@ def fit(
         list[Path] | None,
         typer.Option(help='fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
     ] = None,
-    model: Annotated[
-        str, typer.Option(help='response, or golovach (the paper).')
-    ] = 'response',
+    model: Annotated[str, typer.Option(help='response, or golovach (the paper).')] = 'response',
     full_scale: Annotated[
         float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
     ] = None,
