@@ -57,7 +57,7 @@ def fit(
         list[Path] | None,
         typer.Option(help='fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
     ] = None,
-    model: Annotated[str, typer.Option(help='response, or golovach (the paper).')] = 'response',
+    model: options.Model = options.ModelChoice.response,
     full_scale: Annotated[
         float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
     ] = None,
@@ -100,7 +100,7 @@ def fit(
         settings = FleetOptions(
             fit=FitOptions(
                 gravity=gravity,
-                model=model,
+                model=model.value,
                 full_scale=full_scale,
                 reference_temperature=reference_temperature,
                 min_still_s=min_still,
