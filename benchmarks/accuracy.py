@@ -19,10 +19,12 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit
+from thermo_comp.fitting.priors import population
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation import (
@@ -35,6 +37,7 @@ from thermo_comp.simulation import (
     unit_preset,
 )
 from thermo_comp.typing import Floats, Ints
+from thermo_comp.unit.calibration import Calibration, parameter_layout
 
 WINDOW_S = 60.0
 N_SIBLINGS = 10
@@ -76,20 +79,26 @@ PLAN_GOALS = {
 
 
 @dataclass(frozen=True)
-class Block:
+class Block(ArrayBlock):
     """
     A record as the recording layer would hand it over.
 
     """
 
-    accel_stamp_ns: Ints
-    accel: Floats
-    board_stamp_ns: Ints
-    board: Floats
-    board_after: Ints
-    case_stamp_ns: Ints
-    case: Floats
-    case_after: Ints
+    @property
+    def temperatures(self) -> dict[str, tuple[Ints, Floats, Ints]]:
+        """
+        Readings by the name of their thermometer, with the samples that came before.
+
+        """
+        readings = {
+            'board': (self.board_stamp_ns, self.board),
+            'case': (self.case_stamp_ns, self.case),
+        }
+        return {
+            name: (stamps, value, np.searchsorted(self.accel_stamp_ns, stamps))
+            for name, (stamps, value) in readings.items()
+        }
 
 
 def block(record: Record) -> Block:
@@ -97,15 +106,11 @@ def block(record: Record) -> Block:
     Return one record as a block.
 
     """
-    stamps = [
+    accel, board, case = (
         np.rint(1e9 * time_s).astype(np.int64)
         for time_s in (record.time_s, record.board_time_s, record.case_time_s)
-    ]
-    after = [np.searchsorted(stamps[0], one) for one in stamps[1:]]
-    return Block(
-        stamps[0], record.counts, stamps[1], record.board, after[0], stamps[2], record.case,
-        after[1],
-    )  # fmt: skip
+    )
+    return Block(accel, record.counts, board, record.board, case, record.case)
 
 
 @dataclass(frozen=True)
@@ -131,44 +136,47 @@ class Corrected:
     fit_s: float
 
 
-def fit_and_correct(
-    records: Sequence[Record],
-    test_records: Sequence[Record],
-    *,
-    model: str = 'auto',
-    siblings: Sequence[Sequence[Record]] = (),
-) -> Corrected:
+def fitted(records: Sequence[Record], **options: Any) -> Calibration:
     """
-    Fit on one test and apply to another: the one place that knows the product's interface.
+    Fit one test.
 
     """
-    if siblings:
-        raise NotImplementedError('the fit takes no prior yet')
     sources = [FitSource(record.name, lambda record=record: [block(record)]) for record in records]
+    return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, **options)).calibration
+
+
+def fit_and_correct(
+    records: Sequence[Record], test_records: Sequence[Record], **options: Any
+) -> Corrected:
+    """
+    Fit on one test and apply to another.
+
+    """
     began = time.perf_counter()
-    calibration = fit(sources, FitOptions(gravity=STANDARD_GRAVITY, model=model)).calibration
+    calibration = fitted(records, **options)
     took = time.perf_counter() - began
     forces, sds = [], []
     density = np.array(calibration.noise_density_m_s2_sqrt_hz)
     for record in test_records:
-        found = process_block(Compensator(calibration), block(record))
+        compensator = Compensator(calibration)
+        found = process_block(compensator, block(record))
         slots = found.index // round(WINDOW_S / record.time_s[0])
         first = np.flatnonzero(np.diff(slots, prepend=-1))
         columns = np.column_stack((found.specific_force, found.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # White noise averages down, the rest of the published variance does not.
-        white = density**2 / calibration.unit.cycle_time_s
+        # White noise and rounding average down, the rest of the published variance does not.
+        white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    sets = calibration.static.axes()
-    at = sets[0].n_bias_parameters
+    layout = parameter_layout(calibration)
+    known = np.sqrt(np.diag(calibration.posterior.covariance()))
     return Corrected(
         forces,
         sds,
         np.array([[a.bias for a in axes], np.log([a.scale_factor for a in axes])]),
-        np.array([[one.covariance[k][k] ** 0.5 for one in sets] for k in (0, at)]),
+        known[[[one.static for one in part] for part in (layout.bias, layout.scale)]],
         took,
     )
 
@@ -245,7 +253,9 @@ def part_kinds(options: argparse.Namespace) -> None:
             records = arrays(unit, plan(goal.plan, seed), seed, rate_hz=options.rate_hz)
             tests = arrays(unit, plan('held-out', seed), seed + 500, rate_hz=options.rate_hz)
             least = floor(unit, tests)
-            paper, ours = (fit_and_correct(records, tests, model=m) for m in ('golovach', 'auto'))
+            paper, ours = (
+                fit_and_correct(records, tests, model=m) for m in ('golovach', 'response')
+            )
             sets = errors(paper.specific_force, paper.sd, tests)
             found = errors(ours.specific_force, ours.sd, tests)
             worse = '' if found.vector <= 1.05 * sets.vector else ' (worse than golovach)'
@@ -269,18 +279,21 @@ def part_plans(options: argparse.Namespace) -> None:
             unit = unit_preset(kind, seed)
             tests = arrays(unit, plan('held-out', seed), seed + 500, rate_hz=options.rate_hz)
             least = floor(unit, tests)
-            siblings = [
-                arrays(
-                    unit.sibling(number), plan('chamber-18', number), 100 * seed + number,
-                    rate_hz=options.rate_hz,
+            siblings = population([
+                fitted(
+                    arrays(
+                        unit.sibling(number), plan('chamber-18', number), 100 * seed + number,
+                        rate_hz=options.rate_hz,
+                    ),
+                    serial=f'sibling-{number}',
                 )
                 for number in range(1, N_SIBLINGS + 1)
-            ]  # fmt: skip
+            ])  # fmt: skip
             for name, goals in PLAN_GOALS.items():
                 records = arrays(unit, plan(name, seed), seed, rate_hz=options.rate_hz)
                 cells, claimed = [], []
-                for goal, others in zip(goals, ([], siblings), strict=True):
-                    ours = fit_and_correct(records, tests, siblings=others)
+                for goal, prior in zip(goals, (None, siblings), strict=True):
+                    ours = fit_and_correct(records, tests, prior=prior)
                     found = errors(ours.specific_force, ours.sd, tests)
                     cells.append(judged(found, goal, least))
                     claimed.append(f'{found.claimed:.2f}')

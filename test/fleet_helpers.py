@@ -20,7 +20,7 @@ from thermo_comp.simulation import unit_preset as preset
 
 #: Half an hour over 36 K; the ramps of a freezer, not of a chamber.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
-#: The two sets alone: the smallest fit that there is, for tests that are about everything around it.
+#: The two sets alone: the smallest fit there is, for tests about everything around it.
 OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
 
 
@@ -33,9 +33,10 @@ def write_unit(
     test: int = 0,
     metadata: dict[str, str] | None = None,
     names: Sequence[str] | None = None,
+    is_exchanged: bool = False,
 ) -> list[Path]:
     """
-    Simulate one thermal test of one unit, one bag per position.
+    Simulate one thermal test of one unit, one bag per position; its thermometers may be exchanged.
 
     """
     unit = preset('mems', seed)
@@ -54,8 +55,9 @@ def write_unit(
         path = folder / (names[number] if names else f'{number + 1:02d}.mcap')
         facts = {'serial': unit.serial if serial is None else serial, **(metadata or {})}
         with BagWriter(path, metadata={k: v for k, v in facts.items() if v}) as bag:
-            bag.write_temperature('temperature/board', run.board_stamp_ns, run.board)
-            bag.write_temperature('temperature/case', run.case_stamp_ns, run.case)
+            board, case = ('case', 'board') if is_exchanged else ('board', 'case')
+            bag.write_temperature(f'temperature/{board}', run.board_stamp_ns, run.board)
+            bag.write_temperature(f'temperature/{case}', run.case_stamp_ns, run.case)
             counts = run.counts.astype(np.float64)
             bag.write_counts('accel/counts', run.accel_stamp_ns, counts, 'imu_link')
         paths.append(path)

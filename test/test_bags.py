@@ -38,7 +38,10 @@ def test_their_commands_make_them(command: str, tmp_path: Path, cli: Cli) -> Non
     for path in made:
         shipped = read_recording(ROOT / path.relative_to(tmp_path))
         anew = read_recording(path)
-        assert anew.info.metadata == shipped.info.metadata, path.name
+        # They were made by the version that stands in them.
+        own, theirs = (dict(one.info.metadata) for one in (anew, shipped))
+        assert own.pop('simulated_by').split()[0] == theirs.pop('simulated_by').split()[0]
+        assert own == theirs, path.name
         for name in ('accel_stamp_ns', 'accel', 'board_stamp_ns', 'case_stamp_ns', 'board_after'):
             np.testing.assert_array_equal(
                 getattr(anew.columns, name), getattr(shipped.columns, name), err_msg=path.name
@@ -59,7 +62,7 @@ def test_every_sample_can_be_corrected() -> None:
 
 
 def test_the_readme_counts_right() -> None:
-    for name, samples in (('fit/01.mcap', '17 876'), ('held_out.mcap', '15 407')):
+    for name, samples in (('fit/01.mcap', '18 236'), ('held_out.mcap', '15 407')):
         n = len(read_recording(ROOT / 'bags' / name).columns)
         assert n == int(samples.replace(' ', ''))
         assert samples in README

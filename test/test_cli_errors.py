@@ -153,8 +153,9 @@ class TestBags:
         path = bag(tmp_path / 'bag', board=False)
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--board-topic')
         refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
+        # A fit takes it for what it is.
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
-        refused(cli, 1, r'temperature/board', 'fit', path, *arguments)
+        assert 'no temperature was recorded' in cli('fit', path, *arguments).stdout
 
     def test_missing_case_temperature_is_no_error(
         self, cli: Cli, unit: Path, tmp_path: Path
@@ -232,12 +233,11 @@ class TestCalibrations:
 
 
 class TestFits:
-    def test_too_few_positions(self, cli: Cli, tmp_path: Path) -> None:
-        paths = [bag(tmp_path / 'a.mcap'), bag(tmp_path / 'b.mcap', up=(0.0, 0.6, 0.8))]
-        arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
-        refused(cli, 1, r'2 still positions, need 6', 'fit', *paths, *arguments)
-        # One attitude is told apart, because there is something else to do with it.
-        refused(cli, 1, r'one attitude only.*thermo_comp partial', 'fit', paths[0], *arguments)
+    def test_what_is_no_group_or_model(self, cli: Cli, tmp_path: Path) -> None:
+        arguments = ('fit', bag(tmp_path / 'a.mcap'), '-o', tmp_path / 'new.yaml')
+        arguments += ('--gravity', '9.80665')
+        refused(cli, 2, r'`groups` must be of curve, .*memory', *arguments, '--groups', 'memory')
+        refused(cli, 2, r'quadratic', *arguments, '--model', 'quadratic')
         assert not (tmp_path / 'new.yaml').exists()
 
     def test_gravity_of_another_planet(self, cli: Cli, tmp_path: Path) -> None:

@@ -61,13 +61,13 @@ def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
 @pytest.fixture(scope='module')
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
-    Write three units: one with a corrupt bag among good ones, one of too few positions.
+    Write three units: one with a corrupt bag among good ones, one with its thermometers exchanged.
 
     """
     folder = tmp_path_factory.mktemp('fleet') / 'bags'
     write_unit(folder / 'A' / 'good', 1)
     damage(write_unit(folder / 'A' / 'torn', 2, 7)[2])
-    write_unit(folder / 'B' / 'few', 3, 3)
+    write_unit(folder / 'B' / 'exchanged', 3, 3, is_exchanged=True)
     return folder
 
 
@@ -83,14 +83,14 @@ def test_the_rest_finishes_and_a_second_run_does_nothing(
         client=client,
         tell=lambda _n, _total, row: told.append(str(row['name'])),
     )
-    assert sorted(told) == ['A/good', 'A/torn', 'B/few']
+    assert sorted(told) == ['A/good', 'A/torn', 'B/exchanged']
     assert result.n_done == 3
     rows = {str(row['name']): row for row in result.rows}
     verdicts = {name: str(row['verdict']).split(',')[0] for name, row in rows.items()}
-    assert verdicts == {'A/good': 'valid', 'A/torn': 'valid', 'B/few': 'refused'}
+    assert verdicts == {'A/good': 'valid', 'A/torn': 'valid', 'B/exchanged': 'refused'}
     assert rows['A/torn']['n_left_out'] == 1
     assert load_calibration(out / 'units/A/torn/calibration.yaml').unit.serial == 'mems-0002'
-    assert not (out / 'units/B/few/calibration.yaml').exists()
+    assert not (out / 'units/B/exchanged/calibration.yaml').exists()
 
     assert [row['name'] for row in read_parquet(result.parquet)] == list(rows)
     assert read_parquet(result.parquet)[0] == rows['A/good']
@@ -115,7 +115,7 @@ def test_the_rest_finishes_and_a_second_run_does_nothing(
     assert {name for name in before if before[name] != after[name]} == {'A/good/result.json'}
 
     # A result that somebody edited does not count.
-    (out / 'units/B/few').rename(out / 'units/B/other')
+    (out / 'units/B/exchanged').rename(out / 'units/B/other')
     (out / 'units/A/torn/calibration.yaml').write_text('edited')
     ledger = Ledger(out)
     found = {unit.name: ledger.look_up(unit, OPTIONS) for unit in find_units(Storage(str(fleet)))}
@@ -229,13 +229,13 @@ class TestScheduler:
         self, client: Any, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         address = client.cluster.scheduler_address
-        few = str(fleet / 'B')
-        result = fit_fleet(few, tmp_path / 'out', OPTIONS, scheduler=address)
+        refused = str(fleet / 'B')
+        result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)
         assert [row['verdict'] for row in result.rows] == ['refused']
         # A worker of another version would fit something else under the same key.
         monkeypatch.setattr('thermo_comp.fleet.engine.__version__', '9.9')
         with pytest.raises(FleetError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
-            fit_fleet(few, tmp_path / 'other', OPTIONS, scheduler=address)
+            fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
 
 
 class _Future:
@@ -307,13 +307,13 @@ def test_the_command_s_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_a_unit_without_a_calibration_leaves_exit_code_1(
     client: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_unit(tmp_path / 'bags' / 'u', 1, 2)
+    write_unit(tmp_path / 'bags' / 'u', 1, 3, is_exchanged=True)
     same = FleetOptions(FitOptions(gravity=9.81), Topics())
     fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', same, client=client)
     arguments = (tmp_path / 'bags', tmp_path / 'out', '--gravity', '9.81')
     assert command(*arguments) == 1
     said = capsys.readouterr()
-    assert '- u: 2 still positions, need 6' in said.out
+    assert '- u: the board temperature leads the case' in said.out
     assert '0 of 1 tests calibrated, 0 of them in this run' in said.out
     assert said.err == ''
     assert command(*arguments, '--json') == 1
@@ -322,7 +322,7 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(
 
 
 def test_options_are_part_of_a_result(client: Any, fleet: Path, tmp_path: Path) -> None:
-    few = fleet / 'B'
-    fit_fleet(str(few), tmp_path / 'out', OPTIONS, client=client)
+    refused = fleet / 'B'
+    fit_fleet(str(refused), tmp_path / 'out', OPTIONS, client=client)
     other = replace(OPTIONS, fit=replace(OPTIONS.fit, min_still_s=4.0))
-    assert fit_fleet(str(few), tmp_path / 'out', other, client=client).n_done == 1
+    assert fit_fleet(str(refused), tmp_path / 'out', other, client=client).n_done == 1

@@ -64,7 +64,7 @@ def fleet_of(
                 serial=f'S{i:03d}',
                 lot=lots[i % len(lots)],
                 verdict='valid',
-                model='linear',
+                model='response',
                 start=f'{MONDAY + timedelta(days=day):%Y-%m-%dT%H:%M:%SZ}',
                 raw_ug=300.0,
                 peak_ug=9.0,
@@ -231,7 +231,7 @@ class TestTable:
         assert heading.split(',') == [column.name for column in COLUMNS]
         cells = dict(zip(heading.split(','), line.split(','), strict=True))
         assert (cells['name'], cells['serial']) == ("'=cmd()", "'-1")
-        assert (cells['n_bags'], cells['raw_ug'], cells['lag_1_s']) == ('3', '-1.5', '')
+        assert (cells['n_bags'], cells['raw_ug'], cells['board_lag_s']) == ('3', '-1.5', '')
 
     def test_what_is_no_fleet_table(self, tmp_path: Path) -> None:
         (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')

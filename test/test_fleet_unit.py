@@ -146,7 +146,7 @@ class TestRow:
         outcome = processed(fleet, certificates=True)
         row = outcome.row
         assert (row['name'], row['serial'], row['lot']) == ('lot-A/unit1', 'mems-0001', 'lot-A')
-        assert row['verdict'].startswith('valid, but it only claims ')
+        assert row['verdict'].startswith('valid')
         assert row['reason'].startswith(f'{row["all_ug"]:.0f} ug RMS of |f| - g, ')
         assert (row['problem'], row['left_out']) == ('', '')
         assert (row['n_bags'], row['n_left_out'], row['n_positions']) == (6, 0, 6)
@@ -193,10 +193,10 @@ class TestRow:
         assert row['n_positions'] == 7
 
     def test_what_the_fit_refuses(self, tmp_path: Path) -> None:
-        write_unit(tmp_path / 'u', 1, 4)
+        write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
         outcome = processed(tmp_path)
         assert outcome.row['verdict'] == 'refused'
-        assert '4 still positions, need 6' in outcome.row['problem']
+        assert 'the board temperature leads the case' in outcome.row['problem']
         assert outcome.is_final
         assert outcome.calibration == b''
 

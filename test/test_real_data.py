@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Recordings that other people made: what docs/real_data.md claims, held by the numbers behind it.
+Recordings that other people made, through `fit`: what docs/real_data.md claims.
 
-Skipped with a reason where the recordings are absent; the limits are those that were asked for
-before anything was fitted.
+Skipped with a reason where the recordings are absent.
 
 """
 
@@ -13,20 +12,24 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import ROOT
+from scipy.optimize import least_squares
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
 
-from recorded.data import freezer_bag
-from recorded.faces import read_faces
-from recorded.freezer import coarser, forecast, interleaved, ours, peers, read_freezer, track
-from recorded.handheld import read_handheld
-from recorded.null import freezer_under_another_unit, small_spans, wrong_units
+from recorded.data import FREEZER, GRAVITY, faces_bag, freezer_bag, handheld_bag
 
-from thermo_comp.cli.app import run
+from thermo_comp.convert import load_column_map, table_log, write_log
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.fit_sources import fit_sources
+
+MG = GRAVITY * 1e-3
+OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', min_still_s=2.0)
 
 
 @pytest.fixture(scope='module')
@@ -34,150 +37,89 @@ def work(tmp_path_factory):
     return tmp_path_factory.mktemp('recorded')
 
 
-@pytest.fixture(scope='module')
-def bag(real_data, work):
-    return freezer_bag(real_data, work)
+@pytest.fixture(scope='module', params=[0, 1, 2])
+def unit(request, real_data, work):
+    """Fit a unit that was turned by hand, without any thermometer."""
+    sources, _ = fit_sources([handheld_bag(real_data, work, request.param)])
+    return fit(sources, OPTIONS)
 
 
-@pytest.fixture(scope='module')
-def freezer(real_data, bag):
-    return read_freezer(real_data, bag)
+def means_of(result):
+    data = result.windows.data
+    return np.array([data.mean[data.position == p].mean(axis=0) for p in range(data.n_positions)])
 
 
-@pytest.fixture(scope='module')
-def units(real_data, work):
-    return {unit: read_handheld(real_data, work, unit, jackknife=False) for unit in range(3)}
+def test_handheld_units_leave_what_their_noise_is(unit):
+    assert 20 <= len(unit.positions) <= 22
+    # Windows of 0.5 s have more noise than the 0.48 to 0.57 mg of 1 s.
+    assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9
+    assert unit.residuals[-1].left_out.rms < 1.15 * unit.residuals[-1].fitted.rms
 
 
-def test_jumps_are_found_with_time_and_size(freezer):
-    # Read off the plain plot of |a|: some +20 mg at 366 s and +17 mg at 468 s, means of 2 s.
-    first, second, third = freezer.pose.events
-    assert all(event.kind == 'jump' for event in freezer.pose.events)
-    assert first.time + freezer.origin_s == pytest.approx(366.5, abs=1.0)
-    assert second.time + freezer.origin_s == pytest.approx(467.0, abs=1.0)
-    assert first.along / freezer.per_mg == pytest.approx(20.0, abs=4.0)
-    assert second.along / freezer.per_mg == pytest.approx(17.0, abs=4.0)
-    # A third one, across gravity, that |a| hardly shows.
-    assert third.time + freezer.origin_s == pytest.approx(513.2, abs=0.5)
-    assert np.hypot(*third.step[:2]) / freezer.per_mg == pytest.approx(19.0, abs=3.0)
+def test_handheld_units_agree_with_a_direct_solution(unit):
+    # The nine-parameter cost |M (N - b) / K| - g over the positions' means, by scipy.
+    means = means_of(unit)
+
+    def residual(parameters):
+        matrix = np.eye(3)
+        matrix[1, 0], matrix[2, 0], matrix[2, 1] = parameters[6:]
+        force = (means - parameters[:3]) / parameters[3:6] @ matrix.T
+        return np.linalg.norm(force, axis=1) - GRAVITY
+
+    direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
+    calibration = unit.calibration
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    # Other weights of the same positions: a fraction of the sd of 1 mg, and of 1e-3.
+    np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
+    np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
+    M = np.array(calibration.misalignment)
+    np.testing.assert_allclose([M[1, 0], M[2, 0], M[2, 1]], direct[6:], atol=1.5e-3)
 
 
-@pytest.mark.parametrize('which', ['refusal', 'full_refusal'])
-def test_whole_run_is_refused_with_that_reason(freezer, which):
-    said = getattr(freezer, which)
-    jumps = re.findall(r'at ([\d.]+) s the sensor jumped by \+([\d.]+) mg along gravity', said)
+def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
+    sources, kind = fit_sources([faces_bag(real_data, work)])
+    result = fit(sources, replace(OPTIONS, input=kind, min_still_s=1.0))
+    calibration = result.calibration
+    assert len(result.positions) == 6
+    np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(calibration.misalignment_sd, 1e-3, rtol=0.01)
+    # By hand: half the sum and half the difference of opposite faces, each taken for level.
+    means = means_of(result)
+    high, low = means.max(axis=0), means.min(axis=0)
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    np.testing.assert_allclose([axis.bias for axis in axes], 0.5 * (high + low), atol=1.0)
+    by_hand = 0.5 * (high - low) / GRAVITY
+    np.testing.assert_allclose([axis.scale_factor for axis in axes], by_hand, rtol=1e-3)
+    assert 'misalignment' in {finding.name for finding in result.findings}
+
+
+def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
+    # Read off the plain plot of |a|: +20 mg at 366 s and +17 mg at 468 s; a third across gravity.
+    sources, _ = fit_sources([freezer_bag(real_data, work)])
+    with pytest.raises(FitError, match='not a function of temperature') as refused:
+        fit(sources, OPTIONS)
+    jumps = re.findall(
+        r'at ([\d.]+) s the sensor jumped by \+([\d.]+) mg along gravity', str(refused.value)
+    )
     # Times from the first sample, 1.5 s after the log's zero.
     assert [float(at) for at, _ in jumps] == pytest.approx([365.4, 465.4, 511.6], abs=0.2)
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
-    assert 'without motion' in said
-    assert 'not a function of temperature' in said
 
 
-def test_branches_have_their_own_slopes(freezer):
-    first, second, third, last = freezer.fits
-    middle = np.array([20.0, 30.0])
-    slope = np.diff(first.model.reading(middle))[0] / 10.0 / freezer.per_mg
-    assert slope == pytest.approx(1.61, abs=0.15)
-    assert last.model.coefficients[1] / freezer.per_mg == pytest.approx(-1.04, abs=0.15)
-    for short in (second, third):
-        assert 'too small' in short.refusal
-
-
-@pytest.mark.parametrize('shift_s', [0.0, 5.0, 10.0, 15.0])
-def test_interleaved_blocks(freezer, shift_s):
-    found, models = ours(freezer, interleaved(freezer, shift_s), extend=True)
-    assert found.rms / freezer.per_mg <= 0.75
-    # Some 150 means: a coverage of 95 % has an sd of 1.8 %.
-    assert found.coverage > 0.90
-    assert found.normalised_rms < 1.1
-    assert all(model.order == 2 for model in models)
-
-
-def test_later_part(freezer):
-    found, (model,) = ours(freezer, forecast(freezer), extend=True)
-    assert found.rms / freezer.per_mg <= 0.85
-    assert found.coverage > 0.93
-    assert found.normalised_rms < 1.1
-    assert model.order == 1
-
-
-def test_peers_do_not_do_better_on_the_blocks(freezer):
-    split = interleaved(freezer)
-    mine = ours(freezer, split, extend=True)[0].rms / freezer.per_mg
-    theirs = peers(freezer, split, extend=True)
-    assert theirs['no correction'] > 8.0
-    assert mine < min(theirs.values())
-
-
-def test_thermometer_beats_the_raw_reading(freezer):
-    tracked = track(freezer)
-    for low, high in ((49.0, 120.0), (120.0, 364.0), (520.0, 1200.0), (1200.0, 1940.0)):
-        raw, estimate, sd, largest = tracked.errors(low, high)
-        # One reading is off by 90 mK; the reference itself by some 10 mK, more in the onset.
-        assert estimate < 0.5 * raw
-        assert largest < 0.1
-        assert estimate < 2.0 * sd
-    assert tracked.switches()[0][0] < 49.0
-
-
-def test_regime_sees_plateau_and_reversal(freezer):
-    switches = track(freezer, coarser(freezer.pose.detector, 0.3)).switches()
-    assert [name for _, name in switches] == ['dynamic', 'static', 'dynamic']
-    # It cools by less than 0.3 K/min from about 1000 s on, and is taken out at 1942..1945 s.
-    assert 1000.0 < switches[1][0] < 1800.0
-    assert 1942.0 < switches[2][0] < 1955.0
-
-
-@pytest.mark.parametrize('unit', [0, 1, 2])
-def test_handheld_units(units, unit):
-    found = units[unit]
-    assert 20 <= len(found.intervals) <= 22
-    assert found.ours.has_misalignment
-    assert 0.45 < found.in_sample[0] < 0.60
-    assert found.ratio <= 1.05
-    assert np.abs(found.pulls).max() < 1.0
-
-
-def test_six_faces(real_data, work):
-    faces = read_faces(real_data, work)
-    assert faces.n_positions == 6
-    assert not faces.fit.has_misalignment
-    # Faces are level within a degree or two: 0.05 % of the scale, under a count of the bias.
-    np.testing.assert_allclose(faces.fit.scale, faces.by_hand_scale, rtol=1e-3)
-    np.testing.assert_allclose(faces.fit.bias, faces.by_hand_bias, atol=1.0)
-    assert faces.fit.advice == (faces.refusal,)
-    assert 'add positions between the faces' in faces.refusal
-
-
-def test_small_spans_change_nothing(bag, capsys):
-    for _, said in small_spans(bag):
-        assert 'is too small, need 3' in said
-    before = sorted(bag.parent.iterdir())
-    assert run(['partial', str(bag), '--from', '1200', '--to', '1900']) == 1
-    assert re.search(r'temperature span 1\.\d degC is too small', capsys.readouterr().err)
-    output = bag.parent / 'none.yaml'
-    assert run(['fit', str(bag), '-o', str(output), '--gravity', '9.80665']) == 1
-    assert sorted(bag.parent.iterdir()) == before
-
-
-def test_wrong_unit_is_noticed(bag, units, work):
-    two = {unit: units[unit] for unit in (0, 1)}
-    for found in wrong_units({unit: work / f'handheld{unit}.mcap' for unit in two}, two, work):
-        assert found.is_valid == (found.data == found.calibration)
-    assert not freezer_under_another_unit(bag, units[0]).is_valid
-
-
-def test_page_is_skipped_with_a_reason_where_the_data_are_absent(tmp_path):
-    finished = subprocess.run(
-        [sys.executable, ROOT / 'benchmarks' / 'real_data.py', '--docs', tmp_path],
-        env={'THERMO_COMP_DATA': str(tmp_path / 'nowhere'), 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
-    assert 'skipped: the recordings are not in' in finished.stdout
-    assert list(tmp_path.iterdir()) == []
+def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, work):
+    head, *rows = (real_data / FREEZER).read_text().splitlines()
+    at = head.split(',').index('now[ms]')
+    before = [row for row in rows if 49e3 < float(row.split(',')[at]) < 360e3]
+    table = work / 'before.csv'
+    table.write_text('\n'.join([head, *before]) + '\n')
+    columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
+    write_log(table_log(table, columns), work / 'before.mcap')
+    result = fit(fit_sources([work / 'before.mcap'])[0], OPTIONS)
+    z = result.calibration.static.z
+    # The plain slope of |a| is 1.61 mg/K from 36 to 15 degC.
+    slope = np.diff(z.bias_function.value(np.array([-4.0, 14.0])))[0] / 18.0 / MG
+    assert slope == pytest.approx(1.61, abs=0.2)
+    assert result.residuals[-1].fitted.rms / MG < 0.75
 
 
 def test_no_recording_is_in_the_project():

@@ -111,6 +111,8 @@ def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
         assert fact in page.text
     for plate in PLATES:
         assert plate.question in page.text
+    # Nine positions: none can be left out, and nothing is said of it.
+    assert not re.search(r'\bnan\b', page.text)
 
 
 def test_certificate_says_what_the_other_positions_say_of_each(tmp_path):

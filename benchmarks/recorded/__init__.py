@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the validation on recordings that other people made; `benchmarks/real_data.py` runs it.
+Owns recordings that other people made, as `test/test_real_data.py` reads them.
 
 Nothing of the recordings is stored here: they are read from a folder beside the project, turned
-into bags in a temporary directory, and only numbers and plots are kept.
+into bags in a temporary directory.
 
 """
 

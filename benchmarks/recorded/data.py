@@ -1,23 +1,17 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way from the recordings' own files to bags and sources.
+Owns the way from the recordings' own files to bags.
 
 """
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from thermo_comp.convert import load_column_map, table_log, write_log
 from thermo_comp.convert.columns import Accel, ColumnMap, Stamp
-from thermo_comp.fitting.reduction import ReducedBag, reduce_source
-from thermo_comp.fitting.sources import FitSource
-from thermo_comp.typing import Floats
 
 from . import ROOT
 
@@ -38,15 +32,6 @@ def freezer_bag(folder: Path, work: Path) -> Path:
     columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
     write_log(table_log(folder / FREEZER, columns), bag, force=True)
     return bag
-
-
-def freezer_column(folder: Path, name: str) -> Floats:
-    """
-    Read one column of the freezer run as it is.
-
-    """
-    with (folder / FREEZER).open(newline='') as file:
-        return np.array([float(row[name]) for row in csv.DictReader(file)])
 
 
 def handheld_bag(folder: Path, work: Path, unit: int) -> Path:
@@ -74,35 +59,3 @@ def faces_bag(folder: Path, work: Path) -> Path:
     )
     write_log(table_log(folder / FACES, columns), bag, force=True)
     return bag
-
-
-@dataclass(frozen=True)
-class Samples:
-    """
-    A recording's accelerometer in memory.
-
-    """
-
-    time: Floats
-    accel: Floats
-
-
-def samples_of(source: FitSource) -> Samples:
-    """
-    Read all samples of a source; time counts from its first one [s].
-
-    """
-    blocks = list(source.blocks())
-    stamp_ns = np.concatenate([block.accel_stamp_ns for block in blocks])
-    accel = np.concatenate([block.accel for block in blocks])
-    return Samples((stamp_ns - stamp_ns[0]) * 1e-9, accel)
-
-
-def still_bag(source: FitSource, min_still_s: float = 2.0, window_s: float = 1.0) -> ReducedBag:
-    """
-    Find the still intervals of a recording turned by hand, in windows of one second.
-
-    """
-    return reduce_source(
-        source, 0, window_s=window_s, cell_s=0.5, min_still_s=min_still_s, full_scale=None
-    )

@@ -380,6 +380,8 @@ def _wide_prior(
         # Too few attitudes to tell it from the bias: the curve stays at its prior.
         in_scale &= is_curve
         scale_wide = np.ones(len(groups))
+    # The paper's sets stay whatever they earn: their prior says nothing.
+    wide = 50.0 if options.model == 'golovach' else 1.0
     return Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, _BIAS_SD),

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
 from .posterior import Posterior, Regression
@@ -46,6 +47,8 @@ _LEAST_SIGMA = 1e-8
 _OPEN = 1.0
 # Windows more sds off than this lose weight.
 _FAR_SDS = 3.0
+# ... as seen against the median of so many windows on both sides.
+_NEIGHBOURS = 3
 
 
 @dataclass(frozen=True)
@@ -100,10 +103,10 @@ def learn(
     kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
     held = np.zeros(len(prior.on_bias), dtype=bool) if held is None else held
     allowed = prior
-    if prior.known is None:
+    if prior.known is None and not kept.all():
         silent = _silent(regression.solve(state, prior), prior)
     else:
-        # Nothing is asked of a column whose weights are known beforehand.
+        # Nothing is asked of columns whose weights are known beforehand, nor where all must stay.
         kept = np.ones(len(prior.on_bias), dtype=bool)
         silent = {part: widths_of(prior, part) > 0.0 for part in ('bias', 'scale')}
     silent['scale'] |= held
@@ -131,7 +134,7 @@ def learn(
     if walks:
         prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
-    if prior.known is None:
+    if prior.known is None and not kept.all():
         prior = _left_open(regression, posterior, prior, allowed)
         posterior = regression.solve(posterior.state, prior)
     tell(1.0)
@@ -296,11 +299,19 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
 
 def _downweight(regression: Regression, posterior: Posterior) -> None:
     """
-    Take windows that are far off for as noisy as they look.
+    Take windows that are far off their neighbours for as noisy as they look.
+
+    A knock stands alone; what a model does not explain lasts, and counts.
 
     """
     base = regression.windows.weight[:, None]
-    size = np.abs(posterior.whitened) * np.sqrt(base / regression.weight)
+    size = posterior.whitened * np.sqrt(base / regression.weight)
+    edges = np.flatnonzero(np.diff(regression.windows.position)) + 1
+    for part in np.split(size, edges):
+        if len(part) >= 2 * _NEIGHBOURS + 1:
+            around = np.pad(part, ((_NEIGHBOURS, _NEIGHBOURS), (0, 0)), mode='reflect')
+            part -= np.median(sliding_window_view(around, 2 * _NEIGHBOURS + 1, axis=0), axis=-1)
+    size = np.abs(size)
     usual = 1.4826 * np.median(size, axis=0)
     size = size / np.maximum(usual, 1e-300)
     regression.reweight(base * (_FAR_SDS / np.maximum(size, _FAR_SDS)) ** 2)

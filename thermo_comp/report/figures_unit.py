@@ -327,7 +327,8 @@ def _draw_dots(axes: Axes, evidence: Evidence, sheet: Sheet) -> None:
     ]
     if without:
         left_out = np.array(without)[:, 0] / MICRO_G
-        axes.plot(left_out, np.array(without)[:, 1], 'D', label=LEFT_OUT, mfc='none', mec=RED, ms=5.5)
+        style: Line = {'mfc': 'none', 'mec': RED, 'ms': 5.5}
+        axes.plot(left_out, np.array(without)[:, 1], 'D', label=LEFT_OUT, **style)
         both = np.concatenate((both, left_out))
     both = np.maximum(both, 1e-3)
     log_axis(axes, float(np.min(both)) / 1.4, float(np.max(both)) * 1.4)

@@ -19,36 +19,13 @@ import numpy as np
 from .. import __version__
 from ..judging import SECTIONS
 from ..thermal.regime import Regime
-from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
-from .evidence import CHOSEN, LEFT_OUT, RAW, Evidence
+from .evidence import CHOSEN, RAW, Evidence
 from .html import document, figure, table
 from .inertial import SCHULER_PEAK_PER_MICRO_G, TIMES_S, position_error, schuler_peak
 from .plates import DrawnPlate
+from .tables import axes_table, groups_table, positions_table, steps_table
 from .text import number
-
-#: Steps of the model by their names in `fitting.ResidualRow`.
-_STEPS = {
-    'raw': 'raw',
-    'one_set': 'one set',
-    'two_sets': 'two sets',
-    'fitted': 'response',
-    'left_out': 'left out',
-}
-#: What the groups of `unit.columns` are, in words.
-GROUP_WORDS = {
-    'curve': 'curve over temperature',
-    'set': 'difference of the sets',
-    'now': 'heat flow (case − board)',
-    'rate': 'rate of the board',
-    'board': 'parts that lag the board',
-    'neighbour': 'parts between case and board',
-    'product': 'lags, changing with temperature',
-    'mixed': 'heat flow, changing with temperature',
-    'square': 'curves of parts that lag',
-    'even': 'size of the heat flow',
-    'play': 'hysteresis',
-}
 
 
 def render_page(
@@ -93,10 +70,10 @@ def render_page(
         _inertial(evidence),
         '<h2>Figures</h2>' if plates else '',
         *(figure(plate) for plate in plates),
-        _axes(evidence.calibration),
-        _steps(evidence),
-        _groups(evidence.calibration),
-        _positions(evidence),
+        axes_table(evidence.calibration),
+        steps_table(evidence),
+        groups_table(evidence.calibration),
+        positions_table(evidence),
         _bags(evidence),
         _footer(),
     ]
@@ -238,112 +215,6 @@ def _inertial(evidence: Evidence) -> str:
         texts=2,
         caption='Position error if the RMS residual were the constant error b of a horizontal '
         f'axis: b t²/2, and at most {SCHULER_PEAK_PER_MICRO_G:.1f} m per µg in a Schuler period.',
-    )
-
-
-def _axes(calibration: Calibration | None) -> str:
-    if calibration is None:
-        return ''
-    unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    rows = [
-        (
-            axis,
-            number(reference.scale_factor, 9),
-            number(reference.bias, 6),
-            number(reference.bias / reference.scale_factor / MICRO_G, 5),
-            number(density / MICRO_G),
-            *(f'{value:.6f}'.replace('-', '−') for value in row),
-        )
-        for axis, reference, density, row in zip(
-            AXES,
-            axes,
-            calibration.noise_density_m_s2_sqrt_hz,
-            calibration.misalignment,
-            strict=True,
-        )
-    ]
-    return '<h2>The unit at the reference temperature</h2>' + table(
-        (
-            'axis',
-            f'scale factor, {unit} per m/s²',
-            f'bias, {unit}',
-            'bias, µg',
-            'noise, µg/√Hz',
-            'M₁',
-            'M₂',
-            'M₃',
-        ),
-        rows,
-        caption='M, here by its columns, takes the sensitivity axes to the output frame.',
-    )
-
-
-def _steps(evidence: Evidence) -> str:
-    rows = [
-        (
-            one.section,
-            *(number(getattr(one, name).rms / MICRO_G) for name in _STEPS),
-            str(one.raw.n),
-        )
-        for one in evidence.steps
-        if one.raw.n
-    ]
-    if not rows:
-        return ''
-    return '<h2>What each step of the model leaves</h2>' + table(
-        ('section', *(f'{words}, µg' for words in _STEPS.values()), 'windows'),
-        rows,
-        caption='RMS of |g| − g over the windows of the fit. One set: a curve over temperature, '
-        'blind to the regime; two sets: one for each regime, as the paper has it; response: all '
-        'of the model. Left out: each position with what the other positions say of the unit, '
-        'which is what a new attitude will see.',
-    )
-
-
-def _groups(calibration: Calibration | None) -> str:
-    if calibration is None or not calibration.evidence:
-        return ''
-    return '<h2>What each part of the model explains</h2>' + table(
-        ('part', 'of the', 'explains, µg', 'parameters', 'log evidence'),
-        [
-            (
-                GROUP_WORDS.get(one.group, one.group),
-                one.part,
-                number(one.explains_m_s2 / MICRO_G),
-                f'{one.effective_parameters:.1f}',
-                f'{one.log_evidence_change:+.1f}'.replace('-', '−'),
-            )
-            for one in calibration.evidence
-        ],
-        texts=2,
-        caption='Explains: RMS of its share in the correction over the windows of the fit; shares '
-        'may cancel each other. Parameters: how many the data determine. Log evidence: by how '
-        'much it changes with this part; parts that lower it are dropped.',
-    )
-
-
-def _positions(evidence: Evidence) -> str:
-    if not evidence.positions:
-        return ''
-    shown = [*evidence.residuals, *([LEFT_OUT] if evidence.left_out else [])]
-    return '<h2>Positions</h2>' + table(
-        ('no.', 'bag', 'rest, min', 'up x', 'up y', 'up z', *(f'{r}, µg RMS' for r in shown)),
-        [
-            (
-                str(one.number),
-                evidence.bags[one.bag].name,
-                f'{one.duration_s / 60.0:.1f}',
-                *(f'{value:+.4f}'.replace('-', '−') for value in one.up),
-                *(number(one.residual_rms.get(rung, np.nan) / MICRO_G) for rung in shown),
-            )
-            for one in evidence.positions
-        ],
-        texts=2,
-        caption='Up: the direction of the specific force in the output frame. Left out: with what '
-        'the other positions say of the unit; – where it tells what no other does.'
-        if evidence.left_out
-        else 'Up: the direction of the specific force in the output frame.',
     )
 
 

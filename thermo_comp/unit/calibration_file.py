@@ -24,8 +24,8 @@ from .schema import SchemaError, build, json_schema, plain, required_keys
 from .version_1 import read_version_1
 
 #: With the whole bank of columns and one thermometer beside the board a calibration takes some
-#: 600 kB, nearly all of it the posterior; this is enough for two of them.
-SIZE_LIMIT = 1 << 21
+#: 900 kB, nearly all of it the posterior; this is enough for two of them.
+SIZE_LIMIT = 1 << 22
 
 
 def load_calibration(path: str | Path) -> Calibration:

@@ -1,0 +1,269 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The windows, the curves and the way back to a file: the fit means what the compensator does.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit, reduce_bag
+from thermo_comp.fitting.curves import sets_of
+from thermo_comp.fitting.reduction import ReducedBag
+from thermo_comp.fitting.windows import ThermalWindows, thermal_windows
+from thermo_comp.simulation import (
+    STANDARD_GRAVITY,
+    Position,
+    arrays,
+    parse_cyclogram,
+    positions,
+    unit_preset,
+)
+from thermo_comp.thermal.memory import MemorySpec, ThermalMemory, memory_on_grid
+from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
+from thermo_comp.thermal.state import Layout
+from thermo_comp.thermal.tracker import ThermalTracker
+from thermo_comp.typing import Floats
+from thermo_comp.unit.calibration import Calibration, parameter_layout
+from thermo_comp.unit.columns import ColumnTable, bank, memory_of
+from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
+
+PROGRAM = parse_cyclogram('20 10min, 35@1 10min, 15@1 10min')
+OPTIONS = FitOptions(gravity=STANDARD_GRAVITY)
+SECOND = 1_000_000_000
+
+
+def sources(n: int, seed: int = 1) -> list[FitSource]:
+    plan = [Position(f'bag{k}', PROGRAM, up) for k, up in enumerate(positions(n, seed))]
+    result = []
+    for record in arrays(unit_preset('own-lags', seed), plan, seed):
+        at = [
+            np.rint(1e9 * x).astype(np.int64)
+            for x in (record.time_s, record.board_time_s, record.case_time_s)
+        ]
+        block = ArrayBlock(at[0], record.counts, at[1], record.board, at[2], record.case)
+        result.append(FitSource(record.name, lambda block=block: [block]))
+    return result
+
+
+@pytest.fixture(scope='module')
+def bags() -> list[ReducedBag]:
+    return [reduce_bag(source, k, OPTIONS) for k, source in enumerate(sources(2))]
+
+
+def windows_of(bags: list[ReducedBag]) -> ThermalWindows:
+    return thermal_windows(
+        bags, bank(), sets_of(OPTIONS, bags), DetectorSettings(), ThermalConfig(), 20.0, 60.0
+    )
+
+
+def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(
+    rng: np.random.Generator,
+) -> None:
+    spec = MemorySpec(
+        ('case', 'tip'),
+        (('board', 60.0), ('board', 900.0), ('case', 240.0), ('tip', 7680.0)),
+        ((0.0, 0.4), (900.0, 0.8)),
+    )
+    n, step = 3000, 2
+    board = 20.0 + np.cumsum(0.03 * rng.standard_normal(n))
+    gradients = [np.cumsum(0.02 * rng.standard_normal(n)), 1.0 + 0.1 * rng.standard_normal(n)]
+    found = memory_on_grid(spec, float(step), board, gradients)
+    memory = ThermalMemory(spec)
+    for k in range(n):
+        stamp = k * step * SECOND
+        memory.board_step(stamp, float(board[k]))
+        for bank_, gradient in zip(memory.neighbours, gradients, strict=True):
+            bank_.step(stamp, float(gradient[k]))
+        row = memory.at(stamp, float(board[k]), [float(g[k]) for g in gradients])
+        if k % 100 == 99:
+            # The same recursion in another order of additions.
+            np.testing.assert_allclose(found[k], row, atol=1e-9)
+
+
+def test_columns_are_those_of_the_tracker(bags: list[ReducedBag]) -> None:
+    # Window by window against a tracker with its whole memory, read and sampled as online.
+    windows = windows_of(bags)
+    spec = memory_of(bank())
+    table = ColumnTable(bank(), spec, 20.0)
+    tracker = ThermalTracker(DetectorSettings(), spec, ThermalConfig())
+    bag = bags[0]
+    events = sorted(
+        [
+            (int(s), 'board', float(v))
+            for s, v in zip(bag.board.stamp_ns, bag.board.value, strict=True)
+        ]
+        + [
+            (int(s), 'case', float(v))
+            for s, v in zip(bag.case.stamp_ns, bag.case.value, strict=True)
+        ]
+    )
+    of_bag = windows.data.bag == 0
+    time, rows = windows.data.time[of_bag], windows.data.columns[of_bag]
+    grid = np.arange(int(bag.board.stamp_ns[0]), bag.end_ns, SECOND)
+    states, reading = [], 0
+    for stamp in grid.tolist():
+        while reading < len(events) and events[reading][0] <= stamp:
+            at, name, value = events[reading]
+            tracker.read(name, at, value)
+            reading += 1
+        states.append(tracker.sample(stamp))
+    phi = np.column_stack(table.values(tuple(np.array(states).T)))
+    seconds = (grid - bag.start_ns) * 1e-9
+    n_sets = rows.shape[1] - phi.shape[1]
+    # Means over the windows of a minute.
+    mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
+    scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
+    late = time > 300.0
+    # The lags run on the tracker's estimates here and on its readings there, plays turn at once
+    # or a window's part later.
+    np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
+
+
+def test_sets_and_start_states_by_hand(bags: list[ReducedBag]) -> None:
+    windows = windows_of(bags)
+    data = windows.data
+    t, w = windows.temperature - 20.0, windows.weight
+    assert data.groups[:6] == ('curve',) * 3 + ('set',) * 3
+    # Means of products are those of the means, but for what happens within a minute at 1 K/min.
+    np.testing.assert_allclose(data.columns[:, 0], t, atol=1e-9)
+    np.testing.assert_allclose(data.columns[:, 1], t * t, atol=0.3)
+    np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
+    assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
+    # What is not known of a lag's start fades with its time constant; t multiplies it in products.
+    taus = [tau for _, tau in memory_of(bank()).lags]
+    for k, column in enumerate(bank(), start=6):
+        lag = data.lag[k]
+        if lag < 0:
+            assert not data.start[:, k].any()
+            continue
+        fades = np.exp(-data.time / taus[lag])
+        if column.kind in ('board', 'neighbour') and column.power == 0:
+            np.testing.assert_allclose(data.start[:, k], fades, atol=0.15)
+        assert np.abs(data.start[-1, k]) <= np.abs(data.start[:, k]).max()
+
+
+def test_the_lag_of_a_column_moves_it_as_its_start_says(bags: list[ReducedBag]) -> None:
+    # A lag that began half a kelvin elsewhere, through the columns' own formula.
+    spec = memory_of(bank())
+    layout, table = Layout(spec), ColumnTable(bank(), spec, 20.0)
+    state = np.zeros(layout.width)
+    state[0] = 27.0
+    for lag, place in layout.lags.items():
+        state[place] = 0.3 + 1e-4 * lag[1]
+    before = np.array(table.values(tuple(state)))
+    for column_number, column in enumerate(bank()):
+        if not column.lag or column.kind == 'play':
+            continue
+        moved = state.copy()
+        moved[layout.lags[column.lag]] += 1e-6
+        slope = (
+            np.array(table.values(tuple(moved)))[column_number] - before[column_number]
+        ) / 1e-6
+        u = state[layout.lags[column.lag]]
+        expected = (2.0 * u if column.kind == 'square' else 1.0) * 7.0**column.power
+        assert slope == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ('options', 'static', 'dynamic', 'is_shared'),
+    [
+        ({}, Polynomial, 2, True),
+        ({'static_curve': 'quadratic'}, Polynomial, 2, True),
+        ({'model': 'golovach'}, Polynomial, 2, False),
+        ({'static_curve': 'spline'}, CubicSpline, None, False),
+        ({'static_curve': 'exponential'}, Exponential, 2, False),
+        ({'static_curve': 'linear', 'dynamic_curve': 'linear'}, Polynomial, 1, False),
+    ],
+)
+def test_curves(bags, options, static, dynamic, is_shared) -> None:  # type: ignore[no-untyped-def]
+    found = sets_of(replace(OPTIONS, **options), bags)
+    assert isinstance(found.static, static)
+    assert found.is_shared == is_shared
+    assert dynamic is None or found.dynamic.n_free == dynamic
+    t = np.linspace(-5.0, 15.0, 9)
+    weight = np.linspace(0.0, 1.0, 9)
+    columns, groups = found.columns(t, weight)
+    assert len(columns) == len(groups) == found.static.n_free + 1 + found.dynamic.n_free
+    # At the reference nothing is said; in the static regime nothing of the dynamic set.
+    nothing, _ = found.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
+    levels = [is_level for _, is_level in found.levels()]
+    for column, is_level in zip(nothing, levels, strict=True):
+        np.testing.assert_allclose(column, [0.0, 0.5, 1.0] if is_level else 0.0, atol=1e-12)
+    assert all(column[0] == 0.0 for column in columns[found.static.n_free :])
+
+
+@pytest.fixture(scope='module', params=['golovach', 'exponential'])
+def result(request: pytest.FixtureRequest) -> FitResult:
+    if request.param == 'golovach':
+        return fit(sources(12), replace(OPTIONS, model='golovach'))
+    groups = ('curve', 'set', 'board')
+    return fit(sources(12), replace(OPTIONS, static_curve=request.param, groups=groups))
+
+
+def states_of(windows: ThermalWindows, calibration: Calibration) -> tuple[Floats, ...]:
+    """States that have the windows' raw columns in their places."""
+    columns = calibration.response
+    spec = memory_of(columns)
+    layout = Layout(spec)
+    states = np.zeros((len(windows.temperature), layout.width))
+    states[:, 0], states[:, 3] = windows.temperature, windows.weight
+    raw = dict(zip(bank(), windows.raw.T, strict=True)) if windows.raw.size else {}
+    plain = {(c.kind, c.sensor, c.tau_s, c.width_k): value for c, value in raw.items()}
+    for (tau, width), place in layout.plays.items():
+        states[:, place] = plain['play', 'case', tau, width]
+    for (name, tau), place in layout.lags.items():
+        kind = 'board' if name == 'board' else 'neighbour'
+        states[:, place] = plain.get((kind, 'case', tau, 0.0), 0.0)
+    for place in layout.gradients.values():
+        states[:, place] = windows.gradient
+    return tuple(states.T)
+
+
+def test_the_file_corrects_as_the_regression(result: FitResult) -> None:
+    # Curves, sets and linear columns through the calibration's own correction. Windows are means
+    # over a minute: powers of means are not means of powers, which at 1 K/min is some ppm.
+    windows, calibration = result.windows, result.calibration
+    state, prior = result.learnt.posterior.state, result.learnt.prior
+    correction = Correction(calibration)
+    pairs = correction.bias_scale(states_of(windows, calibration))
+    force = np.column_stack(
+        [(windows.data.mean[:, k] - bias) / scale for k, (bias, scale) in enumerate(pairs)]
+    )
+    force = force @ np.array(calibration.misalignment).T
+    up = state.up[windows.data.position]
+    left = force - STANDARD_GRAVITY * up
+    along = np.sum(left * up, axis=1)
+    report = next(row for row in result.residuals if row.section == 'all')
+    assert np.sqrt(np.mean(along**2)) < 1.3 * report.fitted.rms + 5e-6
+    assert prior.sigma.min() > 0.0
+
+
+def test_covariance_of_the_file_is_that_of_the_posterior(result: FitResult) -> None:
+    # The variance of the bias at some state, through the file's parameters and through the
+    # regression's: the same linear form of the same posterior.
+    calibration, posterior = result.calibration, result.learnt.posterior
+    assert calibration.posterior is not None
+    layout = parameter_layout(calibration)
+    covariance = calibration.posterior.covariance()
+    assert covariance.shape == (layout.n_parameters, layout.n_parameters)
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    nominal = np.array([axis.scale_factor for axis in axes]) / posterior.state.kappa
+    for axis in range(3):
+        at = posterior.layout.bias[axis]
+        expected = np.sqrt(posterior.covariance[at, at]) * nominal[axis]
+        found = np.sqrt(covariance[layout.bias[axis].static, layout.bias[axis].static])
+        assert found == pytest.approx(expected, rel=1e-4)
+        at = posterior.layout.kappa[axis]
+        expected = np.sqrt(posterior.covariance[at, at]) / posterior.state.kappa[axis]
+        found = np.sqrt(covariance[layout.scale[axis].static, layout.scale[axis].static])
+        assert found == pytest.approx(expected, rel=1e-4)
+    skew = posterior.layout.skew[[0, 2]]
+    sd = np.sqrt(np.diag(covariance)[-3:][[0, 2]])
+    np.testing.assert_allclose(sd, np.sqrt(posterior.variance[skew]), rtol=1e-4)
