@@ -63,7 +63,9 @@ class Desk:
         elif name in ('unit01.yaml', 'unit02.yaml', 'unit03.yaml'):
             self._make('unit42.yaml')
             text = (self._ready / 'unit42.yaml').read_text()
-            path.write_text(re.sub(r'serial: .*?([,}\n])', rf'serial: {path.stem}\1', text, count=1))
+            path.write_text(
+                re.sub(r'serial: .*?([,}\n])', rf'serial: {path.stem}\1', text, count=1)
+            )
         elif name == 'autopilot.params':
             self._make('unit42.yaml')
             self._cli('export', self._ready / 'unit42.yaml', '--to', 'px4', '-o', path, '-q')

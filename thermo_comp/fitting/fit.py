@@ -380,8 +380,9 @@ def _wide_prior(
         # Too few attitudes to tell it from the bias: the curve stays at its prior.
         in_scale &= is_curve
         scale_wide = np.ones(len(groups))
-    # The paper's sets stay whatever they earn: their prior says nothing.
-    wide = 50.0 if options.model == 'golovach' else 1.0
+    if options.model == 'golovach':
+        # The paper's sets stay whatever they earn: their prior says nothing.
+        wide, scale_wide = 50.0 * wide, 50.0 * scale_wide
     return Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, _BIAS_SD),

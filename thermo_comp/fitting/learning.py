@@ -44,9 +44,9 @@ _EARNED = 0.5
 # No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
 _LEAST_SIGMA = 1e-8
 # Of the noise of a window, what a column may add unseen before it counts.
-_OPEN = 1.0
+_OPEN = 0.3
 # Windows more sds off than this lose weight.
-_FAR_SDS = 3.0
+_FAR_SDS, _FARTHEST_SDS = 3.0, 1e3
 # ... as seen against the median of so many windows on both sides.
 _NEIGHBOURS = 3
 
@@ -310,10 +310,11 @@ def _downweight(regression: Regression, posterior: Posterior) -> None:
     for part in np.split(size, edges):
         if len(part) >= 2 * _NEIGHBOURS + 1:
             around = np.pad(part, ((_NEIGHBOURS, _NEIGHBOURS), (0, 0)), mode='reflect')
-            part -= np.median(sliding_window_view(around, 2 * _NEIGHBOURS + 1, axis=0), axis=-1)
+            usual = sliding_window_view(around, 2 * _NEIGHBOURS + 1, axis=0)
+            np.subtract(part, np.median(usual, axis=-1), out=part)
     size = np.abs(size)
     usual = 1.4826 * np.median(size, axis=0)
-    size = size / np.maximum(usual, 1e-300)
+    size = np.minimum(size / np.maximum(usual, 1e-300), _FARTHEST_SDS)
     regression.reweight(base * (_FAR_SDS / np.maximum(size, _FAR_SDS)) ** 2)
 
 
