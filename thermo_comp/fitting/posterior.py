@@ -21,15 +21,14 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from ..typing import Floats, Ints
+from .design import Design
 from .factor import JITTER, Factor
-from .unknowns import Layout, Prior, State, Windows, inverse_misalignment, tangent_basis
-from .whitening import Whitener
+from .unknowns import Layout, Prior, State, inverse_misalignment, tangent_basis
 
 # Of what is known of a direction, the least that is left without one position.
 _LEAST_LEFT = 1e-5
@@ -73,20 +72,6 @@ class Posterior:
 
 
 @dataclass(frozen=True)
-class _Whitened:
-    """
-    Base columns of one axis, filtered; their Gram matrix in each position.
-
-    """
-
-    rho: float
-    gains: tuple[Floats, Floats]
-    base: Floats
-    grams: Floats
-    determinant: float
-
-
-@dataclass(frozen=True)
 class _Equations:
     """
     Of one linearisation: Hessian and gradient, residuals, whitened ones, minus twice the
@@ -101,237 +86,11 @@ class _Equations:
     size: float
 
 
-class Regression:
+class Regression(Design):
     """
-    The data of a fit, whitened once for each noise, and the Gauss-Newton on it.
-
-    Parameters
-    ----------
-    windows : Windows
-        The data.
-    gravity : float
-        Local gravity.
-    nominal_scale : ndarray, shape (3,)
-        K0 [input units per m/s^2].
+    The Gauss-Newton on the data of a fit; see `Design` for the parameters.
 
     """
-
-    def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:
-        self.windows = windows
-        self.gravity = gravity
-        self.measured = windows.mean / nominal_scale
-        self.rms = np.sqrt(np.mean(windows.columns**2, axis=0))
-        self.rms[self.rms == 0.0] = 1.0
-        self.weight = np.repeat(windows.weight[:, None], 3, axis=1)
-        self._whitener = Whitener(windows.position, windows.time)
-        self._columns = windows.columns / self.rms
-        # Start states move few distinct series: one per lag and power of t.
-        # What has died away is 0: numbers near the smallest that there are cost a hundred-fold.
-        self._start = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
-        self.moved = np.flatnonzero(windows.lag >= 0)
-        self._base = np.hstack(
-            (np.ones((len(windows.time), 1)), self._columns, self._start[:, self.moved])
-        )
-        edges = np.searchsorted(windows.position, np.arange(windows.n_positions + 1))
-        self._rows = [slice(a, b) for a, b in pairwise(edges.tolist())]
-        self._bags = windows.bag_of_position
-        self.n_bags = int(windows.bag.max()) + 1
-        n_lags = len(windows.start_covariance)
-        self._start_information: Floats = np.asarray(
-            np.linalg.inv(windows.start_covariance) if n_lags else np.zeros((0, 0)), np.float64
-        )
-        self._cache: list[_Whitened | None] = [None] * 3
-
-    def reweight(self, weight: Floats) -> None:
-        """
-        Take other weights of the windows, shape (n, 3).
-
-        """
-        self.weight = weight
-        self._cache = [None] * 3
-
-    def _whitened(self, axis: int, rho: float) -> _Whitened:
-        found = self._cache[axis]
-        if found is None or found.rho != rho:
-            gains = self._whitener.gains(self.weight[:, axis], rho)
-            base = self._whitener.filter(self._base, gains)
-            grams = np.stack([base[rows].T @ base[rows] for rows in self._rows])
-            determinant = self._whitener.log_determinant(gains)
-            found = self._cache[axis] = _Whitened(rho, gains, base, grams, determinant)
-        return found
-
-    def plain_prior(self) -> Prior:
-        """
-        Make a prior in which every column takes part, of widths that say nothing.
-
-        """
-        n = len(self.windows.groups)
-        return Prior(
-            bias_mean=np.zeros(3),
-            bias_sd=np.ones(3),
-            scale_sd=1.0,
-            skew_sd=1.0,
-            on_bias=np.ones(n),
-            on_scale=self.windows.in_scale.astype(np.float64),
-            offset_sd=1e-6,
-            sigma=np.full(3, 1e-5),
-            rho=np.zeros(3),
-        )
-
-    def layout(self, prior: Prior) -> Layout:
-        """
-        Give every unknown its place, those of the unit first; -1 for columns that take no part.
-
-        """
-        n_columns = len(self.windows.groups)
-        n = 0
-
-        def take(*shape: int) -> Ints:
-            nonlocal n
-            size = int(np.prod(shape))
-            n += size
-            return np.arange(n - size, n).reshape(shape)
-
-        uses = {'bias': prior.on_bias > 0.0, 'scale': prior.on_scale > 0.0}
-        n_axis = 2 + sum(int(used.sum()) for used in uses.values())
-        axis = take(3, n_axis)
-        n_bias = int(uses['bias'].sum())
-        on_bias, on_scale = np.full((2, 3, n_columns), -1)
-        on_bias[:, uses['bias']] = axis[:, 2 : 2 + n_bias]
-        on_scale[:, uses['scale']] = axis[:, 2 + n_bias :]
-        skew = take(3)
-        n_unit = n
-        n_positions = self.windows.n_positions
-        moves = uses['bias'] | uses['scale']
-        n_lags = len(self.windows.start_covariance) if (self.windows.lag[moves] >= 0).any() else 0
-        up = np.empty((n_positions, 2), dtype=np.int64)
-        offset = np.empty((n_positions, 3), dtype=np.int64)
-        start = np.empty((self.n_bags, n_lags), dtype=np.int64)
-        blocks = []
-        for bag in range(self.n_bags):
-            first = n
-            for p in np.flatnonzero(self._bags == bag):
-                up[p], offset[p] = take(2), take(3)
-            start[bag] = take(n_lags)
-            blocks.append(slice(first, n))
-        return Layout(
-            axis[:, 0],
-            axis[:, 1],
-            on_bias,
-            on_scale,
-            skew,
-            up,
-            offset,
-            start,
-            axis,
-            n_unit,
-            tuple(blocks),
-            n,
-        )
-
-    def precision(self, prior: Prior, layout: Layout) -> Floats:
-        """
-        Inverse variances of the prior, shape (n,); where there is a matrix instead, 0.
-
-        """
-        result = np.zeros(layout.n + 1)
-        result[layout.kappa] = prior.scale_sd**-2
-        result[layout.bias] = prior.bias_sd**-2.0
-        for places, sd in ((layout.on_bias, prior.on_bias), (layout.on_scale, prior.on_scale)):
-            used = sd > 0.0
-            result[places[:, used]] = sd[used] ** -2.0
-        result[layout.skew] = prior.skew_sd**-2
-        if prior.known is not None:
-            result[: layout.n_unit] = 0.0
-        result[layout.offset] = prior.offset_sd**-2
-        return result[:-1]
-
-    def _inform(self, prior: Prior, layout: Layout) -> list[tuple[slice, Floats]]:
-        """
-        Give what the prior has as matrices: where, and the inverse covariance.
-
-        """
-        result: list[tuple[slice, Floats]] = []
-        if prior.known is not None:
-            result.append((slice(0, layout.n_unit), prior.known.precision))
-        result += [
-            (slice(places[0], places[-1] + 1), self._start_information)
-            for places in layout.start
-            if len(places)
-        ]
-        return result
-
-    def prior_mean(self, prior: Prior, layout: Layout) -> Floats:
-        """
-        Mean of the prior; 0 for all but kappa and bias, shape (n,).
-
-        """
-        mean = np.zeros(layout.n)
-        if prior.known is not None:
-            mean[: layout.n_unit] = prior.known.mean
-            return mean
-        mean[layout.kappa] = 1.0
-        mean[layout.bias] = prior.bias_mean
-        return mean
-
-    def vector(self, state: State, layout: Layout) -> Floats:
-        """
-        Give the unknowns as a vector; attitudes as 0, they move in the tangent plane.
-
-        """
-        result = np.zeros(layout.n + 1)
-        for name in ('kappa', 'bias', 'on_bias', 'on_scale', 'skew', 'offset'):
-            result[getattr(layout, name)] = getattr(state, name)
-        if layout.start.size:
-            result[layout.start] = state.start
-        return result[:-1]
-
-    def _moved(self, state: State, step: Floats, layout: Layout) -> State:
-        padded = np.append(step, 0.0)
-        up = state.up + np.einsum('pij,pj->pi', tangent_basis(state.up), padded[layout.up])
-        start = state.start
-        if layout.start.size:
-            start = start + padded[layout.start]
-        return State(
-            kappa=state.kappa + padded[layout.kappa],
-            bias=state.bias + padded[layout.bias],
-            on_bias=np.where(layout.on_bias >= 0, state.on_bias + padded[layout.on_bias], 0.0),
-            on_scale=np.where(layout.on_scale >= 0, state.on_scale + padded[layout.on_scale], 0.0),
-            skew=state.skew + padded[layout.skew],
-            up=up / np.linalg.norm(up, axis=1, keepdims=True),
-            offset=state.offset + padded[layout.offset],
-            start=start,
-        )
-
-    def _combination(self, state: State, p: int, axis: int, force: float) -> Floats:
-        """
-        Predict one position and axis, as a combination of the base columns.
-
-        """
-        n_columns = len(self.windows.groups)
-        # Eq. (7) with (8) and (9): bias, and scale times input.
-        weight = state.on_bias[axis] + state.kappa[axis] * force * state.on_scale[axis]
-        result = np.zeros(self._base.shape[1])
-        result[0] = state.kappa[axis] * force + state.bias[axis] + state.offset[p, axis]
-        result[1 : n_columns + 1] = weight
-        moved = self.moved
-        result[n_columns + 1 :] = (
-            weight[moved] * state.start[self._bags[p]][self.windows.lag[moved]]
-        )
-        return result
-
-    def residual(self, state: State) -> Floats:
-        """
-        Measured minus predicted, shape (n, 3) [m/s^2].
-
-        """
-        force = self.gravity * state.up @ inverse_misalignment(state.skew).T
-        result = np.empty_like(self.measured)
-        for p, rows in enumerate(self._rows):
-            for axis in range(3):
-                combination = self._combination(state, p, axis, float(force[p, axis]))
-                result[rows, axis] = self.measured[rows, axis] - self._base[rows] @ combination
-        return result
 
     def _equations(self, state: State, prior: Prior, layout: Layout) -> _Equations:
         """
@@ -535,15 +294,6 @@ class Regression:
         step = np.zeros(layout.n)
         step[:n] = -root @ (directions @ ((directions.T @ (root.T @ pull)) / left))
         return self._moved(posterior.state, step, layout)
-
-    def force(self, state: State) -> Floats:
-        """
-        Correct the windows as the compensator would: offsets and start states unknown, (n, 3).
-
-        """
-        along = self.measured - state.bias - self._columns @ state.on_bias.T
-        along /= state.kappa * (1.0 + self._columns @ state.on_scale.T)
-        return np.asarray(along @ np.linalg.inv(inverse_misalignment(state.skew)).T)
 
     def solve(
         self, state: State, prior: Prior, n_steps: int = 6, tolerance: float = 1e-3
