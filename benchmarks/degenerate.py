@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -77,6 +78,19 @@ class Run:
     is_bad: bool
 
 
+def _peak_megabytes(pid: int) -> float:
+    """
+    Largest resident size so far; 0 once the process has ended.
+
+    """
+    try:
+        status = Path(f'/proc/{pid}/status').read_text()
+    except OSError:
+        return 0.0
+    found = re.search(r'VmHWM:\s+(\d+) kB', status)
+    return int(found[1]) / 1024 if found else 0.0
+
+
 def run(name: str, command: str, path: Path, out: Path) -> Run:
     """
     Run one command to its end, or until its time is over.
@@ -94,18 +108,20 @@ def run(name: str, command: str, path: Path, out: Path) -> Run:
     resource.prlimit(process.pid, resource.RLIMIT_DATA, (KILL_MB << 20, KILL_MB << 20))
     code: int | None = None
     pid = 0
+    megabytes = 0.0
     while not pid and time.monotonic() - began < LIMIT_S:
-        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+        # Of what wait4 tells, the memory begins with that of the process which started it.
+        megabytes = max(megabytes, _peak_megabytes(process.pid))
+        pid, status, _ = os.wait4(process.pid, os.WNOHANG)
         time.sleep(0.01)
     if pid:
         code = os.waitstatus_to_exitcode(status)
     else:
         process.kill()
-        _, _, usage = os.wait4(process.pid, 0)
+        os.wait4(process.pid, 0)
     process.returncode = -9 if code is None else code
     lines = log.read_text('utf-8', 'replace').strip().splitlines()
     said = ' | '.join(lines[-2:])
-    megabytes = usage.ru_maxrss / 1024
     is_bad = (
         code not in {0, 1}
         or megabytes > LIMIT_MB

@@ -21,6 +21,7 @@ from pyarrow import parquet
 from thermo_comp.convert import ColumnMap, table_log, write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import open_recording
+from thermo_comp.unit.schema import build
 
 #: One for all inputs of a process.
 FOLDER = tempfile.TemporaryDirectory(prefix='fuzz-')
@@ -98,7 +99,7 @@ def _check_table(name: str, data: bytes) -> None:
     path.write_bytes(data)
 
     def convert() -> None:
-        report = write_log(table_log(path, ColumnMap.model_validate(MAP)), output, force=True)
+        report = write_log(table_log(path, build(ColumnMap, MAP)), output, force=True)
         lost = (report.short_rows, report.non_numeric, report.out_of_range)
         assert report.accel_messages + sum(one.count for one in lost) == report.rows
 

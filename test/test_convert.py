@@ -24,6 +24,7 @@ from thermo_comp.replay import replay
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
+from thermo_comp.unit.schema import build
 
 ROOT = Path(__file__).resolve().parent.parent
 STEP_NS = 10_000_000
@@ -61,7 +62,7 @@ def column_map(**changes: object) -> ColumnMap:
         'serial': 'unit7',
         'frame_id': 'here',
     }
-    return ColumnMap.model_validate({**data, **changes})
+    return build(ColumnMap, {**data, **changes})
 
 
 def test_round_trip_through_the_bag(tmp_path: Path) -> None:
@@ -458,11 +459,12 @@ def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> 
         pq.write_table(pa.table(columns), path)
         return path
 
-    chart = ColumnMap.model_validate(
+    chart = build(
+        ColumnMap,
         {
             'stamp': {'column': 't', 'unit': unit},
             'accel': {'columns': ('x', 'x', 'x'), 'unit': 'm/s^2', 'output': 'imu'},
-        }
+        },
     )
     for stamps in (rows, good + bad[1:]):
         report = write_log(table_log(written(stamps), chart), tmp_path / 'bag.mcap', force=True)
