@@ -36,7 +36,7 @@ rosbag2_bagfile_information:
 """
 MAP = {
     'stamp': {'column': 0, 'unit': 'ns'},
-    'accel': {'columns': (1, 2, 3), 'unit': 'counts', 'output': 'counts'},
+    'accel': {'columns': [1, 2, 3], 'unit': 'counts', 'output': 'counts'},
     'board': {'column': 4},
 }
 #: No message of ours is shorter; zstd makes at most 30 kB of a byte.

@@ -56,7 +56,7 @@ def table(path: Path, n: int = 400, scale: float = 1.0) -> tuple[Path, dict[str,
 def column_map(**changes: object) -> ColumnMap:
     data: dict[str, object] = {
         'stamp': {'column': 'ms', 'unit': 'ms'},
-        'accel': {'columns': ('ax', 'ay', 'az'), 'unit': 'g', 'output': 'imu'},
+        'accel': {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'},
         'board': {'column': 'board'},
         'case': {'column': 'case'},
         'serial': 'unit7',
@@ -67,7 +67,7 @@ def column_map(**changes: object) -> ColumnMap:
 
 def test_round_trip_through_the_bag(tmp_path: Path) -> None:
     path, columns = table(tmp_path / 'log.csv')
-    gyro = {'columns': ('wx', 'wy', 'wz'), 'unit': 'deg/s'}
+    gyro = {'columns': ['wx', 'wy', 'wz'], 'unit': 'deg/s'}
     report = write_log(table_log(path, column_map(gyro=gyro)), tmp_path / 'bag')
     recording = read_recording(tmp_path / 'bag')
     block = recording.columns
@@ -76,12 +76,12 @@ def test_round_trip_through_the_bag(tmp_path: Path) -> None:
     assert recording.info.metadata['converted_from'] == 'log.csv'
     assert block.frame_id == 'here'
     assert block.accel_stamp_ns.tolist() == (columns['ms'] * 10**6).tolist()
-    expected = np.column_stack([columns[k] for k in ('ax', 'ay', 'az')]) * STANDARD_GRAVITY
+    expected = np.column_stack([columns[k] for k in ['ax', 'ay', 'az']]) * STANDARD_GRAVITY
     np.testing.assert_array_equal(block.accel, expected)
     assert block.imu is not None
     np.testing.assert_allclose(
         np.degrees(block.imu.angular_velocity),
-        np.column_stack([columns[k] for k in ('wx', 'wy', 'wz')]),
+        np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
         rtol=1e-14,  # one rounding in each direction
     )
     # The orientation is not there and says so; the rate is there with a covariance not known.
@@ -109,7 +109,7 @@ def test_without_gyro_the_message_says_so(tmp_path: Path) -> None:
 
 def test_counts_stay_counts(tmp_path: Path) -> None:
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
-    accel = {'columns': ('ax', 'ay', 'az'), 'unit': 'counts', 'output': 'counts'}
+    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'counts'}
     write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag.mcap')
     block = read_recording(tmp_path / 'bag.mcap').columns
     np.testing.assert_array_equal(block.accel[:, 0], columns['ax'])
@@ -118,7 +118,7 @@ def test_counts_stay_counts(tmp_path: Path) -> None:
 
 def test_counts_become_an_imu_with_a_sensitivity(tmp_path: Path) -> None:
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
-    accel = {'columns': ('ax', 'ay', 'az'), 'unit': 'counts', 'output': 'imu'}
+    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'imu'}
     write_log(
         table_log(path, column_map(accel={**accel, 'counts_per_g': 2048.0})), tmp_path / 'bag'
     )
@@ -141,7 +141,7 @@ def test_every_odd_row_is_accounted_for(tmp_path: Path) -> None:
     lines[51] = lines[50]
     lines[400] = '4990.0,0.6'
     path.write_text('\n'.join(lines))
-    accel = {'columns': ('ax', 'ay', 'az'), 'unit': 'g', 'output': 'imu', 'clip': (-1.99, 1.99)}
+    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu', 'clip': (-1.99, 1.99)}
     report = write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag')
     block = read_recording(tmp_path / 'bag').columns
     assert report.rows == 400
@@ -201,7 +201,7 @@ def test_implausible_temperatures_are_refused(tmp_path: Path) -> None:
 
 def test_a_wrong_unit_is_refused_with_the_reason(tmp_path: Path) -> None:
     path, _ = table(tmp_path / 'log.csv')
-    accel = {'columns': ('ax', 'ay', 'az'), 'unit': 'm/s^2', 'output': 'imu'}
+    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'm/s^2', 'output': 'imu'}
     with pytest.raises(RecordingError, match=r'stated in m/s\^2, but .*looks like g'):
         write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag')
 
@@ -463,7 +463,7 @@ def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> 
         ColumnMap,
         {
             'stamp': {'column': 't', 'unit': unit},
-            'accel': {'columns': ('x', 'x', 'x'), 'unit': 'm/s^2', 'output': 'imu'},
+            'accel': {'columns': ['x', 'x', 'x'], 'unit': 'm/s^2', 'output': 'imu'},
         },
     )
     for stamps in (rows, good + bad[1:]):
