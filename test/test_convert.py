@@ -141,7 +141,7 @@ def test_every_odd_row_is_accounted_for(tmp_path: Path) -> None:
     lines[51] = lines[50]
     lines[400] = '4990.0,0.6'
     path.write_text('\n'.join(lines))
-    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu', 'clip': (-1.99, 1.99)}
+    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu', 'clip': [-1.99, 1.99]}
     report = write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag')
     block = read_recording(tmp_path / 'bag').columns
     assert report.rows == 400
