@@ -38,10 +38,7 @@ EXTRAS = {
 
 
 def shared(folder, *patterns):
-    """
-    Pair a folder of the source with its place under share/.
-
-    """
+    """Pair a folder of the source with its place under share/."""
     files = sorted(
         str(path.relative_to(ROOT))
         for pattern in patterns
@@ -80,7 +77,7 @@ setup(
         'console_scripts': [
             'thermo_comp = thermo_comp.cli.app:main',
             'thermo_comp_node = thermo_comp.ros.node:main',
-        ],
+        ]
     },
     zip_safe=True,
 )

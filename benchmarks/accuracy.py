@@ -9,7 +9,6 @@ Run ``python benchmarks/accuracy.py`` for everything, or a part with fewer units
 Every fit sees a whole test in unknown attitudes and is applied by the compensator to the plan
 'held-out' (other ramps, other soaks, other attitudes); errors are those of 60 s means, in
 micro-g, against the simulated truth. The floor is what the true model leaves on the same noise.
-
 """
 
 from __future__ import annotations
@@ -47,7 +46,6 @@ N_SIBLINGS = 10
 class Goal:
     """
     What must be reached, worst unit: |g| and vector RMS in micro-g, or relative to the floor.
-
     """
 
     norm: float
@@ -80,17 +78,11 @@ PLAN_GOALS = {
 
 @dataclass(frozen=True)
 class Block(ArrayBlock):
-    """
-    A record as the recording layer would hand it over.
-
-    """
+    """A record as the recording layer would hand it over."""
 
     @property
     def temperatures(self) -> dict[str, tuple[Ints, Floats, Ints]]:
-        """
-        Readings by the name of their thermometer, with the samples that came before.
-
-        """
+        """Readings by the name of their thermometer, with the samples that came before."""
         readings = {
             'board': (self.board_stamp_ns, self.board),
             'case': (self.case_stamp_ns, self.case),
@@ -102,10 +94,7 @@ class Block(ArrayBlock):
 
 
 def block(record: Record) -> Block:
-    """
-    Return one record as a block.
-
-    """
+    """Return one record as a block."""
     accel, board, case = (
         np.rint(1e9 * time_s).astype(np.int64)
         for time_s in (record.time_s, record.board_time_s, record.case_time_s)
@@ -137,10 +126,7 @@ class Corrected:
 
 
 def fitted(records: Sequence[Record], **options: Any) -> Calibration:
-    """
-    Fit one test.
-
-    """
+    """Fit one test."""
     sources = [FitSource(record.name, lambda record=record: [block(record)]) for record in records]
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, **options)).calibration
 
@@ -148,10 +134,7 @@ def fitted(records: Sequence[Record], **options: Any) -> Calibration:
 def fit_and_correct(
     records: Sequence[Record], test_records: Sequence[Record], **options: Any
 ) -> Corrected:
-    """
-    Fit on one test and apply to another.
-
-    """
+    """Fit on one test and apply to another."""
     began = time.perf_counter()
     calibration = fitted(records, **options)
     took = time.perf_counter() - began
@@ -183,10 +166,7 @@ def fit_and_correct(
 
 @dataclass(frozen=True)
 class Errors:
-    """
-    RMS over all windows of the test: |g|, its peak, the vector [ug], and error / claimed sd.
-
-    """
+    """RMS over all windows of the test: |g|, its peak, the vector [ug], and error / claimed sd."""
 
     norm: float
     peak: float
@@ -195,10 +175,7 @@ class Errors:
 
 
 def errors(found: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[Record]) -> Errors:
-    """
-    Compare with the truth.
-
-    """
+    """Compare with the truth."""
     vector = [one - record.specific_force for one, record in zip(found, tests, strict=True)]
     norm = np.concatenate([np.linalg.norm(one, axis=1) for one in found]) - STANDARD_GRAVITY
     ratio = np.concatenate([e / s for e, s in zip(vector, sd, strict=True)])
@@ -211,19 +188,13 @@ def errors(found: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[Record
 
 
 def floor(unit: UnitModel, tests: Sequence[Record]) -> Errors:
-    """
-    Return what the true model leaves on the same noise.
-
-    """
+    """Return what the true model leaves on the same noise."""
     found = [record.corrected_by_truth(unit) for record in tests]
     return errors(found, [np.ones_like(one) for one in found], tests)
 
 
 def judged(found: Errors, goal: Goal | None, least: Errors) -> str:
-    """
-    Return |g| and vector RMS as a cell, with a mark where they miss the goal.
-
-    """
+    """Return |g| and vector RMS as a cell, with a mark where they miss the goal."""
     cell = f'{found.norm:.2f} / {found.vector:.2f}'
     if goal is None:
         return cell
@@ -237,10 +208,7 @@ def _rms(values: Floats) -> float:
 
 
 def part_kinds(options: argparse.Namespace) -> None:
-    """
-    Units of every kind of physics, on a test that the fit never saw.
-
-    """
+    """Units of every kind of physics, on a test that the fit never saw."""
     print(
         '| unit | seed | floor: norm / vector | golovach | fit | peak | error / claimed sd '
         '| fit s |'
@@ -268,10 +236,7 @@ def part_kinds(options: argparse.Namespace) -> None:
 
 
 def part_plans(options: argparse.Namespace) -> None:
-    """
-    Little time in the chamber, alone and with the prior of ten siblings.
-
-    """
+    """Little time in the chamber, alone and with the prior of ten siblings."""
     print('| test | unit | seed | floor | alone | with siblings | error / claimed sd, both |')
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):
@@ -305,10 +270,7 @@ def part_plans(options: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    """
-    Run the parts asked for.
-
-    """
+    """Run the parts asked for."""
     parts = {'kinds': part_kinds, 'plans': part_plans}
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

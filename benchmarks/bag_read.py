@@ -9,7 +9,6 @@ Rates are counts messages per second of wall time, best of the repeats; what mat
 Ours uses two threads beside its own, so on a busy machine compare the CPU times.
 
     python benchmarks/bag_read.py --samples 1000000
-
 """
 
 from __future__ import annotations
@@ -38,10 +37,7 @@ COMPRESSIONS = ('none', 'lz4', 'zstd')
 
 
 def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
-    """
-    Write n counts messages and their temperatures.
-
-    """
+    """Write n counts messages and their temperatures."""
     rng = np.random.default_rng(1)
     block = 1 << 17
     with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes) as bag:
@@ -58,27 +54,18 @@ def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
 
 
 def read_ours_whole(path: Path) -> int:
-    """
-    Read the whole bag into memory.
-
-    """
+    """Read the whole bag into memory."""
     return len(read_recording(path).columns)
 
 
 def read_ours_blocks(path: Path) -> int:
-    """
-    Read block by block, as the compensator does it.
-
-    """
+    """Read block by block, as the compensator does it."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
 
 def read_rosbags(path: Path) -> int:
-    """
-    Read and deserialize every message.
-
-    """
+    """Read and deserialize every message."""
     from rosbags.rosbag2 import Reader
     from rosbags.typesys import Stores, get_typestore
 
@@ -92,10 +79,7 @@ def read_rosbags(path: Path) -> int:
 
 
 def read_mcap(path: Path) -> int:
-    """
-    Read every message, its bytes not decoded.
-
-    """
+    """Read every message, its bytes not decoded."""
     from mcap.reader import make_reader
 
     n = 0
@@ -106,10 +90,7 @@ def read_mcap(path: Path) -> int:
 
 
 def timed(read: Callable[[Path], int], path: Path, n: int) -> tuple[float, float]:
-    """
-    Measure wall and CPU time of one reading, per message.
-
-    """
+    """Measure wall and CPU time of one reading, per message."""
     wall, cpu = time.perf_counter(), time.process_time()
     found = read(path)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -122,7 +103,6 @@ def measure(
 ) -> Iterator[dict[str, Any]]:
     """
     Yield one row of results per compression; all readers take turns, the best of each counts.
-
     """
     for compression in COMPRESSIONS:
         ours, peers = folder / f'{compression}.mcap', folder / f'{compression}_peers.mcap'
@@ -152,10 +132,7 @@ def measure(
 
 
 def main() -> None:
-    """
-    Measure and print.
-
-    """
+    """Measure and print."""
     parser = argparse.ArgumentParser(description='Reading a bag to columns against its peers.')
     parser.add_argument('--samples', type=int, default=2_000_000, help='counts messages for ours')
     parser.add_argument('--peer-samples', type=int, default=200_000, help='and for the peers')

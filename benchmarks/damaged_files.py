@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what can happen to the file of a bag: flipped, wiped, cut off, rows gone, a bomb.
-
-"""
+"""Owns what can happen to the file of a bag: flipped, wiped, cut off, rows gone, a bomb."""
 
 from __future__ import annotations
 
@@ -17,10 +14,7 @@ import zstandard
 def damaged(
     make: Callable[[Path], Path], pattern: str, damage: Callable[[Path], object]
 ) -> Callable[[Path], Path]:
-    """
-    Damage the one file of a bag.
-
-    """
+    """Damage the one file of a bag."""
 
     def made(folder: Path) -> Path:
         bag = make(folder)
@@ -32,20 +26,14 @@ def damaged(
 
 
 def flip(file: Path, place: float = 0.5) -> None:
-    """
-    Flip one bit.
-
-    """
+    """Flip one bit."""
     data = bytearray(file.read_bytes())
     data[int(len(data) * place)] ^= 4
     file.write_bytes(data)
 
 
 def wipe(file: Path) -> None:
-    """
-    Overwrite some kB in the middle.
-
-    """
+    """Overwrite some kB in the middle."""
     data = bytearray(file.read_bytes())
     half = len(data) // 2
     data[half : half + 4096] = bytes(4096)
@@ -53,37 +41,25 @@ def wipe(file: Path) -> None:
 
 
 def cut(file: Path) -> None:
-    """
-    Leave a half.
-
-    """
+    """Leave a half."""
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
 
 
 def delete_rows(file: Path) -> None:
-    """
-    Take rows out of a database.
-
-    """
+    """Take rows out of a database."""
     with sqlite3.connect(file) as database:
         database.execute('delete from messages where id between 100 and 265')
 
 
 def flip_message(file: Path) -> None:
-    """
-    Flip a bit in the topic number of a message: it belongs to no topic then.
-
-    """
+    """Flip a bit in the topic number of a message: it belongs to no topic then."""
     with sqlite3.connect(file) as database:
         database.execute('update messages set topic_id = topic_id + 64 where topic_id = 1')
 
 
 def bomb(file: Path) -> None:
-    """
-    Put 8 GB of zeros into some hundred kB.
-
-    """
+    """Put 8 GB of zeros into some hundred kB."""
     with file.open('wb') as out, zstandard.ZstdCompressor(19).stream_writer(out) as packed:
         for _ in range(1 << 13):
             packed.write(bytes(1 << 20))

@@ -8,7 +8,6 @@ instead of a traceback, and never with 0 where something is lost. What breaks th
 and makes the exit code 1.
 
     python benchmarks/degenerate.py --only jump --json degenerate.json
-
 """
 
 from __future__ import annotations
@@ -64,10 +63,7 @@ TABLES = {'convert'}
 
 @dataclass(frozen=True)
 class Run:
-    """
-    What one command did with one input.
-
-    """
+    """What one command did with one input."""
 
     input: str
     command: str
@@ -79,10 +75,7 @@ class Run:
 
 
 def _peak_megabytes(pid: int) -> float:
-    """
-    Largest resident size so far; 0 once the process has ended.
-
-    """
+    """Largest resident size so far; 0 once the process has ended."""
     try:
         status = Path(f'/proc/{pid}/status').read_text()
     except OSError:
@@ -92,10 +85,7 @@ def _peak_megabytes(pid: int) -> float:
 
 
 def run(name: str, command: str, path: Path, out: Path) -> Run:
-    """
-    Run one command to its end, or until its time is over.
-
-    """
+    """Run one command to its end, or until its time is over."""
     program = Path(sys.executable).with_name('thermo_comp')
     log = out / 'said.txt'
     began = time.monotonic()
@@ -132,10 +122,7 @@ def run(name: str, command: str, path: Path, out: Path) -> Run:
 
 
 def main() -> int:
-    """
-    Make the inputs, run the commands, print the table.
-
-    """
+    """Make the inputs, run the commands, print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--only', default='', help='inputs whose name contains this')
     parser.add_argument('--commands', nargs='*', choices=COMMANDS, default=list(COMMANDS))

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the degenerate inputs: one recording or table, spoilt in as many ways as there are names.
-
 """
 
 from __future__ import annotations
@@ -30,10 +29,7 @@ RATE_HZ, POSITIONS, POSITION_S = 20, 10, 40
 
 @dataclass
 class Columns:
-    """
-    A thermal test in one recording: positions at rest, one after the other, in a ramp.
-
-    """
+    """A thermal test in one recording: positions at rest, one after the other, in a ramp."""
 
     stamp_ns: np.ndarray
     counts: np.ndarray
@@ -45,10 +41,7 @@ class Columns:
 
 
 def whole() -> Columns:
-    """
-    Make the recording that the others are spoilt from.
-
-    """
+    """Make the recording that the others are spoilt from."""
     rng = np.random.default_rng(20)
     n = RATE_HZ * POSITIONS * POSITION_S
     row = np.arange(n)
@@ -62,10 +55,7 @@ def whole() -> Columns:
 
 
 def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = False) -> Path:
-    """
-    Write a bag; with `log`, its log times rise whatever the stamps do.
-
-    """
+    """Write a bag; with `log`, its log times rise whatever the stamps do."""
     path = folder / name
     rising = START_NS + np.arange(len(columns.stamp_ns)) * (SECOND // RATE_HZ) if log else None
     slow = None if rising is None else rising[:: RATE_HZ // 2][: len(columns.reading_ns)]
@@ -79,10 +69,7 @@ def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = Fa
 
 
 def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]:
-    """
-    Spoil the stamps.
-
-    """
+    """Spoil the stamps."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -94,10 +81,7 @@ def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]
 
 
 def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
-    """
-    Spoil anything else.
-
-    """
+    """Spoil anything else."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -108,10 +92,7 @@ def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
 
 
 def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
-    """
-    Let the clock jump in the middle, or after every so many stamps.
-
-    """
+    """Let the clock jump in the middle, or after every so many stamps."""
 
     def change(stamp_ns: np.ndarray) -> np.ndarray:
         row = np.arange(len(stamp_ns))
@@ -122,10 +103,7 @@ def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rosbag2(storage: StoragePlugin, mode: CompressionMode | None) -> Callable[[Path], Path]:
-    """
-    Write the whole recording as another storage.
-
-    """
+    """Write the whole recording as another storage."""
 
     def make(folder: Path) -> Path:
         bare = write(folder, whole())
@@ -151,10 +129,7 @@ ZSTD = rosbag2(StoragePlugin.MCAP, CompressionMode.FILE)
 
 
 def with_pipe(folder: Path) -> Path:
-    """
-    Put a FIFO beside the files of a bag, and one in the place of its metadata.
-
-    """
+    """Put a FIFO beside the files of a bag, and one in the place of its metadata."""
     bag = DB3(folder)
     (bag / 'metadata.yaml').unlink()
     os.mkfifo(bag / 'metadata.yaml')
@@ -163,10 +138,7 @@ def with_pipe(folder: Path) -> Path:
 
 
 def pipe_as_file(folder: Path) -> Path:
-    """
-    Make a folder whose only file is a FIFO.
-
-    """
+    """Make a folder whose only file is a FIFO."""
     bag = folder / 'bag'
     bag.mkdir()
     os.mkfifo(bag / 'bag_0.mcap')
@@ -174,10 +146,7 @@ def pipe_as_file(folder: Path) -> Path:
 
 
 def device_as_file(folder: Path) -> Path:
-    """
-    Let the file of a bag lead to an endless device.
-
-    """
+    """Let the file of a bag lead to an endless device."""
     bag = folder / 'bag'
     bag.mkdir()
     (bag / 'bag_0.db3').symlink_to('/dev/zero')
@@ -185,19 +154,13 @@ def device_as_file(folder: Path) -> Path:
 
 
 def other_name(folder: Path) -> Path:
-    """
-    Give a bag a name that is no UTF-8.
-
-    """
+    """Give a bag a name that is no UTF-8."""
     path = Path(os.fsdecode(os.fsencode(folder) + b'/b\xe9\xff.mcap'))
     return write(folder, whole()).rename(path)
 
 
 def table(change: Callable[[np.ndarray], np.ndarray], kind: str) -> Callable[[Path], Path]:
-    """
-    Write a table with spoilt stamps.
-
-    """
+    """Write a table with spoilt stamps."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -240,10 +203,7 @@ def _samples(columns: Columns, n: int) -> None:
 
 @dataclass(frozen=True)
 class Input:
-    """
-    One degenerate input; `is_lost` = something of it cannot be read, so nobody may say 0.
-
-    """
+    """One degenerate input; `is_lost` = something of it cannot be read, so nobody may say 0."""
 
     make: Callable[[Path], Path]
     is_lost: bool = False

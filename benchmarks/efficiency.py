@@ -4,7 +4,6 @@
 Owns the efficiency of docs/accuracy.md: bias and scale of a fit against the Cramer-Rao bound.
 
 Run ``python benchmarks/efficiency.py``, or with fewer units: ``--units 10``.
-
 """
 
 from __future__ import annotations
@@ -32,10 +31,7 @@ from thermo_comp.typing import Floats
 
 
 def exact_unit(seed: int) -> UnitModel:
-    """
-    Make a unit whose drift is a quadratic of the board's temperature, and nothing else.
-
-    """
+    """Make a unit whose drift is a quadratic of the board's temperature, and nothing else."""
     rng = np.random.default_rng(seed)
 
     def axes(sd: float) -> tuple[float, float, float]:
@@ -55,7 +51,6 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
     Written on its own: window means of counts with white noise, unknown attitudes (two angles
     each), M, and a quadratic of the true board temperature per axis; differentiated numerically.
-
     """
     run = simulate(unit, cyclogram_preset(program), directions[0], rate_hz=1.0)
     truth = run.truth
@@ -104,10 +99,7 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
 
 def efficiency(n_units: int) -> None:
-    """
-    Bias and scale at the reference against the Cramer-Rao bound.
-
-    """
+    """Bias and scale at the reference against the Cramer-Rao bound."""
     print(
         '| positions | units | bias: RMS error / bound | scale | bias: error / claimed sd | scale '
         '| 95 % intervals, bias | scale |'
@@ -137,10 +129,7 @@ def efficiency(n_units: int) -> None:
 
 
 def main() -> int:
-    """
-    Run it.
-
-    """
+    """Run it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

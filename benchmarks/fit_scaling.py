@@ -8,7 +8,6 @@ Bags of four hours are simulated once, written to disk, and then read, and fitte
 their own, so that each peak is that process' alone.
 
     python benchmarks/fit_scaling.py --bags 6 12 24 --rate-hz 100
-
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ from thermo_comp.simulation import (
 
 
 def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
-    """
-    Simulate the chamber program once per position, straight into bags.
-
-    """
+    """Simulate the chamber program once per position, straight into bags."""
     from thermo_comp.recording import BagWriter
 
     unit = unit_preset('thermostatted', 1)
@@ -57,10 +53,7 @@ def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
 
 
 def measure(task: str, paths: list[Path]) -> dict[str, float]:
-    """
-    Run one task in a process of its own.
-
-    """
+    """Run one task in a process of its own."""
     done = subprocess.run(
         [sys.executable, __file__, '--task', task, *map(str, paths)],
         check=False,
@@ -75,10 +68,7 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
 
 
 def run_task(task: str, paths: list[Path]) -> dict[str, float]:
-    """
-    Read the bags, or fit them, and say what it took.
-
-    """
+    """Read the bags, or fit them, and say what it took."""
     from thermo_comp.fitting import FitOptions, fit
     from thermo_comp.fitting.fit_sources import fit_sources
 
@@ -100,10 +90,7 @@ def run_task(task: str, paths: list[Path]) -> dict[str, float]:
 
 
 def main() -> int:
-    """
-    Write, read, fit, print.
-
-    """
+    """Write, read, fit, print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

@@ -9,7 +9,6 @@ are processes of one thread, as the command starts them.
     python benchmarks/fleet.py scaling              strong and weak, 1 and 2 workers
     python benchmarks/fleet.py overhead             500 small units, and 100 workers on paper
     python benchmarks/fleet.py kill --units 200     200 x 12 bags, a worker killed twice
-
 """
 
 from __future__ import annotations
@@ -55,10 +54,7 @@ _REST_S = 4.0
 
 
 def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
-    """
-    Simulate units, one bag per position; those that are there already are kept.
-
-    """
+    """Simulate units, one bag per position; those that are there already are kept."""
     chamber = parse_cyclogram(program)
     for seed in range(1, n_units + 1):
         unit = unit_preset('mems', seed)
@@ -90,10 +86,7 @@ def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
 
 
 def jobs_of(folder: Path, n_units: int) -> list[Job]:
-    """
-    Find the units of a fleet; each comes again under another name where there are too few.
-
-    """
+    """Find the units of a fleet; each comes again under another name where there are too few."""
     found = find_units(Storage(str(folder)))
     return [Job(found[i % len(found)]) for i in range(n_units)]
 
@@ -129,25 +122,16 @@ class Measured:
 
     @property
     def per_task_s(self) -> float:
-        """
-        Return what one task costs client and scheduler.
-
-        """
+        """Return what one task costs client and scheduler."""
         return max(self.own_cpu_s - self.rest_cpu * self.seconds, 0.0) / len(self.tasks)
 
     def busy(self, n_workers: int) -> float:
-        """
-        Return the part of their time in which the workers had something to do.
-
-        """
+        """Return the part of their time in which the workers had something to do."""
         return sum(self.tasks) / (n_workers * self.seconds)
 
 
 def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -> Measured:
-    """
-    Fit units on a cluster that has started and fitted before.
-
-    """
+    """Fit units on a cluster that has started and fitted before."""
     jobs = jobs_of(folder, n_units)
     with connected(None, n_workers) as client:
         count_bytes()
@@ -176,19 +160,13 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
 
 
 def process_cpu() -> float:
-    """
-    Return this process' processor time, with that of its threads.
-
-    """
+    """Return this process' processor time, with that of its threads."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
 
 def count_bytes() -> None:
-    """
-    Count, from now on, what this process writes to its connections.
-
-    """
+    """Count, from now on, what this process writes to its connections."""
     from distributed.comm.tcp import TCP
 
     if hasattr(TCP, 'n_written'):
@@ -205,20 +183,14 @@ def count_bytes() -> None:
 
 
 def bytes_written() -> int:
-    """
-    Return what `count_bytes` has counted.
-
-    """
+    """Return what `count_bytes` has counted."""
     from distributed.comm.tcp import TCP
 
     return int(TCP.n_written)
 
 
 def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
-    """
-    Compare one worker with two, on the same units and on twice as many.
-
-    """
+    """Compare one worker with two, on the same units and on twice as many."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
     options = FleetOptions(fit, certificates=False)
@@ -251,7 +223,6 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
 def overhead(folder: Path, n_units: int) -> None:
     """
     Measure what is lost between the tasks of many small units, and what follows for many workers.
-
     """
     write_fleet(folder / 'small', 20, SMALL_BAGS, SMALL_PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model='quadratic')
@@ -270,10 +241,7 @@ def overhead(folder: Path, n_units: int) -> None:
 
 
 def kill(folder: Path, n_units: int, model: str) -> int:
-    """
-    Kill a worker twice in a run, each time in the middle of a unit; count the rows.
-
-    """
+    """Kill a worker twice in a run, each time in the middle of a unit; count the rows."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fleet = Path(tempfile.mkdtemp(prefix='fleet-', dir=folder))
     for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:
@@ -308,10 +276,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
 
 
 def paper(found: Measured) -> None:
-    """
-    Estimate a hundred workers: tasks as measured, one scheduler that sends them one by one.
-
-    """
+    """Estimate a hundred workers: tasks as measured, one scheduler that sends them one by one."""
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
     print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')
@@ -335,10 +300,7 @@ def paper(found: Measured) -> None:
 
 
 def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: float) -> float:
-    """
-    Play a run: each worker gets the next task when it is free and the scheduler has time.
-
-    """
+    """Play a run: each worker gets the next task when it is free and the scheduler has time."""
     free = [0.0] * n_workers
     scheduler = end = 0.0
     for task in tasks:
@@ -349,18 +311,12 @@ def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: floa
 
 
 def loads() -> str:
-    """
-    Return the machine's load averages.
-
-    """
+    """Return the machine's load averages."""
     return ' '.join(f'{load:.1f}' for load in os.getloadavg())
 
 
 def main() -> int:
-    """
-    Run one part.
-
-    """
+    """Run one part."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

@@ -31,7 +31,6 @@ relays alike, by a request for no latency in /dev/cpu_dma_latency, as cyclictest
 `--sleep` leaves them alone. The host may stop a virtual machine all the same; while it does, no
 process gets on. How much of the time that was stands behind each row ("stolen"): latencies say
 something where it is small.
-
 """
 
 from __future__ import annotations
@@ -65,10 +64,7 @@ CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 
 
 def main() -> None:
-    """
-    Run all cases.
-
-    """
+    """Run all cases."""
     arguments = _arguments()
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -124,10 +120,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def _calibration_for(rate: int, folder: Path) -> str:
-    """
-    Write the example's calibration for a unit of this rate.
-
-    """
+    """Write the example's calibration for a unit of this rate."""
     from dataclasses import replace
 
     from thermo_comp.unit.calibration_file import load_calibration, save_calibration
@@ -142,10 +135,7 @@ def _calibration_for(rate: int, folder: Path) -> str:
 def _measure(
     relay: str, rate: int, seconds: float, options: list[str], *, reloads: bool = False
 ) -> dict[str, Any]:
-    """
-    Run source, relay and sink as processes once; return the figures.
-
-    """
+    """Run source, relay and sink as processes once; return the figures."""
     with ExitStack() as stack:
         middle, sink, source = (
             stack.enter_context(_process(role, options)) for role in (relay, 'sink', 'source')
@@ -177,10 +167,7 @@ def _measure(
 
 
 def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """
-    Sum up the loss; take the medians of CPU time and latencies.
-
-    """
+    """Sum up the loss; take the medians of CPU time and latencies."""
     summary = {name: sum(run[name] for run in runs) for name in ('n_sent', 'n_lost')}
     for name in ('cpu_us', 'stolen', 'p50_ms', 'p99_ms', 'p999_ms'):
         summary[name] = statistics.median(run[name] for run in runs)
@@ -192,7 +179,6 @@ def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     Compare each run's CPU time with that of the naive relay just before it; return the median.
 
     A machine changes its pace over minutes, by more than what is to be told apart.
-
     """
     return statistics.median(
         one['cpu_us'] / other['cpu_us'] for one, other in zip(runs, naive, strict=True)
@@ -220,7 +206,6 @@ def _expect(process: subprocess.Popen[str], word: str) -> None:
 def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
     """
     Ask the system for cores that do not sleep while this is open; say whether it took the request.
-
     """
     with ExitStack() as stack:
         asked = False
@@ -254,17 +239,13 @@ def _process(role: str, options: list[str]) -> Iterator[subprocess.Popen[str]]:
 
 
 def _cpu_time(pid: int) -> float:
-    """
-    CPU time of another process, all threads, to the nanosecond (Linux: clock_getcpuclockid).
-
-    """
+    """CPU time of another process, all threads, to the nanosecond (Linux: clock_getcpuclockid)."""
     return time.clock_gettime((~pid << 3) | 2)
 
 
 def _machine_time() -> tuple[int, int]:
     """
     Give the time that the host took from this machine, and all that has passed; of all cores.
-
     """
     file = Path('/proc/stat')
     if not file.is_file():

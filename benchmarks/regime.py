@@ -12,7 +12,6 @@ alarms, about one in 20 h, which is more than ours has. Seeded: one command, one
     python benchmarks/regime.py --quick            # seconds
     python benchmarks/regime.py --workers 2        # some minutes
     python benchmarks/regime.py regret             # what a wrong flag costs, alone
-
 """
 
 from __future__ import annotations
@@ -55,20 +54,14 @@ Matrix = list[tuple[Scene, dict[str, Outcome]]]
 
 
 def quantiles(delays: list[float]) -> tuple[float, float]:
-    """
-    Median and 95 %; infinite when there is none.
-
-    """
+    """Median and 95 %; infinite when there is none."""
     if not delays:
         return np.inf, np.inf
     return float(np.median(delays)), float(np.percentile(delays, 95))
 
 
 def cost_table() -> Rows:
-    """
-    Cost of a reading beside that of the smallest numpy call.
-
-    """
+    """Cost of a reading beside that of the smallest numpy call."""
     measured = cost()
     unit = measured['numpy scalar call']
     rows = [['per reading', 'CPU us', 'numpy scalar calls']]
@@ -77,10 +70,7 @@ def cost_table() -> Rows:
 
 
 def table(title: str, rows: Rows) -> None:
-    """
-    Print a Markdown table, the first row its head.
-
-    """
+    """Print a Markdown table, the first row its head."""
     print(f'## {title}\n')
     for k, row in enumerate(rows):
         print('| ' + ' | '.join(each.replace('|', '\\|') for each in row) + ' |')
@@ -90,10 +80,7 @@ def table(title: str, rows: Rows) -> None:
 
 
 def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
-    """
-    Delays of the named ramp by sensor, and of the CUSUM that knows it.
-
-    """
+    """Delays of the named ramp by sensor, and of the CUSUM that knows it."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [((scene,), n, 0.0, seed, rippled) for scene in scenes for rippled in (False, True)]
@@ -135,10 +122,7 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
 
 
 def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
-    """
-    Switches per hour of soak by sensor.
-
-    """
+    """Switches per hour of soak by sensor."""
     runs = max(1, round(hours / len(SENSORS) / SOAK_H))
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, SOAK_H, seed + k) for scene in scenes for k in range(runs)]
@@ -163,10 +147,7 @@ def run_matrix(
     n_ramps: int | None,
     hours: float,
 ) -> Matrix:
-    """
-    All rules over all scenes; `hours` of soak tune the rivals, 0 leaves them out.
-
-    """
+    """All rules over all scenes; `hours` of soak tune the rivals, 0 leaves them out."""
     ramps = (0.1, 0.5, 3.0) if is_quick else (0.1, 0.2, 0.5, 1.0, 3.0)
     lags = (180.0, 900.0) if is_quick else (180.0, 900.0, 1200.0)
     jobs: list[Job] = [
@@ -185,10 +166,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """
-    Count what ours made of the ramps, by the rate of the readings.
-
-    """
+    """Count what ours made of the ramps, by the rate of the readings."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, each[OURS]) for scene, each in matrix if scene.rate_hz == rate]
@@ -205,10 +183,7 @@ def rate_table(matrix: Matrix) -> Rows:
 
 
 def rule_table(matrix: Matrix) -> Rows:
-    """
-    Missed ramps, flips and the flagged share, by rule.
-
-    """
+    """Missed ramps, flips and the flagged share, by rule."""
     rows = [
         [
             'rule',
@@ -238,10 +213,7 @@ def rule_table(matrix: Matrix) -> Rows:
 
 
 def scene_table(matrix: Matrix, lag: float) -> Rows:
-    """
-    Median delay and flagged share of each rule in each scene of one lag.
-
-    """
+    """Median delay and flagged share of each rule in each scene of one lag."""
     names = list(matrix[0][1])
     rows = [['sensor', 'Hz', 'K/min', *(f'`{name}`' for name in names)]]
     for scene, each in matrix:
@@ -255,10 +227,7 @@ def scene_table(matrix: Matrix, lag: float) -> Rows:
 
 
 def draw_rules(seed: int, folder: Path) -> None:
-    """
-    Draw one ramp under every rule.
-
-    """
+    """Draw one ramp under every rule."""
     scene = Scene(0.5, 900.0, 0.01, 0.0, 1.0)
     rng = rng_of(seed, 11, scene)
     t = np.arange(-2700.0, 10800.0)
@@ -274,28 +243,19 @@ Tables = Iterator[tuple[str, Rows]]
 
 
 def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """
-    Run the ramp that the requirement names.
-
-    """
+    """Run the ramp that the requirement names."""
     rows = onset_table(pool, arguments.quick, arguments.seed)
     yield 'Onset of 0.5 K/min behind 15 min at 1 Hz', rows
 
 
 def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """
-    Count switches in soak.
-
-    """
+    """Count switches in soak."""
     hours = 25.0 if arguments.quick else arguments.soak_hours
     yield 'Switches in soak with ripple and drift, 1 Hz', soak_table(pool, hours, arguments.seed)
 
 
 def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """
-    Run all rules over all scenes.
-
-    """
+    """Run all rules over all scenes."""
     n_ramps = arguments.ramps
     hours = 0.0 if n_ramps else TUNING_H
     rates = arguments.rates or ((1.0, 0.1) if arguments.quick else tuple(RAMPS))
@@ -312,18 +272,12 @@ def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_cost(_pool: Pool, _arguments: argparse.Namespace) -> Tables:
-    """
-    Time a reading.
-
-    """
+    """Time a reading."""
     yield 'Cost', cost_table()
 
 
 def part_regret(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """
-    Put simulated units under the flag.
-
-    """
+    """Put simulated units under the flag."""
     jobs = [(name, arguments.seed) for name in UNIT_NAMES]
     units = pool.map(judge_unit, jobs, chunksize=1)
     yield 'Regret of the flag, two sets of the model golovach', regret_table(units)
@@ -343,10 +297,7 @@ PARTS: dict[str, Callable[[Pool, argparse.Namespace], Tables]] = {
 
 
 def main() -> None:
-    """
-    Run the parts and print their tables.
-
-    """
+    """Run the parts and print their tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

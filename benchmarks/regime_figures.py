@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the figures of docs/regime.md, drawn from what benchmarks/regime.py has computed.
-
-"""
+"""Owns the figures of docs/regime.md, drawn from what benchmarks/regime.py has computed."""
 
 from __future__ import annotations
 
@@ -24,7 +21,6 @@ def plot_rules(
 ) -> None:
     """
     Draw one ramp and its relaxation: temperatures, derivatives of the case, the flag of each rule.
-
     """
     minutes = t / 60.0
     rate = np.gradient(case, t) * 60.0
@@ -53,10 +49,7 @@ def plot_rules(
 
 
 def plot_regret(units: list[Unit], folder: Path) -> None:
-    """
-    Draw the error in truth of one unseen bag of each unit under the three flags.
-
-    """
+    """Draw the error in truth of one unseen bag of each unit under the three flags."""
     figure = Figure(figsize=(9.0, 2.3 * len(units)), dpi=110, layout='constrained')
     for axes, unit in zip(figure.subplots(len(units), 1, sharex=True), units, strict=True):
         bag = next(one for one in unit.bags if one.program == PROGRAMS[1])
@@ -77,9 +70,6 @@ def plot_regret(units: list[Unit], folder: Path) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """
-    Write a figure; the same numbers give the same file.
-
-    """
+    """Write a figure; the same numbers give the same file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={'Software': None})

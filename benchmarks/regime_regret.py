@@ -8,7 +8,6 @@ and under the detector that the fit learns. The compensator is then fed the char
 would have converted without noise, with its noisy thermometers: what is left of |f| - g is the
 error in truth. It runs three times: under our flag, always static, always dynamic. The perfect
 flag takes at each sample the set that is nearer.
-
 """
 
 from __future__ import annotations
@@ -74,19 +73,13 @@ class Judged:
 
     @property
     def perfect(self) -> Floats:
-        """
-        |f| - g under the perfect flag [ug].
-
-        """
+        """|f| - g under the perfect flag [ug]."""
         return np.where(np.abs(self.static) < np.abs(self.dynamic), self.static, self.dynamic)
 
 
 @dataclass(frozen=True)
 class Unit:
-    """
-    A unit under the flags.
-
-    """
+    """A unit under the flags."""
 
     name: str
     bags: tuple[Judged, ...]
@@ -94,27 +87,18 @@ class Unit:
 
 
 def rms(values: Floats) -> float:
-    """
-    Root of the mean square.
-
-    """
+    """Root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def seconds(values: Floats) -> Floats:
-    """
-    Means over a second.
-
-    """
+    """Means over a second."""
     n = len(values) // RATE_HZ * RATE_HZ
     return np.asarray(values[:n].reshape(n // RATE_HZ, RATE_HZ, *values.shape[1:]).mean(axis=1))
 
 
 def judge_unit(job: tuple[str, int]) -> Unit:
-    """
-    Simulate and fit one unit, and judge its flag.
-
-    """
+    """Simulate and fit one unit, and judge its flag."""
     name, seed = job
     unit = unit_preset(name, seed)
 
@@ -141,10 +125,7 @@ def judge_unit(job: tuple[str, int]) -> Unit:
 
 
 def block_of(run: SimulatedRun, accel: Floats | None = None) -> SimulatedBlock:
-    """
-    Give a run the form of a recording's block, with its counts or other samples.
-
-    """
+    """Give a run the form of a recording's block, with its counts or other samples."""
     return SimulatedBlock(
         run.accel_stamp_ns,
         run.counts.astype(np.float64) if accel is None else accel,
@@ -159,10 +140,7 @@ def block_of(run: SimulatedRun, accel: Floats | None = None) -> SimulatedBlock:
 
 
 def judge_bag(program: str, calibration: Calibration, run: SimulatedRun) -> Judged:
-    """
-    Compensate one bag under each flag.
-
-    """
+    """Compensate one bag under each flag."""
     truth = run.truth
     unit = truth.unit
     on_axes = truth.specific_force @ np.linalg.inv(unit.M).T
@@ -194,7 +172,6 @@ def compensated(
 ) -> tuple[Floats, Ints, list[tuple[int, bool]]]:
     """
     Specific force, stamps and flags of one bag; with a weight of the dynamic set, under that.
-
     """
     # a charge without noise may stand still
     compensator = Compensator(calibration, CompensatorConfig(stuck_timeout_s=0.0))
@@ -205,10 +182,7 @@ def compensated(
 
 
 def norm_error(force: Floats) -> Floats:
-    """
-    |f| - g in ug.
-
-    """
+    """|f| - g in ug."""
     return np.asarray((np.linalg.norm(force, axis=1) - STANDARD_GRAVITY) / MICRO_G)
 
 
@@ -218,7 +192,6 @@ def jumps_of(both: Floats, static: Floats, dynamic: Floats) -> Floats:
 
     The output is a mean of the sets; of its change the part is taken that the change of the
     weight makes.
-
     """
     gap = dynamic - static
     size = np.sum(gap**2, axis=1)
@@ -230,10 +203,7 @@ def jumps_of(both: Floats, static: Floats, dynamic: Floats) -> Floats:
 
 
 def regret_table(units: list[Unit]) -> list[list[str]]:
-    """
-    |g| RMS under our flag over that under the perfect one.
-
-    """
+    """|g| RMS under our flag over that under the perfect one."""
     rows = [
         [
             'unit',
@@ -273,10 +243,7 @@ def regret_table(units: list[Unit]) -> list[list[str]]:
 
 
 def switch_table(units: list[Unit]) -> list[list[str]]:
-    """
-    Show what crossing over does to the output.
-
-    """
+    """Show what crossing over does to the output."""
     rows = [
         [
             'unit',

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the scenes of benchmarks/regime.py: ramps behind lags, sensors, the rival rules, the bound.
-
 """
 
 from __future__ import annotations
@@ -26,10 +25,7 @@ SENSORS = ((0.001, 0.0), (0.01, 0.0), (0.001, 0.0625), (0.01, 0.0625), (0.01, 1.
 
 @dataclass(frozen=True)
 class Scene:
-    """
-    One cell of the matrix: a ramp, a lag, a sensor.
-
-    """
+    """One cell of the matrix: a ramp, a lag, a sensor."""
 
     ramp_k_min: float
     lag_s: float
@@ -39,28 +35,19 @@ class Scene:
 
     @property
     def sensor(self) -> str:
-        """
-        The sensor in words.
-
-        """
+        """The sensor in words."""
         quantum = f', {1e3 * self.quantum:g} mK steps' if self.quantum else ''
         return f'{1e3 * self.noise_sd:g} mK{quantum}'
 
 
 def first_order(t: Floats, lag: float) -> Floats:
-    """
-    Response of a lag to a unit ramp that starts at 0.
-
-    """
+    """Response of a lag to a unit ramp that starts at 0."""
     x = np.maximum(t, 0.0)
     return x - lag * (1.0 - np.exp(-x / lag))
 
 
 def second_order(t: Floats, lag: float, other: float) -> Floats:
-    """
-    Response of two different lags in a row to a unit ramp that starts at 0.
-
-    """
+    """Response of two different lags in a row to a unit ramp that starts at 0."""
     x = np.maximum(t, 0.0)
     decay = lag**2 * np.exp(-x / lag) - other**2 * np.exp(-x / other)
     return x - lag - other + decay / (lag - other)
@@ -69,10 +56,7 @@ def second_order(t: Floats, lag: float, other: float) -> Floats:
 def temperatures(
     scene: Scene, t: Floats, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
 ) -> tuple[Floats, Floats]:
-    """
-    Case and board for a ramp from 0 to `duration`; no ramp when the duration is 0.
-
-    """
+    """Case and board for a ramp from 0 to `duration`; no ramp when the duration is 0."""
     rate = scene.ramp_k_min / 60.0 * rng.choice((-1.0, 1.0))
     start = 20.0 + rng.uniform(-0.5, 0.5) * max(scene.quantum, 0.1)
     board_lag = BOARD_LAG_S if abs(BOARD_LAG_S - scene.lag_s) > 1.0 else 1.01 * scene.lag_s
@@ -92,19 +76,13 @@ def temperatures(
 
 
 def read(truth: Floats, scene: Scene, rng: np.random.Generator) -> Floats:
-    """
-    Let a sensor read.
-
-    """
+    """Let a sensor read."""
     reading = truth + rng.normal(0.0, scene.noise_sd, truth.shape)
     return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
 
 
 def moving_fit(readings: Floats, n: int, powers: int, wanted: int, at_end: bool) -> Floats:
-    """
-    Derive a least-squares polynomial over the last n readings, per sample period.
-
-    """
+    """Derive a least-squares polynomial over the last n readings, per sample period."""
     k = np.arange(n) - (n - 1 if at_end else 0.5 * (n - 1))
     design = np.stack([k**p for p in range(powers + 1)], axis=1)
     weights = np.linalg.pinv(design)[wanted] * (1.0, 1.0, 2.0)[wanted]
@@ -114,28 +92,19 @@ def moving_fit(readings: Floats, n: int, powers: int, wanted: int, at_end: bool)
 
 
 def second_derivative(scene: Scene, readings: Floats) -> Floats:
-    """
-    |d2T/dt2| of a parabola over the window, K/s^2.
-
-    """
+    """|d2T/dt2| of a parabola over the window, K/s^2."""
     n = max(5, round(WINDOW_S * scene.rate_hz))
     return np.abs(moving_fit(readings, n, 2, 2, at_end=False)) * scene.rate_hz**2
 
 
 def first_derivative(scene: Scene, readings: Floats) -> Floats:
-    """
-    |dT/dt| of a straight line over the window, K/s.
-
-    """
+    """|dT/dt| of a straight line over the window, K/s."""
     n = max(5, round(WINDOW_S * scene.rate_hz))
     return np.abs(moving_fit(readings, n, 1, 1, at_end=False)) * scene.rate_hz
 
 
 def savitzky_golay(scene: Scene, readings: Floats) -> Floats:
-    """
-    |dT/dt| at the newest end of a parabola over the window, K/s.
-
-    """
+    """|dT/dt| at the newest end of a parabola over the window, K/s."""
     n = max(5, round(WINDOW_S * scene.rate_hz))
     return np.abs(moving_fit(readings, n, 2, 1, at_end=True)) * scene.rate_hz
 
@@ -146,7 +115,6 @@ def exponential_fit(scene: Scene, readings: Floats) -> Floats:
 
     After the idea of Kozlov and Tarygin (Sensors 2020, 20(5), 1299): only readings that change the
     output of a quantized sensor are used, as the edge crossed, and the model extrapolates.
-
     """
     lag, span = scene.lag_s, SPAN_S
     if not scene.quantum:
@@ -196,7 +164,6 @@ def known_signature_delays(
     Page's statistic with the signature of the true ramp: the largest log likelihood ratio over
     the onset times. Its threshold comes from the exceedances counted in noise alone, whose
     logarithm falls linearly with the level.
-
     """
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the runs of benchmarks/regime.py: a detector or a rule over ramps and soaks, and its cost.
-
 """
 
 from __future__ import annotations
@@ -28,10 +27,7 @@ Job = tuple[tuple[Scene, ...], int, float, int, bool]
 
 @dataclass
 class Outcome:
-    """
-    What a rule made of the ramps of one scene.
-
-    """
+    """What a rule made of the ramps of one scene."""
 
     delays: list[float]
     missed: int
@@ -42,28 +38,19 @@ class Outcome:
 
 
 def settings(scene: Scene) -> DetectorSettings:
-    """
-    Shipped defaults, with the sensor and the unit's lags filled in.
-
-    """
+    """Shipped defaults, with the sensor and the unit's lags filled in."""
     case = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s)
     board = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s + BOARD_LAG_S)
     return DetectorSettings(ripple_c=RIPPLE_C, case=case, board=board)
 
 
 def rng_of(seed: int, purpose: int, scene: Scene) -> np.random.Generator:
-    """
-    Make the generator of one scene, the same in whichever order scenes run.
-
-    """
+    """Make the generator of one scene, the same in whichever order scenes run."""
     return np.random.default_rng([seed, purpose, *(round(1e6 * v) for v in vars(scene).values())])
 
 
 def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
-    """
-    Flag of the shipped detector at each reading: 1 dynamic, 0 static, -1 unknown.
-
-    """
+    """Flag of the shipped detector at each reading: 1 dynamic, 0 static, -1 unknown."""
     detector_settings = settings(scene)
     case_thermometer = Thermometer(detector_settings.case)
     board_thermometer = Thermometer(detector_settings.board)
@@ -80,10 +67,7 @@ def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
 
 
 def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
-    """
-    Delay, flips and flagged share of ramps from 0 to `duration`.
-
-    """
+    """Delay, flips and flagged share of ramps from 0 to `duration`."""
     outcome = Outcome([], 0, 0, 0, 0.0, 0)
     for t, flag in flags:
         outcome.n += 1
@@ -104,10 +88,7 @@ def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
 
 
 def tuned(scene: Scene, hours: float, seed: int) -> dict[str, float]:
-    """
-    Threshold of each rival: the largest value of its statistic in some hours of soak.
-
-    """
+    """Threshold of each rival: the largest value of its statistic in some hours of soak."""
     rng = rng_of(seed, 3, scene)
     thresholds = dict.fromkeys(RIVALS if hours else (), 0.0)
     for _ in range(round(hours / SEGMENT_H)):
@@ -120,10 +101,7 @@ def tuned(scene: Scene, hours: float, seed: int) -> dict[str, float]:
 
 
 def run_scenes(job: Job) -> list[tuple[Scene, dict[str, Outcome]]]:
-    """
-    All rules over `n` ramps of each scene of one sensor, the rivals tuned on its soak first.
-
-    """
+    """All rules over `n` ramps of each scene of one sensor, the rivals tuned on its soak first."""
     scenes, n, hours, seed, is_rippled = job
     thresholds = tuned(scenes[0], hours, seed)
     return [(scene, run_ramps(scene, n, thresholds, seed, is_rippled)) for scene in scenes]
@@ -132,10 +110,7 @@ def run_scenes(job: Job) -> list[tuple[Scene, dict[str, Outcome]]]:
 def run_ramps(
     scene: Scene, n: int, thresholds: dict[str, float], seed: int, is_rippled: bool
 ) -> dict[str, Outcome]:
-    """
-    Ours, and the rivals at their thresholds, over `n` ramps of one scene.
-
-    """
+    """Ours, and the rivals at their thresholds, over `n` ramps of one scene."""
     rng = rng_of(seed, 5, scene)
     # long enough for three edges of the coarsest sensor
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
@@ -152,10 +127,7 @@ def run_ramps(
 
 
 def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
-    """
-    Count openings, switches and the decided share of one soak, shipped detector.
-
-    """
+    """Count openings, switches and the decided share of one soak, shipped detector."""
     scene, hours, seed = job
     rng = rng_of(seed, 7, scene)
     t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)
@@ -167,10 +139,7 @@ def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
 
 
 def cost() -> dict[str, float]:
-    """
-    CPU microseconds per reading, best of three, and those of one numpy scalar call.
-
-    """
+    """CPU microseconds per reading, best of three, and those of one numpy scalar call."""
     scene = Scene(0.5, 900.0, 0.001, 0.0, 1.0)
     rng = np.random.default_rng(0)
     t = np.arange(-7200.0, 7200.0)

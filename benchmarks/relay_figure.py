@@ -6,7 +6,6 @@ Draws what `node_relay.py --json` has measured: CPU time per sample and latency 
     python benchmarks/relay_figure.py relay.json docs/figures/node_relay.png
 
 Several runs at different rates make one figure.
-
 """
 
 from __future__ import annotations
@@ -27,10 +26,7 @@ STYLES = {'reliable': ('-', 'o'), 'best_effort': ('--', 's')}
 
 
 def draw(measured: list[dict[str, Any]], path: Path) -> None:
-    """
-    Draw both panels into one file.
-
-    """
+    """Draw both panels into one file."""
     figure, (cpu, latency) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout='constrained')
     for reliability, (line, marker) in STYLES.items():
         cases = [case for case in measured if case['reliability'] == reliability]
@@ -57,10 +53,7 @@ def draw(measured: list[dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """
-    Read the figures and draw them.
-
-    """
+    """Read the figures and draw them."""
     parser = argparse.ArgumentParser(description='Draw the figures of node_relay.py.')
     parser.add_argument('figures', type=Path, nargs='+', help='what `node_relay.py --json` wrote')
     parser.add_argument('picture', type=Path, help='PNG file to write')

@@ -4,7 +4,6 @@
 Owns the processes that `node_relay.py` runs side by side: source, relays, sink, reloader.
 
 They talk to their parent by lines on standard input and output, and to each other by DDS.
-
 """
 
 from __future__ import annotations
@@ -45,10 +44,7 @@ def _qos(reliability: str, depth: int = DEPTH) -> Any:
 
 
 def _source(arguments: argparse.Namespace) -> None:
-    """
-    Publish samples at the rate, temperatures at 10 Hz.
-
-    """
+    """Publish samples at the rate, temperatures at 10 Hz."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.serialization import serialize_message
@@ -107,7 +103,6 @@ def _sink(arguments: argparse.Namespace) -> None:
 
     The middleware notes when each message arrived, so they may wait here: a sink that woke up for
     each would take the relay's core away.
-
     """
     import numpy as np
     import rclpy
@@ -144,10 +139,7 @@ def _sink(arguments: argparse.Namespace) -> None:
 
 
 def _naive(arguments: argparse.Namespace) -> None:
-    """
-    Copy Vector3Stamped to Imu as the tutorials do it.
-
-    """
+    """Copy Vector3Stamped to Imu as the tutorials do it."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.executors import ExternalShutdownException
@@ -171,10 +163,7 @@ def _naive(arguments: argparse.Namespace) -> None:
 
 
 def _floor(arguments: argparse.Namespace) -> None:
-    """
-    Copy the bytes of one subscription to a publisher around one wait set.
-
-    """
+    """Copy the bytes of one subscription to a publisher around one wait set."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -205,10 +194,7 @@ def _floor(arguments: argparse.Namespace) -> None:
 
 
 def _node(arguments: argparse.Namespace) -> None:
-    """
-    Run the real node.
-
-    """
+    """Run the real node."""
     from thermo_comp.ros.node import main as run_node
 
     overrides = [
@@ -223,7 +209,6 @@ def _reloader(arguments: argparse.Namespace) -> None:
     """
     Set `calibration_file` again and again, to the calibration and to the largest file that is
     read to its end and refused; print how long each answer took.
-
     """
     import rclpy
     from rcl_interfaces.srv import SetParameters
@@ -264,10 +249,7 @@ ROLES = {
 
 
 def main() -> None:
-    """
-    Play one role.
-
-    """
+    """Play one role."""
     parser = argparse.ArgumentParser(description='One process of node_relay.py.')
     parser.add_argument('role', choices=tuple(ROLES))
     parser.add_argument('--rate', type=int, required=True)

@@ -10,7 +10,6 @@ temperatures at 1 Hz.
 
     python benchmarks/replay.py --hours 24        # the day: read, compensate, linear in length
     python benchmarks/replay.py --gigabytes 10    # peak memory of a replay of a large bag
-
 """
 
 from __future__ import annotations
@@ -44,19 +43,13 @@ BLOCK = 100 * RATE_HZ
 
 
 def calibration() -> Calibration:
-    """
-    Return the example unit, converting at the bags' rate.
-
-    """
+    """Return the example unit, converting at the bags' rate."""
     value = load_calibration(CALIBRATION)
     return replace(value, unit=replace(value.unit, cycle_time_s=1.0 / RATE_HZ))
 
 
 def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
-    """
-    Write n counts messages and the temperatures beside them.
-
-    """
+    """Write n counts messages and the temperatures beside them."""
     rng = np.random.default_rng(1)
     noise = np.round(rng.normal(0.0, 8.0, (BLOCK, 3)))
     with BagWriter(path, compression=compression) as bag:
@@ -74,19 +67,13 @@ def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
 
 
 def read(path: Path) -> int:
-    """
-    Read to columns, block by block.
-
-    """
+    """Read to columns, block by block."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks(n_messages=BLOCK_MESSAGES))
 
 
 def read_and_compensate(path: Path) -> int:
-    """
-    Read to columns and correct.
-
-    """
+    """Read to columns and correct."""
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
         return sum(
@@ -96,10 +83,7 @@ def read_and_compensate(path: Path) -> int:
 
 
 def compensate(path: Path) -> tuple[int, float]:
-    """
-    Correct columns; return how many and the CPU seconds that it alone took.
-
-    """
+    """Correct columns; return how many and the CPU seconds that it alone took."""
     compensator = Compensator(calibration())
     spent = 0.0
     n = 0
@@ -113,25 +97,13 @@ def compensate(path: Path) -> tuple[int, float]:
 
 
 def ours(path: Path, output: Path) -> int:
-    """
-    Replay as the command does.
-
-    """
+    """Replay as the command does."""
     return replay_bag(path, calibration(), output, overwrite=True).counters.n_out
 
 
 def rosbags_pipeline(path: Path, output: Path) -> int:
-    """
-    Do the same message by message with rosbags.
-
-    """
-    from rosbags.rosbag2 import (
-        CompressionFormat,
-        CompressionMode,
-        Reader,
-        StoragePlugin,
-        Writer,
-    )
+    """Do the same message by message with rosbags."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -174,10 +146,7 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
 
 
 def seconds(run: Callable[[], object], repeats: int = 1) -> tuple[float, float]:
-    """
-    Measure the best wall time and the best CPU time (all threads) of some repeats.
-
-    """
+    """Measure the best wall time and the best CPU time (all threads) of some repeats."""
     wall = cpu = float('inf')
     for _ in range(repeats):
         begin, begin_cpu = time.perf_counter(), time.process_time()
@@ -188,10 +157,7 @@ def seconds(run: Callable[[], object], repeats: int = 1) -> tuple[float, float]:
 
 
 def pipelines(folder: Path, n: int, repeats: int) -> None:
-    """
-    Compare the whole way, bag to bag, in samples per second.
-
-    """
+    """Compare the whole way, bag to bag, in samples per second."""
     path, output = folder / 'in.mcap', folder / 'out'
     n_peer = n // 20
     peer = folder / 'peer.mcap'
@@ -212,10 +178,7 @@ def pipelines(folder: Path, n: int, repeats: int) -> None:
 
 
 def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
-    """
-    Measure reading, reading and compensating, and how they grow with the length.
-
-    """
+    """Measure reading, reading and compensating, and how they grow with the length."""
     print(
         f'{compression}: wall (CPU) seconds; alone = compensation only, million samples per CPU s'
     )
@@ -242,10 +205,7 @@ def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
 
 
 def memory(folder: Path, gigabytes: float) -> None:
-    """
-    Replay a large bag in a process of its own and report its peak memory.
-
-    """
+    """Replay a large bag in a process of its own and report its peak memory."""
     path, output = folder / 'large.mcap', folder / 'large_out.mcap'
     per_sample = 99  # bytes of one counts message in an uncompressed MCAP, roughly
     write_bag(path, int(gigabytes * 1e9 / per_sample), 'none')
@@ -269,10 +229,7 @@ def memory(folder: Path, gigabytes: float) -> None:
 
 
 def main() -> None:
-    """
-    Measure and print.
-
-    """
+    """Measure and print."""
     parser = argparse.ArgumentParser(description='The offline run against its peers.')
     parser.add_argument('--samples', type=int, default=1_000_000, help='of the pipelines')
     parser.add_argument('--hours', type=float, default=2.0, help='of the day')

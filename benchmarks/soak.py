@@ -11,7 +11,6 @@ every two seconds. Every second the resident memory of the node is read, every t
 the samples since, from before the publish call to after the take. Slopes are least squares over
 what follows the first tenth, with the standard error that independent windows of a minute give.
 Exit code 1 where a sample is missing.
-
 """
 
 from __future__ import annotations
@@ -48,19 +47,13 @@ TIMEOUT_S = 30.0
 
 
 class Temperatures:
-    """
-    The case and the board behind it, step by step.
-
-    """
+    """The case and the board behind it, step by step."""
 
     def __init__(self) -> None:
         self.case = self.board = 20.0
 
     def step(self, seconds: float) -> tuple[float, float]:
-        """
-        Go on by one reading; return (board, case).
-
-        """
+        """Go on by one reading; return (board, case)."""
         phase = seconds % (2.0 * (RAMP_S + REST_S))
         up = min(phase, RAMP_S) - min(max(phase - RAMP_S - REST_S, 0.0), RAMP_S)
         dt = 1.0 / READINGS_HZ
@@ -72,10 +65,7 @@ class Temperatures:
 
 
 class Soak:
-    """
-    The peer of the node: driver, INS, operator.
-
-    """
+    """The peer of the node: driver, INS, operator."""
 
     def __init__(self, node: Any, context: Any, rate: int) -> None:
         import rclpy
@@ -117,10 +107,7 @@ class Soak:
         self._thread.start()
 
     def close(self) -> None:
-        """
-        Leave the middleware.
-
-        """
+        """Leave the middleware."""
         self._loop.stop()
         self._thread.join(TIMEOUT_S)
         self._loop.close()
@@ -151,10 +138,7 @@ class Soak:
             self._news.notify_all()
 
     def send(self, n: int) -> None:
-        """
-        Publish samples, with the temperatures that belong before them.
-
-        """
+        """Publish samples, with the temperatures that belong before them."""
         head, frame_length, frame = HEAD
         for index in range(self.n_sent, self.n_sent + n):
             sec, nanosec = divmod(self.start_ns + index * SECOND_NS // self.rate, SECOND_NS)
@@ -168,19 +152,13 @@ class Soak:
         self.n_sent += n
 
     def wait_for(self, condition: Any, what: str, timeout: float = TIMEOUT_S) -> None:
-        """
-        Wait for a condition on what was heard, or end with what the node said.
-
-        """
+        """Wait for a condition on what was heard, or end with what the node said."""
         with self._news:
             if not self._news.wait_for(condition, timeout) or not self.process.is_alive:
                 raise SystemExit(f'{what} did not come; {self.account}; {self.process.said}')
 
     def meet(self) -> None:
-        """
-        Publish until the first sample comes back; count from there.
-
-        """
+        """Publish until the first sample comes back; count from there."""
         deadline = time.monotonic() + TIMEOUT_S
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
@@ -198,10 +176,7 @@ class Soak:
         self.latencies.clear()
 
     def reload(self, path: str) -> None:
-        """
-        Set `calibration_file`, without waiting for the answer.
-
-        """
+        """Set `calibration_file`, without waiting for the answer."""
         from rcl_interfaces.srv import SetParameters
         from rclpy.parameter import Parameter
 
@@ -213,10 +188,7 @@ class Soak:
         self.client.call_async(request).add_done_callback(count)
 
     def run(self, seconds: float, paths: list[str]) -> dict[str, Any]:
-        """
-        Publish for so long; return the account.
-
-        """
+        """Publish for so long; return the account."""
         memory: list[tuple[float, float]] = []
         latency: list[tuple[float, float, float]] = []
         n_reloads = n_sent = 0
@@ -275,7 +247,6 @@ def _resident_kib(pid: int) -> float:
 def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, float] | None:
     """
     Return the slope per hour and its standard error, from means over windows; None if too short.
-
     """
     table = np.array(rows)
     table = table[table[:, 0] >= 0.1 * table[-1, 0]]
@@ -294,7 +265,6 @@ def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, floa
 def calibrations(rate: int, folder: Path) -> list[str]:
     """
     Write two calibrations of the example's unit at a rate, with quick lags, to change between.
-
     """
     from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
     from thermo_comp.unit.calibration_file import load_calibration, save_calibration
@@ -317,10 +287,7 @@ def calibrations(rate: int, folder: Path) -> list[str]:
 
 
 def main() -> int:
-    """
-    Run a soak and print its account.
-
-    """
+    """Run a soak and print its account."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--minutes', type=float, default=60.0)
     parser.add_argument('--rate', type=int, default=2000, help='samples per second')

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what is fuzzed through a file of its own: databases, compressed bags, tables.
-
-"""
+"""Owns what is fuzzed through a file of its own: databases, compressed bags, tables."""
 
 from __future__ import annotations
 
@@ -51,20 +48,14 @@ def _one_line(check: Callable[[], None]) -> None:
 
 
 def check_database(data: bytes) -> None:
-    """
-    Any bytes are a database with messages, or one clear line.
-
-    """
+    """Any bytes are a database with messages, or one clear line."""
     path = Path(FOLDER.name, 'bag.db3')
     path.write_bytes(data)
     _one_line(lambda: _read(path, len(data)))
 
 
 def check_compressed(data: bytes) -> None:
-    """
-    Any bytes are a compressed file of a bag, or one clear line.
-
-    """
+    """Any bytes are a compressed file of a bag, or one clear line."""
     folder = Path(FOLDER.name, 'bag')
     folder.mkdir(exist_ok=True)
     (folder / 'metadata.yaml').write_text(METADATA, encoding='ascii')
@@ -79,18 +70,12 @@ def _read(path: Path, n_bytes: int) -> None:
 
 
 def check_csv(data: bytes) -> None:
-    """
-    Any bytes are a table that becomes a bag, or one clear line.
-
-    """
+    """Any bytes are a table that becomes a bag, or one clear line."""
     _check_table('log.csv', data)
 
 
 def check_parquet(data: bytes) -> None:
-    """
-    Any bytes are a Parquet table that becomes a bag, or one clear line.
-
-    """
+    """Any bytes are a Parquet table that becomes a bag, or one clear line."""
     _check_table('log.parquet', data)
 
 
@@ -107,10 +92,7 @@ def _check_table(name: str, data: bytes) -> None:
 
 
 def database(messages: list[tuple[str, str, int, bytes]]) -> bytes:
-    """
-    Make a database of (topic, type, log time, content), as short as it can be.
-
-    """
+    """Make a database of (topic, type, log time, content), as short as it can be."""
     path = Path(FOLDER.name, 'seed.db3')
     path.unlink(missing_ok=True)
     kinds = {topic: (number, kind) for number, (topic, kind, _, _) in enumerate(messages, 1)}
@@ -136,10 +118,7 @@ def database(messages: list[tuple[str, str, int, bytes]]) -> bytes:
 
 
 def tables(start_ns: int) -> tuple[bytes, bytes]:
-    """
-    Make a small table as CSV and as Parquet.
-
-    """
+    """Make a small table as CSV and as Parquet."""
     rows = [(start_ns + 10**7 * k, 10.0 + k, 20.0, 2900.0, 21.5) for k in range(4)]
     text = ''.join(','.join(map(str, row)) + '\n' for row in rows).encode()
     path = Path(FOLDER.name, 'seed.parquet')
@@ -150,8 +129,5 @@ def tables(start_ns: int) -> tuple[bytes, bytes]:
 
 
 def compressed(bag: bytes) -> bytes:
-    """
-    Compress a file of a bag as rosbag2 does.
-
-    """
+    """Compress a file of a bag as rosbag2 does."""
     return zstandard.compress(bag)

@@ -8,7 +8,6 @@ Runs the fuzz targets, guided by coverage, for a time or a number of inputs.
 Needs the extra `fuzz` (atheris). A target fails on an exception, on an input that takes 10 s, and
 beyond 1 GiB of memory; the input is then left as `crash-*` in the working folder. What was found
 worth keeping grows in `fuzz/corpus/`, which is not under version control.
-
 """
 
 from __future__ import annotations
@@ -24,10 +23,7 @@ NAMES = ('calibration', 'mcap', 'cdr', 'db3', 'zstd', 'csv', 'parquet')
 
 
 def main() -> int:
-    """
-    Run one target here, or all of them one after the other.
-
-    """
+    """Run one target here, or all of them one after the other."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('target', choices=(*NAMES, 'all'), nargs='?', default='all')
     parser.add_argument('--seconds', type=int, default=60, help='per target (default 60)')

@@ -5,7 +5,6 @@ Owns what is fuzzed: the doors through which bytes of strangers come, and what m
 
 Each target takes any bytes and raises where a promise is broken; its seeds are small and whole, so
 that the fuzzer begins behind the first checks.
-
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ MAGIC = b'\x89MCAP0\r\n'
 
 @dataclass(frozen=True)
 class Target:
-    """
-    A door.
-
-    """
+    """A door."""
 
     check: Callable[[bytes], None]
     seeds: list[bytes]
@@ -45,10 +41,7 @@ class Target:
 
 
 def small_calibration() -> Calibration:
-    """
-    Make a unit of a few terms.
-
-    """
+    """Make a unit of a few terms."""
     axis = AxisSet(Polynomial((0.0, 0.5)), Polynomial((1.0, 1e-5)))
     sets = RegimeSet(x=axis, y=axis, z=axis, temperature_range_c=(5, 35), rate_range_k_min=(-1, 1))
     return Calibration(
@@ -71,10 +64,7 @@ COMPENSATOR = Compensator(UNIT)
 
 
 def check_calibration(data: bytes) -> None:
-    """
-    Any bytes are a calibration, or one clear line; a calibration survives its round trip.
-
-    """
+    """Any bytes are a calibration, or one clear line; a calibration survives its round trip."""
     try:
         value = parse_calibration(data, 'fuzz.yaml')
     except CalibrationError as error:
@@ -108,34 +98,22 @@ noise_density_m_s2_sqrt_hz: [1, 1, 1]
 
 
 class MemoryFile:
-    """
-    A file that is nowhere.
-
-    """
+    """A file that is nowhere."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
         self.size = len(data)
 
     def read_at(self, at: int, n_bytes: int) -> bytes:
-        """
-        Read as `pread` does.
-
-        """
+        """Read as `pread` does."""
         return self._data[at : at + n_bytes]
 
     def close(self) -> None:
-        """
-        Forget nothing.
-
-        """
+        """Forget nothing."""
 
 
 def check_mcap(data: bytes) -> None:
-    """
-    Any bytes are a bag, or one clear line; no more comes out than can have been in it.
-
-    """
+    """Any bytes are a bag, or one clear line; no more comes out than can have been in it."""
     with suppress(RecordingError):
         try:
             with open_mcap([Path('fuzz.mcap')], lambda _: MemoryFile(data), require=()) as reader:
@@ -150,10 +128,7 @@ def check_mcap(data: bytes) -> None:
 
 
 def check_cdr(data: bytes) -> None:
-    """
-    Any messages: what the node would publish is a whole, finite Imu message.
-
-    """
+    """Any messages: what the node would publish is a whole, finite Imu message."""
     # ROS is needed for this target only.
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.serialization import deserialize_message
@@ -188,10 +163,7 @@ def check_cdr(data: bytes) -> None:
 
 
 def check_parameters(data: bytes) -> None:
-    """
-    Any requests to set parameters: each is answered, with a reason where it is refused.
-
-    """
+    """Any requests to set parameters: each is answered, with a reason where it is refused."""
     # ROS is needed for this target and the one above only.
     from rcl_interfaces.msg import Parameter, ParameterValue
     from rcl_interfaces.srv import SetParameters
@@ -232,10 +204,7 @@ def _text(text: str) -> bytes:
 
 
 def cdr(stamp_ns: int, *numbers: float) -> bytes:
-    """
-    Serialize a stamped message of doubles.
-
-    """
+    """Serialize a stamped message of doubles."""
     sec, nanosec = divmod(stamp_ns, 1_000_000_000)
     head = struct.pack('<4siII', b'\0\1\0\0', sec, nanosec, 4) + b'imu\0'
     return head + bytes(-(len(head) - 4) % 8) + struct.pack(f'<{len(numbers)}d', *numbers)
@@ -284,20 +253,11 @@ def _messages() -> list[bytes]:
 
 
 def targets() -> dict[str, Target]:
-    """
-    Return the targets by name.
-
-    """
+    """Return the targets by name."""
     return {
         'calibration': Target(
             check_calibration,
-            [
-                SMALLEST,
-                b'{unit: {serial: a}}',
-                b'a: &a [*a]',
-                b'[' * 20,
-                b'a: 1e5',
-            ],
+            [SMALLEST, b'{unit: {serial: a}}', b'a: &a [*a]', b'[' * 20, b'a: 1e5'],
             1600,
         ),
         'mcap': Target(check_mcap, [_bag(''), _bag('zstd'), _bag('lz4')], 4096),
@@ -308,10 +268,7 @@ def targets() -> dict[str, Target]:
 
 
 def file_targets() -> dict[str, Target]:
-    """
-    Return the targets that need a file of their own.
-
-    """
+    """Return the targets that need a file of their own."""
     messages = [
         (topic, kind, START_NS + k, cdr(START_NS + k, *range(k, k + width)))
         for topic, kind, width in _KINDS

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the small calibrations and blocks that the tests of the core are built on.
-
-"""
+"""Owns the small calibrations and blocks that the tests of the core are built on."""
 
 from __future__ import annotations
 
@@ -107,7 +104,6 @@ class Columns:
 def columns_from_events(events):
     """
     Columns from (kind, stamp_ns, value) in file order; kind is 'accel' or a thermometer's name.
-
     """
     accel = [(s, v) for kind, s, v in events if kind == 'accel']
     readings = {}

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns what every test shares: an own DDS domain per test process, seeds, the command line's door.
-
 """
 
 from __future__ import annotations
@@ -42,10 +41,7 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
 class Cli(Protocol):
-    """
-    Run ``thermo_comp`` as a user does, in a process of its own.
-
-    """
+    """Run ``thermo_comp`` as a user does, in a process of its own."""
 
     def __call__(
         self, *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
@@ -64,10 +60,7 @@ def root() -> Path:
 
 @pytest.fixture(scope='session')
 def real_data() -> Path:
-    """
-    Return the folder of real recordings made by others, which the project may not ship.
-
-    """
+    """Return the folder of real recordings made by others, which the project may not ship."""
     folder = Path(os.environ.get('THERMO_COMP_DATA', ROOT.parent / 'shared' / 'data'))
     if not folder.is_dir():
         pytest.skip(f'the real recordings are not in {folder} (set THERMO_COMP_DATA)')

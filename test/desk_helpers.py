@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A user's desk: a folder with every file that an example in a help text or a page names.
-
-"""
+"""A user's desk: a folder with every file that an example in a help text or a page names."""
 
 from __future__ import annotations
 
@@ -50,10 +47,7 @@ class Desk:
         (self._ready / 'config').symlink_to(ROOT / 'config')
 
     def _make(self, name: str) -> None:
-        """
-        Make one file, when the first example asks for it.
-
-        """
+        """Make one file, when the first example asks for it."""
         path = self._ready / name
         if path.exists():
             return
@@ -154,10 +148,7 @@ class Desk:
         return self._cli(*arguments, cwd=here)
 
     def _view(self, arguments: list[str], here: Path) -> subprocess.CompletedProcess[str]:
-        """
-        Start a command that serves until Ctrl-C, and press Ctrl-C once it says where.
-
-        """
+        """Start a command that serves until Ctrl-C, and press Ctrl-C once it says where."""
         process = subprocess.Popen(
             [sys.executable, '-m', 'thermo_comp', *arguments],
             cwd=here,
@@ -181,7 +172,6 @@ def same_words(got: str, expected: str) -> bool:
 
     A figure may differ on another processor (last bits) or another day (dates, speed); its order
     of magnitude may not.
-
     """
     if NUMBER.sub('#', got).split() != NUMBER.sub('#', expected).split():
         return False

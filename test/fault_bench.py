@@ -6,7 +6,6 @@ Owns the fault bench: messages over DDS into the real node process, and what com
 Messages go in at full speed, some hundred at a time; after each lot the bench waits until the
 node's diagnostics account for every sample. So nothing is lost that is not to be lost, a fault
 shows in at least one report, and the result does not depend on the machine.
-
 """
 
 from __future__ import annotations
@@ -22,15 +21,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from fault_rig import (
-    CONFIG,
-    STANDS_S,
-    START_NS,
-    Event,
-    counts_of,
-    force_at,
-    seconds_of,
-)
+from fault_rig import CONFIG, STANDS_S, START_NS, Event, counts_of, force_at, seconds_of
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
@@ -75,10 +66,7 @@ PARAMETERS = (
 
 @dataclass
 class Heard:
-    """
-    What the node said while one bag played.
-
-    """
+    """What the node said while one bag played."""
 
     stamp_ns: np.ndarray
     force: np.ndarray
@@ -93,10 +81,7 @@ class Heard:
 
 
 class Bench:
-    """
-    A peer of the node: three drivers and an INS in one.
-
-    """
+    """A peer of the node: three drivers and an INS in one."""
 
     def __init__(self, node: NodeProcess, context: Context) -> None:
         self.process = node
@@ -279,10 +264,7 @@ def lots(events: list[Event]) -> Iterator[list[Event]]:
 
 @contextmanager
 def bench(calibration: Path, *parameters: str) -> Iterator[Bench]:
-    """
-    Start a node process and a peer that has met it.
-
-    """
+    """Start a node process and a peer that has met it."""
     overrides = [f'calibration_file:={calibration}', *PARAMETERS, *parameters]
     arguments = [word for one in overrides for word in ('-p', one)]
     context = Context()

@@ -4,7 +4,6 @@
 Owns docs/faults.md: the page that says in words what the rows of the fault bench hold.
 
 Run ``python test/fault_page.py`` after changing a row; a test compares.
-
 """
 
 from __future__ import annotations

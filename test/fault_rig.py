@@ -7,7 +7,6 @@ and what may be done to its messages.
 The unit is described by what its calibration can describe, so that every error beyond noise is the
 fault's: any published number can be held against the truth with the covariance it came with. Time
 is short: the lags are seconds where those of a real unit are minutes.
-
 """
 
 from __future__ import annotations
@@ -22,12 +21,7 @@ from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
 
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.unit.calibration import (
-    Axes,
-    AxisReference,
-    Calibration,
-    Unit,
-)
+from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
 
 START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
@@ -109,10 +103,7 @@ def force_at(seconds: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Truth:
-    """
-    The unit's thermal truth on a fine grid.
-
-    """
+    """The unit's thermal truth on a fine grid."""
 
     time: np.ndarray
     case: np.ndarray

@@ -5,7 +5,6 @@ Owns the table of faults: what is injected, what must come out, what the diagnos
 
 Times are seconds of the bag of `fault_rig`: it turns until 40, ramps from 60 to 120, and the lag
 of the board has died by 270. The same rows make the table in docs/faults.md.
-
 """
 
 from __future__ import annotations
@@ -40,10 +39,7 @@ N_SAMPLES = round(RATE_HZ * DURATION_S)
 
 @dataclass(frozen=True)
 class Row:
-    """
-    One fault.
-
-    """
+    """One fault."""
 
     fault: str
     injection: str
@@ -150,10 +146,7 @@ def sensor_rows(name: str) -> list[Row]:
             '+40 K for 50 s',
             'not used until it has been lost; then a new beginning, with a larger covariance',
             value(name, 80.0, 130.0, lambda v: v + 40.0),
-            (
-                (WARN, f'{name} temperature jumped by +'),
-                (WARN, 'outside the calibrated range'),
-            ),
+            ((WARN, f'{name} temperature jumped by +'), (WARN, 'outside the calibrated range')),
             3950,
             recovered=230.0,
         ),

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the table of the faults around the node and of files; each has a test of its own.
-
-"""
+"""Owns the table of the faults around the node and of files; each has a test of its own."""
 
 from __future__ import annotations
 
@@ -12,10 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Told:
-    """
-    A fault around the node or of a file, with a test of its own.
-
-    """
+    """A fault around the node or of a file, with a test of its own."""
 
     fault: str
     injection: str

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns window tables with known truth for the tests of the regression, without samples or sensors.
-
 """
 
 from __future__ import annotations
@@ -27,10 +26,7 @@ MICRO = 1e-6 * GRAVITY
 
 @dataclass(frozen=True)
 class Truth:
-    """
-    One unit, in m/s^2 of the nominal scale factor; weights per physical unit of the columns.
-
-    """
+    """One unit, in m/s^2 of the nominal scale factor; weights per physical unit of the columns."""
 
     kappa: Floats = field(default_factory=lambda: np.array([1.0003, 0.9996, 1.0005]))
     bias: Floats = field(default_factory=lambda: np.array([5e-3, -8e-3, 2e-3]))
@@ -57,10 +53,7 @@ def table_of(
     step_s: float = 120.0,
     up: Floats | None = None,
 ) -> tuple[Windows, Floats]:
-    """
-    Draw a table of windows, one bag per position; also return the true directions.
-
-    """
+    """Draw a table of windows, one bag per position; also return the true directions."""
     up = positions(n_positions, 3) if up is None else up
     time = step_s * (np.arange(n_windows) + 0.5)
     # Once up and down in each bag, each time a little otherwise.
@@ -115,20 +108,14 @@ def _columns(time: Floats, step_s: float, turns: float) -> Floats:
 
 
 def widths(names: tuple[str, ...], sd: float) -> Floats:
-    """
-    Width of each column: 0 where it takes no part.
-
-    """
+    """Width of each column: 0 where it takes no part."""
     return np.where(np.isin(GROUPS, names), sd, 0.0)
 
 
 def prior_of(
     truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: object
 ) -> Prior:
-    """
-    Return a wide prior with the true noises.
-
-    """
+    """Return a wide prior with the true noises."""
     known: dict[str, object] = {
         'bias_mean': np.zeros(3),
         'bias_sd': np.full(3, 1.0),
@@ -144,10 +131,7 @@ def prior_of(
 
 
 def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
-    """
-    Return a regression and a state a little beside the truth.
-
-    """
+    """Return a regression and a state a little beside the truth."""
     regression = Regression(windows, GRAVITY, NOMINAL)
     turned = up + np.array([2e-3, -1e-3, 3e-3])
     turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)

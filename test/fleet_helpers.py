@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns small fleets: units that are simulated in a hundredth of a second, and fitted in a half.
-
-"""
+"""Owns small fleets: units that are simulated in a hundredth of a second, and fitted in a half."""
 
 from __future__ import annotations
 
@@ -37,7 +34,6 @@ def write_unit(
 ) -> list[Path]:
     """
     Simulate one thermal test of one unit, one bag per position; its thermometers may be exchanged.
-
     """
     unit = preset('mems', seed)
     folder.mkdir(parents=True, exist_ok=True)
@@ -65,10 +61,7 @@ def write_unit(
 
 
 def damage(path: Path) -> None:
-    """
-    Overwrite some bytes in the middle of a bag, as a bad disk does.
-
-    """
+    """Overwrite some bytes in the middle of a bag, as a bad disk does."""
     content = bytearray(path.read_bytes())
     middle = len(content) // 3
     content[middle : middle + 64] = bytes(64)

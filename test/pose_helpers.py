@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the simulated rests in one attitude that the tests of the partial fits are built on.
-
-"""
+"""Owns the simulated rests in one attitude that the tests of the partial fits are built on."""
 
 from __future__ import annotations
 
@@ -35,10 +32,7 @@ class ImuBlock(ArrayBlock):
 
 @dataclass
 class Rest:
-    """
-    Samples of a sensor at rest: noise on `level`, a board that cools from `warm` by `fall`.
-
-    """
+    """Samples of a sensor at rest: noise on `level`, a board that cools from `warm` by `fall`."""
 
     rng: np.random.Generator
     duration_s: float = 600.0

@@ -5,7 +5,6 @@ Owns the reading of the README: its blocks, the outputs that it shows, and how a
 
 ``python test/readme_helpers.py`` runs the shown commands and writes what they say into the README,
 and the picture of the demonstration into docs/images; look at the difference before you commit it.
-
 """
 
 from __future__ import annotations
@@ -26,10 +25,7 @@ _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
 def shown() -> dict[str, tuple[list[str], str]]:
-    """
-    Return what the README shows: sub-command -> (words of the command line, output).
-
-    """
+    """Return what the README shows: sub-command -> (words of the command line, output)."""
     found = {}
     for kind, text in FENCES:
         if kind == 'console':
@@ -46,7 +42,6 @@ def is_alike(got: str, expected: str) -> bool:
 
     A figure may differ on another processor (last bits) or another day (speed); its order of
     magnitude may not.
-
     """
     if _NUMBER.sub('#', got).split() != _NUMBER.sub('#', expected).split():
         return False
@@ -57,7 +52,6 @@ def is_alike(got: str, expected: str) -> bool:
 def refresh() -> None:
     """
     Write the real output of the shown commands, and the table of the parameters, into the README.
-
     """
     from thermo_comp.ros.parameters import parameters_table
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns bags made by other tools, and the plain-Python account of what a reader must make of them.
-
 """
 
 from __future__ import annotations
@@ -41,10 +40,7 @@ START_NS = 1_600_000_000_000_000_000
 
 @dataclass
 class Message:
-    """
-    One message of a test bag: what is put into it.
-
-    """
+    """One message of a test bag: what is put into it."""
 
     topic: str
     log_ns: int
@@ -100,10 +96,7 @@ def write_mcap(
     repeat: bool = True,
     enable_crcs: bool = True,
 ) -> None:
-    """
-    Write a bare file with the `mcap` library.
-
-    """
+    """Write a bare file with the `mcap` library."""
     with path.open('wb') as file:
         writer = McapWriter(
             file,
@@ -135,16 +128,9 @@ def write_mcap(
 
 
 def write_rosbag2(
-    path: Path,
-    messages: list[Message],
-    *,
-    storage: str = 'mcap',
-    compression: str = '',
+    path: Path, messages: list[Message], *, storage: str = 'mcap', compression: str = ''
 ) -> None:
-    """
-    Write a rosbag2 directory with `rosbags`.
-
-    """
+    """Write a rosbag2 directory with `rosbags`."""
     plugin = StoragePlugin.MCAP if storage == 'mcap' else StoragePlugin.SQLITE3
     writer = Writer2(path, version=9, storage_plugin=plugin)
     if compression:
@@ -160,10 +146,7 @@ def write_rosbag2(
 
 
 def write_rosbag1(path: Path, messages: list[Message]) -> None:
-    """
-    Write a ROS 1 bag with `rosbags`.
-
-    """
+    """Write a ROS 1 bag with `rosbags`."""
     store = typestore(1)
     with Writer1(path) as writer:
         connections: dict[str, Any] = {}
@@ -178,10 +161,7 @@ def write_rosbag1(path: Path, messages: list[Message]) -> None:
 
 
 def read_with_rosbags(path: Path) -> list[tuple[str, int, Any]]:
-    """
-    Topic, log time and content of each message, in the order that `rosbags` gives.
-
-    """
+    """Topic, log time and content of each message, in the order that `rosbags` gives."""
     with Reader2(path) as reader:
         return [
             (c.topic, log_ns, typestore().deserialize_cdr(data, c.msgtype))
@@ -190,10 +170,7 @@ def read_with_rosbags(path: Path) -> list[tuple[str, int, Any]]:
 
 
 def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
-    """
-    Make the columns that a bag with these messages, in reading order, must give.
-
-    """
+    """Make the columns that a bag with these messages, in reading order, must give."""
     columns: dict[str, list[Any]] = {
         f'{role}_{name}': []
         for role in ('accel', 'board', 'case')
@@ -216,10 +193,7 @@ def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
 
 
 def assert_columns(block: Block, messages: list[Message]) -> None:
-    """
-    Check that the block holds exactly these messages in this order.
-
-    """
+    """Check that the block holds exactly these messages in this order."""
     expected = columns_of(messages)
     for role in ('accel', 'board', 'case'):
         for name in ('stamp_ns', 'log_ns'):
@@ -237,10 +211,7 @@ def assert_columns(block: Block, messages: list[Message]) -> None:
 
 
 def regular_messages(n: int = 40, accel: str = ACCEL, every: int = 8) -> list[Message]:
-    """
-    Make a small well-behaved bag: counts, and both temperatures each some counts.
-
-    """
+    """Make a small well-behaved bag: counts, and both temperatures each some counts."""
     messages: list[Message] = []
     width = 3 if accel == ACCEL else 37
     for row in range(n):

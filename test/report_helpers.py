@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the small thermal tests that the report's tests look at: simulated, so that truth is known.
-
 """
 
 from __future__ import annotations
@@ -31,10 +30,7 @@ N_POSITIONS = 9
 
 @cache
 def run(position: int = 0) -> SimulatedRun:
-    """
-    Run one position of a thermostatted unit through 54 minutes of ramps and soaks.
-
-    """
+    """Run one position of a thermostatted unit through 54 minutes of ramps and soaks."""
     return simulate(
         unit_preset('thermostatted', 1),
         parse_cyclogram(PROGRAM),
@@ -46,10 +42,7 @@ def run(position: int = 0) -> SimulatedRun:
 
 @cache
 def fitted() -> FitResult:
-    """
-    Fit all positions of that unit.
-
-    """
+    """Fit all positions of that unit."""
     sources = []
     for position in range(N_POSITIONS):
         one = run(position)
@@ -74,19 +67,13 @@ def fitted() -> FitResult:
 
 @cache
 def evidence() -> Evidence:
-    """
-    Gather what that fit has to show.
-
-    """
+    """Gather what that fit has to show."""
     return evidence_of_fit(fitted(), program=PROGRAM)
 
 
 @cache
 def certificate() -> str:
-    """
-    Write the page of that fit; drawing takes seconds, so it is done once.
-
-    """
+    """Write the page of that fit; drawing takes seconds, so it is done once."""
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / 'page.html'
         write_report(evidence(), page)
@@ -94,16 +81,9 @@ def certificate() -> str:
 
 
 def write_bag(path: Path, position: int = 0, frame_id: str = 'imu_link', **metadata: str) -> Path:
-    """
-    Write a position's run as a bag.
-
-    """
+    """Write a position's run as a bag."""
     one = run(position)
-    facts = {
-        'serial': 'thermostatted-0001',
-        'truth': json.dumps({'profile': PROGRAM}),
-        **metadata,
-    }
+    facts = {'serial': 'thermostatted-0001', 'truth': json.dumps({'profile': PROGRAM}), **metadata}
     with BagWriter(path, metadata=facts) as writer:
         writer.write_temperature('temperature/board', one.board_stamp_ns, one.board)
         writer.write_temperature('temperature/case', one.case_stamp_ns, one.case)

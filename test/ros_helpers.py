@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the other end of the node in tests: a peer on real DDS that publishes, listens and calls.
-
 """
 
 from __future__ import annotations
@@ -47,10 +46,7 @@ def standing(k: int) -> tuple[float, float, float]:
 
 
 class Peer:
-    """
-    A node with a thread of its own; everything received wakes `wait_for`.
-
-    """
+    """A node with a thread of its own; everything received wakes `wait_for`."""
 
     def __init__(self) -> None:
         self.context = Context()
@@ -152,10 +148,7 @@ def _messages(values: dict[str, Any]) -> list[ParameterMessage]:
 
 
 class Driver:
-    """
-    Publishes samples and temperatures as a unit's drivers do, and knows what it sent.
-
-    """
+    """Publishes samples and temperatures as a unit's drivers do, and knows what it sent."""
 
     def __init__(
         self,
@@ -189,10 +182,7 @@ def drive(
     topic: str = 'accel/counts',
     qos: QoSProfile = DEEP,
 ) -> Driver:
-    """
-    Connect drivers to a node of this process.
-
-    """
+    """Connect drivers to a node of this process."""
     driver = Driver(peer, kind, topic, qos)
     peer.join(node)
     return driver
@@ -200,10 +190,7 @@ def drive(
 
 @contextlib.contextmanager
 def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
-    """
-    Run the real node in a thread of this process, in a context of its own.
-
-    """
+    """Run the real node in a thread of this process, in a context of its own."""
     context = Context()
     rclpy.init(args=['--ros-args', *ros_args], context=context)
     try:

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What the pages on theory and architecture say of the source is what stands there.
-
-"""
+"""What the pages on theory and architecture say of the source is what stands there."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The sample bags are what their README says: small, complete, and made by its two commands.
-
-"""
+"""The sample bags are what their README says: small, complete, and made by its two commands."""
 
 from __future__ import annotations
 

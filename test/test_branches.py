@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Steps at rest: what jumped, when and by how much; what was only turned, moved or bumped.
-
-"""
+"""Steps at rest: what jumped, when and by how much; what was only turned, moved or bumped."""
 
 from __future__ import annotations
 

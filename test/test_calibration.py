@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The calibration value and its file: round trip to the bit, and every refusal with its key.
-
-"""
+"""The calibration value and its file: round trip to the bit, and every refusal with its key."""
 
 import contextlib
 import json
@@ -261,12 +258,7 @@ def test_files_that_are_no_files(tmp_path):
 @pytest.mark.parametrize(
     ('old', 'new', 'key', 'message'),
     [
-        (
-            '[4.0, 37.0]',
-            '[4.0, 999.0]',
-            'static.y.bias_function',
-            'must be finite over its range',
-        ),
+        ('[4.0, 37.0]', '[4.0, 999.0]', 'static.y.bias_function', 'must be finite over its range'),
         ('[4.0, 37.0]', '[4.0, 1e5]', 'static.temperature_range_c[1]', 'less than 1000'),
         ('[4.0, 37.0]', '[-300, 37.0]', 'static.temperature_range_c[0]', 'at least -273.15'),
         ('c: 20.0', 'c: 1e308', 'reference_temperature_c', 'less than 1000'),

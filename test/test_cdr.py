@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Serialized in, serialized out: always what rclpy would make of the same message, or a fallback.
-
 """
 
 from __future__ import annotations
@@ -222,7 +221,7 @@ def test_temperature() -> None:
         st.floats(),
         st.integers(0, 40),
         st.sampled_from([b'', b'\0\0\0\0', bytes(8)]),
-    ),
+    )
 )
 def test_a_temperature_is_read_as_rclpy_reads_it(data: bytes) -> None:
     try:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The command line: help with examples, tables that fit and pipe, JSON that parses, quick starts.
-
 """
 
 from __future__ import annotations
@@ -35,10 +34,7 @@ COMMANDS = sorted(
 
 @pytest.fixture(scope='session')
 def bag(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Path:
-    """
-    Simulate a short thermal test through the command line.
-
-    """
+    """Simulate a short thermal test through the command line."""
     # 15 minutes at 10 Hz, without the 4 samples before the board's first reading at 0.5 s: 8996.
     path = tmp_path_factory.mktemp('cli') / 'bag'
     cli('simulate', '--profile', '20 4min, 30@2 6min', '--rate-hz', '10', '-o', path)
@@ -136,10 +132,7 @@ class TestOutput:
 
 
 def on_a_terminal(*arguments: str, no_color: bool = False) -> str:
-    """
-    Run the command line on a pseudo-terminal and return what it showed.
-
-    """
+    """Run the command line on a pseudo-terminal and return what it showed."""
     leader, follower = pty.openpty()
     environment = {**os.environ, 'COLUMNS': '80', 'TERM': 'xterm-256color'}
     environment.pop('NO_COLOR', None)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The demonstration does what it says: over real DDS, losing nothing, with the offline run's bits.
-
 """
 
 from __future__ import annotations

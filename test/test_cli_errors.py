@@ -5,7 +5,6 @@ Bad input gets one clear line on stderr and an exit code, through the door that 
 
 1: the data or the result is bad. 2: the command line is wrong. Never a traceback (`cli` asserts
 that of every run), nothing on stdout, nothing left behind.
-
 """
 
 from __future__ import annotations
@@ -36,10 +35,7 @@ def bag(
     n: int = 600,
     up: tuple[float, float, float] = (0.6, 0.0, 0.8),
 ) -> Path:
-    """
-    Write a minute of a resting unit with the topics asked for.
-
-    """
+    """Write a minute of a resting unit with the topics asked for."""
     stamps = START_NS + np.arange(n) * 100_000_000
     with BagWriter(path, metadata={'serial': serial} if serial else None) as writer:
         for topic, wanted in ((TOPICS.board, board), (TOPICS.case, case)):
@@ -58,10 +54,7 @@ def unit(tmp_path: Path) -> Path:
 
 
 def refused(cli: Cli, code: int, message: str, *arguments: str | Path) -> None:
-    """
-    Run a command that must fail with exactly one line that says this.
-
-    """
+    """Run a command that must fail with exactly one line that says this."""
     finished = cli(*arguments, code=code)
     lines = finished.stderr.splitlines()
     assert len(lines) == 1, finished.stderr

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What a terminal shows can be believed: examples run, JSON parses, quiet is quiet, lines fit.
-
-"""
+"""What a terminal shows can be believed: examples run, JSON parses, quiet is quiet, lines fit."""
 
 from __future__ import annotations
 
@@ -21,10 +18,7 @@ from thermo_comp.cli.app import app
 
 
 def leaves(group: Any, prefix: str = '') -> dict[str, Any]:
-    """
-    Return every command by the words that call it, those of groups included.
-
-    """
+    """Return every command by the words that call it, those of groups included."""
     found: dict[str, Any] = {}
     for name, one in group.commands.items():
         inner = hasattr(one, 'commands')

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The table of columns: the bank, what it needs remembered, and each value by hand.
-
-"""
+"""The table of columns: the bank, what it needs remembered, and each value by hand."""
 
 from __future__ import annotations
 
@@ -19,14 +16,7 @@ from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.thermal.state import Layout
 from thermo_comp.thermal.tracker import ThermalTracker
-from thermo_comp.unit.columns import (
-    BANK_TAUS,
-    UNBOUNDED,
-    Column,
-    bank,
-    memory_of,
-    values,
-)
+from thermo_comp.unit.columns import BANK_TAUS, UNBOUNDED, Column, bank, memory_of, values
 
 WIDE = {'range': UNBOUNDED}
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The compensator against hand numbers, Monte Carlo, and itself: stream = batch, chunked = whole.
-
 """
 
 import math

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A table becomes a bag in which every row is accounted for, and comes back from it unchanged.
-
-"""
+"""A table becomes a bag in which every row is accounted for, and comes back from it unchanged."""
 
 from __future__ import annotations
 
@@ -31,10 +28,7 @@ STEP_NS = 10_000_000
 
 
 def table(path: Path, n: int = 400, scale: float = 1.0) -> tuple[Path, dict[str, np.ndarray]]:
-    """
-    Write a still log with slow temperatures that are held between their own readings.
-
-    """
+    """Write a still log with slow temperatures that are held between their own readings."""
     rng = np.random.default_rng(1)
     columns = {
         'ms': 1000 + 10 * np.arange(n),
@@ -364,10 +358,7 @@ class TestCommand:
 
 
 class TestFreezer:
-    """
-    A real MPU6050 in a freezer, with all the faults a real log has.
-
-    """
+    """A real MPU6050 in a freezer, with all the faults a real log has."""
 
     @pytest.fixture
     def path(self, real_data: Path) -> Path:
@@ -437,7 +428,6 @@ def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> 
     WHY: an integer stamp of 2e10 s wrapped to 600 s, and 1e30 put all rows on one stamp.
 
     WHAT: a row is in the bag at its own stamp, or it is left out and counted.
-
     """
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Other people's bags: topics of any name, ROS 1 and 2, and units that are checked at rest.
-
-"""
+"""Other people's bags: topics of any name, ROS 1 and 2, and units that are checked at rest."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@
 ArduPilot logs: what a hand-written DataFlash file holds comes out of the bag, sensor by sensor.
 
 The writer below follows the public description of the format and shares no code with the reader.
-
 """
 
 from __future__ import annotations
@@ -33,10 +32,7 @@ STEP_US = 20_000
 
 
 class DataflashWriter:
-    """
-    A minimal DataFlash log: formats, then messages.
-
-    """
+    """A minimal DataFlash log: formats, then messages."""
 
     def __init__(self) -> None:
         self.body = b''

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Tables of numbers: every layout reads alike, every bad cell is seen, every error names the place.
-
 """
 
 from __future__ import annotations
@@ -79,12 +78,7 @@ def test_chunks_make_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_stamps_are_exact() -> None:
     # A float64 of nanoseconds since 1970 has steps of 256 ns.
     cells = ['1767225600.123456789', '1767225600123456789e-9', ' +2 ', '1.5e-9']
-    assert exact_ns(cells, 9).tolist() == [
-        1767225600123456789,
-        1767225600123456789,
-        2 * 10**9,
-        2,
-    ]
+    assert exact_ns(cells, 9).tolist() == [1767225600123456789, 1767225600123456789, 2 * 10**9, 2]
     assert exact_ns(['1767225600123456789'], 0).tolist() == [1767225600123456789]
     bad = ['', 'soon', 'nan', 'inf', '1e40', '99999999999999999999']
     assert exact_ns(bad, 0).tolist() == [NO_STAMP] * len(bad)

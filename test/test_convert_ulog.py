@@ -4,7 +4,6 @@
 PX4 logs: what a hand-written ULog file holds comes out of the bag, sensor by sensor.
 
 The writer below follows the public description of the format and shares no code with the reader.
-
 """
 
 from __future__ import annotations
@@ -33,10 +32,7 @@ STEP_US = 10_000
 
 
 class UlogWriter:
-    """
-    A minimal ULog: header, flag bits, formats, subscriptions, data.
-
-    """
+    """A minimal ULog: header, flag bits, formats, subscriptions, data."""
 
     def __init__(self, *formats: str) -> None:
         self.body = b'ULog\x01\x12\x35\x01' + struct.pack('<Q', 0)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The belief about units rests on physics: at rest |a| is gravity, in whatever unit it is written.
-
 """
 
 from __future__ import annotations
@@ -65,10 +64,7 @@ def test_nothing_is_said_against_what_may_be_true() -> None:
 
 
 def shaken(rng: np.random.Generator, n: int, scale: float, noise: float) -> np.ndarray:
-    """
-    Still, with a shaken middle fifth.
-
-    """
+    """Still, with a shaken middle fifth."""
     accel = scale * np.array([0.6, 0.0, 0.8]) + noise * rng.standard_normal((n, 3))
     middle = slice(2 * n // 5, 3 * n // 5)
     accel[middle] += 20.0 * noise * rng.standard_normal((len(accel[middle]), 3))

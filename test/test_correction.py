@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Corrections with full banks: stream = batch to the bit, axes apart, sd = scatter of what is drawn.
-
 """
 
 from __future__ import annotations
@@ -55,10 +54,7 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
         edge = 1.0 if column.kind == 'even' else 4.0 + 4.0 * rng.random()
         terms.append(
             ResponseTerm(
-                **keys,
-                range=(-edge, edge),
-                bias=tuple(bias.tolist()),
-                scale=tuple(scale.tolist()),
+                **keys, range=(-edge, edge), bias=tuple(bias.tolist()), scale=tuple(scale.tolist())
             )
         )
     one = axis_set((0.0, 0.3, 1e-3), (1.0, 7e-5), residual_sd_m_s2=1e-5)
@@ -242,8 +238,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     state = np.array(state)
     moved = np.repeat(state[:, np.newaxis], len(draws), axis=1)
     wide = replace(
-        unit,
-        response=tuple(replace(one, range=(-1000.0, 1000.0)) for one in unit.response),
+        unit, response=tuple(replace(one, range=(-1000.0, 1000.0)) for one in unit.response)
     )
     # Squares of lags bend: the spread is asked for where they are straight.
     small = 0.05

@@ -4,7 +4,6 @@
 Degenerate inputs through the real commands: those that once cost gigabytes, hung or lied.
 
 The whole table, every command on every input, is `benchmarks/degenerate.py`.
-
 """
 
 from __future__ import annotations

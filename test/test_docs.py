@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 What the pages tell a reader to type works: every command, every snippet, every page in the site.
-
 """
 
 from __future__ import annotations
@@ -27,10 +26,7 @@ ELSEWHERE = ('thermo_comp demo', 'thermo_comp play bags/held_out.mcap --rate 20'
 
 
 def commands() -> list[tuple[str, str, str]]:
-    """
-    Return page, command and the output shown for it (empty for none).
-
-    """
+    """Return page, command and the output shown for it (empty for none)."""
     found = []
     for page in PAGES:
         for kind, text in FENCE.findall(page.read_text(encoding='utf-8')):

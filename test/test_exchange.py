@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Exchange with autopilots: their formulas written out again here, round trips, losses, refusals.
-
 """
 
 from __future__ import annotations
@@ -17,14 +16,7 @@ from builders import term
 
 from thermo_comp.convert.exchange import export_ardupilot, export_px4, import_parameters
 from thermo_comp.errors import CalibrationError
-from thermo_comp.unit.calibration import (
-    Axes,
-    AxisReference,
-    AxisSet,
-    Calibration,
-    RegimeSet,
-    Unit,
-)
+from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.functions import CubicSpline, Polynomial
 
 ONE = Polynomial((1.0,))
@@ -137,8 +129,7 @@ def test_counts_are_divided_by_the_scale_factor(cubic: Calibration) -> None:
     axes = Axes(*(AxisReference(300.0, 300.0 * bias) for bias in (0.1, -0.2, 0.3)))
     scaled = [
         replace(
-            one,
-            bias_function=Polynomial(tuple(300.0 * c for c in one.bias_function.coefficients)),
+            one, bias_function=Polynomial(tuple(300.0 * c for c in one.bias_function.coefficients))
         )
         for one in cubic.static.axes()
     ]

@@ -3,7 +3,6 @@
 """
 Outputs that cannot be written, and writers that are killed: the old file or the new one, never
 half; one clear line; what a killed writer left can be read.
-
 """
 
 from __future__ import annotations
@@ -36,10 +35,7 @@ COMMANDS = {
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """
-    Return a file system of 4 KiB.
-
-    """
+    """Return a file system of 4 KiB."""
     disk = tmp_path / 'disk'
     disk.mkdir()
     command = ['mount', '-t', 'tmpfs', '-o', 'size=4k', 'none', str(disk)]

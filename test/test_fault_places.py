@@ -6,7 +6,6 @@ Faults at the places of a ramp where they are worst, through the compensator wit
 WHY: a covariance that held for a fault in the middle of a ramp did not for the same fault where
 the ramp was about to begin, or where a sensor came back elsewhere.
 PROMISE: whatever is published is within five of the standard deviations it was published with.
-
 """
 
 from __future__ import annotations

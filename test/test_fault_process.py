@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Faults of processes and files around the node: restarts, signals, reloads, calibration files.
-
-"""
+"""Faults of processes and files around the node: restarts, signals, reloads, calibration files."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The fault table: every row over DDS into the real node process, every number against the truth.
-
 """
 
 from __future__ import annotations

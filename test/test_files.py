@@ -5,7 +5,6 @@ How an output comes to be: nothing that is read, and nothing of another kind, is
 
 WHY: `--force` destroyed the recordings that a command read; of two writers one lost its result
 without a word; an output was open to all whatever the umask said, and took the place of a link.
-
 """
 
 from __future__ import annotations
@@ -53,10 +52,7 @@ def umask(mask: int) -> Iterator[None]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """
-    Return a folder with a bag of each sort, a calibration, and other names of them.
-
-    """
+    """Return a folder with a bag of each sort, a calibration, and other names of them."""
     save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
     bag(tmp_path / 'raw.mcap')
     bag(tmp_path / 'raw')

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The fit as a whole, on simulated units whose truth is known.
-
-"""
+"""The fit as a whole, on simulated units whose truth is known."""
 
 from __future__ import annotations
 
@@ -45,10 +42,7 @@ def stamps(seconds: Floats) -> np.ndarray:
 
 @dataclass(frozen=True)
 class CausalBlock(ArrayBlock):
-    """
-    A block that also says when each reading arrived among the samples.
-
-    """
+    """A block that also says when each reading arrived among the samples."""
 
     @property
     def temperatures(self) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:

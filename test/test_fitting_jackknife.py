@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What the fit claims of real units, against what they do from position to position.
-
-"""
+"""What the fit claims of real units, against what they do from position to position."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What the evidence chooses: groups, widths and noises of tables whose truth is known.
-
-"""
+"""What the evidence chooses: groups, widths and noises of tables whose truth is known."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The regression: mode, covariance and evidence against dense linear algebra, bounds and symmetries.
-
 """
 
 from __future__ import annotations
@@ -11,17 +10,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from fitting_truth import (
-    GRAVITY,
-    GROUPS,
-    MICRO,
-    NOMINAL,
-    START,
-    Truth,
-    begin,
-    prior_of,
-    table_of,
-)
+from fitting_truth import GRAVITY, GROUPS, MICRO, NOMINAL, START, Truth, begin, prior_of, table_of
 from scipy.optimize import least_squares
 
 from thermo_comp.errors import FitError
@@ -41,10 +30,7 @@ def flat(state: State) -> Floats:
 
 
 class Dense:
-    """
-    The same posterior the slow way: one vector, dense covariances, numerical derivatives.
-
-    """
+    """The same posterior the slow way: one vector, dense covariances, numerical derivatives."""
 
     def __init__(self, windows: Windows, prior: Prior, at: Posterior) -> None:
         self.windows, self.prior, self.at = windows, prior, at
@@ -275,9 +261,7 @@ def test_a_position_that_tells_what_no_other_does_is_not_left_out(
     np.testing.assert_allclose(np.sqrt(found.variance[found.layout.skew]), 1e-3, rtol=1e-3)
 
 
-def test_what_takes_no_part_any_more_is_gone(
-    solved: tuple[Regression, Prior, Posterior],
-) -> None:
+def test_what_takes_no_part_any_more_is_gone(solved: tuple[Regression, Prior, Posterior]) -> None:
     regression, prior, found = solved
     narrow = replace(prior, on_bias=prior.on_bias * [1, 1, 0, 0, 0, 0])
     # Even where no step is made.

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Reduction of samples: cells, still intervals, windows, readings; gravity; what sensors show.
-
-"""
+"""Reduction of samples: cells, still intervals, windows, readings; gravity; what sensors show."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The verdict: each refusal and each advice, with its number, on tables made to deserve it.
-
-"""
+"""The verdict: each refusal and each advice, with its number, on tables made to deserve it."""
 
 from __future__ import annotations
 
@@ -111,9 +108,7 @@ def test_six_faces_tell_no_misalignment(good: tuple[ThermalWindows, np.ndarray])
     assert not can_tell_misalignment(np.vstack((faces, tilted)))
 
 
-def test_few_and_badly_spread_positions_are_said(
-    good: tuple[ThermalWindows, np.ndarray],
-) -> None:
+def test_few_and_badly_spread_positions_are_said(good: tuple[ThermalWindows, np.ndarray]) -> None:
     windows, up = good
     assert '5 distinct positions: what tells' in findings_of(windows, up[:5])['positions'].message
     flat = np.column_stack((np.cos(np.arange(12.0)), np.sin(np.arange(12.0)), np.zeros(12)))

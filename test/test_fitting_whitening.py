@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Whitening: what the filter makes of series is what the dense covariance matrix makes of them.
-
-"""
+"""Whitening: what the filter makes of series is what the dense covariance matrix makes of them."""
 
 from __future__ import annotations
 

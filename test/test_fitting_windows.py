@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The windows, the curves and the way back to a file: the fit means what the compensator does.
-
-"""
+"""The windows, the curves and the way back to a file: the fit means what the compensator does."""
 
 from __future__ import annotations
 
@@ -63,9 +60,7 @@ def windows_of(bags: list[ReducedBag]) -> ThermalWindows:
     )
 
 
-def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(
-    rng: np.random.Generator,
-) -> None:
+def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng: np.random.Generator) -> None:
     spec = MemorySpec(
         ('case', 'tip'),
         (('board', 60.0), ('board', 900.0), ('case', 240.0), ('tip', 7680.0)),

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 A fleet comes through what happens to fleets: bad bags, refusals, dead workers, interruptions.
-
 """
 
 from __future__ import annotations
@@ -38,19 +37,13 @@ pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `flee
 
 @pytest.fixture(scope='module')
 def client() -> Iterator[Any]:
-    """
-    Start two workers, once for this file.
-
-    """
+    """Start two workers, once for this file."""
     with connected(None, 2) as client:
         yield client
 
 
 def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """
-    Return all files of a folder, with the time of their last change.
-
-    """
+    """Return all files of a folder, with the time of their last change."""
     return {
         str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
         for path in sorted(folder.rglob('*'))
@@ -62,7 +55,6 @@ def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     Write three units: one with a corrupt bag among good ones, one with its thermometers exchanged.
-
     """
     folder = tmp_path_factory.mktemp('fleet') / 'bags'
     write_unit(folder / 'A' / 'good', 1)
@@ -239,10 +231,7 @@ class TestScheduler:
 
 
 class _Future:
-    """
-    A task that has ended in some way.
-
-    """
+    """A task that has ended in some way."""
 
     def __init__(self, status: str, error: Exception | None = None) -> None:
         self.status, self._error = status, error
@@ -286,10 +275,7 @@ def test_a_fleet_without_dask_says_what_to_install(
 
 
 def command(folder: Path, out: Path, *options: str) -> int:
-    """
-    Run the command in this process, return its exit code.
-
-    """
+    """Run the command in this process, return its exit code."""
     return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
 
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A fleet's bags are found wherever they lie, read by ranges, and each byte of them only once.
-
-"""
+"""A fleet's bags are found wherever they lie, read by ranges, and each byte of them only once."""
 
 from __future__ import annotations
 
@@ -38,10 +35,7 @@ def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def memory() -> Iterator[tuple[object, str]]:
-    """
-    Give an empty folder of fsspec's memory file system, and its URL.
-
-    """
+    """Give an empty folder of fsspec's memory file system, and its URL."""
     fs = fsspec.filesystem('memory')
     name = f'/{uuid4().hex}'
     yield fs, f'memory:/{name}'
@@ -50,10 +44,7 @@ def memory() -> Iterator[tuple[object, str]]:
 
 
 class _Bytes:
-    """
-    A file that counts how often each of its bytes was read.
-
-    """
+    """A file that counts how often each of its bytes was read."""
 
     def __init__(self, content: bytes) -> None:
         self.content, self.size = content, len(content)
@@ -115,11 +106,7 @@ class TestElsewhere:
 
     @pytest.mark.parametrize('block', [1 << 18, 1 << 10])
     def test_each_byte_comes_once(
-        self,
-        block: int,
-        unit: Path,
-        memory: tuple[object, str],
-        monkeypatch: pytest.MonkeyPatch,
+        self, block: int, unit: Path, memory: tuple[object, str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr('thermo_comp.fleet.storage._BLOCK_BYTES', block)
         fs, url = memory

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A fleet table tells what is there to tell, and nothing where there is nothing.
-
-"""
+"""A fleet table tells what is there to tell, and nothing where there is nothing."""
 
 from __future__ import annotations
 
@@ -38,7 +35,6 @@ def fleet_of(
 ) -> list[Row]:
     """
     Draw a fleet: every quantity normal (sizes log-normal), or around that of an earlier test.
-
     """
     rows = []
     for i in range(n):
@@ -184,10 +180,7 @@ class TestLots:
 
 
 def hostile(rng: np.random.Generator) -> list[Row]:
-    """
-    Draw a fleet whose bags were written by somebody who dislikes us.
-
-    """
+    """Draw a fleet whose bags were written by somebody who dislikes us."""
     evil = '<script>alert(1)</script>"&$x_1$'
     first = fleet_of(12, rng, lots=('A', evil))
     rows = [*first, *fleet_of(12, rng, lots=('A', evil), day=400.0, like=first)]

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A unit's fit is the same whoever reduced its bags, and says what became of each of them.
-
-"""
+"""A unit's fit is the same whoever reduced its bags, and says what became of each of them."""
 
 from __future__ import annotations
 
@@ -44,10 +41,7 @@ def only_unit(folder: Path) -> FoundUnit:
 
 
 def numbers_of(outcome: UnitOutcome | None) -> dict[str, float]:
-    """
-    Return every number of a row that is not about the run itself.
-
-    """
+    """Return every number of a row that is not about the run itself."""
     assert outcome is not None
     return {
         name: cell
@@ -77,19 +71,14 @@ def statistics(fleet: Path) -> Statistics:
 
 @pytest.fixture(scope='module')
 def theirs(fleet: Path) -> Calibration:
-    """
-    Fit the unit as `thermo_comp fit` does.
-
-    """
+    """Fit the unit as `thermo_comp fit` does."""
     sources, _ = fit_sources(sorted((fleet / 'lot-A' / 'unit1').iterdir()))
     return fit(sources, OPTIONS.fit).calibration
 
 
 class TestTree:
     @settings(
-        max_examples=50,
-        deadline=None,
-        suppress_health_check=[HealthCheck.function_scoped_fixture],
+        max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
     )
     @given(data=st.data())
     def test_any_tree_over_any_order_merges_to_the_same(
@@ -104,9 +93,7 @@ class TestTree:
         assert all(a is b for a, b in zip(parts[0], statistics, strict=True))
 
     @settings(
-        max_examples=3,
-        deadline=None,
-        suppress_health_check=[HealthCheck.function_scoped_fixture],
+        max_examples=3, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
     )
     @given(data=st.data())
     def test_the_fit_is_that_of_one_process(

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Temperature functions against hand numbers, scipy and their own derivatives.
-
-"""
+"""Temperature functions against hand numbers, scipy and their own derivatives."""
 
 import numpy as np
 import pytest

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The field check: a good calibration passes, an aged one shows, motion is not mistaken for either.
-
 """
 
 import math

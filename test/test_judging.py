@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The judge: residuals known by hand, windows of the stated length, verdicts one by one.
-
-"""
+"""The judge: residuals known by hand, windows of the stated length, verdicts one by one."""
 
 from __future__ import annotations
 
@@ -42,10 +39,7 @@ def resting(
     error: float = 0.0,
     serial: str = '',
 ) -> Path:
-    """
-    Write a unit at rest, z up, from one temperature to another, whose z axis drifts with it.
-
-    """
+    """Write a unit at rest, z up, from one temperature to another, whose z axis drifts with it."""
     rng = np.random.default_rng(3)
     begin, end = temperature if isinstance(temperature, tuple) else (temperature, temperature)
     n = round(minutes * 60.0 * rate_hz)
@@ -70,10 +64,7 @@ def resting(
 
 
 def corrected_by(slope: float, claim: float = 0.0, **changes: object) -> Calibration:
-    """
-    Correct the z axis by so much per K; claim so much [m/s^2].
-
-    """
+    """Correct the z axis by so much per K; claim so much [m/s^2]."""
     parts = {name: axis_set(residual_sd_m_s2=claim) for name in 'xy'}
     part = regime_set(**parts, z=axis_set((0.0, slope), residual_sd_m_s2=claim))
     return dataclasses.replace(calibration(static=part, dynamic=part), **changes)
@@ -86,10 +77,7 @@ def judged(bag: Path, one: Calibration, **keys: object) -> Judgement:
 def made(
     residual: float, raw: float, claimed: float, n: int = 40, dynamic: int = 10, outside: int = 0
 ) -> Windows:
-    """
-    Make windows of one position, z up, whose figures are given in micro-g.
-
-    """
+    """Make windows of one position, z up, whose figures are given in micro-g."""
     force, constant = np.zeros((n, 3)), np.zeros((n, 3))
     force[:, 2] = GRAVITY + residual * MICRO_G
     constant[:, 2] = GRAVITY + raw * MICRO_G
@@ -328,10 +316,7 @@ class TestVerdict:
 def around(
     n: int, bias: tuple[float, ...], scale: tuple[float, ...], noise: float = 0.0
 ) -> Windows:
-    """
-    Make windows of a unit in n positions whose axes have moved by so much [m/s^2], [1].
-
-    """
+    """Make windows of a unit in n positions whose axes have moved by so much [m/s^2], [1]."""
     rng = np.random.default_rng(5)
     faces = np.vstack((np.eye(3), -np.eye(3)))
     others = rng.standard_normal((max(n - 6, 0), 3))

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The launch files name what exists: arguments, executables, parameters and topics.
-
-"""
+"""The launch files name what exists: arguments, executables, parameters and topics."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
 OTHERS = {
     ('tf2_ros', 'static_transform_publisher'): set(),
     ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {
-        *('use_mag', 'world_frame', 'publish_tf', 'remove_gravity_vector', 'orientation_stddev'),
+        *('use_mag', 'world_frame', 'publish_tf', 'remove_gravity_vector', 'orientation_stddev')
     },
     ('robot_localization', 'ekf_node'): {
         *('frequency', 'two_d_mode', 'publish_tf', 'odom_frame', 'base_link_frame'),
@@ -69,10 +66,7 @@ class TestEveryFile:
 
 
 def parameters_set(arguments: dict[str, str]) -> dict[str, str]:
-    """
-    Give the parameters that our launch file sets, as launch evaluates its substitutions.
-
-    """
+    """Give the parameters that our launch file sets, as launch evaluates its substitutions."""
     given = {one.get('name', ''): one.get('default', '') for one in parse(OURS).findall('arg')}
     given |= arguments
 

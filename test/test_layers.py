@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Holds the house together: imports go down only, and each heavy library has one home.
-
-"""
+"""Holds the house together: imports go down only, and each heavy library has one home."""
 
 from __future__ import annotations
 
@@ -67,7 +64,7 @@ HOMES = {
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {
-    'fitting/assembly.py',  # the date of a fit is provenance, and stands in the calibration file
+    'fitting/assembly.py'  # the date of a fit is provenance, and stands in the calibration file
 }
 
 SOURCES = sorted(PACKAGE.rglob('*.py'))
@@ -79,10 +76,7 @@ def unit_of(path: Path) -> str:
 
 
 def imports_of(path: Path, with_types: bool = True) -> Iterator[tuple[int, str]]:
-    """
-    Yield (line, absolute dotted name) of every import, also of those inside functions.
-
-    """
+    """Yield (line, absolute dotted name) of every import, also of those inside functions."""
     here = ('thermo_comp', *path.relative_to(PACKAGE).with_suffix('').parts)
     tree = ast.parse(path.read_text(encoding='utf-8'), str(path))
     typing = {
@@ -107,7 +101,6 @@ def imports_of(path: Path, with_types: bool = True) -> Iterator[tuple[int, str]]
 def own_unit(name: str) -> str | None:
     """
     Return the unit that an absolute name of this package belongs to, None for other packages.
-
     """
     parts = name.split('.')
     if parts[0] != 'thermo_comp':
@@ -138,7 +131,6 @@ def test_imports_go_down_only(path: Path) -> None:
 def own_file(name: str) -> str:
     """
     Return the file of this package that an absolute name is imported from, by its dotted name.
-
     """
     parts = name.split('.')[1:]
     while parts:
@@ -154,7 +146,6 @@ def own_file(name: str) -> str:
 def circle(uses: dict[str, set[str]]) -> dict[str, set[str]]:
     """
     Return what is left of a graph without its leaves, again and again; nothing without a circle.
-
     """
     while True:
         leaves = {one for one, targets in uses.items() if not targets & uses.keys()}
@@ -183,10 +174,7 @@ def test_no_circle(by: str) -> None:
 
 
 def loaded_after(statement: str, *watched: str) -> list[str]:
-    """
-    Return which of the watched modules a fresh interpreter holds after one statement.
-
-    """
+    """Return which of the watched modules a fresh interpreter holds after one statement."""
     code = f'{statement}\nimport sys\nprint(*[m for m in {watched!r} if m in sys.modules])'
     finished = subprocess.run(
         [sys.executable, '-c', code],

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Holds the viewers' layouts to the bags: every path in them leads to a number in a replayed bag.
-
 """
 
 from __future__ import annotations
@@ -32,10 +31,7 @@ LIVE_ONLY = {'/diagnostics'}
 
 
 def replayed(folder: Path, kind: str) -> dict[str, str]:
-    """
-    Replay a minute of a bag with its inputs kept; return the type of each topic.
-
-    """
+    """Replay a minute of a bag with its inputs kept; return the type of each topic."""
     stamps = 10**18 + np.arange(600) * (SECOND_NS // 10)
     slow = 10**18 + np.arange(-1, 60) * SECOND_NS
     source = folder / f'{kind}.mcap'
@@ -62,10 +58,7 @@ def topics(tmp_path_factory) -> dict[str, str]:
 
 
 def field_kind(message: str, fields: list[str]) -> str:
-    """
-    Follow field names through message definitions; return what stands at their end.
-
-    """
+    """Follow field names through message definitions; return what stands at their end."""
     name = message
     for part in fields:
         field, _, index = part.partition('[')

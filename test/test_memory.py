@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The thermal memory against closed forms: lags of ramps and steps, loops of plays, unknown starts.
-
 """
 
 from __future__ import annotations
@@ -13,12 +12,7 @@ import numpy as np
 import pytest
 from builders import SECOND_NS
 
-from thermo_comp.thermal.memory import (
-    LagBank,
-    MemorySpec,
-    ThermalMemory,
-    start_covariance,
-)
+from thermo_comp.thermal.memory import LagBank, MemorySpec, ThermalMemory, start_covariance
 from thermo_comp.thermal.plays import Plays
 
 TAUS = (60.0, 900.0, 7680.0)

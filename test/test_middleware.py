@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The profile for Fast DDS: it does what it is there for, and one of the user's wins.
-
-"""
+"""The profile for Fast DDS: it does what it is there for, and one of the user's wins."""
 
 from __future__ import annotations
 

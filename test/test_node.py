@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The node on real DDS: what goes in, what comes out, and what it says about itself.
-
-"""
+"""The node on real DDS: what goes in, what comes out, and what it says about itself."""
 
 from __future__ import annotations
 
@@ -23,16 +20,7 @@ from builders import calibration, rich_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_helpers import (
-    DEEP,
-    SECOND_NS,
-    Peer,
-    drive,
-    node_in_thread,
-    stamp_of,
-    stamped,
-    standing,
-)
+from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 What strangers on the network may ask of the node and send to it: it answers, and samples go on.
-
 """
 
 from __future__ import annotations

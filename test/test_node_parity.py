@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A bag played over DDS into the node and the offline replay of it give the same, bit for bit.
-
-"""
+"""A bag played over DDS into the node and the offline replay of it give the same, bit for bit."""
 
 from __future__ import annotations
 
@@ -38,7 +35,6 @@ def thermal_test(path: Path, imu: bool = False) -> int:
 
     Late means: stamped before the samples that stand before them in the bag. Only a node that
     respects the order of arrival, and no other order, does with them what the replay does.
-
     """
     rng = np.random.default_rng(11)
     n = MINUTES * 60 * RATE_HZ

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The node as a process: its calibration changes while samples flow, through the real services.
-
-"""
+"""The node as a process: its calibration changes while samples flow, through the real services."""
 
 from __future__ import annotations
 

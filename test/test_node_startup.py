@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The node as a process: bad start-ups end at once with one clear line, good ones end cleanly.
-
-"""
+"""The node as a process: bad start-ups end at once with one clear line, good ones end cleanly."""
 
 from __future__ import annotations
 
@@ -59,11 +56,7 @@ def unit(tmp_path: Path) -> Path:
     ],
 )
 def test_bad_start(
-    overrides: list[str],
-    text: str,
-    unit: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
+    overrides: list[str], text: str, unit: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / 'text.yaml').write_text('just words')
     nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)

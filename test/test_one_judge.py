@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-One judge: commands that look at the same bags with the same calibration say the same.
-
-"""
+"""One judge: commands that look at the same bags with the same calibration say the same."""
 
 from __future__ import annotations
 

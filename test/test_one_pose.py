@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Too little for the whole: what a recording tells comes out, the rest stays at its prior.
-
-"""
+"""Too little for the whole: what a recording tells comes out, the rest stays at its prior."""
 
 from __future__ import annotations
 

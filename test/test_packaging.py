@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The package says one thing in every place where it says it: version, licence, commands, keys.
-
-"""
+"""The package says one thing in every place where it says it: version, licence, commands, keys."""
 
 from __future__ import annotations
 
@@ -49,10 +46,7 @@ KNOWN_KEYS = {
 
 
 def setup_literals() -> dict[str, object]:
-    """
-    Return the module-level literals of setup.py without running it.
-
-    """
+    """Return the module-level literals of setup.py without running it."""
     literals: dict[str, object] = {}
     for node in ast.parse((ROOT / 'setup.py').read_text()).body:
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):

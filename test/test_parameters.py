@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-One table gives the parameters their types, ranges, checks and documentation.
-
-"""
+"""One table gives the parameters their types, ranges, checks and documentation."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What no thermometer can say is not believed, and what one can say is never doubted.
-
-"""
+"""What no thermometer can say is not believed, and what one can say is never doubted."""
 
 from __future__ import annotations
 
@@ -50,7 +47,6 @@ def test_a_step_of_40_degrees_is_no_temperature():
     """
     WHY: a loose wire or a stuck bit reads 60 degC on a board that was at 20 degC a second ago.
     WHAT: such readings are left out; the first good one after them counts at once.
-
     """
     tracker = tracker_of()
     now = soak(tracker)
@@ -79,7 +75,6 @@ def test_a_small_step_is_believed_with_doubt():
     """
     WHY: two kelvin at once are no temperature of a board either, but a sensor that came back.
     WHAT: the new level counts, and for about a lag the variance says that it may be wrong.
-
     """
     tracker = tracker_of()
     now = soak(tracker)
@@ -97,7 +92,6 @@ def test_what_a_sensor_says_first_may_be_wrong():
     """
     WHY: a DS18B20 says 85 degC before its first conversion.
     WHAT: the true readings after it are not taken for an impossible step.
-
     """
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
@@ -152,7 +146,6 @@ def test_two_sensors_that_stand_still_count_with_growing_doubt():
     """
     WHY: a driver that hangs may repeat both last readings; a bench supply may give constants.
     WHAT: the samples go on, and the temperature's variance grows as a ramp might carry it away.
-
     """
     tracker = tracker_of()
     for second in range(600):
@@ -235,7 +228,6 @@ def test_a_regime_that_nobody_watched_is_unknown():
     """
     WHY: after ten minutes without readings a ramp may have begun or ended unseen.
     WHAT: the regime is unknown again, and with it the covariance larger.
-
     """
     tracker = tracker_of()
     now = soak(tracker, seconds=1500)

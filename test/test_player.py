@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Player and recorder on real DDS: every message, byte for byte, in the order of the bag.
-
-"""
+"""Player and recorder on real DDS: every message, byte for byte, in the order of the bag."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The posterior: covariance to factor and back, what it may leave out, and where parameters stand.
-
 """
 
 from dataclasses import replace

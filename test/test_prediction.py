@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Holds what a calibration says of soaks, ramps and steps: by hand, and as the compensator has it.
-
 """
 
 from __future__ import annotations
@@ -22,10 +21,7 @@ from thermo_comp.unit.prediction import predicted_sd, ramp_states, step_states
 
 
 def slope_and_lag(variances: dict[int, float]):
-    """
-    Give a unit a slope and a lag of 600 s, and variances to some parameters of its x axis.
-
-    """
+    """Give a unit a slope and a lag of 600 s, and variances to some parameters of its x axis."""
     one = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Holds what an earlier calibration and siblings are worth to a fit that has little else.
-
-"""
+"""Holds what an earlier calibration and siblings are worth to a fit that has little else."""
 
 from __future__ import annotations
 
@@ -45,10 +42,7 @@ def source(record: Record) -> FitSource:
 
 @cache
 def test_of(number: int, first: int, last: int) -> tuple[Record, ...]:
-    """
-    Record some of twelve positions of one sibling.
-
-    """
+    """Record some of twelve positions of one sibling."""
     ups = positions(12, number)[first:last]
     stations = [Position(f'p{k}', PROGRAM, up) for k, up in enumerate(ups)]
     return tuple(arrays(KIND.sibling(number, 0.15), stations, 100 * number + first))
@@ -59,10 +53,7 @@ test_of.__test__ = False
 
 @cache
 def fitted(number: int) -> FitResult:
-    """
-    Fit a sibling on all its twelve positions.
-
-    """
+    """Fit a sibling on all its twelve positions."""
     options = FitOptions(STANDARD_GRAVITY, serial=f'unit-{number}')
     return fit([source(record) for record in test_of(number, 0, 12)], options)
 

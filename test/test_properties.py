@@ -4,7 +4,6 @@
 Properties: whatever comes, what goes out is finite, sound, in order and within what is possible.
 
 The suite tries each a few times; `make nightly` ten thousand times.
-
 """
 
 from __future__ import annotations

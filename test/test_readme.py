@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What the README shows is what a reader gets: its commands run, its tables and links are true.
-
-"""
+"""What the README shows is what a reader gets: its commands run, its tables and links are true."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@
 Recordings that other people made, through `fit`: what docs/real_data.md claims.
 
 Skipped with a reason where the recordings are absent.
-
 """
 
 from __future__ import annotations

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A clock that jumps: what a jump becomes, what it leaves alone, and what is no clock at all.
-
-"""
+"""A clock that jumps: what a jump becomes, what it leaves alone, and what is no clock at all."""
 
 from __future__ import annotations
 
@@ -22,10 +19,7 @@ STEP_NS = 10_000_000
 
 
 def blocks_of(path: Path, stamp_ns: np.ndarray, reading_ns: np.ndarray) -> list[Block]:
-    """
-    Write samples and readings in this order, and read them on one clock.
-
-    """
+    """Write samples and readings in this order, and read them on one clock."""
     n = len(stamp_ns)
     log_ns = START_NS + STEP_NS * np.arange(n)
     with BagWriter(path) as bag:

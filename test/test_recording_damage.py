@@ -3,7 +3,6 @@
 """
 Damage: a torn bag is read up to its last whole message and said to be torn; a corrupt one is one
 clear error; nothing crashes, hangs or takes memory that the file does not justify.
-
 """
 
 from __future__ import annotations
@@ -22,20 +21,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from recording_helpers import (
-    assert_columns,
-    regular_messages,
-    write_mcap,
-    write_rosbag2,
-)
+from recording_helpers import assert_columns, regular_messages, write_mcap, write_rosbag2
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import (
-    BagWriter,
-    Recording,
-    inspect_recording,
-    read_recording,
-)
+from thermo_comp.recording import BagWriter, Recording, inspect_recording, read_recording
 
 HEAD_BYTES = 31
 
@@ -45,10 +34,7 @@ def read(path: Path) -> Recording:
 
 
 def outcome(path: Path) -> Recording | RecordingError:
-    """
-    Read a bag that may be damaged; any other exception than the right one fails the test.
-
-    """
+    """Read a bag that may be damaged; any other exception than the right one fails the test."""
     try:
         return read(path)
     except RecordingError as error:
@@ -56,10 +42,7 @@ def outcome(path: Path) -> Recording | RecordingError:
 
 
 def chunk_places(path: Path) -> list[tuple[int, int]]:
-    """
-    Position and length of each chunk record, by the `mcap` library's reading of the summary.
-
-    """
+    """Position and length of each chunk record, by the `mcap` library's reading of the summary."""
     with path.open('rb') as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -68,10 +51,7 @@ def chunk_places(path: Path) -> list[tuple[int, int]]:
 
 @lru_cache(maxsize=8)
 def small_bag(compression: str, use_chunking: bool = True) -> tuple[bytes, int, int]:
-    """
-    Bytes of a bag of 24 counts in three chunks, and the last chunk's position and length.
-
-    """
+    """Bytes of a bag of 24 counts in three chunks, and the last chunk's position and length."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         write_mcap(
@@ -86,10 +66,7 @@ def small_bag(compression: str, use_chunking: bool = True) -> tuple[bytes, int, 
 
 
 def every_cut(content: bytes, position: int, length: int) -> list[int]:
-    """
-    Every byte of the last chunk, and every 17th of the indexes and the summary behind it.
-
-    """
+    """Every byte of the last chunk, and every 17th of the indexes and the summary behind it."""
     end = position + length
     return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
 
@@ -140,7 +117,6 @@ def test_cut_inside_a_compressed_chunk_gives_a_prefix(tmp_path: Path, compressio
 def test_most_of_a_large_torn_chunk_is_saved(tmp_path: Path) -> None:
     """
     A streaming decompressor gives what stands before the cut: not the chunk is lost, but a block.
-
     """
     n = 60_000
     stamps = np.arange(n) * 2_500_000
@@ -180,7 +156,6 @@ def test_zeros_at_the_end_are_no_messages(tmp_path: Path) -> None:
     """
     WHY: after a power failure a file may have its full length and zeros for its last pages.
     PROMISE: no message with a zeroed part is given out.
-
     """
     messages = regular_messages(24)
     path = tmp_path / 'bag.mcap'
@@ -391,7 +366,6 @@ def test_a_wrong_message_index_is_only_a_hint(tmp_path: Path) -> None:
     """
     WHY: offsets of a damaged index can point into a payload that looks like a record.
     PROMISE: the records themselves decide, whatever the index says.
-
     """
     messages = regular_messages(24)
     path = tmp_path / 'bag.mcap'

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What a bag promises and what comes of it; what it may cost to open one.
-
-"""
+"""What a bag promises and what comes of it; what it may cost to open one."""
 
 from __future__ import annotations
 

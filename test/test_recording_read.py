@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Reading: any bag that another tool wrote gives the columns of its messages in a player's order.
-
 """
 
 from __future__ import annotations
@@ -52,7 +51,6 @@ WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
 def bags(draw: st.DrawFn, accel: str = ACCEL, lowest: int = -3) -> list[Message]:
     """
     Messages in the order of writing: ties and steps back in log time, mixed frames and orders.
-
     """
     frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
     topics = (accel, BOARD, CASE, OTHER)
@@ -224,7 +222,6 @@ def test_overlapping_chunks_of_single_topics_are_merged(tmp_path: Path) -> None:
     """
     WHY: a tool that writes a chunk per topic puts the temperatures behind the samples they are
     for; read in file order, each would be applied a chunk too late. PROMISE: log-time order.
-
     """
     messages = regular_messages(200)
     by_topic = sorted(
@@ -399,7 +396,6 @@ def test_readers_that_are_given_up_leave_no_threads(
     WHY: a generator given up is closed by the garbage collector wherever that happens to run;
     one that then waited for its threads stopped the process for good. PROMISE: threads belong to
     the open recording and end with it.
-
     """
     monkeypatch.setattr('thermo_comp.recording.assemble.BLOCK_MESSAGES', 10)
     path = tmp_path / 'bag.mcap'

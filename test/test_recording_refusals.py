@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What is refused: other layouts, other encodings, other topics, things that are no bags.
-
-"""
+"""What is refused: other layouts, other encodings, other topics, things that are no bags."""
 
 from __future__ import annotations
 
@@ -29,12 +26,7 @@ from recording_helpers import (
 from test_recording_damage import read, whole_file
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import (
-    BagWriter,
-    Topics,
-    inspect_recording,
-    open_recording,
-)
+from thermo_comp.recording import BagWriter, Topics, inspect_recording, open_recording
 
 
 def short_message(data: bytes) -> bytes:
@@ -192,10 +184,7 @@ def test_two_topics_that_fit_are_ambiguous(tmp_path: Path) -> None:
 
 
 def test_names_from_a_bag_cannot_forge_lines(tmp_path: Path) -> None:
-    """
-    WHY: a topic's name is whatever stands in the file; an error is one line of a terminal.
-
-    """
+    """WHY: a topic's name is whatever stands in the file; an error is one line of a terminal."""
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         for row in range(30):

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Finding records: the walk over many at a time equals a walk one by one, whatever bytes there are.
-
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ def other(content: bytes) -> bytes:
 def one_by_one(data: bytes) -> tuple[list[tuple[int, int, int, int]], list[bytes], int]:
     """
     Walk in a plain loop: place, size, channel, log time of each message; other contents; the end.
-
     """
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
@@ -65,10 +63,7 @@ DECEITFUL = [
 
 @st.composite
 def records(draw: st.DrawFn) -> bytes:
-    """
-    Long regular stretches with irregular ones between.
-
-    """
+    """Long regular stretches with irregular ones between."""
     pieces: list[bytes] = []
     for _ in range(draw(st.integers(1, 6))):
         content = draw(st.sampled_from(DECEITFUL) | st.binary(max_size=60))
@@ -112,10 +107,7 @@ def index_of(entries: list[tuple[int, int, int, int]]) -> bytes:
 @settings(max_examples=120, deadline=None)
 @given(data=records(), drawn=st.data())
 def test_a_false_index_changes_nothing(data: bytes, drawn: st.DataObject) -> None:
-    """
-    WHY: offsets that point into payloads which look like records could give false samples.
-
-    """
+    """WHY: offsets that point into payloads which look like records could give false samples."""
     wanted, wanted_others, _ = one_by_one(data)
     places = drawn.draw(
         st.lists(st.integers(0, len(data)) | st.sampled_from([e[0] for e in wanted]), max_size=20)
@@ -124,9 +116,7 @@ def test_a_false_index_changes_nothing(data: bytes, drawn: st.DataObject) -> Non
     index = index_of([*kept, *((at, 0, 1, 0) for at in places)])
     others: list[bytes] = []
     messages = locate(
-        np.frombuffer(data, np.uint8),
-        memoryview(index),
-        lambda _, content: others.append(content),
+        np.frombuffer(data, np.uint8), memoryview(index), lambda _, content: others.append(content)
     )
     assert listed(messages) == wanted
     assert others == wanted_others

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Writing: other tools read back what was written, all of it at once or nothing.
-
-"""
+"""Writing: other tools read back what was written, all of it at once or nothing."""
 
 from __future__ import annotations
 
@@ -30,21 +27,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as Reader2
 
 from thermo_comp.errors import OutputError, RecordingError
-from thermo_comp.recording import (
-    BagWriter,
-    ImuColumns,
-    open_recording,
-    read_recording,
-)
+from thermo_comp.recording import BagWriter, ImuColumns, open_recording, read_recording
 
 STEP_NS = 2_500_000
 REQUIRED: tuple[()] = ()
 
 
 def imu_columns(rng: np.random.Generator, n: int) -> ImuColumns:
-    return ImuColumns(
-        *(rng.normal(size=(n, width)) for width in (4, 9, 3, 9, 9)),
-    )
+    return ImuColumns(*(rng.normal(size=(n, width)) for width in (4, 9, 3, 9, 9)))
 
 
 @settings(max_examples=40, deadline=None)
@@ -57,12 +47,7 @@ def imu_columns(rng: np.random.Generator, n: int) -> ImuColumns:
     seed=st.integers(0, 1000),
 )
 def test_rosbags_and_mcap_read_back_what_was_written(
-    counts: list[int],
-    frame_id: str,
-    compression: Any,
-    chunk_bytes: int,
-    is_file: bool,
-    seed: int,
+    counts: list[int], frame_id: str, compression: Any, chunk_bytes: int, is_file: bool, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     written: list[tuple[int, int, str]] = []
@@ -204,10 +189,7 @@ def test_the_directory_is_what_rosbag2_writes(tmp_path: Path) -> None:
 
 
 def test_a_bare_file_names_itself(tmp_path: Path) -> None:
-    """
-    WHY: it is written under another name first, and that one must not stand in its metadata.
-
-    """
+    """WHY: it is written under another name first, and that one must not stand in its metadata."""
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:
         (metadata,) = make_reader(stream).iter_metadata()
@@ -311,10 +293,7 @@ def test_directories_are_exchanged_without_the_system_call_too(
 
 @contextmanager
 def limited_file_size(n_bytes: int) -> Iterator[None]:
-    """
-    Let no file of this process grow beyond a size: what a full disk does to a writer.
-
-    """
+    """Let no file of this process grow beyond a size: what a full disk does to a writer."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What the documentation takes from the code is what the code says today.
-
-"""
+"""What the documentation takes from the code is what the code says today."""
 
 import importlib.util
 from pathlib import Path

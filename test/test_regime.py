@@ -5,7 +5,6 @@ The detector: early, quiet, never blind, in small; the long runs are in benchmar
 
 All runs are seeded. A limit on a median of n delays holds with the benchmark's spread: the median
 of 24 scatters by about 0.3 of the delays' sd, 1 s at 1 mK and 3 s with coarse steps.
-
 """
 
 import math
@@ -46,10 +45,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """
-    Run n ramps and return what switched after each began, and how many began static.
-
-    """
+    """Run n ramps and return what switched after each began, and how many began static."""
     settings = detector_settings(noise, quantum, lag)
     found, n_static = [], 0
     for seed in range(n):
@@ -68,10 +64,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
 
 @pytest.fixture(scope='module')
 def headline():
-    """
-    Run the ramp that the requirement names: 0.5 K/min behind 15 min, 1 Hz, after a soak.
-
-    """
+    """Run the ramp that the requirement names: 0.5 K/min behind 15 min, 1 Hz, after a soak."""
     return {
         name: onsets(*sensor, 0.5, LAG_S, 24, end_s=300.0, soak_s=2700.0)
         for name, sensor in SENSORS.items()
@@ -238,7 +231,6 @@ def test_unknown_until_the_windows_are_filled():
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=12000.0, **parts):
     """
     One run; `parts` may replace the case's or the board's readings by a function of (t, reading).
-
     """
     rng = np.random.default_rng(8)
     t = np.arange(begin, end)

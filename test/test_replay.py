@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The offline run gives, bit for bit, what a compensator gives sample by sample in the bag's order.
-
 """
 
 from __future__ import annotations
@@ -39,10 +38,7 @@ SECOND_NS = 1_000_000_000
 def thermal_test(
     path: Path, minutes: float = 40.0, rate_hz: float = 10.0, serial: str = '', imu: bool = False
 ) -> Path:
-    """
-    Write a recording with a ramp between two soaks, board lagging, in several write groups.
-
-    """
+    """Write a recording with a ramp between two soaks, board lagging, in several write groups."""
     rng = np.random.default_rng(7)
     n = round(minutes * 60.0 * rate_hz)
     stamps = START_NS + np.rint((np.arange(n) + 1.0) * (1e9 / rate_hz)).astype(np.int64)
@@ -86,10 +82,7 @@ def calibrated(**changes: object) -> Calibration:
 def one_by_one(
     block: Block, calibration: Calibration
 ) -> tuple[list[tuple[int, ...]], list[tuple[int, bool]]]:
-    """
-    Run a whole recording through the streaming compensator, message by message.
-
-    """
+    """Run a whole recording through the streaming compensator, message by message."""
     compensator = Compensator(calibration)
     readings = [
         (int(after), name, int(stamp), float(value))
@@ -112,10 +105,7 @@ def one_by_one(
 
 
 def output_of(path: Path) -> tuple[Block, list[tuple[int, bool]]]:
-    """
-    Read a corrected bag through a library that is not ours.
-
-    """
+    """Read a corrected bag through a library that is not ours."""
     flags = []
     with AnyReader([path]) as reader:
         wanted = [c for c in reader.connections if c.topic == '/' + REGIME_TOPIC]

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Holds the certificate: what it says, that it says it truly, and that it needs and runs nothing.
-
 """
 
 from __future__ import annotations
@@ -22,12 +21,7 @@ from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.fitting.reduction import Readings
 from thermo_comp.judging import open_bag
 from thermo_comp.recording import BagWriter
-from thermo_comp.report import (
-    Evidence,
-    evidence_of_bags,
-    evidence_of_fit,
-    write_report,
-)
+from thermo_comp.report import Evidence, evidence_of_bags, evidence_of_fit, write_report
 from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.plates import PLATES, png_files
 from thermo_comp.simulation import STANDARD_GRAVITY, ideal_regime, parse_cyclogram
@@ -37,10 +31,7 @@ VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 
 
 class Page(HTMLParser):
-    """
-    Reads a page as a browser would: tags, their attributes, text.
-
-    """
+    """Reads a page as a browser would: tags, their attributes, text."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -76,10 +67,7 @@ def page_of(evidence: Evidence, folder: Path, **keys: object) -> Page:
 
 
 def bare() -> Evidence:
-    """
-    Gather the least that makes a page: a calibration alone.
-
-    """
+    """Gather the least that makes a page: a calibration alone."""
     return evidence_of_bags([], fitted().calibration)
 
 

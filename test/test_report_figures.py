@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Holds the figures: legible without colour, with units, and true to the numbers behind them.
-
-"""
+"""Holds the figures: legible without colour, with units, and true to the numbers behind them."""
 
 from __future__ import annotations
 
@@ -144,10 +141,7 @@ def test_trace_without_a_case_sensor_follows_the_board():
 
 
 def look(line: Artist) -> tuple[object, ...]:
-    """
-    Give what a reader without colours tells lines apart by: dashes, marker, darkness.
-
-    """
+    """Give what a reader without colours tells lines apart by: dashes, marker, darkness."""
     if isinstance(line, StepPatch):
         dashes, colour, marker = line.get_linestyle(), line.get_edgecolor(), ''
     else:

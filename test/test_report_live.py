@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Holds the live view: it follows its files, survives bad ones, and answers to nobody else.
-
-"""
+"""Holds the live view: it follows its files, survives bad ones, and answers to nobody else."""
 
 from __future__ import annotations
 
@@ -166,10 +163,7 @@ def test_server_answers_its_own_names_only(unit):
 
 
 class Watched(LiveReport):
-    """
-    Tells when the browser has come for the page, and for its version after that.
-
-    """
+    """Tells when the browser has come for the page, and for its version after that."""
 
     def __init__(self, calibration: Path) -> None:
         super().__init__(calibration)

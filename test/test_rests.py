@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 The full fit looks at its rests: a jump in any bag stops it, one attitude does, motion does not.
-
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Samples that are none: stuck, zero, too fast, of another unit; stream = batch about all of them.
-
 """
 
 from __future__ import annotations
@@ -143,16 +142,12 @@ def test_counts_at_another_rate_are_of_another_scale(rng):
     """
     WHY: a count is charge per cycle; at 2 kHz a cycle holds a twentieth of that at 100 Hz.
     WHAT: samples that come faster than conversions can are held back, and let go again later.
-
     """
     compensator = Compensator(calibration())
     run(compensator, recording(500, 100.0, lambda _: at_rest(rng)))
     twentieth = tuple(round(value / 20.0) for value in at_rest(rng))
     fast = recording(
-        20_000,
-        2000.0,
-        lambda k: tuple(float(value + k % 2) for value in twentieth),
-        5 * SECOND_NS,
+        20_000, 2000.0, lambda k: tuple(float(value + k % 2) for value in twentieth), 5 * SECOND_NS
     )
     stamps, _ = run(compensator, fast)
     assert take_snapshot(compensator).is_too_fast
@@ -195,7 +190,6 @@ def test_a_reversed_axis_is_refused_when_the_platform_stands(rng):
     """
     WHY: with an axis wired the wrong way round every number is wrong, and looks like one.
     WHAT: |f| misses gravity by twice the bias; nothing goes out until it is gravity again.
-
     """
     bias = 60.0  # 0.2 m/s^2
     unit = calibration(axes=Axes(*[AxisReference(K, bias)] * 3))

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Plain values to dataclasses: every hint takes what it says and refuses the rest by its key.
-
-"""
+"""Plain values to dataclasses: every hint takes what it says and refuses the rest by its key."""
 
 from __future__ import annotations
 
@@ -101,11 +98,7 @@ def test_nothing_is_converted_but_integers_to_floats() -> None:
         ({'name': 'ab', 'shapes': [{'kind': 'square'}]}, 'shapes[0].side', 'missing'),
         ({'name': 'ab', 'frame': {'radius': 0}}, 'frame.radius', 'must be greater than 0, got 0'),
         ({'name': 'ab', 'frame': {'radius': 10.0}}, 'frame.radius', 'less than 10, got 10.0'),
-        (
-            {'name': 'ab', 'frame': {'radius': float('inf')}},
-            'frame.radius',
-            'finite number',
-        ),
+        ({'name': 'ab', 'frame': {'radius': float('inf')}}, 'frame.radius', 'finite number'),
         ({'name': 'ab', 'frame': {'radius': '1'}}, 'frame.radius', "valid number, got '1'"),
     ],
 )

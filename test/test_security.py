@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Bytes of strangers stay bytes, and the node asks the network for what it needs and no more.
-
-"""
+"""Bytes of strangers stay bytes, and the node asks the network for what it needs and no more."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 A whole test in memory: the run of the bags, the units of every kind, the physics of their errors.
-
 """
 
 from __future__ import annotations
@@ -77,10 +76,7 @@ def test_means_scatter_as_those_of_the_cycles(kind: str) -> None:
 
 @pytest.mark.parametrize('kind', TRIAD_NAMES)
 def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
-    """
-    The floor that every table is held against: 0.65 ug of |g| over 60 s, 1.12 of the vector.
-
-    """
+    """The floor that every table is held against: 0.65 ug of |g| over 60 s, 1.12 of the vector."""
     unit = unit_preset(kind, 2)
     errors, norms = [], []
     for record in arrays(unit, plan('held-out', 2), 7, window_s=60.0):
@@ -150,10 +146,7 @@ def test_plans_are_what_their_names_say() -> None:
 
 
 def test_a_joint_that_slips_goes_round_a_loop() -> None:
-    """
-    Rate-independent: the way back differs from the way there, and time does not matter.
-
-    """
+    """Rate-independent: the way back differs from the way there, and time does not matter."""
     there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
     for is_gradual in (False, True):
         effect = SlipEffect('a', 1.0, is_gradual, bias=(2.0, 0.0, 0.0))
@@ -186,10 +179,7 @@ def test_a_limited_flow_is_a_matter_of_on_and_off() -> None:
 
 
 def test_a_switched_load_heats_its_part() -> None:
-    """
-    By what the heat balance of an endless spell says, and not before it is on.
-
-    """
+    """By what the heat balance of an endless spell says, and not before it is on."""
     unit = unit_preset('own-lags', 1)
     spell = 200_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The charge-balancing converter: nothing lost, nothing that depends on blocks.
-
-"""
+"""The charge-balancing converter: nothing lost, nothing that depends on blocks."""
 
 from __future__ import annotations
 
@@ -30,7 +27,6 @@ def test_a_day_at_400_hz_of_a_third_of_a_count_loses_nothing() -> None:
     """
     WHY: a float running sum of 1e9 counts has no digits left for the fraction. WHAT: whole and
     fraction are kept apart, so a day ends on the exact count.
-
     """
     converter = Converter()
     charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)

@@ -7,7 +7,6 @@ The table of what a description can reach is measured here by exact least square
 attitudes, on 60 s means over a program that the fit never saw. The time constants of the slow
 lags are read off the network itself (how its inner parts relax with the case and the board held),
 so the rows are bounds of their kind of description, not results of a fit.
-
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ MINUTE = 60
 
 
 def _static(unit: UnitModel, board: Floats) -> tuple[Floats, ...]:
-    """
-    Return bias [ug] and relative scale after endless soaks, by the board's temperature.
-
-    """
+    """Return bias [ug] and relative scale after endless soaks, by the board's temperature."""
     still = []
     for temperature in board:
         parts = unit.network.equilibrium(unit.network.air_for('board', float(temperature)))
@@ -63,7 +59,6 @@ def test_bare_quartz_has_the_published_slopes(seed: int) -> None:
     """
     Q-Flex class: scale slope 68..87 ppm/K from 5 to 35 degC with 0.31 ppm/K^2 of curvature, bias
     slope 0.3..5 ug/K.
-
     """
     unit = unit_preset('bare-quartz', seed)
     board = np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5])
@@ -95,10 +90,7 @@ def test_specimens_differ_and_return() -> None:
 
 
 class _Campaign:
-    """
-    Minute means of runs in several positions, with the known forces.
-
-    """
+    """Minute means of runs in several positions, with the known forces."""
 
     def __init__(self, unit: UnitModel, program: Cyclogram, seed: int) -> None:
         self.unit = unit
@@ -156,10 +148,7 @@ def _inner_time_constants(unit: UnitModel) -> Floats:
 
 
 def _norm_error(kind: str, fitted: _Campaign, seen: _Campaign) -> float:
-    """
-    Return the RMS error of |g| in ug, of all minutes of `seen`.
-
-    """
+    """Return the RMS error of |g| in ug, of all minutes of `seen`."""
     unit = fitted.unit
     along_axes = np.linalg.inv(unit.M).T
     corrected = seen.accel.copy()
@@ -183,7 +172,6 @@ def test_what_each_description_can_reach() -> None:
     ones are. WHAT: polynomials of T_board leave tens to a hundred and fifty ug, the gradient
     helps several-fold, slow lags bring the noise; for the thermostatted unit and the bare one
     about 320 / 60 / 12 / 0.7 and 540 / 145 / 25 / 1.2 ug.
-
     """
     bounds = {
         'thermostatted': {

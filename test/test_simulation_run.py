@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A simulated run: its columns follow its truth, its seeds, and nothing else.
-
-"""
+"""A simulated run: its columns follow its truth, its seeds, and nothing else."""
 
 from __future__ import annotations
 
@@ -109,10 +106,7 @@ def test_one_noisy_axis_leaves_the_others_exactly_equal(unit: UnitModel) -> None
 
 
 def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None:
-    """
-    Outliers come on top of the same noise; a drifting bias on top of the same white noise.
-
-    """
+    """Outliers come on top of the same noise; a drifting bias on top of the same white noise."""
     plain = simulate(unit, SHORT, UP)
     hit = simulate(replace(unit, board=replace(unit.board, outlier_probability=0.05)), SHORT, UP)
     is_hit = hit.board != plain.board
@@ -165,10 +159,7 @@ def test_axes_permute() -> None:
 
 
 def test_counts_follow_the_truth(unit: UnitModel) -> None:
-    """
-    Without noise the running sum of the counts is that of ``bias + K scale inverse(M) f``.
-
-    """
+    """Without noise the running sum of the counts is that of ``bias + K scale inverse(M) f``."""
     run = simulate(unit.without_noise(), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T
@@ -182,7 +173,6 @@ def test_white_noise_has_its_density(unit: UnitModel) -> None:
     """
     Second route: Welch's spectrum is flat at ``2 density^2`` (one-sided), and the scatter of
     60 s means is ``density / sqrt(60)``.
-
     """
     still = unit.without_drift()
     run = simulate(still, cyclogram_preset('soak'), UP, rate_hz=50.0, seed=3)
@@ -244,10 +234,7 @@ def test_chamber_ripple_stays_within_its_amplitude(unit: UnitModel) -> None:
 
 
 def test_cold_start_warms_itself_up(unit: UnitModel) -> None:
-    """
-    Switched on in still air the board drifts by its self-heating; started warm it does not.
-
-    """
+    """Switched on in still air the board drifts by its self-heating; started warm it does not."""
     soak = cyclogram_preset('soak')
     cold = simulate(unit, soak, UP, rate_hz=1.0, warm=False).truth.temperature('board')
     warm = simulate(unit, soak, UP, rate_hz=1.0).truth.temperature('board')
@@ -299,7 +286,6 @@ def test_positions_tell_the_nine_terms_apart(n: int, least: float) -> None:
     """
     Six faces leave the products of axes to the few degrees of a hand; from nine positions on all
     terms of a quadric (bias, scale, misalignment) are seen, with the evenness of their number.
-
     """
     up = positions(n, 5)
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)

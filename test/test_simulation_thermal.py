@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The thermal network against hand-solved cases, an integrator and its own heat balance.
-
-"""
+"""The thermal network against hand-solved cases, an integrator and its own heat balance."""
 
 from __future__ import annotations
 
@@ -31,10 +28,7 @@ ROUNDING = 1e-9
 
 
 def test_one_part_follows_a_ramp_as_the_textbook_says() -> None:
-    """
-    A first-order lag in a ramp: ``T = r (t - tau (1 - exp(-t / tau)))``.
-
-    """
+    """A first-order lag in a ramp: ``T = r (t - tau (1 - exp(-t / tau)))``."""
     tau, rate = 900.0, 0.5 / 60.0
     network = ThermalNetwork({'case': 900.0}, (Link(AIR, 'case', 1.0),))
     response = ThermalResponse(network, [0.0, 3600.0], [20.0, 20.0 + rate * 3600.0])
@@ -47,7 +41,6 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
     """
     Air - case - board with back-loading: eigenvalues from the quadratic formula, lags from the
     heat balance of an endless ramp, amplitudes from the start at rest.
-
     """
     c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
     network = ThermalNetwork(
@@ -108,10 +101,7 @@ def test_rate_is_the_slope_of_the_temperature() -> None:
 
 
 def test_creep_relaxes_towards_its_part() -> None:
-    """
-    What creeps after a part that warms by a step lags it by its own exponential.
-
-    """
+    """What creeps after a part that warms by a step lags it by its own exponential."""
     step = np.full((7201, 1), 10.0)
     step[0] = 0.0
     history = PartHistory(('case',), step, np.zeros(1), 1.0)
@@ -122,10 +112,7 @@ def test_creep_relaxes_towards_its_part() -> None:
 
 
 def test_still_state_obeys_the_heat_balance() -> None:
-    """
-    With everything settled all power leaves through the air's path and nothing changes.
-
-    """
+    """With everything settled all power leaves through the air's path and nothing changes."""
     unit = unit_preset('bare-quartz', 5)
     warm = unit.network.equilibrium(12.0)
     to_air = next(link for link in unit.network.links if AIR in (link.a, link.b))

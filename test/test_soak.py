@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The soak in short: at 2 kHz, through reloads and an onset, what goes in comes out.
-
-"""
+"""The soak in short: at 2 kHz, through reloads and an onset, what goes in comes out."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A look at a recording tells what a fit would miss in it.
-
-"""
+"""A look at a recording tells what a fit would miss in it."""
 
 from __future__ import annotations
 
@@ -28,10 +25,7 @@ def survey(
     case: bool = True,
     backwards: bool = False,
 ) -> Survey:
-    """
-    Describe an hour at 5 Hz with readings every second.
-
-    """
+    """Describe an hour at 5 Hz with readings every second."""
     rng = np.random.default_rng(5)
     n = 18000
     stamps = START_NS + (np.arange(n) + 1) * 200_000_000

@@ -5,7 +5,6 @@ Text that somebody else chose: shown, never obeyed; a serial is one printable li
 
 WHY: serials, topics and metadata of a bag reached the terminal raw, with escape sequences and
 lines that looked like the program's own; a Cyrillic serial ended a command on a latin-1 terminal.
-
 """
 
 from __future__ import annotations

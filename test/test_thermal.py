@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The thermal tracker: memory against its closed form, cross-over, lost sensors, restart.
-
-"""
+"""The thermal tracker: memory against its closed form, cross-over, lost sensors, restart."""
 
 import math
 

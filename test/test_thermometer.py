@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The thermometer against closed-form temperatures: error, honesty, robustness, invariance.
-
-"""
+"""The thermometer against closed-form temperatures: error, honesty, robustness, invariance."""
 
 import math
 
@@ -30,10 +27,7 @@ SENSORS = {
 
 
 def run(thermometer, t, readings):
-    """
-    Temperature, rate and their variances after each reading, shape (n, 4).
-
-    """
+    """Temperature, rate and their variances after each reading, shape (n, 4)."""
     rows = []
     for stamp_ns, reading in zip(
         np.round(t * 1e9).astype(np.int64).tolist(), readings.tolist(), strict=True
@@ -63,10 +57,7 @@ def state(thermometer):
 
 
 def settled(noise=0.001, n=600, **changes):
-    """
-    Return a thermometer after n readings of 20 degC, one a second.
-
-    """
+    """Return a thermometer after n readings of 20 degC, one a second."""
     thermometer = Thermometer(ThermometerSettings(noise, **changes))
     rng = np.random.default_rng(5)
     run(thermometer, np.arange(n), read(np.full(n, 20.0), noise, 0.0, rng))
@@ -77,7 +68,6 @@ def settled(noise=0.001, n=600, **changes):
 def errors():
     """
     Squared errors and variances of all sensors over a soak, a ramp and a soak, three runs each.
-
     """
     found = {}
     for name, (noise, quantum, dt) in SENSORS.items():

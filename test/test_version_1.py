@@ -5,7 +5,6 @@ Calibration files of version 1: what they gave by their own equations, the conve
 
 The file beside this test was written by the release that wrote version 1; its equations are
 written out again here, from the plain values of the file.
-
 """
 
 from copy import deepcopy

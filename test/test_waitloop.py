@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The one file that leaves rclpy's documented API: these tests fail loudly when rclpy changes.
-
-"""
+"""The one file that leaves rclpy's documented API: these tests fail loudly when rclpy changes."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Closed-form temperatures behind thermal lags, and sensors that read them, for the tests.
-
-"""
+"""Closed-form temperatures behind thermal lags, and sensors that read them, for the tests."""
 
 import numpy as np
 
@@ -17,10 +14,7 @@ BOARD_LAG_S = 600.0
 
 
 def lagged(t, corners, lag):
-    """
-    Response of a first-order lag to a chamber whose rate [K/min] changes at corners [s].
-
-    """
+    """Response of a first-order lag to a chamber whose rate [K/min] changes at corners [s]."""
     out = np.zeros(len(t))
     before = 0.0
     for at, rate in corners:
@@ -31,10 +25,7 @@ def lagged(t, corners, lag):
 
 
 def lagged_twice(t, corners, lag, other):
-    """
-    Let two different lags in a row respond.
-
-    """
+    """Let two different lags in a row respond."""
     out = np.zeros(len(t))
     before = 0.0
     for at, rate in corners:
@@ -46,28 +37,19 @@ def lagged_twice(t, corners, lag, other):
 
 
 def ripple(t, lag, period, phase=0.0, amplitude=0.1):
-    """
-    Let a lag respond to a chamber's control ripple.
-
-    """
+    """Let a lag respond to a chamber's control ripple."""
     omega = 2.0 * np.pi / period
     return amplitude / np.hypot(1.0, omega * lag) * np.sin(omega * t + phase)
 
 
 def read(truth, noise, quantum, rng):
-    """
-    White noise, then rounding.
-
-    """
+    """White noise, then rounding."""
     reading = truth + rng.normal(0.0, noise, len(truth))
     return np.round(reading / quantum) * quantum if quantum else reading
 
 
 def detector_settings(noise, quantum=0.0, lag=LAG_S, **changes):
-    """
-    Shipped defaults for a unit of known lags and sensors.
-
-    """
+    """Shipped defaults for a unit of known lags and sensors."""
     return DetectorSettings(
         case=ThermometerSettings(noise, quantum, lag_s=lag),
         board=ThermometerSettings(noise, quantum, lag_s=lag + BOARD_LAG_S),
@@ -76,10 +58,7 @@ def detector_settings(noise, quantum=0.0, lag=LAG_S, **changes):
 
 
 def switches(settings, t, case, board):
-    """
-    Return the times [s], regimes and directions at which the regime changes.
-
-    """
+    """Return the times [s], regimes and directions at which the regime changes."""
     case_thermometer, board_thermometer = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
     found = []

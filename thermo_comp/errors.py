@@ -6,7 +6,6 @@ Owns the exception tree: everything the world can do wrong, said in one line.
 A caller's mistake in the numeric core is a plain `ValueError`; the classes here are for what
 comes from outside: files, bags, data that cannot carry a fit. The command line prints
 `str(error)` and nothing else.
-
 """
 
 from __future__ import annotations
@@ -15,10 +14,7 @@ from pathlib import Path
 
 
 class ThermoCompError(Exception):
-    """
-    Any failure that a user can cause and mend; its text is one complete line.
-
-    """
+    """Any failure that a user can cause and mend; its text is one complete line."""
 
 
 class CalibrationError(ThermoCompError):
@@ -97,14 +93,10 @@ class OutputError(ThermoCompError):
 
 
 class FleetError(ThermoCompError):
-    """
-    A fleet that cannot be fitted as a whole: no bags, no scheduler, a missing library.
-
-    """
+    """A fleet that cannot be fitted as a whole: no bags, no scheduler, a missing library."""
 
 
 class FitError(ThermoCompError):
     """
     Data that cannot carry the fit asked of it; the text says what is missing and what to record.
-
     """

@@ -6,7 +6,6 @@ Owns how a file is read within bounds and how an output comes to be, for all tha
 An output never replaces what the command reads; without `overwrite` it never replaces anything,
 whoever else writes at the same time; with it, only what is of the same kind. It takes its name
 when it is whole. A link is written through: it goes on pointing where it did.
-
 """
 
 from __future__ import annotations
@@ -52,10 +51,7 @@ class Kind:
     is_folder: bool = False
 
     def refusal(self, path: Path) -> str:
-        """
-        Say why what stands under a name is not of this kind; nothing where it is.
-
-        """
+        """Say why what stands under a name is not of this kind; nothing where it is."""
         if path.is_dir() != self.is_folder:
             return f'it is a {"folder" if path.is_dir() else "file"}'
         if self.is_folder:
@@ -115,7 +111,6 @@ def bag_kind(path: str | Path, others: str = '') -> Kind:
 def shown_name(path: str | Path) -> str:
     """
     Give the last part of a path as text that can be written anywhere, even where it is no UTF-8.
-
     """
     return os.fsencode(Path(path).name).decode('utf-8', 'replace')
 
@@ -125,11 +120,6 @@ def open_regular(path: str | Path) -> BinaryIO:
     Open a regular file for reading.
 
     A directory, a FIFO or a device is refused before anything is read, so a reader never blocks.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
 
     Returns
     -------
@@ -175,11 +165,7 @@ def read_bounded(path: str | Path, limit: int) -> bytes:
 
 
 def check_output(
-    path: str | Path,
-    kind: Kind,
-    *,
-    overwrite: bool = False,
-    others: Iterable[str | Path] = (),
+    path: str | Path, kind: Kind, *, overwrite: bool = False, others: Iterable[str | Path] = ()
 ) -> None:
     """
     Refuse an output before any work is done for it.
@@ -275,10 +261,7 @@ class Draft:
             sync_directory(self._target.parent)
 
     def drop(self) -> None:
-        """
-        Remove what was written so far.
-
-        """
+        """Remove what was written so far."""
         with suppress(OSError):
             if self.partial.is_dir():
                 shutil.rmtree(self.partial)
@@ -364,10 +347,7 @@ def write_atomically(
 
 
 def sync_directory(path: Path) -> None:
-    """
-    Flush a directory's entries to disk.
-
-    """
+    """Flush a directory's entries to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -377,10 +357,7 @@ def sync_directory(path: Path) -> None:
 
 @contextmanager
 def _told(path: str | Path) -> Iterator[None]:
-    """
-    Say which output failed, and not the hidden name, which nobody knows of.
-
-    """
+    """Say which output failed, and not the hidden name, which nobody knows of."""
     try:
         yield
     except FileExistsError as error:
@@ -395,20 +372,14 @@ def _hidden_sibling(path: Path) -> Path:
 
 
 def _overlaps(target: Path, other: Path) -> bool:
-    """
-    Say whether a target is, holds or lies in another file, by whatever names and links.
-
-    """
+    """Say whether a target is, holds or lies in another file, by whatever names and links."""
     if target == other or other in target.parents or target in other.parents:
         return True
     return not _identities(target).isdisjoint(_identities(other))
 
 
 def _identities(path: Path) -> set[tuple[int, int]]:
-    """
-    Identify a file, or a folder with the files in it.
-
-    """
+    """Identify a file, or a folder with the files in it."""
     found = set()
     for one in (path, *(path.iterdir() if path.is_dir() else ())):
         with suppress(OSError):
@@ -418,10 +389,7 @@ def _identities(path: Path) -> set[tuple[int, int]]:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """
-    Let two folders swap names in one step, where the system can.
-
-    """
+    """Let two folders swap names in one step, where the system can."""
     import ctypes
 
     rename = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)

@@ -6,7 +6,6 @@ Owns YAML as plain values: mappings, lists, texts, numbers, true, false and null
 Scalars are those of YAML 1.2, so 1e-05 is a number and `no` is a text. No aliases, so no alias
 bombs; no tags, so no objects; no key twice. One pass over the events of the parser, without
 recursion, so no depth and no number of nodes is reached before it is refused.
-
 """
 
 from __future__ import annotations
@@ -85,10 +84,7 @@ def load_plain_yaml(
 
 
 def is_plain_text(text: str) -> bool:
-    """
-    Say whether an unquoted scalar is a text here.
-
-    """
+    """Say whether an unquoted scalar is a text here."""
     return not (text in _WORDS or _INTEGER.fullmatch(text) or _FLOAT.fullmatch(text))
 
 
@@ -151,9 +147,7 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
     if _INTEGER.fullmatch(text):
         if len(text) > _INTEGER_DIGITS:
             raise PlainYamlError(
-                'not valid YAML',
-                _line(event),
-                f'an integer of {len(text)} digits is not accepted',
+                'not valid YAML', _line(event), f'an integer of {len(text)} digits is not accepted'
             )
         return int(text)
     if _FLOAT.fullmatch(text):

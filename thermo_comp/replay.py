@@ -6,7 +6,6 @@ Owns the offline run of the node: a whole bag through the compensator into anoth
 The same code corrects, block by block instead of sample by sample, and a temperature counts from
 the first sample that stands behind it in the bag: so the values are those, bit for bit, of a node
 that got the bag's messages in this order. Memory is bounded by one block.
-
 """
 
 from __future__ import annotations
@@ -160,10 +159,7 @@ def input_for(calibration: Calibration, asked: Input) -> Input:
 def corrected_blocks(
     compensator: Compensator, blocks: Iterable[Block]
 ) -> Iterable[CorrectedBlock]:
-    """
-    Run blocks, in file order, through a compensator; its counters go on counting.
-
-    """
+    """Run blocks, in file order, through a compensator; its counters go on counting."""
     for block in blocks:
         corrected = process_block(compensator, block)
         yield CorrectedBlock(block, corrected, compensator.take_flags())
@@ -266,10 +262,7 @@ def replay(
 
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
-    """
-    Keep the first flag (stamp, regime) and each that differs from the one before.
-
-    """
+    """Keep the first flag (stamp, regime) and each that differs from the one before."""
     changes: list[tuple[int, bool]] = []
     for stamp_ns, is_dynamic in flags:
         if not changes or changes[-1][1] != is_dynamic:
@@ -281,10 +274,7 @@ def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
 def _messages_of(
     bag: BagWriter, reader: RecordingReader, frame_id: str, others: Iterable[RawMessages]
 ) -> Iterator[WriteBlock]:
-    """
-    Write blocks as the node's messages, and beside them what was recorded until then.
-
-    """
+    """Write blocks as the node's messages, and beside them what was recorded until then."""
     following = iter(others)
     one = next(following, None)
 
@@ -321,10 +311,7 @@ def _messages_of(
 
 @contextmanager
 def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
-    """
-    Write blocks as rows, one for each corrected sample.
-
-    """
+    """Write blocks as rows, one for each corrected sample."""
     regime = 0
 
     def write(item: CorrectedBlock) -> None:
@@ -351,10 +338,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _others(reader: RecordingReader) -> Iterator[RawMessages]:
-    """
-    Read the topics that are neither inputs nor outputs.
-
-    """
+    """Read the topics that are neither inputs nor outputs."""
     taken = {OUTPUT_TOPIC, REGIME_TOPIC, *(topic.strip('/') for topic in reader.topics.values())}
     return reader.raw({topic for topic in reader.info.topics if topic.strip('/') not in taken})
 
@@ -370,10 +354,7 @@ def _rows(imu: ImuColumns, index: Ints) -> ImuColumns:
 
 
 def _write_inputs(writer: BagWriter, block: Block, reader: RecordingReader) -> None:
-    """
-    Copy the inputs; their log time becomes their stamp, as that of the outputs is.
-
-    """
+    """Copy the inputs; their log time becomes their stamp, as that of the outputs is."""
     stamps = {
         reader.topics.get('accel'): block.accel_stamp_ns,
         reader.topics.get('board'): block.board_stamp_ns,

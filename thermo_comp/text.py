@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what becomes of text that somebody else chose: serials, topics, metadata, file names.
-
-"""
+"""Owns what becomes of text that somebody else chose: serials, topics, metadata, file names."""
 
 from __future__ import annotations
 
@@ -17,7 +14,6 @@ def one_line(text: str) -> str:
 
     Line breaks, escape sequences, marks of direction and bytes that are no text stand there as
     Python would write them in a literal; everything else stays as it is.
-
     """
     if text.isprintable():
         return text

@@ -5,7 +5,6 @@ Owns recordings that other people made, as `test/test_real_data.py` reads them.
 
 Nothing of the recordings is stored here: they are read from a folder beside the project, turned
 into bags in a temporary directory.
-
 """
 
 from __future__ import annotations
@@ -17,8 +16,5 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def data_folder() -> Path:
-    """
-    Return where the recordings are looked for.
-
-    """
+    """Return where the recordings are looked for."""
     return Path(os.environ.get('THERMO_COMP_DATA', ROOT.parent / 'shared' / 'data'))

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the way from the recordings' own files to bags.
-
-"""
+"""Owns the way from the recordings' own files to bags."""
 
 from __future__ import annotations
 
@@ -24,10 +21,7 @@ FACES_RATE_HZ = 204.8
 
 
 def freezer_bag(folder: Path, work: Path) -> Path:
-    """
-    Convert the freezer run with the column map that ships with the project.
-
-    """
+    """Convert the freezer run with the column map that ships with the project."""
     bag = work / 'freezer.mcap'
     columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
     write_log(table_log(folder / FREEZER, columns), bag, force=True)
@@ -35,10 +29,7 @@ def freezer_bag(folder: Path, work: Path) -> Path:
 
 
 def handheld_bag(folder: Path, work: Path, unit: int) -> Path:
-    """
-    Convert one handheld unit with the column map that ships with the project.
-
-    """
+    """Convert one handheld unit with the column map that ships with the project."""
     bag = work / f'handheld{unit}.mcap'
     columns = load_column_map(ROOT / 'config' / 'columns' / 'handheld.yaml')
     columns = replace(columns, serial=f'mpu9150-{unit}')
@@ -47,10 +38,7 @@ def handheld_bag(folder: Path, work: Path, unit: int) -> Path:
 
 
 def faces_bag(folder: Path, work: Path) -> Path:
-    """
-    Convert the Ferraris session: its annotations are not read, only its counts.
-
-    """
+    """Convert the Ferraris session: its annotations are not read, only its counts."""
     bag = work / 'faces.mcap'
     columns = ColumnMap(
         serial='ferraris',

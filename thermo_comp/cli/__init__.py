@@ -4,5 +4,4 @@
 Owns the command line: arguments -> one library call -> table or JSON -> exit code.
 
 Exit codes: 0 done, 1 the data or the result is bad, 2 the command line is wrong.
-
 """

@@ -4,7 +4,6 @@
 Owns the one door of the command line: which commands there are and what an exit code means.
 
 Heavy libraries are imported by the commands when they run, so that ``--help`` is quick.
-
 """
 
 from __future__ import annotations
@@ -65,10 +64,7 @@ def _top(
         ),
     ] = False,
 ) -> None:
-    """
-    Thermal-drift compensation of a three-axis accelerometer.
-
-    """
+    """Thermal-drift compensation of a three-axis accelerometer."""
 
 
 app.command()(fit.fit)
@@ -176,10 +172,7 @@ def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _unexpected(failure: Exception) -> int:
-    """
-    Keep the traceback of what nobody has foreseen, say where, return its exit code.
-
-    """
+    """Keep the traceback of what nobody has foreseen, say where, return its exit code."""
     import tempfile
     import traceback
 
@@ -198,10 +191,7 @@ def _unexpected(failure: Exception) -> int:
 
 
 def _usage(mistake: Exception) -> int:
-    """
-    Print a mistake in the command line with the next step, return its exit code.
-
-    """
+    """Print a mistake in the command line with the next step, return its exit code."""
     message = getattr(mistake, 'format_message', lambda: str(mistake))()
     context = getattr(mistake, 'ctx', None)
     command = 'thermo_comp' if context is None else context.command_path

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp convert``: other people's logs into bags.
-
-"""
+"""Owns ``thermo_comp convert``: other people's logs into bags."""
 
 from __future__ import annotations
 
@@ -25,10 +22,7 @@ _BAGS = {'.mcap', '.db3', '.bag'}
 
 
 class UnitChoice(str, Enum):
-    """
-    What a driver may publish as linear acceleration.
-
-    """
+    """What a driver may publish as linear acceleration."""
 
     m_s2 = 'm/s^2'
     g = 'g'
@@ -83,7 +77,6 @@ def convert(
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
       thermo_comp convert flight.ulg --imu 1 -o unit43
-
     """
     from ..convert import write_log
     from ..files import bag_kind, check_output
@@ -128,10 +121,7 @@ def _bag_reader(
 def _reader(
     log: Path, columns: Path | None, imu: int | None, baro: int | None, allow_compensated: bool
 ) -> Callable[[], ForeignLog]:
-    """
-    Tell the format of a table or log by its name, and refuse options that it has no use for.
-
-    """
+    """Tell the format of a table or log by its name, and refuse options that it has no use for."""
     from ..convert import dataflash_log, load_column_map, table_log, ulog_log
 
     suffix = log.suffix.lower()

@@ -6,7 +6,6 @@ Owns ``thermo_comp demo``: the main job on the sample bags, end to end, over rea
 Fit on nine bags; the tenth is played onto live topics, compensated by the node in a process of
 its own, and recorded from its output. What comes out is held against the offline run, bit for
 bit, and against gravity.
-
 """
 
 from __future__ import annotations
@@ -44,10 +43,7 @@ _MODELS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class _Played:
-    """
-    What went through the node.
-
-    """
+    """What went through the node."""
 
     n_in: int
     n_out: int
@@ -74,7 +70,6 @@ def demo(
 
     Example:
       thermo_comp demo --out out
-
     """
     require_ros()
     out = Output(as_json, quiet)
@@ -121,10 +116,7 @@ def demo(
 
 
 def _sample_bags(given: Path | None) -> Path:
-    """
-    Find the sample bags: where the user says, here, or in the source tree.
-
-    """
+    """Find the sample bags: where the user says, here, or in the source tree."""
     places = [given] if given else [Path('bags'), Path(__file__).parents[2] / 'bags']
     for place in places:
         if (place / 'held_out.mcap').is_file():
@@ -135,10 +127,7 @@ def _sample_bags(given: Path | None) -> Path:
 
 
 def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
-    """
-    Fit the three calibrations that are compared, and write the one for the node.
-
-    """
+    """Fit the three calibrations that are compared, and write the one for the node."""
     from ..fitting import FitOptions, fit
     from ..fitting.fit_sources import fit_sources
     from ..unit.calibration_file import save_calibration
@@ -156,10 +145,7 @@ def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
 
 
 def _play(bag: Path, calibration: Path, recorded: Path, done: Callable[[float], None]) -> _Played:
-    """
-    Send the bag through the node and record what comes out, on this machine only.
-
-    """
+    """Send the bag through the node and record what comes out, on this machine only."""
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     from ..recording import inspect_recording
     from ..ros.round_trip import round_trip
@@ -179,10 +165,7 @@ def _play(bag: Path, calibration: Path, recorded: Path, done: Callable[[float], 
 
 
 def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool:
-    """
-    Compare the node's recorded output with the offline run, bit for bit.
-
-    """
+    """Compare the node's recorded output with the offline run, bit for bit."""
     import numpy as np
 
     from ..online.compensator import Compensator
@@ -239,10 +222,7 @@ def _say(out: Output, result: Evaluation) -> None:
 
 
 def _draw(bag: Path, calibration: Calibration, output: Path) -> tuple[Path, Path]:
-    """
-    Write the certificate and its figures; return the page and the figure of |g|.
-
-    """
+    """Write the certificate and its figures; return the page and the figure of |g|."""
     from ..judging import open_bag
     from ..report import evidence_of_bags, write_report
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp evaluate``: what a calibration leaves of |g| on bags it has not seen.
-
-"""
+"""Owns ``thermo_comp evaluate``: what a calibration leaves of |g| on bags it has not seen."""
 
 from __future__ import annotations
 
@@ -58,7 +55,6 @@ def evaluate(
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
-
     """
     from ..files import CSV, check_output, write_atomically
     from ..judging import evaluate as run
@@ -111,7 +107,6 @@ def evaluate(
 def say(out: Output, result: Evaluation) -> None:
     """
     Print an evaluation: a table of all calibrations, what is known of the first one, its verdict.
-
     """
     from ..judging import SECTIONS
     from ..unit.gravity import MICRO_G
@@ -145,10 +140,7 @@ def say(out: Output, result: Evaluation) -> None:
 
 
 def _say_axes(out: Output, judged: Judgement) -> None:
-    """
-    Print what is known axis by axis: wander always, shifts where the positions tell.
-
-    """
+    """Print what is known axis by axis: wander always, shifts where the positions tell."""
     from ..unit.gravity import MICRO_G
 
     columns = ['axis', 'static ug', 'dynamic ug']

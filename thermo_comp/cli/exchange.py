@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns ``thermo_comp export`` and ``import``: a calibration to and from an autopilot's parameters.
-
 """
 
 from __future__ import annotations
@@ -23,10 +22,7 @@ _LIMIT = 4 << 20
 
 
 class Autopilot(str, Enum):
-    """
-    Whose parameters.
-
-    """
+    """Whose parameters."""
 
     px4 = 'px4'
     ardupilot = 'ardupilot'
@@ -64,7 +60,6 @@ def export(
     Example:
       thermo_comp export unit42.yaml --to px4 -o unit42.params
       thermo_comp export unit42.yaml --to ardupilot --up 0 0 1 -o unit42.parm
-
     """
     from ..convert.exchange import export_ardupilot, export_px4
     from ..files import PARAMETERS, check_output, write_atomically
@@ -131,7 +126,6 @@ def import_(
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml
-
     """
     from ..convert.exchange import import_parameters
     from ..files import CALIBRATION, check_output, read_bounded

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp fit``: bags of a thermal test to a calibration, once per unit.
-
-"""
+"""Owns ``thermo_comp fit``: bags of a thermal test to a calibration, once per unit."""
 
 from __future__ import annotations
 
@@ -88,7 +85,6 @@ def fit(
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
-
     """
     from ..files import CALIBRATION, PAGE, check_output
     from ..fitting import FitOptions, resolve_gravity
@@ -185,7 +181,6 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
 def _say_positions(out: Output, result: FitResult) -> None:
     """
     Print every rest: where, when, how long, which way was up, and |f| - g by the fit and without.
-
     """
     from ..unit.gravity import MICRO_G
 
@@ -207,10 +202,7 @@ def _say_positions(out: Output, result: FitResult) -> None:
 
 
 def _say_groups(out: Output, result: FitResult) -> None:
-    """
-    Print what each group of the model earns, and the noise that is left.
-
-    """
+    """Print what each group of the model earns, and the noise that is left."""
     from ..unit.gravity import MICRO_G
 
     calibration = result.calibration
@@ -230,19 +222,13 @@ def _say_groups(out: Output, result: FitResult) -> None:
     )
     white, walk = (
         ' '.join(micro_g(value / MICRO_G) for value in values)
-        for values in (
-            calibration.noise_density_m_s2_sqrt_hz,
-            calibration.slow_noise_m_s2_sqrt_h,
-        )
+        for values in (calibration.noise_density_m_s2_sqrt_hz, calibration.slow_noise_m_s2_sqrt_h)
     )
     out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
 
 
 def _say_residuals(out: Output, result: FitResult) -> None:
-    """
-    Print |f| - g by step of the model; the last column is what a new attitude will see.
-
-    """
+    """Print |f| - g by step of the model; the last column is what a new attitude will see."""
     response = result.calibration.provenance.model
     out.table(
         ('section', 'windows', 'raw', 'one set', 'two sets', response, 'left out'),

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp fleet``: the thermal tests of many units, on all the processors there are.
-
-"""
+"""Owns ``thermo_comp fleet``: the thermal tests of many units, on all the processors there are."""
 
 from __future__ import annotations
 
@@ -28,10 +25,7 @@ app = typer.Typer(
 
 @app.callback()
 def _fleet() -> None:
-    """
-    Fit many units, and see what they tell together.
-
-    """
+    """Fit many units, and see what they tell together."""
 
 
 @app.command()
@@ -87,7 +81,6 @@ def fit(
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
-
     """
     from ..fitting import FitOptions
     from ..fleet import FleetOptions, fit_fleet, read_parquet
@@ -191,9 +184,6 @@ def _micro_g(row: Row, name: str) -> str:
 
 
 def _short(name: str, limit: int = 22) -> str:
-    """
-    Keep the end of a long name, which tells units apart, so that the table fits 80 columns.
-
-    """
+    """Keep the end of a long name, which tells units apart, so that the table fits 80 columns."""
     clean = one_line(name)
     return clean if len(clean) <= limit else f'~{clean[1 - limit :]}'

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns ``thermo_comp info``: what is in a bag or a calibration, and whether it is fit for a fit.
-
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ def info(
 
     Example:
       thermo_comp info chamber.mcap
-
     """
     out = Output(as_json, quiet)
     if path.suffix in ('.yaml', '.yml'):
@@ -131,9 +129,7 @@ def _calibration(out: Output, path: Path) -> None:
                 micro_g(axis.bias / axis.scale_factor / MICRO_G),
             )
             for name, axis in zip(
-                'xyz',
-                (calibration.axes.x, calibration.axes.y, calibration.axes.z),
-                strict=True,
+                'xyz', (calibration.axes.x, calibration.axes.y, calibration.axes.z), strict=True
             )
         ],
     )

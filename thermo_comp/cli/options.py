@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the options that several commands share, each with one meaning everywhere.
-
-"""
+"""Owns the options that several commands share, each with one meaning everywhere."""
 
 from __future__ import annotations
 
@@ -20,10 +17,7 @@ if TYPE_CHECKING:
 
 
 class InputChoice(str, Enum):
-    """
-    What the accelerometer's messages are.
-
-    """
+    """What the accelerometer's messages are."""
 
     auto = 'auto'
     counts = 'counts'
@@ -31,20 +25,14 @@ class InputChoice(str, Enum):
 
 
 class ModelChoice(str, Enum):
-    """
-    The models of a fit.
-
-    """
+    """The models of a fit."""
 
     response = 'response'
     golovach = 'golovach'
 
 
 class CurveChoice(str, Enum):
-    """
-    The families of curves over temperature.
-
-    """
+    """The families of curves over temperature."""
 
     linear = 'linear'
     quadratic = 'quadratic'
@@ -54,10 +42,7 @@ class CurveChoice(str, Enum):
 
 
 def check_serial(serial: str | None) -> str | None:
-    """
-    Refuse what can be no serial; an empty one is for the command to judge.
-
-    """
+    """Refuse what can be no serial; an empty one is for the command to judge."""
     if serial:
         try:
             valid_serial(serial)
@@ -127,10 +112,7 @@ AgeingBias = Annotated[
 
 
 def acceleration(text: str | None) -> float | None:
-    """
-    Read an acceleration with its unit [m/s^2]; None where none is given.
-
-    """
+    """Read an acceleration with its unit [m/s^2]; None where none is given."""
     from ..unit.gravity import parse_acceleration
 
     try:
@@ -140,20 +122,14 @@ def acceleration(text: str | None) -> float | None:
 
 
 def positive(value: float, name: str) -> float:
-    """
-    Refuse a number that is not positive and finite.
-
-    """
+    """Refuse a number that is not positive and finite."""
     if not 0.0 < value < float('inf'):
         raise usage(f'{name} must be positive, got {value:g}')
     return value
 
 
 def topics_of(counts: str, imu: str, board: str, case: str) -> Topics:
-    """
-    Collect the topic options.
-
-    """
+    """Collect the topic options."""
     from ..recording import Topics
 
     return Topics(counts, imu, board, case)
@@ -167,11 +143,6 @@ def place(gravity: float | None, latitude: float | None, height: float | None) -
     ----------
     gravity, latitude, height : float or None
         The options of these names.
-
-    Returns
-    -------
-    float or None
-        Local gravity.
 
     Raises
     ------
@@ -194,8 +165,5 @@ def place(gravity: float | None, latitude: float | None, height: float | None) -
 
 
 def usage(message: str, **context: Any) -> typer.BadParameter:
-    """
-    Return a mistake in the command line, to be raised: exit code 2.
-
-    """
+    """Return a mistake in the command line, to be raised: exit code 2."""
     return typer.BadParameter(message, **context)

@@ -6,7 +6,6 @@ Owns how the command line speaks: tables, JSON, progress, and one line per error
 Results go to stdout, everything about the run (progress, notes, errors) to stderr, so that a pipe
 carries results only. Everything goes through `_print`: what somebody else chose (serials, topics,
 metadata, file names) can neither forge a line nor move the cursor, and any terminal can show it.
-
 """
 
 from __future__ import annotations
@@ -49,26 +48,17 @@ class Output:
         self.quiet = quiet
 
     def line(self, text: str = '') -> None:
-        """
-        Print one sentence of the result.
-
-        """
+        """Print one sentence of the result."""
         if not (self.as_json or self.quiet):
             _print(text)
 
     def note(self, text: str) -> None:
-        """
-        Print one sentence about the run, on stderr.
-
-        """
+        """Print one sentence about the run, on stderr."""
         if not self.quiet:
             _print(f'thermo_comp: {text}', sys.stderr)
 
     def torn(self, infos: Iterable[RecordingInfo]) -> bool:
-        """
-        Say of each bag that was cut off where it was; tell whether there is one.
-
-        """
+        """Say of each bag that was cut off where it was; tell whether there is one."""
         found = [info for info in infos if info.truncated]
         for info in found:
             self.note(f'{info.path}: {info.truncated}')
@@ -76,18 +66,12 @@ class Output:
 
     @staticmethod
     def end(*, is_torn: bool) -> None:
-        """
-        End a command that has done its work; what it read was not whole, if a bag was torn.
-
-        """
+        """End a command that has done its work; what it read was not whole, if a bag was torn."""
         if is_torn:
             raise typer.Exit(1)
 
     def json(self, data: Mapping[str, Any]) -> None:
-        """
-        Print the result for machines, in ASCII; numbers that JSON does not know become null.
-
-        """
+        """Print the result for machines, in ASCII; numbers that JSON does not know become null."""
         if self.as_json:
             print(json.dumps(plain(data), indent=2, allow_nan=False))
 
@@ -177,37 +161,25 @@ def _ignore(_done: float) -> None:
 
 
 def error(message: str) -> None:
-    """
-    Print the one line that a failed command leaves behind.
-
-    """
+    """Print the one line that a failed command leaves behind."""
     line = ' '.join(message.split())
     _print(f'thermo_comp: error: {line}', sys.stderr)
 
 
 def _print(text: str, file: TextIO | None = None) -> None:
-    """
-    Print one line.
-
-    """
+    """Print one line."""
     stream = sys.stdout if file is None else file
     print(_shown(text, stream), file=stream)
 
 
 def _shown(text: str, file: TextIO) -> str:
-    """
-    Return a line as the stream can carry it.
-
-    """
+    """Return a line as the stream can carry it."""
     encoding = file.encoding or 'utf-8'
     return one_line(text).encode(encoding, 'backslashreplace').decode(encoding)
 
 
 def text(cell: Cell) -> str:
-    """
-    Return a table cell as text: at most four significant digits, a dash for nothing.
-
-    """
+    """Return a table cell as text: at most four significant digits, a dash for nothing."""
     if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
         return '-'
     if isinstance(cell, float):
@@ -218,10 +190,7 @@ def text(cell: Cell) -> str:
 
 
 def micro_g(value: float) -> str:
-    """
-    Return a residual in micro-g as the tables show it.
-
-    """
+    """Return a residual in micro-g as the tables show it."""
     return f'{value:.1f}' if abs(value) < 99.95 else f'{value:.0f}'
 
 
@@ -236,10 +205,7 @@ def _is_number(cell: str) -> bool:
 def aligned(
     columns: Sequence[str], cells: Sequence[Sequence[str]], right: Sequence[bool], title: str = ''
 ) -> Iterator[str]:
-    """
-    Yield the lines of a table as plain text, two blanks between columns.
-
-    """
+    """Yield the lines of a table as plain text, two blanks between columns."""
     widths = [
         max(len(column), *(len(row[i]) for row in cells)) if cells else len(column)
         for i, column in enumerate(columns)
@@ -254,10 +220,7 @@ def aligned(
 
 
 def plain(value: Any) -> Any:
-    """
-    Return a value in JSON's types: arrays as lists, dataclasses as objects, NaN as null.
-
-    """
+    """Return a value in JSON's types: arrays as lists, dataclasses as objects, NaN as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp play``: a bag onto the live topics of the node.
-
-"""
+"""Owns ``thermo_comp play``: a bag onto the live topics of the node."""
 
 from __future__ import annotations
 
@@ -51,7 +48,6 @@ def play(
     Example:
       thermo_comp play chamber.mcap --rate 20
       thermo_comp play chamber.mcap --ros-args -r __ns:=/imu0
-
     """
     require_ros()
     from ..ros.player import play as run

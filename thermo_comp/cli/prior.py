@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp prior``: calibrations of siblings to what their type has in common.
-
-"""
+"""Owns ``thermo_comp prior``: calibrations of siblings to what their type has in common."""
 
 from __future__ import annotations
 
@@ -34,7 +31,6 @@ def prior(
 
     Example:
       thermo_comp prior unit01.yaml unit02.yaml unit03.yaml -o type.yaml
-
     """
     from ..files import CALIBRATION, check_output
     from ..fitting.priors import population

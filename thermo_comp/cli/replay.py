@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp replay``: a whole bag through the compensator, offline.
-
-"""
+"""Owns ``thermo_comp replay``: a whole bag through the compensator, offline."""
 
 from __future__ import annotations
 
@@ -24,8 +21,7 @@ def replay(
     bag: options.Bag,
     calibration: options.CalibrationFile,
     output: Annotated[
-        Path,
-        typer.Option('--output', '-o', help='*.mcap, a folder, *.csv or *.parquet.'),
+        Path, typer.Option('--output', '-o', help='*.mcap, a folder, *.csv or *.parquet.')
     ],
     keep_inputs: Annotated[
         bool, typer.Option('--keep-inputs', help='Copy the input messages beside the output.')
@@ -64,7 +60,6 @@ def replay(
 
     Example:
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
-
     """
     from ..files import bag_kind, check_output
     from ..online.status import CompensatorConfig

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp report``: a certificate of a calibration, from bags.
-
-"""
+"""Owns ``thermo_comp report``: a certificate of a calibration, from bags."""
 
 from __future__ import annotations
 
@@ -56,7 +53,6 @@ def report(
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
-
     """
     from ..files import PAGE, check_output
     from ..judging import open_bag

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp simulate``: bags of a thermal test with known truth.
-
-"""
+"""Owns ``thermo_comp simulate``: bags of a thermal test with known truth."""
 
 from __future__ import annotations
 
@@ -51,8 +48,7 @@ def simulate(
         ),
     ] = None,
     profile: Annotated[
-        str,
-        typer.Option(help="Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'."),
+        str, typer.Option(help="Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'.")
     ] = 'chamber',
     positions: Annotated[
         int, typer.Option(help='Number of positions, one bag each.', min=1, max=999)
@@ -81,7 +77,6 @@ def simulate(
 
     Example:
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
-
     """
     from .. import simulation
     from ..files import bag_kind, check_output
@@ -158,10 +153,7 @@ def _write(
     force: bool,
     tell: Callable[[int], None],
 ) -> dict[str, int]:
-    """
-    Write one run; the recording starts with the first temperatures, as a recorder would.
-
-    """
+    """Write one run; the recording starts with the first temperatures, as a recorder would."""
     from .. import __version__
     from ..recording import BagWriter, Topics
 

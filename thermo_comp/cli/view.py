@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp view``: a calibration's certificate in the browser, live.
-
-"""
+"""Owns ``thermo_comp view``: a calibration's certificate in the browser, live."""
 
 from __future__ import annotations
 
@@ -55,7 +52,6 @@ def view(
 
     Example:
       thermo_comp view unit42.yaml held_out.mcap
-
     """
     from ..report.live import LiveOptions, LiveReport, LiveServer
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the way from other people's logs to bags: tables with a column map, PX4, ArduPilot, bags.
-
 """
 
 from .bag import bag_log

@@ -6,7 +6,6 @@ Owns what the logs of autopilots have in common: numbered IMUs, their thermomete
 The thermometer inside the IMU sits with the converter and lags: it becomes the board temperature.
 The barometer beside it hardly heats itself and follows the surroundings: it becomes the case
 temperature. A simulator's log is refused: it has no noise, so nothing can be weighed by it.
-
 """
 
 from __future__ import annotations
@@ -166,10 +165,7 @@ def _choose(found: Mapping[int, T], wanted: int | None, what: str, path: str) ->
 
 
 def _reported(readings: Readings) -> Readings:
-    """
-    Leave out what no thermometer said: NaN, and the zeros of a sensor that has none.
-
-    """
+    """Leave out what no thermometer said: NaN, and the zeros of a sensor that has none."""
     use: Bools = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
     if not readings.celsius[use].any():
         use = np.zeros(len(use), dtype=np.bool_)

@@ -6,7 +6,6 @@ Owns other people's bags: ROS 1 and 2 recordings whose topics and units are thei
 Drivers call their topics as they like and not all of them publish m/s^2. The Imu topic is found
 by its type; a thermometer is told by its neighbours: beside the Imu it is the board's, beside a
 barometer (sensor_msgs/FluidPressure) the case's. What rests must read gravity in the stated unit.
-
 """
 
 from __future__ import annotations
@@ -153,10 +152,7 @@ def _of_type(present: Present, kind: str) -> list[str]:
 
 
 def _common(one: str, other: str) -> int:
-    """
-    Count the leading name parts that two topics share, their last ones not counted.
-
-    """
+    """Count the leading name parts that two topics share, their last ones not counted."""
     shared = 0
     parts = (name.strip('/').split('/')[:-1] for name in (one, other))
     for a, b in zip(*parts, strict=False):

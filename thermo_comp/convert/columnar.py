@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the conversion of a table with a column map.
-
-"""
+"""Owns the conversion of a table with a column map."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@
 Owns the column map: which column of a table is what, in which unit, and how it becomes a message.
 
 A map is a small YAML file beside the log; config/columns/ has examples.
-
 """
 
 from __future__ import annotations
@@ -27,20 +26,14 @@ _STAMP_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 @dataclass(frozen=True)
 class Format:
-    """
-    How the text is laid out; found out where it is not said.
-
-    """
+    """How the text is laid out; found out where it is not said."""
 
     delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
     header: bool | None = None
 
     @property
     def character(self) -> str | None:
-        """
-        The delimiter as one character.
-
-        """
+        """The delimiter as one character."""
         names = {'tab': '\t', 'blank': ' '}
         return None if self.delimiter is None else names.get(self.delimiter, self.delimiter)
 
@@ -51,7 +44,6 @@ class Stamp:
     A column of time stamps, or a fixed rate.
 
     The start is not 0 by default, because ROS takes a zero stamp for "no time yet".
-
     """
 
     column: Column | None = None
@@ -67,10 +59,7 @@ class Stamp:
 
     @property
     def exponent(self) -> int:
-        """
-        Power of ten from the unit to nanoseconds.
-
-        """
+        """Power of ten from the unit to nanoseconds."""
         return _STAMP_EXPONENTS[self.unit or 'ns']
 
 
@@ -82,7 +71,6 @@ class Accel:
     `output` is what becomes of them: ``counts`` (geometry_msgs/Vector3Stamped) or ``imu``
     (sensor_msgs/Imu, m/s^2). `clip` are the readings, in the table's unit, at and beyond which
     the sensor saturates.
-
     """
 
     columns: tuple[Column, Column, Column]
@@ -101,10 +89,7 @@ class Accel:
 
     @property
     def factor(self) -> float:
-        """
-        What a reading is multiplied by to become the message's value.
-
-        """
+        """What a reading is multiplied by to become the message's value."""
         if self.output == 'counts':
             return 1.0
         per_g = {'m/s^2': STANDARD_GRAVITY, 'g': 1.0, 'mg': 1000.0}
@@ -113,10 +98,7 @@ class Accel:
 
 @dataclass(frozen=True)
 class Gyro:
-    """
-    The gyroscope's three columns; they travel in the Imu message.
-
-    """
+    """The gyroscope's three columns; they travel in the Imu message."""
 
     columns: tuple[Column, Column, Column]
     unit: Literal['rad/s', 'deg/s']
@@ -130,7 +112,6 @@ class Thermometer:
     Slow sensors hold their last value between readings of their own. `publish` says which rows
     become messages: ``change`` (the value differs from the last one, or `heartbeat_s` is over),
     ``period`` (every `period_s`) or ``all``.
-
     """
 
     column: Column
@@ -151,10 +132,7 @@ class Thermometer:
 
     @property
     def linear(self) -> tuple[float, float]:
-        """
-        Slope and offset from the table's reading to degC.
-
-        """
+        """Slope and offset from the table's reading to degC."""
         if self.unit == 'raw':
             return self.degc_per_count or 0.0, self.degc_at_zero or 0.0
         return {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}[self.unit]
@@ -162,10 +140,7 @@ class Thermometer:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """
-    The whole map.
-
-    """
+    """The whole map."""
 
     stamp: Stamp
     accel: Accel
@@ -189,11 +164,6 @@ def load_column_map(path: str | Path) -> ColumnMap:
     ----------
     path : str or Path
         The YAML file.
-
-    Returns
-    -------
-    ColumnMap
-        The map.
 
     Raises
     ------

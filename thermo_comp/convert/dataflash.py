@@ -147,7 +147,6 @@ def read_dataflash(path: str | Path) -> tuple[AutopilotLog, dict[str, float]]:
 def _messages(reader: Any, name: str, path: Path) -> tuple[dict[str, npt.NDArray[Any]], int]:
     """
     Gather one message type: its columns, and how many of its messages the file ends inside of.
-
     """
     number = reader.name_to_id[name]
     layout = reader.formats[number]

@@ -11,7 +11,6 @@ range, in m/s^2, and nothing else::
 
 What a calibration holds beyond that is named in the notes of an export, with the error that its
 loss leaves. ``raw`` there is already in m/s^2, scaled by the driver: counts are divided by K.
-
 """
 
 from __future__ import annotations
@@ -119,10 +118,7 @@ def export_px4(
 
 
 def export_ardupilot(
-    calibration: Calibration,
-    *,
-    imu: int = 1,
-    up: tuple[float, float, float] | None = None,
+    calibration: Calibration, *, imu: int = 1, up: tuple[float, float, float] | None = None
 ) -> ParameterFile:
     """
     Write a calibration's static set as ArduPilot parameters.
@@ -246,10 +242,7 @@ def import_parameters(
 
 
 def _comments(calibration: Calibration, notes: list[str]) -> list[str]:
-    """
-    Head a parameter file; whatever a note holds, it ends with its line.
-
-    """
+    """Head a parameter file; whatever a note holds, it ends with its line."""
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
     return [f'# {one_line(said)}' for said in (title, *notes)]
 
@@ -257,10 +250,7 @@ def _comments(calibration: Calibration, notes: list[str]) -> list[str]:
 def _cubics(
     calibration: Calibration, reference: float, up: tuple[float, float, float] | None
 ) -> tuple[Floats, list[str]]:
-    """
-    Cubic of each axis' offset [m/s^2] about a reference, shape (3, 4), and what it lacks.
-
-    """
+    """Cubic of each axis' offset [m/s^2] about a reference, shape (3, 4), and what it lacks."""
     direction = np.zeros(3) if up is None else np.array(up, dtype=np.float64)
     if up is not None and not abs(np.linalg.norm(direction) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')

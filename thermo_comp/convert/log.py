@@ -4,7 +4,6 @@
 Owns the way from any foreign log to a bag: checks, thinning, and the account of every row.
 
 A reader of a format makes a `ForeignLog`; `write_log` does the rest, the same for all formats.
-
 """
 
 from __future__ import annotations
@@ -358,7 +357,6 @@ def _write(
 ) -> None:
     """
     Write the messages; a stamp that goes back keeps its place in the bag through its log time.
-
     """
     topics = Topics()
     stamp_ns = log.stamp_ns[usable]
@@ -415,10 +413,7 @@ def _log_times(readings: Readings | None) -> Ints:
 
 
 def _imu_columns(n: int, gyro: Floats | None) -> ImuColumns:
-    """
-    Return the rest of an Imu message: what the log has not is marked with -1, REP 145.
-
-    """
+    """Return the rest of an Imu message: what the log has not is marked with -1, REP 145."""
     absent = np.zeros((n, 9))
     absent[:, 0] = -1.0
     return ImuColumns(

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns Parquet tables, behind the extra ``parquet``.
-
-"""
+"""Owns Parquet tables, behind the extra ``parquet``."""
 
 from __future__ import annotations
 
@@ -85,10 +82,7 @@ def read_parquet(
         stamp_ns=None
         if stamp is None
         else _stamps(
-            path,
-            headings[places[stamp]],
-            table.column(headings[places[stamp]]),
-            stamp_exponent,
+            path, headings[places[stamp]], table.column(headings[places[stamp]]), stamp_exponent
         ),
         n_short=0,
     )

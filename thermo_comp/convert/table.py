@@ -5,7 +5,6 @@ Owns tables of numbers: CSV, TSV, blank-separated or Parquet -> named columns of
 
 A cell that is no number becomes NaN and its row is counted; a stamp is read exactly, as decimal
 digits, because nanoseconds since 1970 do not fit a float.
-
 """
 
 from __future__ import annotations
@@ -88,11 +87,6 @@ def read_text(
     has_header : bool or None, optional
         Whether the first line holds headings; found out by default.
 
-    Returns
-    -------
-    Table
-        The columns.
-
     Raises
     ------
     RecordingError
@@ -148,7 +142,6 @@ def sniff(head: str) -> str:
 def _rows(file: Iterable[str], delimiter: str) -> Iterator[tuple[int, list[str]]]:
     """
     Yield (line number, cells) of every line that holds something; ``#`` starts a comment line.
-
     """
     if delimiter == ' ':
         cells: Iterable[list[str]] = (line.split() for line in file)
@@ -160,10 +153,7 @@ def _rows(file: Iterable[str], delimiter: str) -> Iterator[tuple[int, list[str]]
 
 
 def is_number(cell: str) -> bool:
-    """
-    Return whether a cell reads as a number (NaN and infinity count as such).
-
-    """
+    """Return whether a cell reads as a number (NaN and infinity count as such)."""
     try:
         float(cell)
     except ValueError:

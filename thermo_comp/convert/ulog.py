@@ -144,7 +144,6 @@ def _vectors(columns: dict[str, Any]) -> Floats:
 def _matched(stamp_ns: Ints, gyro_ns: Ints, gyro: Floats) -> Floats | None:
     """
     Interpolate the rate to the accelerometer's stamps; None where it was logged more sparsely.
-
     """
     use = gyro_ns != NO_STAMP
     gyro_ns, gyro = gyro_ns[use], gyro[use]

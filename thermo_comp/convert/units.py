@@ -6,7 +6,6 @@ Owns the belief about units: what a still accelerometer reads says what it reads
 At rest the specific force is gravity, whatever the attitude: |a| is 1 in g, 9.8 in m/s^2, 1000 in
 mg, and the sensitivity in counts. A log whose map says otherwise is refused, because a factor of
 9.8 that nobody sees ends in a calibration.
-
 """
 
 from __future__ import annotations

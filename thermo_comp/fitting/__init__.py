@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the fit: bags of a thermal test -> still positions -> regression -> calibration, with proof.
-
 """
 
 from .evidence import PositionReport, ResidualRow

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the way from a posterior to the Calibration that the compensator applies, and its covariance.
-
 """
 
 from __future__ import annotations
@@ -81,10 +80,7 @@ class UnitFacts:
 
 @dataclass(frozen=True)
 class _Weights:
-    """
-    Physical weights, shape (3, m): input units, and relative, per unit of the column.
-
-    """
+    """Physical weights, shape (3, m): input units, and relative, per unit of the column."""
 
     bias: Floats
     scale: Floats
@@ -127,11 +123,6 @@ def build_calibration(
         For the provenance.
     findings : sequence of Finding, optional
         For the provenance; what is good is left out.
-
-    Returns
-    -------
-    Calibration
-        The calibration.
 
     """
     state, prior = learnt.posterior.state, learnt.prior
@@ -224,10 +215,7 @@ def build_calibration(
 
 
 def _axis_set(sets: Sets, weights: _Weights, axis: int, is_dynamic: bool, slow: float) -> AxisSet:
-    """
-    Make the curves of one axis in one regime.
-
-    """
+    """Make the curves of one axis in one regime."""
     n = sets.static.n_free
     bias, scale = weights.bias[axis], weights.scale[axis]
     family = sets.dynamic if is_dynamic else sets.static
@@ -253,10 +241,7 @@ def _axis_set(sets: Sets, weights: _Weights, axis: int, is_dynamic: bool, slow: 
 def _shaped(
     family: TemperatureFunction, reference: float, values: tuple[float, ...]
 ) -> TemperatureFunction:
-    """
-    Make a function of a family with its value at the reference and its free coefficients.
-
-    """
+    """Make a function of a family with its value at the reference and its free coefficients."""
     if isinstance(family, Polynomial):
         return Polynomial((reference, *values))
     if isinstance(family, CubicSpline):
@@ -341,7 +326,6 @@ def _slow_error(windows: ThermalWindows, learnt: Learnt) -> Floats:
     Say what the bias does of itself: another one in each mounting, and a walk [m/s^2].
 
     The walk's mean square over a run as long as the bags is half of what it has at the end.
-
     """
     prior = learnt.prior
     data = windows.data

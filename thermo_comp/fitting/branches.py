@@ -8,7 +8,6 @@ The temperature does not jump, so no function of temperature can follow, and a f
 smears it over the whole curve. A jump is told from a turn of the unit by three witnesses: the
 readings beside it are as quiet as ever; the norm of the reading changes, which a turn leaves
 nearly alone; the gyroscope, where there is one, saw no rotation.
-
 """
 
 from __future__ import annotations
@@ -151,10 +150,7 @@ def find_branches(
 
 @dataclass(frozen=True)
 class _Near:
-    """
-    Samples beside one gap.
-
-    """
+    """Samples beside one gap."""
 
     time: Floats
     stamp_ns: Ints
@@ -195,10 +191,7 @@ def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
 
 
 def _angular_velocity(block: object) -> Floats | None:
-    """
-    Angular rate of a block that has one: a recording's, when its input is an Imu.
-
-    """
+    """Angular rate of a block that has one: a recording's, when its input is an Imu."""
     rate = getattr(getattr(block, 'imu', None), 'angular_velocity', None)
     if rate is None or not np.asarray(rate).any():
         return None
@@ -248,10 +241,7 @@ def _examine(
 
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
-    """
-    Estimate what the board's readings did at a step, and the sd of that.
-
-    """
+    """Estimate what the board's readings did at a step, and the sd of that."""
     time = _seconds(bag.board.stamp_ns, bag.start_ns)
     use = (time >= begin) & (time <= end)
     time, value = time[use], bag.board.value[use]
@@ -267,10 +257,7 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
 
 
 def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats) -> int:
-    """
-    Find the first sample after the step that explains most, beside a straight drift.
-
-    """
+    """Find the first sample after the step that explains most, beside a straight drift."""
     n = len(time)
     trend = _trend(time)
     left = accel - trend @ (trend.T @ accel)
@@ -287,7 +274,6 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats) -> int:
 def _step(time: Floats, accel: Floats, at: float, quiet_sd: Floats) -> tuple[Floats, Floats]:
     """
     Estimate a step at a known time, beside a straight drift, and its sd from the quiet noise.
-
     """
     trend = _trend(time)
     jump = (time >= at).astype(np.float64)
@@ -297,26 +283,19 @@ def _step(time: Floats, accel: Floats, at: float, quiet_sd: Floats) -> tuple[Flo
 
 
 def _trend(time: Floats) -> Floats:
-    """
-    Columns of a level and a drift, orthonormal, shape (n, 2).
-
-    """
+    """Columns of a level and a drift, orthonormal, shape (n, 2)."""
     t = time - time.mean()
     return np.column_stack([np.full(len(t), len(t) ** -0.5), t / np.sqrt(t @ t)])
 
 
 def _local_variance(samples: Floats) -> Floats:
-    """
-    Noise from neighbouring differences, which a drift does not widen.
-
-    """
+    """Noise from neighbouring differences, which a drift does not widen."""
     return np.asarray(0.5 * np.mean(np.diff(samples, axis=0) ** 2, axis=0))
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
     """
     Angle turned through within a second of the step, against the gyro's own level on each side.
-
     """
     levels = (np.median(gyro[:at], axis=0), np.median(gyro[at:], axis=0))
     dt = np.diff(time)

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the families of the curves over temperature: what a fit's option means in functions.
-
-"""
+"""Owns the families of the curves over temperature: what a fit's option means in functions."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the equations of the windows: base columns, whitened once for each noise, and the prediction.
-
 """
 
 from __future__ import annotations
@@ -19,10 +18,7 @@ from .whitening import Whitener
 
 @dataclass(frozen=True)
 class _Whitened:
-    """
-    Base columns of one axis, filtered; their Gram matrix in each position.
-
-    """
+    """Base columns of one axis, filtered; their Gram matrix in each position."""
 
     rho: float
     gains: tuple[Floats, Floats]
@@ -73,10 +69,7 @@ class Design:
         self._cache: list[_Whitened | None] = [None] * 3
 
     def reweight(self, weight: Floats) -> None:
-        """
-        Take other weights of the windows, shape (n, 3).
-
-        """
+        """Take other weights of the windows, shape (n, 3)."""
         self.weight = weight
         self._cache = [None] * 3
 
@@ -91,10 +84,7 @@ class Design:
         return found
 
     def plain_prior(self) -> Prior:
-        """
-        Make a prior in which every column takes part, of widths that say nothing.
-
-        """
+        """Make a prior in which every column takes part, of widths that say nothing."""
         n = len(self.windows.groups)
         return Prior(
             bias_mean=np.zeros(3),
@@ -111,7 +101,6 @@ class Design:
     def layout(self, prior: Prior) -> Layout:
         """
         Give every unknown its place, those of the unit first; -1 for columns that take no part.
-
         """
         n_columns = len(self.windows.groups)
         n = 0
@@ -160,10 +149,7 @@ class Design:
         )
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:
-        """
-        Inverse variances of the prior, shape (n,); where there is a matrix instead, 0.
-
-        """
+        """Inverse variances of the prior, shape (n,); where there is a matrix instead, 0."""
         result = np.zeros(layout.n + 1)
         result[layout.kappa] = prior.scale_sd**-2
         result[layout.bias] = prior.bias_sd**-2.0
@@ -177,10 +163,7 @@ class Design:
         return result[:-1]
 
     def _inform(self, prior: Prior, layout: Layout) -> list[tuple[slice, Floats]]:
-        """
-        Give what the prior has as matrices: where, and the inverse covariance.
-
-        """
+        """Give what the prior has as matrices: where, and the inverse covariance."""
         result: list[tuple[slice, Floats]] = []
         if prior.known is not None:
             result.append((slice(0, layout.n_unit), prior.known.precision))
@@ -192,10 +175,7 @@ class Design:
         return result
 
     def prior_mean(self, prior: Prior, layout: Layout) -> Floats:
-        """
-        Mean of the prior; 0 for all but kappa and bias, shape (n,).
-
-        """
+        """Mean of the prior; 0 for all but kappa and bias, shape (n,)."""
         mean = np.zeros(layout.n)
         if prior.known is not None:
             mean[: layout.n_unit] = prior.known.mean
@@ -205,10 +185,7 @@ class Design:
         return mean
 
     def vector(self, state: State, layout: Layout) -> Floats:
-        """
-        Give the unknowns as a vector; attitudes as 0, they move in the tangent plane.
-
-        """
+        """Give the unknowns as a vector; attitudes as 0, they move in the tangent plane."""
         result = np.zeros(layout.n + 1)
         for name in ('kappa', 'bias', 'on_bias', 'on_scale', 'skew', 'offset'):
             result[getattr(layout, name)] = getattr(state, name)
@@ -234,10 +211,7 @@ class Design:
         )
 
     def _combination(self, state: State, p: int, axis: int, force: float) -> Floats:
-        """
-        Predict one position and axis, as a combination of the base columns.
-
-        """
+        """Predict one position and axis, as a combination of the base columns."""
         n_columns = len(self.windows.groups)
         # Eq. (7) with (8) and (9): bias, and scale times input.
         weight = state.on_bias[axis] + state.kappa[axis] * force * state.on_scale[axis]
@@ -251,10 +225,7 @@ class Design:
         return result
 
     def residual(self, state: State) -> Floats:
-        """
-        Measured minus predicted, shape (n, 3) [m/s^2].
-
-        """
+        """Measured minus predicted, shape (n, 3) [m/s^2]."""
         force = self.gravity * state.up @ inverse_misalignment(state.skew).T
         result = np.empty_like(self.measured)
         for p, rows in enumerate(self._rows):
@@ -266,7 +237,6 @@ class Design:
     def force(self, state: State) -> Floats:
         """
         Correct the windows as the compensator would: offsets and start states unknown, (n, 3).
-
         """
         along = self.measured - state.bias - self._columns @ state.on_bias.T
         along /= state.kappa * (1.0 + self._columns @ state.on_scale.T)

@@ -5,7 +5,6 @@ Owns what a fit shows for itself: residuals of each step of the model, and of ea
 
 A position is judged twice: as fitted, and by the unit's parameters without that position, which
 is what a new attitude will see.
-
 """
 
 from __future__ import annotations
@@ -124,10 +123,7 @@ def residual_rows(
 
 
 def _with_only(regression: Regression, learnt: Learnt, groups: tuple[str, ...]) -> State:
-    """
-    Fit again with some groups only, as wide as they like to be.
-
-    """
+    """Fit again with some groups only, as wide as they like to be."""
     only = np.array([group in groups for group in regression.windows.groups])
     # What such a model leaves is no noise of the windows; it counts for all of them alike.
     prior = replace(
@@ -145,7 +141,6 @@ def left_out_residual(regression: Regression, learnt: Learnt) -> Floats:
     """
     ``|f| - g`` of each position's windows by the others, shape (n,) [m/s^2]; NaN for a position
     that tells what no other does.
-
     """
     position = regression.windows.position
     result = np.full(len(position), np.nan)

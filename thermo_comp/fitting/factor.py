@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the linear algebra of a step: a Hessian whose parts belong to the unit or to one bag.
-
-"""
+"""Owns the linear algebra of a step: a Hessian whose parts belong to the unit or to one bag."""
 
 from __future__ import annotations
 
@@ -18,10 +15,7 @@ JITTER = 1e-13
 
 
 class Factor:
-    """
-    The Hessian, factored: what belongs to one bag alone is eliminated first.
-
-    """
+    """The Hessian, factored: what belongs to one bag alone is eliminated first."""
 
     def __init__(self, hessian: Floats, layout: Layout) -> None:
         n = layout.n_unit
@@ -42,10 +36,7 @@ class Factor:
         self.log_determinant += 2.0 * float(np.log(np.diag(self._unit[0])).sum())
 
     def solve(self, right: Floats) -> Floats:
-        """
-        Solve for one right side.
-
-        """
+        """Solve for one right side."""
         n = self._n
         right = right / self._root
         first = right[:n].copy()
@@ -58,10 +49,7 @@ class Factor:
         return np.asarray(result / self._root)
 
     def covariances(self) -> tuple[Floats, list[Floats]]:
-        """
-        Covariance of what belongs to the unit, and of what belongs to each bag.
-
-        """
+        """Covariance of what belongs to the unit, and of what belongs to each bag."""
         n, root = self._n, self._root
         unit = cho_solve(self._unit, np.eye(n))
         blocks = []

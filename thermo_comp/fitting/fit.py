@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the fit as a whole: sources in, calibration with its evidence out.
-
-"""
+"""Owns the fit as a whole: sources in, calibration with its evidence out."""
 
 from __future__ import annotations
 
@@ -354,15 +351,9 @@ def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibra
 
 
 def _wide_prior(
-    windows: ThermalWindows,
-    start: ConstantCalibration,
-    up: Floats,
-    options: FitOptions,
+    windows: ThermalWindows, start: ConstantCalibration, up: Floats, options: FitOptions
 ) -> Prior:
-    """
-    Say what is known of any unit before its data are seen.
-
-    """
+    """Say what is known of any unit before its data are seen."""
     groups = windows.data.groups
     allowed = np.array([options.groups is None or group in options.groups for group in groups])
     allowed &= windows.has_temperature
@@ -397,10 +388,7 @@ def _wide_prior(
 
 
 def _drift(windows: ThermalWindows, start: ConstantCalibration) -> float:
-    """
-    RMS of what the readings do within the positions, largest axis [m/s^2].
-
-    """
+    """RMS of what the readings do within the positions, largest axis [m/s^2]."""
     data = windows.data
     reading = data.mean / start.scale
     own = np.array([reading[data.position == p].mean(axis=0) for p in range(data.n_positions)])
@@ -410,7 +398,6 @@ def _drift(windows: ThermalWindows, start: ConstantCalibration) -> float:
 def board_lag(windows: ThermalWindows) -> float:
     """
     Time constant of the board behind the case: slope of the gradient over the board's rate [s].
-
     """
     rate = windows.rate - np.mean(windows.rate)
     power = float(rate @ rate)

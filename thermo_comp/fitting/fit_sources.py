@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the way from bags to what the fit reads.
-
-"""
+"""Owns the way from bags to what the fit reads."""
 
 from __future__ import annotations
 
@@ -128,11 +125,6 @@ def recording_source(
 def digest(path: Path) -> str:
     """
     Return the SHA-256 of a bag: of the file, or of a directory's files in the order of names.
-
-    Parameters
-    ----------
-    path : Path
-        The bag.
 
     Returns
     -------

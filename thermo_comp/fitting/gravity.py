@@ -42,11 +42,6 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     height_m : float
         Height above the ellipsoid [m], -1000..10000.
 
-    Returns
-    -------
-    float
-        Gravity.
-
     Raises
     ------
     ValueError
@@ -80,11 +75,6 @@ def resolve_gravity(
         Local gravity as measured; it wins.
     latitude_deg, height_m : float or None
         Place, used when `gravity` is not given; both are needed.
-
-    Returns
-    -------
-    float
-        Local gravity.
 
     Raises
     ------

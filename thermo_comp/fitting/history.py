@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the thermal history of a bag: the causal thermal state, on a uniform grid.
-
-
-"""
+"""Owns the thermal history of a bag: the causal thermal state, on a uniform grid."""
 
 from __future__ import annotations
 

@@ -53,10 +53,7 @@ _NEIGHBOURS = 3
 
 @dataclass(frozen=True)
 class Learnt:
-    """
-    A posterior under the prior that the data chose.
-
-    """
+    """A posterior under the prior that the data chose."""
 
     posterior: Posterior
     prior: Prior
@@ -142,10 +139,7 @@ def learn(
 
 
 def _idle(posterior: Posterior, prior: Prior, part: str, kept: Bools) -> list[int]:
-    """
-    Find the columns that do not earn their place.
-
-    """
+    """Find the columns that do not earn their place."""
     sd, places = widths_of(prior, part), places_of(posterior, part)
     return [
         column
@@ -163,7 +157,6 @@ def _left_open(
     A column that left was not needed; whether it is 0 the data tell to ``1 / sqrt(S)``, S what
     they say of it beside the columns that stayed. Where that is more than the noise of a window
     it comes back, with this width.
-
     """
     told = regression.told_of_absent(posterior.state, prior, allowed)
     widths = {}
@@ -178,10 +171,7 @@ def _left_open(
 
 @dataclass(frozen=True)
 class _Fixed:
-    """
-    Columns whose width the data cannot tell, by part; and columns that may not leave.
-
-    """
+    """Columns whose width the data cannot tell, by part; and columns that may not leave."""
 
     silent: dict[str, Bools]
     kept: Bools
@@ -209,10 +199,7 @@ def _settle(
     *,
     rounds: int = _MOST_ROUNDS,
 ) -> tuple[Posterior, Prior]:
-    """
-    Repeat the fixed point of widths and white noise until nothing moves.
-
-    """
+    """Repeat the fixed point of widths and white noise until nothing moves."""
     for k in range(rounds):
         posterior = regression.solve(state, prior, n_steps=2)
         state = posterior.state
@@ -261,17 +248,13 @@ def _settle(
 def _smallest(regression: Regression, prior: Prior, part: str) -> float:
     """
     Return a width that the data cannot tell from 0; a column that stays all the same keeps it.
-
     """
     sd = 1e-2 * float(np.mean(prior.sigma) / np.sqrt(len(regression.windows.time)))
     return sd if part == 'bias' else sd / regression.gravity
 
 
 def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float, float]:
-    """
-    Effective parameters of some unknowns, and the sum of their squares.
-
-    """
+    """Effective parameters of some unknowns, and the sum of their squares."""
     where = places.ravel()
     return float(posterior.told[where].sum()), float(np.sum(vector[where] ** 2))
 
@@ -282,10 +265,7 @@ def _position_sd(regression: Regression, prior: Prior) -> float:
 
 
 def _sigma(posterior: Posterior, prior: Prior) -> Floats:
-    """
-    White noise of each axis, from what is left and what was spent on it.
-
-    """
+    """White noise of each axis, from what is left and what was spent on it."""
     n = len(posterior.whitened)
     square = np.sum(posterior.whitened**2, axis=0)
     told, layout = posterior.told, posterior.layout
@@ -302,7 +282,6 @@ def _downweight(regression: Regression, posterior: Posterior) -> None:
     Take windows that are far off their neighbours for as noisy as they look.
 
     A knock stands alone; what a model does not explain lasts, and counts.
-
     """
     base = regression.windows.weight[:, None]
     size = posterior.whitened * np.sqrt(base / regression.weight)
@@ -319,10 +298,7 @@ def _downweight(regression: Regression, posterior: Posterior) -> None:
 
 
 def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:
-    """
-    Search the walk's share of each axis along the log evidence.
-
-    """
+    """Search the walk's share of each axis along the log evidence."""
     rho = prior.rho.copy()
     for axis in range(3):
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what the user may say of a fit.
-
-"""
+"""Owns what the user may say of a fit."""
 
 from __future__ import annotations
 

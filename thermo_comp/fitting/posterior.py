@@ -76,7 +76,6 @@ class _Equations:
     """
     Of one linearisation: Hessian and gradient, residuals, whitened ones, minus twice the
     log likelihood.
-
     """
 
     hessian: Floats
@@ -87,16 +86,10 @@ class _Equations:
 
 
 class Regression(Design):
-    """
-    The Gauss-Newton on the data of a fit; see `Design` for the parameters.
-
-    """
+    """The Gauss-Newton on the data of a fit; see `Design` for the parameters."""
 
     def _equations(self, state: State, prior: Prior, layout: Layout) -> _Equations:
-        """
-        Hessian and gradient of minus the log likelihood, and the residuals.
-
-        """
+        """Hessian and gradient of minus the log likelihood, and the residuals."""
         residual = self.residual(state)
         white = np.empty_like(residual)
         filtered = np.empty_like(residual)
@@ -129,10 +122,7 @@ class Regression(Design):
     def _block(
         self, state: State, prior: Prior, layout: Layout, p: int, axis: int, filtered: Floats
     ) -> tuple[Ints, Floats, Floats]:
-        """
-        Say what one axis in one position tells: places behind its own, Hessian, gradient.
-
-        """
+        """Say what one axis in one position tells: places behind its own, Hessian, gradient."""
         n_columns = len(self.windows.groups)
         moved, lag = self.moved, self.windows.lag
         found = self._whitened(axis, float(prior.rho[axis]))

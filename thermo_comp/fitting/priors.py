@@ -7,7 +7,6 @@ Both are calibrations: a mean and a covariance of all parameters. What a type of
 is the mean over units of the parameters relative to the scale factors, and their scatter; an
 earlier calibration of the unit itself has grown by its ageing. The fit takes either as the
 Gaussian prior of its regression, in the columns of that file.
-
 """
 
 from __future__ import annotations
@@ -71,20 +70,14 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
 
 
 def prior_sets(calibration: Calibration) -> Sets:
-    """
-    Return the curves of a calibration: each regime has its own.
-
-    """
+    """Return the curves of a calibration: each regime has its own."""
     return Sets(
         calibration.static.x.bias_function, calibration.dynamic.x.bias_function, is_shared=False
     )
 
 
 def constants_of(calibration: Calibration) -> ConstantCalibration:
-    """
-    Return the nine constants of a calibration at its reference temperature.
-
-    """
+    """Return the nine constants of a calibration at its reference temperature."""
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     return ConstantCalibration(
         np.array([axis.bias for axis in axes]),
@@ -94,10 +87,7 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def state_of(calibration: Calibration, regression: Regression, up: Floats) -> State:
-    """
-    Return the regression's unknowns as a calibration has them, whose scale is nominal.
-
-    """
+    """Return the regression's unknowns as a calibration has them, whose scale is nominal."""
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     K = np.array([axis.scale_factor for axis in axes])
     bias = np.array([axis.bias for axis in axes])
@@ -153,11 +143,6 @@ def known_of(
         As `prior_sets` gives them.
     ageing : Ageing
         What has come to the covariance since.
-
-    Returns
-    -------
-    Known
-        The prior.
 
     Raises
     ------
@@ -262,10 +247,7 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 
 
 def _vector(calibration: Calibration, columns: Sequence[Column], mean_K: Floats) -> Floats:
-    """
-    Return a unit's parameters in the order of the file, at the mean scale factors.
-
-    """
+    """Return a unit's parameters in the order of the file, at the mean scale factors."""
     weights = {
         replace(column, range=(0.0, 1.0)): term
         for column, term in zip(prior_columns(calibration), calibration.response, strict=True)
@@ -303,10 +285,7 @@ def _calibration(
     mean: Floats,
     scatter: Floats,
 ) -> Calibration:
-    """
-    Write a mean and a scatter as a calibration like the first one.
-
-    """
+    """Write a mean and a scatter as a calibration like the first one."""
     first = calibrations[0]
     static: list[AxisSet] = []
     dynamic: list[AxisSet] = []

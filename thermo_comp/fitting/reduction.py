@@ -8,7 +8,6 @@ One pass over the blocks, in bounded memory: samples become cells of about half 
 for the last one. Within a window every thermal regressor is linear in time to far below the
 noise, so the window's mean is a sufficient statistic; its noise is what the regression finds,
 because a charge-balancing converter makes means better than the scatter of its samples says.
-
 """
 
 from __future__ import annotations
@@ -159,11 +158,6 @@ def reduce_source(
     fewest_windows : int, optional
         A still interval too short for so many has shorter ones.
 
-    Returns
-    -------
-    ReducedBag
-        The reduced bag.
-
     """
     cells = CellAccumulator(cell_s, full_scale, window_s)
     board, case = _ReadingCollector(), _ReadingCollector()
@@ -232,7 +226,6 @@ def _windows(cells: Cells, bag: int, lower: int, upper: int, per_window: int) ->
 class _ReadingCollector:
     """
     Gathers one thermometer's readings: possible ones, in rising order, averaged when very fast.
-
     """
 
     def __init__(self) -> None:

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the judgement of the rests: a sensor that jumped, which no temperature explains.
-
-"""
+"""Owns the judgement of the rests: a sensor that jumped, which no temperature explains."""
 
 from __future__ import annotations
 
@@ -26,11 +23,6 @@ _NEAR_S, _NEAR_DEG = 30.0, 10.0
 def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
     """
     Find where a sensor jumped at rest; streams the bag again only where that may be.
-
-    Parameters
-    ----------
-    bag : ReducedBag
-        The bag.
 
     Returns
     -------
@@ -77,10 +69,7 @@ def judge_rests(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding
 
 
 def milli_g(bags: Sequence[ReducedBag], kind: str) -> float:
-    """
-    Input units of a thousandth of g: of the typical reading at rest, for counts.
-
-    """
+    """Input units of a thousandth of g: of the typical reading at rest, for counts."""
     if kind == 'm/s^2':
         return STANDARD_GRAVITY * 1e-3
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])

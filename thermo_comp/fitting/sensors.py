@@ -5,7 +5,6 @@ Owns what the bags say of the thermometers: noise, quantum, lag, ramps; the dete
 
 Rates are taken here from both sides, over a minute each, which only a recording allows; what is
 learnt makes the causal thermometers and the detector expect what this chamber did.
-
 """
 
 from __future__ import annotations
@@ -51,20 +50,14 @@ class Course:
 
     @property
     def is_resting(self) -> Bools:
-        """
-        Where the chamber rests: no ramp for five minutes before and after.
-
-        """
+        """Where the chamber rests: no ramp for five minutes before and after."""
         moving = np.abs(self.rate) > max(0.2 * self.fastest, _CLEAR * self.rate_sd)
         near = np.convolve(moving, np.ones(61))[30:-30] > 0.5
         return np.asarray(~near)
 
     @property
     def fastest(self) -> float:
-        """
-        Rate that all but a hundredth of the course stays below [K/s].
-
-        """
+        """Rate that all but a hundredth of the course stays below [K/s]."""
         return float(np.quantile(np.abs(self.rate), 0.99))
 
 
@@ -110,11 +103,6 @@ def learn_thermometer(
         Its readings, bag by bag.
     base : ThermometerSettings
         What to keep where there are too few readings, or no ramp.
-
-    Returns
-    -------
-    ThermometerSettings
-        Settings.
 
     """
     long = [readings.value for readings in recorded if len(readings.value) >= 30]
@@ -183,10 +171,7 @@ def _noise_of(values: Sequence[Floats], quantum: float) -> float:
 
 
 def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
-    """
-    Rates of each bag that is long enough to have any.
-
-    """
+    """Rates of each bag that is long enough to have any."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:
@@ -211,10 +196,7 @@ def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list
 
 
 def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
-    """
-    Seven tenths of the slowest long ramp [K/min], within reason.
-
-    """
+    """Seven tenths of the slowest long ramp [K/min], within reason."""
     slowest = usual / 0.7
     for one in courses:
         clear = np.abs(one.rate) > max(_CLEAR * one.rate_sd, 0.1 / 60.0)
@@ -227,10 +209,7 @@ def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
 
 
 def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
-    """
-    Amplitude of the surroundings' ripple in soaks: through the lag it made the rates seen.
-
-    """
+    """Amplitude of the surroundings' ripple in soaks: through the lag it made the rates seen."""
     rates = [one.rate[one.is_resting] for one in courses]
     resting = np.concatenate(rates) if rates else np.zeros(0)
     if len(resting) < 60 or not courses:

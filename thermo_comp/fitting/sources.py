@@ -5,7 +5,6 @@ Owns what the fit reads: blocks of accelerometer samples and temperature reading
 
 The fit lives below the recording layer, so it says here what it needs and lets bags, tables and
 simulated runs provide it.
-
 """
 
 from __future__ import annotations
@@ -18,52 +17,31 @@ from ..typing import Floats, Ints
 
 
 class SourceBlock(Protocol):
-    """
-    A run of messages; `recording.Block` is one.
-
-    """
+    """A run of messages; `recording.Block` is one."""
 
     @property
     def accel_stamp_ns(self) -> Ints:
-        """
-        Stamps of the samples, shape (n,).
-
-        """
+        """Stamps of the samples, shape (n,)."""
 
     @property
     def accel(self) -> Floats:
-        """
-        Counts, or m/s^2, shape (n, 3).
-
-        """
+        """Counts, or m/s^2, shape (n, 3)."""
 
     @property
     def board_stamp_ns(self) -> Ints:
-        """
-        Stamps of the board readings, shape (m,).
-
-        """
+        """Stamps of the board readings, shape (m,)."""
 
     @property
     def board(self) -> Floats:
-        """
-        Board temperature, shape (m,).
-
-        """
+        """Board temperature, shape (m,)."""
 
     @property
     def case_stamp_ns(self) -> Ints:
-        """
-        Stamps of the case readings, shape (k,).
-
-        """
+        """Stamps of the case readings, shape (k,)."""
 
     @property
     def case(self) -> Floats:
-        """
-        Case temperature, shape (k,).
-
-        """
+        """Case temperature, shape (k,)."""
 
 
 @dataclass(frozen=True)

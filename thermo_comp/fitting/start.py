@@ -5,7 +5,6 @@ Owns the first guess: constant bias, scale, misalignment and attitudes from posi
 
 The mean of each position lies on an ellipsoid. It is fitted without temperature, first by its
 best box, then by least squares on ``|f| - g``; the full regression starts from there.
-
 """
 
 from __future__ import annotations
@@ -42,10 +41,7 @@ class ConstantCalibration:
     misalignment: Floats
 
     def force(self, measured: Floats) -> Floats:
-        """
-        Specific force of measured vectors, shape (n, 3).
-
-        """
+        """Specific force of measured vectors, shape (n, 3)."""
         return np.asarray(((measured - self.bias) / self.scale) @ self.misalignment.T)
 
 
@@ -119,10 +115,7 @@ def _refine(
 
 
 def position_means(windows: Windows) -> Floats:
-    """
-    Mean raw vector of each position, shape (n_positions, 3).
-
-    """
+    """Mean raw vector of each position, shape (n_positions, 3)."""
     first = np.searchsorted(windows.position, np.arange(windows.n_positions))
     total = np.add.reduceat(windows.weight, first)
     weighted = np.add.reduceat(windows.mean * windows.weight[:, None], first, axis=0)

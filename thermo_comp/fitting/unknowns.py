@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what the regression works on: the windows, the prior, the unknowns and their places.
-
-"""
+"""Owns what the regression works on: the windows, the prior, the unknowns and their places."""
 
 from __future__ import annotations
 
@@ -58,18 +55,12 @@ class Windows:
 
     @property
     def n_positions(self) -> int:
-        """
-        Number of positions.
-
-        """
+        """Number of positions."""
         return int(self.position[-1]) + 1
 
     @property
     def bag_of_position(self) -> Ints:
-        """
-        Bag of each position.
-
-        """
+        """Bag of each position."""
         return self.bag[np.searchsorted(self.position, np.arange(self.n_positions))]
 
 
@@ -133,10 +124,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class State:
-    """
-    The unknowns; weights are of columns in units of their RMS.
-
-    """
+    """The unknowns; weights are of columns in units of their RMS."""
 
     kappa: Floats
     bias: Floats
@@ -150,10 +138,7 @@ class State:
 
 @dataclass(frozen=True)
 class Layout:
-    """
-    Places of the unknowns in the vector of parameters.
-
-    """
+    """Places of the unknowns in the vector of parameters."""
 
     kappa: Ints
     bias: Ints
@@ -171,10 +156,7 @@ class Layout:
 
 
 def tangent_basis(up: Floats) -> Floats:
-    """
-    Two unit vectors across each given one, shape (n, 3, 2).
-
-    """
+    """Two unit vectors across each given one, shape (n, 3, 2)."""
     helper = np.zeros_like(up)
     helper[np.arange(len(up)), np.argmin(np.abs(up), axis=1)] = 1.0
     first = np.cross(up, helper)
@@ -183,10 +165,7 @@ def tangent_basis(up: Floats) -> Floats:
 
 
 def inverse_misalignment(skew: Floats) -> Floats:
-    """
-    Return A = M^-1: from the frame to the sensitivity axes, lower triangular, unit diagonal.
-
-    """
+    """Return A = M^-1: from the frame to the sensitivity axes, lower triangular, unit diagonal."""
     matrix = np.eye(3)
     matrix[1, 0], matrix[2, 0], matrix[2, 1] = skew
     return matrix
@@ -195,10 +174,7 @@ def inverse_misalignment(skew: Floats) -> Floats:
 def initial_state(
     windows: Windows, n_bags: int, bias: Floats, kappa: Floats, skew: Floats, up: Floats
 ) -> State:
-    """
-    Make a state without any thermal term.
-
-    """
+    """Make a state without any thermal term."""
     m = len(windows.groups)
     return State(
         kappa=kappa,

@@ -5,7 +5,6 @@ Owns the verdict: whether the bags can carry a calibration, with numbers and adv
 
 Only contradictions are refused. A refusal stops the fit unless the user allows it by name; advice
 goes into the result.
-
 """
 
 from __future__ import annotations
@@ -102,11 +101,6 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding]
     options : FitOptions
         What the user said of them.
 
-    Returns
-    -------
-    list of Finding
-        Findings.
-
     """
     findings = []
     n_samples = sum(bag.n_samples for bag in bags)
@@ -178,11 +172,6 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> list[F
     has_case : bool
         Whether there are case temperatures.
 
-    Returns
-    -------
-    list of Finding
-        Findings.
-
     """
     findings = _judge_positions(up)
     if not windows.has_temperature:
@@ -238,10 +227,7 @@ def _judge_ramps(windows: ThermalWindows) -> list[Finding]:
 
 
 def _judge_order(windows: ThermalWindows) -> list[Finding]:
-    """
-    Check that the case leads: the gradient has the sign of the board's rate.
-
-    """
+    """Check that the case leads: the gradient has the sign of the board's rate."""
     moving = np.abs(windows.rate) * 60.0 > _RAMP_K_MIN
     if windows.data.weight[moving].sum() < 30.0 * windows.data.weight.max():
         return []
@@ -280,10 +266,7 @@ def _judge_positions(up: Floats) -> list[Finding]:
 
 
 def can_tell_misalignment(up: Floats) -> bool:
-    """
-    Whether positions are enough, and spread enough, to estimate M.
-
-    """
+    """Whether positions are enough, and spread enough, to estimate M."""
     distinct = distinct_directions(up)
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
         return False
@@ -364,11 +347,6 @@ def judge_result(
         The unit of the samples.
     has_temperature : bool, optional
         Whether there was a temperature to explain anything.
-
-    Returns
-    -------
-    list of Finding
-        Findings.
 
     """
     findings = []

@@ -113,8 +113,5 @@ class Whitener:
         return result
 
     def log_determinant(self, gains: tuple[Floats, Floats]) -> float:
-        """
-        Logarithm of the determinant of the noise's covariance, in units of sigma^2.
-
-        """
+        """Logarithm of the determinant of the noise's covariance, in units of sigma^2."""
         return 2.0 * float(np.log(gains[1][self._is_there]).sum())

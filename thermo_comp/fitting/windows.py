@@ -5,7 +5,6 @@ Owns the windows: reduced bags in, the regression's table of samples and columns
 
 The thermal tracker that the compensator runs is run here over the bags' readings, and the columns
 are those of `unit.columns`, so a regressor means in the fit what it means online.
-
 """
 
 from __future__ import annotations
@@ -51,10 +50,7 @@ class Sets:
     is_shared: bool = True
 
     def columns(self, t: Floats, weight: Floats) -> tuple[list[Floats], list[str]]:
-        """
-        Evaluate the columns of the sets, and name their groups.
-
-        """
+        """Evaluate the columns of the sets, and name their groups."""
         static, dynamic = self.static.basis(t), self.dynamic.basis(t)
         if not self.is_shared:
             static = [(1.0 - weight) * value for value in static]
@@ -62,10 +58,7 @@ class Sets:
         return [*static, *switched], [group for group, _ in self.levels()]
 
     def levels(self) -> list[tuple[str, bool]]:
-        """
-        Group of each column, and whether it is a level.
-
-        """
+        """Group of each column, and whether it is a level."""
         curve = [(CURVE, False)] * self.static.n_free
         return [*curve, (SET, True), *[(SET, False)] * self.dynamic.n_free]
 
@@ -103,10 +96,7 @@ class ThermalWindows:
 
     @property
     def has_temperature(self) -> bool:
-        """
-        Whether any temperature was recorded.
-
-        """
+        """Whether any temperature was recorded."""
         return bool(np.ptp(self.temperature) > 0.0)
 
 
@@ -224,7 +214,6 @@ def _states(
 ) -> tuple[float, Floats, Floats, Floats]:
     """
     Run the tracker: where its estimate has settled, grid, states, shares of the start states.
-
     """
     if not len(bag.board.value):
         # Nothing is known: a unit that stays at the reference.
@@ -259,10 +248,7 @@ def _moved(
     shares: Floats,
     reference_temperature: float,
 ) -> Floats:
-    """
-    Differentiate each column by the start state of its lag, shape (n, k).
-
-    """
+    """Differentiate each column by the start state of its lag, shape (n, k)."""
     t = states[:, BOARD] - reference_temperature
     result = np.zeros((len(states), len(columns)))
     by_lag = {column.lag: raw[k] for k, column in enumerate(columns) if column.kind == 'board'}
@@ -281,7 +267,6 @@ def _merged(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Count-weighted means of neighbouring windows up to a length, or to a part of a short rest.
-
     """
     window_s = min(window_s, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or window_s)
     slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))

@@ -52,7 +52,6 @@ class GroupWorth:
 def told_of(posterior: Posterior, part: str) -> Floats:
     """
     Effective parameters of each column, of all axes; 0 for those that take no part, shape (m,).
-
     """
     places = places_of(posterior, part)
     told = np.append(posterior.told, 0.0)
@@ -62,16 +61,12 @@ def told_of(posterior: Posterior, part: str) -> Floats:
 def places_of(posterior: Posterior, part: str) -> Ints:
     """
     Return the places of the weights of a part, shape (3, m); -1 for columns that take no part.
-
     """
     return posterior.layout.on_bias if part == 'bias' else posterior.layout.on_scale
 
 
 def widths_of(prior: Prior, part: str) -> Floats:
-    """
-    Return the widths of a part, shape (m,).
-
-    """
+    """Return the widths of a part, shape (m,)."""
     return prior.on_bias if part == 'bias' else prior.on_scale
 
 

@@ -5,7 +5,6 @@ Owns fleets: hundreds of units, each fitted where a worker is free, and what the
 
 - `fit_fleet` finds the units, does what is missing on Dask, writes table and page.
 - The only package that knows `dask`, `distributed` and `fsspec`: the extra ``fleet``.
-
 """
 
 from __future__ import annotations

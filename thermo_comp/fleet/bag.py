@@ -6,7 +6,6 @@ Owns a bag of the fleet: which files make it, how it is opened where it lies, wh
 What is kept are its sufficient statistics (`fitting.ReducedBag`): windows, temperature readings,
 counters. The thermal estimators run causally through a bag from its first reading on, so the bag
 is the smallest piece that can be reduced by itself.
-
 """
 
 from __future__ import annotations
@@ -57,18 +56,12 @@ class FoundBag:
 
     @property
     def is_folder(self) -> bool:
-        """
-        Whether it is a directory with files of its own.
-
-        """
+        """Whether it is a directory with files of its own."""
         return self.files[0].name != self.name
 
     @property
     def n_bytes(self) -> int:
-        """
-        Size of its files.
-
-        """
+        """Size of its files."""
         return sum(file.size for file in self.files)
 
 
@@ -101,10 +94,7 @@ def group_files(files: list[StoredFile]) -> list[FoundBag]:
 
 
 def _is_bag_folder(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
-    """
-    Whether a folder is a rosbag2 directory; one whose recorder was killed has no metadata.
-
-    """
+    """Whether a folder is a rosbag2 directory; one whose recorder was killed has no metadata."""
     if any(PurePosixPath(file.name).name == _METADATA for file in inside):
         return True
     stems = [PurePosixPath(file.name).stem for file in stored]
@@ -114,10 +104,7 @@ def _is_bag_folder(folder: str, inside: list[StoredFile], stored: list[StoredFil
 
 
 def mcap_names(bag: FoundBag) -> list[str]:
-    """
-    List the MCAP files of a bag as they follow each other; empty where it has none.
-
-    """
+    """List the MCAP files of a bag as they follow each other; empty where it has none."""
     paths = (Path(file.name) for file in bag.files if file.name.endswith('.mcap'))
     return [path.as_posix() for path in in_split_order(paths)]
 
@@ -259,10 +246,7 @@ def reduce_found(
 
 @contextmanager
 def _hashing(storage: Storage, bag: FoundBag) -> Iterator[HashingFile | None]:
-    """
-    Open a bag that is one MCAP file so that reading it hashes it.
-
-    """
+    """Open a bag that is one MCAP file so that reading it hashes it."""
     if bag.is_folder or not mcap_names(bag):
         yield None
         return
@@ -308,17 +292,11 @@ def _reduced(
 
 
 def _short(error: RecordingError, name: str) -> str:
-    """
-    Name the bag as the fleet does, wherever it lies.
-
-    """
+    """Name the bag as the fleet does, wherever it lies."""
     parts = (name, error.topic, error.message)
     return ': '.join(part for part in parts if part)
 
 
 def _elsewhere() -> Iterable[SourceBlock]:
-    """
-    Stand in for the samples of a bag that was reduced where it lies.
-
-    """
+    """Stand in for the samples of a bag that was reduced where it lies."""
     raise FitError('the samples stayed where the bag lies')

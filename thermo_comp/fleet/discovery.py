@@ -6,7 +6,6 @@ Owns which bags belong to which unit: a folder per unit, or the serials that the
 ``DIR/[LOT/]UNIT/BAG``: the bags of one folder are one thermal test of one unit, so a unit that was
 tested twice has two folders and comes out twice. Bags that lie in DIR itself are sorted by the
 serial in their metadata.
-
 """
 
 from __future__ import annotations
@@ -90,10 +89,7 @@ def _lot(name: str) -> str:
 
 
 def _by_serial(storage: Storage, bags: list[FoundBag], taken: set[str]) -> list[FoundUnit]:
-    """
-    Sort the bags that lie in the fleet's folder itself.
-
-    """
+    """Sort the bags that lie in the fleet's folder itself."""
 
     def serial_of(bag: FoundBag) -> str:
         try:

@@ -6,7 +6,6 @@ Owns the way onto Dask: a cluster of this machine or of others, and what its acc
 A fleet is cut into units: reduction and fit of one are one task, and no statistics leave the
 worker. Where there are fewer units than threads, and large ones, it is cut into bags, whose
 statistics go to where the unit is fitted. Both ways end in the same numbers.
-
 """
 
 from __future__ import annotations
@@ -144,21 +143,13 @@ def _check_workers(client: Any, scheduler: str) -> None:
 
 
 def version() -> str:
-    """
-    Return the version of whoever is asked.
-
-    """
+    """Return the version of whoever is asked."""
     return __version__
 
 
 def n_tasks(jobs: Sequence[Job]) -> int:
     """
     Count what can be done at a time: units, or bags where a unit is large.
-
-    Parameters
-    ----------
-    jobs : sequence of Job
-        The units.
 
     Returns
     -------

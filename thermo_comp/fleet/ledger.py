@@ -5,7 +5,6 @@ Owns the folder of results: what is there already, and how a unit's files get th
 
 ``OUT/units/NAME/`` holds calibration.yaml, certificate.html and, written last, result.json: a
 unit without it has not been done, whatever else lies there.
-
 """
 
 from __future__ import annotations
@@ -50,10 +49,7 @@ class Known:
 
     @property
     def key(self) -> str:
-        """
-        Hash of what it was made of.
-
-        """
+        """Hash of what it was made of."""
         return str(self.row['key'])
 
 
@@ -81,17 +77,11 @@ class Ledger:
             raise FleetError(f'{folder}: cannot be made: {error.strerror}') from error
 
     def folder_of(self, name: str) -> Path:
-        """
-        Return the folder of a unit's files; no name leads out of the fleet's.
-
-        """
+        """Return the folder of a unit's files; no name leads out of the fleet's."""
         return self.folder.joinpath('units', *map(_safe, name.split('/')))
 
     def certificate_of(self, name: str) -> str:
-        """
-        Return where a unit's certificate lies in the folder; empty where it has none.
-
-        """
+        """Return where a unit's certificate lies in the folder; empty where it has none."""
         path = self.folder_of(name) / CERTIFICATE
         return path.relative_to(self.folder).as_posix() if path.is_file() else ''
 
@@ -175,10 +165,7 @@ class Ledger:
 
 
 def _kept(row: dict[str, Cell], folder: Path) -> dict[str, Cell]:
-    """
-    Return the row of a run that leaves an earlier calibration, and its record, as they are.
-
-    """
+    """Return the row of a run that leaves an earlier calibration, and its record, as they are."""
     kept = f'{folder / CALIBRATION} of an earlier run stays'
     said = '; '.join(str(part) for part in (row['problem'], kept) if part)
     return empty_row(**{**row, 'problem': said})
@@ -203,10 +190,7 @@ def _files(unit: FoundUnit) -> list[list[str | int]]:
 
 
 def _is_whole(folder: Path, row: dict[str, Cell], options: FleetOptions) -> bool:
-    """
-    Whether the files that belong to a result are there as they were written.
-
-    """
+    """Whether the files that belong to a result are there as they were written."""
     if not is_fitted(row):
         return True
     if options.certificates and not (folder / CERTIFICATE).is_file():
@@ -219,10 +203,7 @@ def _is_whole(folder: Path, row: dict[str, Cell], options: FleetOptions) -> bool
 
 
 def _safe(part: str) -> str:
-    """
-    Make a name that somebody else chose a name of one file.
-
-    """
+    """Make a name that somebody else chose a name of one file."""
     name = quote(part, safe=" +,=@()'") or '%'
     if not name.strip('.'):
         name = name.replace('.', '%2E')

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the fleet's page: what a lab has to act on first, the whole table last.
-
-"""
+"""Owns the fleet's page: what a lab has to act on first, the whole table last."""
 
 from __future__ import annotations
 

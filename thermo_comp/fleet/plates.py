@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the list of the fleet's figures: what each asks, and what of the table it shows.
-
-"""
+"""Owns the list of the fleet's figures: what each asks, and what of the table it shows."""
 
 from __future__ import annotations
 

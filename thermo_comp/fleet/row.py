@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the fleet table: which columns a unit has, and what a fit puts into them.
-
-"""
+"""Owns the fleet table: which columns a unit has, and what a fit puts into them."""
 
 from __future__ import annotations
 
@@ -135,11 +132,6 @@ def fitted_cells(result: FitResult) -> dict[str, Cell]:
     """
     Take the cells of a fitted unit from its fit.
 
-    Parameters
-    ----------
-    result : FitResult
-        The fit.
-
     Returns
     -------
     dict of str to str, int, float or None
@@ -195,29 +187,18 @@ def judged_cells(judgement: Judgement) -> dict[str, Cell]:
 
 
 def is_fitted(row: Row) -> bool:
-    """
-    Whether a unit has a calibration.
-
-    """
+    """Whether a unit has a calibration."""
     return row['verdict'] not in ('', REFUSED, FAILED)
 
 
 def is_valid(row: Row) -> bool:
-    """
-    Whether a unit's calibration was shown to be valid on its own bags.
-
-    """
+    """Whether a unit's calibration was shown to be valid on its own bags."""
     return str(row['verdict']).startswith((Verdict.VALID.value, Verdict.WIDE.value))
 
 
 def calibration_cells(calibration: Calibration) -> dict[str, Cell]:
     """
     Take the cells that a calibration alone fills.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
 
     Returns
     -------

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns a run over a fleet: find, do what is missing, write the table and the page.
-
-"""
+"""Owns a run over a fleet: find, do what is missing, write the table and the page."""
 
 from __future__ import annotations
 
@@ -55,18 +52,12 @@ class FleetResult:
 
     @property
     def n_fitted(self) -> int:
-        """
-        Units with a calibration.
-
-        """
+        """Units with a calibration."""
         return sum(is_fitted(row) for row in self.rows)
 
     @property
     def is_whole(self) -> bool:
-        """
-        Whether every unit has a calibration that is valid on its bags, on all of them.
-
-        """
+        """Whether every unit has a calibration that is valid on its bags, on all of them."""
         return all(is_valid(row) for row in self.rows) and not any(
             row['n_left_out'] or row['n_torn'] for row in self.rows
         )
@@ -149,10 +140,7 @@ def fit_fleet(
 
 
 def _refuse_alike(units: Sequence[FoundUnit], ledger: Ledger) -> None:
-    """
-    Refuse two units whose results would lie in one folder.
-
-    """
+    """Refuse two units whose results would lie in one folder."""
     seen: dict[Path, str] = {}
     for unit in units:
         other = seen.setdefault(ledger.folder_of(unit.name), unit.name)

@@ -5,7 +5,6 @@ Owns where a fleet's bags lie: any file system that fsspec knows, read by ranges
 
 A bag is never copied: the reader asks for stretches of a file, and what passes by is hashed, so
 that each byte crosses the network once.
-
 """
 
 from __future__ import annotations
@@ -94,25 +93,16 @@ class Storage:
 
     @property
     def name(self) -> str:
-        """
-        The folder's own name.
-
-        """
+        """The folder's own name."""
         return str(self._root).rstrip('/').rpartition('/')[2]
 
     @property
     def address(self) -> str:
-        """
-        Return what another process must be told to find the folder, wherever it was started.
-
-        """
+        """Return what another process must be told to find the folder, wherever it was started."""
         return str(self._root) if self.is_local else self.url
 
     def local_path(self, name: str) -> Path:
-        """
-        Return the path of a file of this machine.
-
-        """
+        """Return the path of a file of this machine."""
         return Path(self._root) / name
 
     def files(self) -> list[StoredFile]:
@@ -208,10 +198,7 @@ class RangeFile:
             self.size = int(fs.size(path) or 0)
 
     def read_at(self, at: int, n_bytes: int) -> bytes:
-        """
-        Read up to so many bytes.
-
-        """
+        """Read up to so many bytes."""
         end = min(at + n_bytes, self.size)
         if end <= at:
             return b''
@@ -241,23 +228,12 @@ class RangeFile:
         return data
 
     def close(self) -> None:
-        """
-        Forget the blocks.
-
-        """
+        """Forget the blocks."""
         self._blocks.clear()
 
 
 class HashingFile:
-    """
-    An open file that hashes what is read of it, in whatever order that is.
-
-    Parameters
-    ----------
-    inner : RandomAccess
-        The file.
-
-    """
+    """An open file that hashes what is read of it, in whatever order that is."""
 
     def __init__(self, inner: RandomAccess) -> None:
         self._inner = inner
@@ -269,10 +245,7 @@ class HashingFile:
         self.size = inner.size
 
     def read_at(self, at: int, n_bytes: int) -> bytes:
-        """
-        Read up to so many bytes.
-
-        """
+        """Read up to so many bytes."""
         data = self._inner.read_at(at, n_bytes)
         with self._lock:
             self._take(at, data)
@@ -298,10 +271,7 @@ class HashingFile:
             self._n_waiting -= len(data)
 
     def digest(self) -> str:
-        """
-        Read what was not read yet, and return the SHA-256 of the whole file.
-
-        """
+        """Read what was not read yet, and return the SHA-256 of the whole file."""
         with self._lock:
             while self._at < self.size:
                 data = self._inner.read_at(self._at, _BLOCK_BYTES)
@@ -311,10 +281,7 @@ class HashingFile:
             return self._hash.hexdigest()
 
     def close(self) -> None:
-        """
-        Leave the file open: its owner closes it after asking for the digest.
-
-        """
+        """Leave the file open: its owner closes it after asking for the digest."""
 
 
 def digest_of(storage: Storage, names: list[str]) -> str:
@@ -340,10 +307,7 @@ def digest_of(storage: Storage, names: list[str]) -> str:
 
 @contextmanager
 def _as_os_error() -> Iterator[None]:
-    """
-    Turn what a file system raises into what a reader of files expects.
-
-    """
+    """Turn what a file system raises into what a reader of files expects."""
     try:
         yield
     except Exception as error:  # each file system has exceptions of its own
@@ -351,18 +315,12 @@ def _as_os_error() -> Iterator[None]:
 
 
 def _words(error: Exception) -> str:
-    """
-    Say in one line what went wrong.
-
-    """
+    """Say in one line what went wrong."""
     said = getattr(error, 'strerror', None) or ' '.join(str(error).split())
     return said or type(error).__name__
 
 
 def _leads_up(folder: Path) -> bool:
-    """
-    Whether a folder is a link to one that contains the link: it would never end.
-
-    """
+    """Whether a folder is a link to one that contains the link: it would never end."""
     above = folder.parent.resolve()
     return folder.is_symlink() and folder.resolve() in (above, *above.parents)

@@ -5,7 +5,6 @@ Owns what a fleet table tells: spreads, units that stand out, drift, lots that d
 
 Spreads are robust (median and median absolute deviation), because the units that stand out are in
 them. Every limit is set so that a fleet without anything to find raises an alarm once in twenty.
-
 """
 
 from __future__ import annotations
@@ -157,10 +156,7 @@ class Change:
 
     @property
     def z(self) -> float:
-        """
-        Change over its standard deviation.
-
-        """
+        """Change over its standard deviation."""
         return self.change / self.sd if self.sd > 0.0 else 0.0
 
 
@@ -191,10 +187,7 @@ class Drift:
 
     @property
     def worst(self) -> Change:
-        """
-        The surest change.
-
-        """
+        """The surest change."""
         return max(self.changes, key=lambda one: abs(one.z))
 
 
@@ -258,10 +251,7 @@ class Summary:
 
     @property
     def surest_drifts(self) -> list[Drift]:
-        """
-        Sort the drifts by their surest change.
-
-        """
+        """Sort the drifts by their surest change."""
         return sorted(self.drifts, key=lambda one: -abs(one.worst.z))
 
 
@@ -447,10 +437,7 @@ def _normal_limit(n: int) -> float:
 
 
 def _kind(verdict: str) -> str:
-    """
-    Leave the amount out of a verdict, so that like ones count together.
-
-    """
+    """Leave the amount out of a verdict, so that like ones count together."""
     wide = Verdict.WIDE.value
     return f'{wide} little' if verdict.startswith(wide) else verdict
 
@@ -460,8 +447,5 @@ def _number(cell: object) -> float:
 
 
 def _pattern(problem: str) -> str:
-    """
-    Leave the figures out of a sentence, so that like reasons count together.
-
-    """
+    """Leave the figures out of a sentence, so that like reasons count together."""
     return re.sub(r'\d+(?:\.\d+)?', '#', problem)

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the fleet table as files: Parquet for programs, CSV for people.
-
-"""
+"""Owns the fleet table as files: Parquet for programs, CSV for people."""
 
 from __future__ import annotations
 
@@ -46,10 +43,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def to_parquet(rows: Sequence[Row]) -> bytes:
-    """
-    Return the table as Parquet; what a column means stands in its metadata.
-
-    """
+    """Return the table as Parquet; what a column means stands in its metadata."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -67,10 +61,7 @@ def to_parquet(rows: Sequence[Row]) -> bytes:
 
 
 def to_csv(rows: Sequence[Row]) -> str:
-    """
-    Return the table as CSV with a heading; numbers have all their digits.
-
-    """
+    """Return the table as CSV with a heading; numbers have all their digits."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator='\n')
     writer.writerow([column.name for column in COLUMNS])

@@ -5,7 +5,6 @@ Owns a unit's fit as a tree: statistics of its bags, merged in any order, then o
 
 Merging is a union sorted by name: associative, commutative, and nothing is added up in it, so
 the fit sees the same numbers in the same order whoever reduced what, and when.
-
 """
 
 from __future__ import annotations
@@ -58,10 +57,7 @@ class FleetOptions:
     certificates: bool = True
 
     def digest(self) -> str:
-        """
-        Hash everything that a result depends on besides its bags.
-
-        """
+        """Hash everything that a result depends on besides its bags."""
         said = {'version': __version__, **asdict(self)}
         text = json.dumps(said, sort_keys=True, default=repr)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -112,10 +108,7 @@ class UnitOutcome:
 
     @property
     def key(self) -> str:
-        """
-        Hash of what it was made of.
-
-        """
+        """Hash of what it was made of."""
         return str(self.row['key'])
 
 
@@ -139,10 +132,7 @@ def merged(parts: Iterable[Statistics]) -> Statistics:
 
 
 def reduce_unit(url: str, unit: FoundUnit, options: FleetOptions) -> Statistics:
-    """
-    Reduce all bags of a unit here, one after the other.
-
-    """
+    """Reduce all bags of a unit here, one after the other."""
     return merged(
         (reduce_found(url, bag, options.fit, options.topics, options.input),) for bag in unit.bags
     )
@@ -281,10 +271,7 @@ def _fitted(
 
 
 def numbered(bags: Iterable[ReducedBag]) -> list[ReducedBag]:
-    """
-    Give each bag's intervals the number of its place.
-
-    """
+    """Give each bag's intervals the number of its place."""
     return [
         replace(bag, intervals=tuple(replace(one, bag=number) for one in bag.intervals))
         for number, bag in enumerate(bags)
@@ -313,10 +300,7 @@ def _settings(good: Sequence[BagStatistics], unit: FoundUnit, options: FitOption
 
 
 def _losses(outcome: UnitOutcome, good: Sequence[BagStatistics]) -> list[str]:
-    """
-    Say what of the unit's bags the fit did not see.
-
-    """
+    """Say what of the unit's bags the fit did not see."""
     lost = [one.note for one in good if one.note]
     n_left_out = len(outcome.bags) - len(good)
     if n_left_out:
@@ -329,10 +313,7 @@ def _losses(outcome: UnitOutcome, good: Sequence[BagStatistics]) -> list[str]:
 def _certified(
     result: FitResult, losses: Sequence[str], with_page: bool
 ) -> tuple[bytes, Evidence]:
-    """
-    Judge a fit, and make the page if it is wanted.
-
-    """
+    """Judge a fit, and make the page if it is wanted."""
     from ..report import evidence_of_fit, render_report
 
     evidence = evidence_of_fit(result, is_brief=not with_page)

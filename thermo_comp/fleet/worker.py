@@ -4,7 +4,6 @@
 Owns how a worker of this machine behaves: it minds its work, and leaves talking to its master.
 
 Dask loads this module in each worker process that it starts, and calls `dask_setup`.
-
 """
 
 from __future__ import annotations
@@ -14,9 +13,6 @@ import signal
 
 
 def dask_setup(_worker: object) -> None:
-    """
-    Leave Ctrl-C, which a terminal sends to all processes, to the one that was started in it.
-
-    """
+    """Leave Ctrl-C, which a terminal sends to all processes, to the one that was started in it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logging.getLogger('distributed').setLevel(logging.CRITICAL)

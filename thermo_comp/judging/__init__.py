@@ -6,7 +6,6 @@ Owns the judgement of a calibration against recordings: one judge, for every com
 - `evaluate` reads recordings and judges calibrations on them; `open_bag` and `judge_bags` are its
   two halves.
 - `judge` says what windows at rest tell of a calibration: a `Judgement`.
-
 """
 
 from .evaluation import Evaluation, OpenedBag, evaluate, judge_bags, open_bag

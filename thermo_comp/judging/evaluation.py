@@ -5,7 +5,6 @@ Owns the way from recordings to a judgement: each is read once, in bounded memor
 
 Reading and judging are apart: whoever looks at a bag under several calibrations, or again when
 the calibration has changed, reads it once.
-
 """
 
 from __future__ import annotations
@@ -106,11 +105,6 @@ def open_bag(
         Whether its hash is wanted, which takes reading it once more.
     progress : callable or None, optional
         Told the fraction read.
-
-    Returns
-    -------
-    OpenedBag
-        The bag.
 
     Raises
     ------

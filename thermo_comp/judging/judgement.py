@@ -6,7 +6,6 @@ Owns the judgement of a calibration on recordings: one verdict, with its numbers
 At rest ``|f|`` is local gravity in any attitude, so no fixture is needed. Like is compared with
 like: the RMS of the residual with the RMS of what is claimed for the very same windows. What lies
 outside the calibrated ranges is told apart and decides nothing.
-
 """
 
 from __future__ import annotations
@@ -35,10 +34,7 @@ SECTIONS = ('static', 'dynamic', 'all', 'outside')
 
 
 class Verdict(Enum):
-    """
-    The verdicts; the value is the verdict's wording.
-
-    """
+    """The verdicts; the value is the verdict's wording."""
 
     VALID = 'valid'
     WIDE = 'valid, but it only claims'
@@ -49,10 +45,7 @@ class Verdict(Enum):
 
     @property
     def is_valid(self) -> bool:
-        """
-        Whether the calibration was shown to hold.
-
-        """
+        """Whether the calibration was shown to hold."""
         return self in (Verdict.VALID, Verdict.WIDE)
 
 
@@ -84,10 +77,7 @@ class Section:
 
     @property
     def ratio(self) -> float:
-        """
-        RMS over claimed RMS.
-
-        """
+        """RMS over claimed RMS."""
         return self.rms / self.claimed_rms
 
 
@@ -131,42 +121,27 @@ class Judgement:
 
     @property
     def is_valid(self) -> bool:
-        """
-        Whether the calibration was shown to hold.
-
-        """
+        """Whether the calibration was shown to hold."""
         return self.kind.is_valid
 
     @property
     def exit_code(self) -> int:
-        """
-        0 for a calibration that was shown to hold, else 1.
-
-        """
+        """0 for a calibration that was shown to hold, else 1."""
         return 0 if self.is_valid else 1
 
     @property
     def verdict(self) -> str:
-        """
-        The verdict in words.
-
-        """
+        """The verdict in words."""
         if self.kind is Verdict.WIDE:
             return f'{self.kind.value} {spoken(self.sections["all"].claimed_rms)}'
         return str(self.kind.value)
 
     def __str__(self) -> str:
-        """
-        Give the verdict with its numbers, as every command prints it.
-
-        """
+        """Give the verdict with its numbers, as every command prints it."""
         return f'{self.verdict}: {self.reason}'
 
     def facts(self) -> dict[str, Any]:
-        """
-        Give everything but the windows, as every command's JSON holds it.
-
-        """
+        """Give everything but the windows, as every command's JSON holds it."""
         return {
             'verdict': self.verdict,
             'reason': self.reason,

@@ -6,7 +6,6 @@ Owns what has moved since a calibration: nine constants fitted once more to the 
 In each position ``|f| = g`` whatever the attitude. What bias, scale and misalignment it takes to
 make it so for all positions is what the axes have moved by; a calibration that still holds takes
 none.
-
 """
 
 from __future__ import annotations
@@ -52,10 +51,7 @@ class AxisShift:
 
 
 def distinct_positions(windows: Windows) -> int:
-    """
-    Count the directions that differ by more than five degrees.
-
-    """
+    """Count the directions that differ by more than five degrees."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(_SAME_DIRECTION_DEG))
     for mean in _means(windows, windows.force):
@@ -121,10 +117,7 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
 
 
 def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
-    """
-    Name the shifts that are sure, as in ``z bias +12 +- 3 ug``.
-
-    """
+    """Name the shifts that are sure, as in ``z bias +12 +- 3 ug``."""
     said = []
     for axis, shift in zip('xyz', shifts, strict=False):
         for name, value, sd, unit in (
@@ -139,11 +132,6 @@ def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
 def wander(windows: Windows) -> Floats:
     """
     Tell what moves each axis at rest, to a constant, whatever the number of positions.
-
-    Parameters
-    ----------
-    windows : Windows
-        The windows.
 
     Returns
     -------
@@ -166,10 +154,7 @@ def _counts(windows: Windows) -> Floats:
 
 
 def _means(windows: Windows, values: Floats) -> Floats:
-    """
-    Average by position.
-
-    """
+    """Average by position."""
     found, place = np.unique(windows.position, return_inverse=True)
     total = np.zeros((len(found), *values.shape[1:]))
     np.add.at(total, place, values)

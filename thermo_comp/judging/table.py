@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the windows as a table for other programs.
-
-"""
+"""Owns the windows as a table for other programs."""
 
 from __future__ import annotations
 

@@ -6,7 +6,6 @@ Owns the windows that a judgement rests on: means at rest of exactly the stated 
 A window is a run of whole sums of one still interval. Its mean goes through the compensator as a
 sample does, with the readings that came before it, so that force, covariance and regime are the
 node's; what is kept of a bag of any length is a row per window.
-
 """
 
 from __future__ import annotations
@@ -87,17 +86,11 @@ class Windows:
     noise_sd: Floats
 
     def __len__(self) -> int:
-        """
-        Count the windows.
-
-        """
+        """Count the windows."""
         return len(self.time)
 
     def select(self, rows: Bools) -> Windows:
-        """
-        Keep some of the windows.
-
-        """
+        """Keep some of the windows."""
         kept = {
             one.name: getattr(self, one.name)[rows]
             for one in fields(self)
@@ -107,18 +100,12 @@ class Windows:
 
     @cached_property
     def raw_residual(self) -> Floats:
-        """
-        ``|f| - g`` by the constants alone, shape (n,).
-
-        """
+        """``|f| - g`` by the constants alone, shape (n,)."""
         return norm_residual(self.raw, self.gravity)
 
     @cached_property
     def residual(self) -> Floats:
-        """
-        ``|f| - g`` by the calibration, shape (n,).
-
-        """
+        """``|f| - g`` by the calibration, shape (n,)."""
         return norm_residual(self.force, self.gravity)
 
 
@@ -275,10 +262,7 @@ _MEAN, _FORCE, _WIDTH = slice(10, 13), slice(13, 16), 16
 def _table(
     bags: Sequence[ReducedBag], window_s: float, correct: Callable[[ReducedBag, Floats], None]
 ) -> Floats:
-    """
-    Put the sums of bags together to windows, a row each.
-
-    """
+    """Put the sums of bags together to windows, a row each."""
     parts = [np.zeros((0, _WIDTH))]
     first_position = 0
     for number, bag in enumerate(bags):
@@ -316,10 +300,7 @@ def _sums(interval: StillInterval, sum_s: float, n: int) -> Floats:
 
 
 def _joined(sums: Floats, per: int) -> Floats:
-    """
-    Join so many sums to a window each; out are those that were not corrected as a whole.
-
-    """
+    """Join so many sums to a window each; out are those that were not corrected as a whole."""
     grouped = sums.reshape(-1, per, _WIDTH)
     count = grouped[:, :, _COUNT]
     result = np.array(grouped[:, 0])
@@ -362,10 +343,7 @@ def _windows(
 
 
 def _correct(compensator: Compensator, bag: ReducedBag, sums: Floats) -> None:
-    """
-    Run sums through the compensator, with the readings that came before each.
-
-    """
+    """Run sums through the compensator, with the readings that came before each."""
     stamps = np.concatenate((bag.board.stamp_ns, bag.case.stamp_ns))
     order = np.argsort(stamps, kind='stable')
     values = np.concatenate((bag.board.value, bag.case.value))[order].tolist()
@@ -390,10 +368,7 @@ def _correct(compensator: Compensator, bag: ReducedBag, sums: Floats) -> None:
 
 
 def _along(force: Sequence[float], covariance: Sequence[float]) -> float:
-    """
-    Project a covariance xx, xy, xz, yy, yz, zz on the direction of a force.
-
-    """
+    """Project a covariance xx, xy, xz, yy, yz, zz on the direction of a force."""
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance
     square = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)

@@ -6,7 +6,6 @@ Owns the batch form of the compensator: whole columns at once, with the stream's
 The thermal side runs reading by reading through the same tracker; only what it gives at the
 segments' ends is gathered, evaluated for all segments together and applied to all samples with
 the operations of `Compensator.process` in their order.
-
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ class _Segments:
     Runs of samples over which the correction is linear in time, as columns.
 
     Columns of numbers, not a list of runs: objects that stay keep the garbage collector busy.
-
     """
 
     __slots__ = (
@@ -63,10 +61,7 @@ class _Segments:
         self.end_states = array('d')
 
     def columns(self, numbers: array[float]) -> list[Floats]:
-        """
-        Give what stands one behind the other, as columns.
-
-        """
+        """Give what stands one behind the other, as columns."""
         table = np.frombuffer(numbers).reshape(len(self.start_ns), -1)
         return list(table.T.copy())
 
@@ -76,7 +71,6 @@ def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlo
     Correct a block, e.g. a `recording.Block`, with the bits that `Compensator.process` gives.
 
     Flags wait in `Compensator.take_flags`, counts in its `counters`.
-
     """
     counters = compensator.counters
     n_seen = counters.n_in - counters.n_out_of_order
@@ -103,10 +97,7 @@ def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlo
 
 
 def _one_by_one(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
-    """
-    Process a block in which time jumps: rare, so the stream's own code serves.
-
-    """
+    """Process a block in which time jumps: rare, so the stream's own code serves."""
     events = [
         (int(after), name, int(stamp_ns), float(celsius))
         for name in compensator.thermal.inputs
@@ -208,10 +199,7 @@ def _add_segments(
     after: int,
     n_seen: int,
 ) -> None:
-    """
-    Add the segments of samples first..after, over which no reading takes effect.
-
-    """
+    """Add the segments of samples first..after, over which no reading takes effect."""
     thermal = compensator.thermal
     tracker = thermal.tracker
     last_ns = stamps.item(after - 1)
@@ -245,11 +233,7 @@ def _add_segments(
 
 
 def _apply(
-    compensator: Compensator,
-    segments: _Segments,
-    index: Ints,
-    stamps: Stamps,
-    samples: Floats,
+    compensator: Compensator, segments: _Segments, index: Ints, stamps: Stamps, samples: Floats
 ) -> CompensatedBlock:
     if not segments.first:
         return CompensatedBlock(index[:0], stamps[:0], np.empty((0, 3)), np.empty((0, 9)))
@@ -287,10 +271,7 @@ def _apply(
 
 
 def _covered(first: Ints, counts: Ints, n_samples: int) -> Ints | None:
-    """
-    Find the samples that lie in a segment; None when all do.
-
-    """
+    """Find the samples that lie in a segment; None when all do."""
     if int(counts.sum()) == n_samples:
         return None
     return np.concatenate([np.arange(f, f + c) for f, c in zip(first, counts, strict=True)])
@@ -307,10 +288,7 @@ def _judge(
     keep: Bools,
     is_stuck: Bools | None,
 ) -> None:
-    """
-    Leave out what the stream would not publish, and count why.
-
-    """
+    """Leave out what the stream would not publish, and count why."""
     counters = compensator.counters
     is_good = keep
     if is_stuck is not None:
@@ -356,7 +334,6 @@ def _refuted(
 ) -> list[bool]:
     """
     Let the first sample of each segment tell of gravity; say which segments are held back for it.
-
     """
     gravity, trace = compensator.gravity, compensator.thermal.correction.noise_trace
     is_refuted: list[bool] = []
@@ -382,10 +359,7 @@ def _refuted(
 def _stuck(
     compensator: Compensator, stamps: Stamps, samples: Floats, may_be_zero: bool
 ) -> Bools | None:
-    """
-    Find the samples that are not believed: too long the same, or three exact zeros.
-
-    """
+    """Find the samples that are not believed: too long the same, or three exact zeros."""
     if not compensator.stuck.is_on:
         return None
     found = compensator.stuck.find(stamps, samples)

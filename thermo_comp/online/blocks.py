@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the shape of a batch: columns in file order in, columns of published samples out.
-
-"""
+"""Owns the shape of a batch: columns in file order in, columns of published samples out."""
 
 from __future__ import annotations
 
@@ -18,39 +15,24 @@ Readings: TypeAlias = tuple[Stamps, Floats, Stamps]
 
 
 class AccelBlock(Protocol):
-    """
-    Columns of a run of messages in file order.
-
-    """
+    """Columns of a run of messages in file order."""
 
     @property
     def accel_stamp_ns(self) -> Stamps:
-        """
-        Stamps of the samples, shape (n,).
-
-        """
+        """Stamps of the samples, shape (n,)."""
 
     @property
     def accel(self) -> Floats:
-        """
-        Samples in the calibration's input unit, shape (n, 3).
-
-        """
+        """Samples in the calibration's input unit, shape (n, 3)."""
 
     @property
     def temperatures(self) -> Mapping[str, Readings]:
-        """
-        Readings by the name of their thermometer, ``'board'`` and the others.
-
-        """
+        """Readings by the name of their thermometer, ``'board'`` and the others."""
 
 
 @dataclass(frozen=True)
 class CompensatedBlock:
-    """
-    The published samples of a block.
-
-    """
+    """The published samples of a block."""
 
     #: Which samples of the block these are, shape (n,).
     index: Ints

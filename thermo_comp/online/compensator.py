@@ -10,7 +10,6 @@ and a node that got everything in order publishes the bits that the offline repl
 Each segment begins with a look at what the samples say of themselves: their rate, and, from the
 segment's first sample, |f| against gravity while the platform stands. So the checks cost nothing
 per sample, and a batch comes to the same verdicts.
-
 """
 
 from __future__ import annotations
@@ -165,10 +164,7 @@ class Compensator:
             self.counters.n_saturated += 1
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
-        """
-        Correct the first sample after an event, which serves the checks, too.
-
-        """
+        """Correct the first sample after an event, which serves the checks, too."""
         if not self._admit(stamp_ns):
             return None
         thermal = self.thermal
@@ -233,19 +229,13 @@ class Compensator:
         self.gravity = self._gravity_monitor()
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """
-        Take the regime flags that became due: (stamp of the leading sensor's reading, S).
-
-        """
+        """Take the regime flags that became due: (stamp of the leading sensor's reading, S)."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
     @property
     def is_refusing(self) -> bool:
-        """
-        Whether the samples of the present segment are held back.
-
-        """
+        """Whether the samples of the present segment are held back."""
         return self._limit < 0.0
 
     @is_refusing.setter
@@ -253,17 +243,13 @@ class Compensator:
         self._limit = -1.0 if value else self._full_scale
 
     def take_pending(self) -> list[tuple[int, int, int, float]]:
-        """
-        Take the readings that no sample has reached: (stamp, kind, order, degC).
-
-        """
+        """Take the readings that no sample has reached: (stamp, kind, order, degC)."""
         self._event_ns = EVER_NS
         return self.thermal.queue.take()
 
     def flush(self, stamp_ns: int) -> None:
         """
         Let queued readings up to a stamp take effect without a sample (no samples are coming).
-
         """
         self.thermal.flush(stamp_ns)
         self._event_ns = EVER_NS
@@ -274,17 +260,13 @@ class Compensator:
 
         The thermometers, the regime and the memory go on where the new calibration reads them in
         the same way and remembers the same; otherwise they start anew.
-
         """
         self.thermal.swap(calibration, self.now_ns)
         self._use(calibration)
         self._event_ns = EVER_NS
 
     def reconfigure(self, config: CompensatorConfig) -> None:
-        """
-        Take over other settings between two samples.
-
-        """
+        """Take over other settings between two samples."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckWatch(config.stuck_timeout_s)
         self.config = config
@@ -294,24 +276,17 @@ class Compensator:
 
     @property
     def now_ns(self) -> int | None:
-        """
-        Stamp of the last sample; None before the first.
-
-        """
+        """Stamp of the last sample; None before the first."""
         return self.last_ns if self.last_ns != EVER_NS else None
 
     def pending_ahead(self, stamp_ns: int) -> float:
         """
         How far the farthest reading that waits for a sample lies ahead of a stamp [s]; 0 if none.
-
         """
         return self.thermal.queue.ahead(stamp_ns)
 
     def reset(self) -> None:
-        """
-        Forget temperatures, regime and queue; counters stay.
-
-        """
+        """Forget temperatures, regime and queue; counters stay."""
         self.thermal.queue.take()
         self.thermal.flags.clear()
         self._forget_samples()

@@ -7,7 +7,6 @@ A calibration that has aged, or a unit that was exchanged, shows as a residual l
 own uncertainty. Samples are gathered in windows of one second; a window counts as still when its
 scatter is that of the sensor and its mean that of the window before. A part of the samples
 serves as well as all of them; the window is longer where they are few.
-
 """
 
 from __future__ import annotations
@@ -85,10 +84,7 @@ class GravityMonitor:
         self._origin = (0.0, 0.0, 0.0)
 
     def wants(self, stamp_ns: int) -> bool:
-        """
-        Say whether a sample is far enough from the last one to tell something new.
-
-        """
+        """Say whether a sample is far enough from the last one to tell something new."""
         return not 0 <= stamp_ns - self._last_ns < PROBE_NS
 
     def add(
@@ -135,11 +131,7 @@ class GravityMonitor:
             self._close(covariance, noise_variance)
             self._window_ns = None
 
-    def _close(
-        self,
-        covariance: Sequence[float],
-        noise_variance: float,
-    ) -> None:
+    def _close(self, covariance: Sequence[float], noise_variance: float) -> None:
         n = self._n
         shift = [self._sum_x / n, self._sum_y / n, self._sum_z / n]
         mean = tuple(o + s for o, s in zip(self._origin, shift, strict=True))
@@ -188,10 +180,7 @@ class GravityMonitor:
 
     @property
     def result(self) -> GravityResidual | None:
-        """
-        The residual so far; None before the first still window.
-
-        """
+        """The residual so far; None before the first still window."""
         if not self._n_windows:
             return None
         return GravityResidual(

@@ -5,7 +5,6 @@ Owns the arithmetic of many samples: that of `Compensator.process`, in its order
 
 What a sample costs here is memory traffic, so the samples go through in pieces whose columns stay
 in the cache, and a segment's coefficients are spread over its samples just before they are used.
-
 """
 
 from __future__ import annotations
@@ -46,10 +45,7 @@ class Lines:
         self._counts: Ints = counts
 
     def select(self, begin: int, end: int) -> None:
-        """
-        Say of which samples the coefficients are wanted.
-
-        """
+        """Say of which samples the coefficients are wanted."""
         low = int(np.searchsorted(self._ends, begin, 'right'))
         high = int(np.searchsorted(self._ends, end, 'left')) + 1
         self._rows = slice(low, high)
@@ -59,24 +55,17 @@ class Lines:
     def spread(self, column: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """
         Repeat the value of each selected segment for each of its samples, in an array of its own.
-
         """
         return np.repeat(column[self._rows], self._counts)
 
     def age(self, stamps: Stamps) -> Floats:
-        """
-        Time since the beginning of each sample's segment [s].
-
-        """
+        """Time since the beginning of each sample's segment [s]."""
         start_ns = self.spread(self._start_ns)
         age: Floats = np.subtract(stamps, start_ns, out=start_ns) * 1e-9
         return age
 
     def corrected(self, axis: int, raw: Floats, dt: Floats, out: Floats | None = None) -> Floats:
-        """
-        Take bias and scale from the samples of one axis.
-
-        """
+        """Take bias and scale from the samples of one axis."""
         bias, bias_slope, scale, scale_slope = self._columns[4 * axis : 4 * axis + 4]
         value: Floats = self.spread(bias_slope)
         value *= dt
@@ -90,10 +79,7 @@ class Lines:
         return result
 
     def variance(self, axis: int, x: Floats, out: Floats | None = None) -> Floats:
-        """
-        Error variance of one axis.
-
-        """
+        """Error variance of one axis."""
         a, b, c = self._columns[12 + 3 * axis : 15 + 3 * axis]
         value: Floats = self.spread(c)
         value *= x
@@ -104,10 +90,7 @@ class Lines:
 
 
 def correct(
-    lines: Lines,
-    misalignment: tuple[float, ...],
-    stamps: Stamps,
-    samples: Floats,
+    lines: Lines, misalignment: tuple[float, ...], stamps: Stamps, samples: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Correct the samples that stand in segments, and find the extremes of each axis on the way.
@@ -148,12 +131,7 @@ def correct(
             np.minimum(lowest, columns.min(axis=1), out=lowest)
             np.maximum(highest, columns.max(axis=1), out=highest)
             _correct(
-                lines,
-                misalignment,
-                stamps[piece],
-                columns,
-                force[:, piece],
-                covariance[:, piece],
+                lines, misalignment, stamps[piece], columns, force[:, piece], covariance[:, piece]
             )
     return force.T, covariance.T, lowest, highest
 

@@ -7,7 +7,6 @@ samples that come faster than conversions can.
 A converter with noise does not give the same three numbers to the bit for seconds, and three exact
 zeros are no measurement but a dead wire. A count is charge per conversion cycle, so samples that
 come at another rate are of another scale, whatever else they are.
-
 """
 
 from __future__ import annotations
@@ -52,27 +51,18 @@ class StuckWatch:
 
     @property
     def is_on(self) -> bool:
-        """
-        Whether anything is watched.
-
-        """
+        """Whether anything is watched."""
         return self.limit_ns != _NEVER_NS
 
     def reset(self) -> None:
-        """
-        Forget the last sample.
-
-        """
+        """Forget the last sample."""
         #: The sample that the run began with and its stamp.
         self.run = (nan, nan, nan, 0)
         #: How often it has come again.
         self.n_same = 0
 
     def again(self, stamp_ns: int) -> bool:
-        """
-        Count one more equal sample; say whether it is too many.
-
-        """
+        """Count one more equal sample; say whether it is too many."""
         self.n_same += 1
         return self.n_same >= STUCK_SAMPLES and stamp_ns - self.run[3] > self.limit_ns
 
@@ -137,10 +127,7 @@ class StuckWatch:
 
 
 def _may_stand_still(samples: Floats) -> bool:
-    """
-    Look at a few samples whether `STUCK_SAMPLES` in a row may be equal anywhere.
-
-    """
+    """Look at a few samples whether `STUCK_SAMPLES` in a row may be equal anywhere."""
     probes = samples[::_PROBE_STEP]
     # Most differ in any one component already.
     same = np.flatnonzero(probes[1:, 0] == probes[:-1, 0])
@@ -178,10 +165,7 @@ class RateWatch:
         self.reset()
 
     def reset(self) -> None:
-        """
-        Begin to count.
-
-        """
+        """Begin to count."""
         self.is_too_fast = False
         self.ratio = 1.0
         self._level = 0.0

@@ -10,7 +10,6 @@ the temperature without a staircase, and a batch needs the full evaluation once 
 
 What parameters and the starts of the lags leave uncertain changes slowly: it is evaluated at the
 first segment that begins in each span of ten seconds of the stamps, and held.
-
 """
 
 from __future__ import annotations
@@ -96,10 +95,7 @@ class ThermalSide:
         )
 
     def swap(self, calibration: Calibration, now_ns: int | None) -> None:
-        """
-        Take over another calibration; see `Compensator.swap`.
-
-        """
+        """Take over another calibration; see `Compensator.swap`."""
         old, sensors = self.tracker, self.inputs
         detector = self.calibration.detector
         self._use(calibration, self.config)
@@ -117,20 +113,14 @@ class ThermalSide:
                 self.tracker.read(name, sensor.stamp_ns, sensor.temperature)
 
     def reconfigure(self, config: CompensatorConfig, now_ns: int | None) -> None:
-        """
-        Take over other settings.
-
-        """
+        """Take over other settings."""
         self.config = config
         self._timeout_ns = int(config.temperature_timeout_s * 1e9)
         self._forget_segment()
         self.tracker.reconfigure(self._thermal_config(), now_ns)
 
     def reset(self) -> None:
-        """
-        Forget temperatures, regime and rate; what waits, and counters, stay.
-
-        """
+        """Forget temperatures, regime and rate; what waits, and counters, stay."""
         self.tracker.reset()
         self.rate.reset()
         self._forget_segment()
@@ -138,17 +128,13 @@ class ThermalSide:
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """
         Queue a reading; one of a thermometer that the calibration does not know is nothing to it.
-
         """
         if name in self.inputs:
             kind = self.inputs.index(name)
             self.count_rejected(kind, self.queue.push(stamp_ns, kind, celsius))
 
     def apply(self, stamp_ns: int, kind: int, celsius: float) -> None:
-        """
-        Let a reading of one of `inputs` take effect now.
-
-        """
+        """Let a reading of one of `inputs` take effect now."""
         self._n_applied += 1
         tracker = self.tracker
         is_used = tracker.read(self.inputs[kind], stamp_ns, celsius)
@@ -164,47 +150,32 @@ class ThermalSide:
                 self.flags.append((stamp_ns, regime is Regime.DYNAMIC))
 
     def count_rejected(self, kind: int, n_readings: int) -> None:
-        """
-        Count readings of one of `inputs` that are not used.
-
-        """
+        """Count readings of one of `inputs` that are not used."""
         if kind == 0:
             self.counters.n_board_rejected += n_readings
         else:
             self.counters.n_case_rejected += n_readings
 
     def flush(self, stamp_ns: int) -> None:
-        """
-        Let what waits take effect up to a stamp.
-
-        """
+        """Let what waits take effect up to a stamp."""
         for reading_ns, kind, _, celsius in self.queue.due(stamp_ns):
             self.apply(reading_ns, kind, celsius)
 
     @property
     def fresh_until_ns(self) -> int:
-        """
-        The last stamp at which the board temperature is not too old; before any without one.
-
-        """
+        """The last stamp at which the board temperature is not too old; before any without one."""
         board_ns = self.tracker.board.stamp_ns
         return EVER_NS if board_ns is None else board_ns + self._timeout_ns
 
     def count_unmeasured(self, n_samples: int) -> None:
-        """
-        Count samples that came without a board temperature, or too long after it.
-
-        """
+        """Count samples that came without a board temperature, or too long after it."""
         if self.tracker.board.stamp_ns is None:
             self.counters.n_no_temperature += n_samples
         else:
             self.counters.n_stale += n_samples
 
     def start_of(self, stamp_ns: int) -> int:
-        """
-        Find where the segment of a stamp begins: counted from the last reading.
-
-        """
+        """Find where the segment of a stamp begins: counted from the last reading."""
         updated_ns = self.tracker.updated_ns or 0
         return stamp_ns - (stamp_ns - updated_ns) % SEGMENT_NS
 
@@ -238,7 +209,6 @@ class ThermalSide:
     def rate_refuses(self) -> bool:
         """
         Whether samples are held back because they cannot be conversions of the calibrated cycle.
-
         """
         return self.rate.is_too_fast and self._counts_cycles
 
@@ -246,16 +216,12 @@ class ThermalSide:
     def noise_excess(self) -> float:
         """
         What the rate adds to the noise of a sample, relative to that of the calibrated cycle.
-
         """
         excess = self.rate.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[Variance[float]]:
-        """
-        Give the slow part of the variance of a segment, evaluated at its end or held.
-
-        """
+        """Give the slow part of the variance of a segment, evaluated at its end or held."""
         key = start_ns // SLOW_NS
         if key != self._slow_key:
             self._slow_key = key

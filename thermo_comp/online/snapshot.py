@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the look at a compensator that diagnostics take: ages, excesses, faults, checks.
-
-"""
+"""Owns the look at a compensator that diagnostics take: ages, excesses, faults, checks."""
 
 from __future__ import annotations
 
@@ -21,10 +18,7 @@ SHORTEST_STALE_S = 0.5
 
 
 def take_snapshot(compensator: Compensator) -> CompensatorStatus:
-    """
-    Say how a compensator stands at the stamp of its last sample.
-
-    """
+    """Say how a compensator stands at the stamp of its last sample."""
     thermal = compensator.thermal
     tracker = thermal.tracker
     stamp_ns = compensator.now_ns

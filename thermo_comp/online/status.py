@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what surrounds the compensator's arithmetic: its settings, its counters, its status.
-
-"""
+"""Owns what surrounds the compensator's arithmetic: its settings, its counters, its status."""
 
 from __future__ import annotations
 
@@ -52,10 +49,7 @@ class CompensatorConfig:
     gravity_tolerance_m_s2: float = 0.5
 
     def __post_init__(self) -> None:
-        """
-        Refuse values that mean nothing.
-
-        """
+        """Refuse values that mean nothing."""
         refuse_outside(
             self,
             positive=('temperature_timeout_s',),
@@ -79,10 +73,7 @@ DROPPED = (
 
 @dataclass(slots=True)
 class Counters:
-    """
-    What came in and why some of it did not go out.
-
-    """
+    """What came in and why some of it did not go out."""
 
     n_out: int = 0
     n_not_finite: int = 0
@@ -101,10 +92,7 @@ class Counters:
 
     @property
     def n_dropped(self) -> int:
-        """
-        Samples that came in and did not go out.
-
-        """
+        """Samples that came in and did not go out."""
         return (
             self.n_not_finite
             + self.n_saturated
@@ -118,19 +106,13 @@ class Counters:
 
     @property
     def n_in(self) -> int:
-        """
-        Samples that came in.
-
-        """
+        """Samples that came in."""
         return self.n_out + self.n_dropped
 
 
 @dataclass(frozen=True, slots=True)
 class GravityResidual:
-    """
-    What the still windows say.
-
-    """
+    """What the still windows say."""
 
     #: |f| - g [m/s^2], averaged over the recent still windows.
     residual: float
@@ -143,19 +125,13 @@ class GravityResidual:
 
     @property
     def sigmas(self) -> float:
-        """
-        Size of the residual in its own standard deviations.
-
-        """
+        """Size of the residual in its own standard deviations."""
         return abs(self.residual) / self.residual_sd
 
 
 @dataclass(frozen=True, slots=True)
 class CompensatorStatus:
-    """
-    Snapshot for diagnostics.
-
-    """
+    """Snapshot for diagnostics."""
 
     counters: Counters
     stamp_ns: int | None

@@ -4,7 +4,6 @@
 Owns bags: recordings to columns and columns to recordings, streaming, in bounded memory.
 
 The only package that knows `rosbags` and `mcap`.
-
 """
 
 from __future__ import annotations

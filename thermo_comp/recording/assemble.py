@@ -6,7 +6,6 @@ Owns the step from decoded runs of messages to Blocks of limited size.
 Whatever reads a storage yields `Part` after `Part`. Within and across parts, the rank of a
 message is its place in the reading order over all topics; a Block's ``board_after`` and
 ``case_after`` are nothing but counts of smaller ranks.
-
 """
 
 from __future__ import annotations
@@ -53,10 +52,7 @@ class Rows:
     raw: tuple[Bytes, Ints] | None = None
 
     def cut(self, begin: int, end: int) -> Rows:
-        """
-        Take the rows from `begin` up to `end` as views.
-
-        """
+        """Take the rows from `begin` up to `end` as views."""
         before = [text for row, text in self.frames if row <= begin][-1:]
         later = [(row - begin, text) for row, text in self.frames if begin < row < end]
         raw = self.raw
@@ -87,10 +83,6 @@ def join_rows(pieces: list[Rows], width: int) -> Rows:
         In reading order.
     width : int
         Numbers per row where there is no piece at all.
-
-    Returns
-    -------
-    Rows
 
     """
     if len(pieces) == 1:
@@ -124,11 +116,7 @@ def join_rows(pieces: list[Rows], width: int) -> Rows:
 
 
 def assemble(
-    parts: Iterable[Part],
-    *,
-    is_imu: bool,
-    names: dict[Role, tuple[str, str]],
-    n_messages: int = 0,
+    parts: Iterable[Part], *, is_imu: bool, names: dict[Role, tuple[str, str]], n_messages: int = 0
 ) -> Iterator[Block]:
     """
     Gather parts into blocks.
@@ -143,10 +131,6 @@ def assemble(
         Topic and type per role, for the raw messages.
     n_messages : int, optional
         A block is given out once it has so many; 0 = `BLOCK_MESSAGES`.
-
-    Yields
-    ------
-    Block
 
     """
     waiting: list[Part] = []

@@ -6,7 +6,6 @@ Owns one stretch of an MCAP file with messages: read it, decompress it, find its
 A chunk of ordinary size is taken as a whole. Large chunks, torn chunks and messages outside any
 chunk are read window by window; a window holds whole records only, and the piece of a record at
 its end opens the next one.
-
 """
 
 from __future__ import annotations
@@ -160,10 +159,7 @@ class _Chunk:
 
 
 def _open(record: bytes, at: int, span: ChunkSpan) -> _Chunk:
-    """
-    Decompress the chunk whose record begins at this place of the bytes read.
-
-    """
+    """Decompress the chunk whose record begins at this place of the bytes read."""
     end = at + span.length + span.index_length
     if end > len(record):
         raise DamagedError('the file ends inside it')
@@ -287,10 +283,7 @@ def _fill(stream: Stream, n_bytes: int, is_torn: bool) -> tuple[bytes, bool]:
 
 
 def _needed(rest: bytes) -> int:
-    """
-    Bytes of a window that holds the record at its front.
-
-    """
+    """Bytes of a window that holds the record at its front."""
     if len(rest) < mcap.PREFIX_BYTES:
         return WINDOW_BYTES
     length = int.from_bytes(rest[1 : mcap.PREFIX_BYTES], 'little')
@@ -300,10 +293,7 @@ def _needed(rest: bytes) -> int:
 
 
 def _without_last(messages: Messages) -> Messages:
-    """
-    Drop the message before a stretch of zeros: its own end may be zeros too.
-
-    """
+    """Drop the message before a stretch of zeros: its own end may be zeros too."""
     return Messages(
         messages.at[:-1], messages.size[:-1], messages.channel[:-1], messages.log_ns[:-1]
     )

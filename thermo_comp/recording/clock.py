@@ -7,7 +7,6 @@ A clock that is set while it runs (1970, then NTP) or a recorder that slept leav
 in the stamps. Whatever walks a grid of time would walk it. After an hour without a reading nothing
 is known of a unit's thermal state any more, so an hour tells as much as a year: a longer jump,
 either way, becomes an hour.
-
 """
 
 from __future__ import annotations

@@ -5,7 +5,6 @@ Owns the columns: what a bag becomes once it is read, and the words that describ
 
 A column is a numpy array with one row per message. All times are integer nanoseconds: the
 ``stamp`` is the message's own header stamp, the ``log`` is when the recorder got it.
-
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ class Topics:
 
     A name matches with or without its leading slash and, where only one topic of the bag fits,
     with any namespace in front: ``accel/counts`` finds ``/imu0/accel/counts``.
-
     """
 
     counts: str = 'accel/counts'
@@ -75,10 +73,7 @@ class RecordingInfo:
 
     @property
     def n_messages(self) -> int:
-        """
-        Count the messages of all topics.
-
-        """
+        """Count the messages of all topics."""
         return sum(count for _, count in self.topics.values())
 
 
@@ -171,18 +166,12 @@ class Block:
     raw: tuple[RawMessages, ...] = ()
 
     def __len__(self) -> int:
-        """
-        Count the accelerometer messages.
-
-        """
+        """Count the accelerometer messages."""
         return len(self.accel_stamp_ns)
 
     @property
     def temperatures(self) -> dict[str, tuple[Ints, Floats, Ints]]:
-        """
-        Readings by the name of their thermometer: stamps, degC, samples before.
-
-        """
+        """Readings by the name of their thermometer: stamps, degC, samples before."""
         return {
             'board': (self.board_stamp_ns, self.board, self.board_after),
             'case': (self.case_stamp_ns, self.case, self.case_after),

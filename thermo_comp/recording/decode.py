@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the step from found messages to the rows of each role.
-
-"""
+"""Owns the step from found messages to the rows of each role."""
 
 from __future__ import annotations
 
@@ -78,10 +75,6 @@ class Decoder:
             Ranks are this number plus the message's place in `data`, in that order; or, where it
             is None, the messages are put in order of log time and ranked from 0.
 
-        Returns
-        -------
-        Part
-
         Raises
         ------
         RecordingError
@@ -145,10 +138,6 @@ class Decoder:
         log_ns, rank : ndarray of int64, shape (n,)
             Their log times and ranks.
 
-        Returns
-        -------
-        Rows
-
         Raises
         ------
         RecordingError
@@ -198,10 +187,7 @@ def pack(data: Bytes, start: Ints, size: Ints) -> tuple[Bytes, Ints]:
 
 
 def _reencoded(stamped: Stamped, frames: list[tuple[int, str]]) -> tuple[Bytes, Ints]:
-    """
-    CDR of messages that came in another encoding.
-
-    """
+    """CDR of messages that came in another encoding."""
     pieces: list[Bytes] = []
     sizes: list[Ints] = []
     stops = [row for row, _ in frames[1:]] + [len(stamped.stamp_ns)]

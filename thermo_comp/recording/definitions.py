@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what a bag says of its topics beside their messages: type definitions and QoS profiles.
-
-"""
+"""Owns what a bag says of its topics beside their messages: type definitions and QoS profiles."""
 
 from __future__ import annotations
 
@@ -54,10 +51,6 @@ def known_definition(kind: str) -> Definition:
     ----------
     kind : str
         E.g. ``sensor_msgs/msg/Imu``.
-
-    Returns
-    -------
-    Definition
 
     Raises
     ------

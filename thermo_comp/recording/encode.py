@@ -5,7 +5,6 @@ Owns the way from columns to MCAP message records: structured arrays, no loop ov
 
 Columns wait as they are. Once it is known which messages make a chunk, just their records are
 built, so that nothing larger than a chunk is ever laid out.
-
 """
 
 from __future__ import annotations
@@ -37,10 +36,6 @@ def layout(n_bytes: int, /, **fields: tuple[Any, int]) -> np.dtype[Any]:
         Bytes of a row.
     **fields : (type, int)
         Type and offset of each field.
-
-    Returns
-    -------
-    dtype
 
     """
     content: Any = {
@@ -147,10 +142,7 @@ class StampedRecords:
         self._pattern = pattern.view((np.void, n_bytes))[0]
 
     def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
-        """
-        Build the records of the chosen messages.
-
-        """
+        """Build the records of the chosen messages."""
         which = _run(chosen)
         rows: NDArray[Any] = np.empty(len(chosen), self._layout)
         rows.view((np.void, self._layout.itemsize))[:] = self._pattern
@@ -186,10 +178,7 @@ class BoolRecords:
         self._values = values
 
     def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
-        """
-        Build the records of the chosen messages.
-
-        """
+        """Build the records of the chosen messages."""
         rows: NDArray[Any] = np.zeros(len(chosen), self._LAYOUT)
         _fill_head(rows, self.channel, self.log_ns[chosen])
         rows['order'] = 1
@@ -223,10 +212,7 @@ class RawRecords:
         self.size = self._length + RECORD_HEAD.itemsize
 
     def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
-        """
-        Build the records of the chosen messages.
-
-        """
+        """Build the records of the chosen messages."""
         length = self._length[chosen]
         for each in np.unique(length).tolist():
             which = np.flatnonzero(length == each)
@@ -387,10 +373,7 @@ def _fill_numbers(rows: NDArray[Any], pieces: Sequence[Piece]) -> None:
 
 
 def _run(chosen: Ints) -> Ints | slice:
-    """
-    Say the same as a slice, where rising places stand one behind the other.
-
-    """
+    """Say the same as a slice, where rising places stand one behind the other."""
     first, last = int(chosen[0]), int(chosen[-1])
     if last - first + 1 != len(chosen) or (chosen[1:] < chosen[:-1]).any():
         return chosen
@@ -423,10 +406,6 @@ def as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
     n : int, optional
         The length it must have.
 
-    Returns
-    -------
-    ndarray of int64, shape (n,)
-
     Raises
     ------
     ValueError
@@ -458,10 +437,6 @@ def as_numbers(name: str, values: ArrayLike, n: int, width: int) -> Floats:
         The column.
     n, width : int
         The shape it must have.
-
-    Returns
-    -------
-    ndarray, shape (n, width)
 
     Raises
     ------

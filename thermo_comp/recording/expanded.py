@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns bags whose files rosbag2 has compressed as a whole: expanded beside, then read as any other.
-
 """
 
 from __future__ import annotations
@@ -68,35 +67,23 @@ class ExpandedSource:
         self.metadata = self._source.metadata
 
     def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
-        """
-        Decode the messages of the chosen topics, in reading order.
-
-        """
+        """Decode the messages of the chosen topics, in reading order."""
         with self._named():
             yield from self._source.parts(selection, raw=raw)
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
-        """
-        Read topics as they are, about in order of log time.
-
-        """
+        """Read topics as they are, about in order of log time."""
         with self._named():
             yield from self._source.raw(topics)
 
     def close(self) -> None:
-        """
-        Close the files and remove what was expanded.
-
-        """
+        """Close the files and remove what was expanded."""
         self._source.close()
         self._folder.cleanup()
 
     @contextmanager
     def _named(self) -> Iterator[None]:
-        """
-        Name the file that the user has, not the expanded one.
-
-        """
+        """Name the file that the user has, not the expanded one."""
         try:
             yield
         except RecordingError as error:

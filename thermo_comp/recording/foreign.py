@@ -5,7 +5,6 @@ Owns every storage that is not plain MCAP: sqlite3, ROS 1 and packed messages, t
 
 `rosbags` finds the messages, file by file; their bytes are laid side by side and decoded many at a
 time. What it raises on a damaged bag is translated here.
-
 """
 
 from __future__ import annotations
@@ -116,10 +115,6 @@ class ForeignSource:
         raw : bool
             Keep the serialized messages too.
 
-        Yields
-        ------
-        Part
-
         Raises
         ------
         RecordingError
@@ -172,19 +167,13 @@ class ForeignSource:
                     )
 
     def close(self) -> None:
-        """
-        Close the files.
-
-        """
+        """Close the files."""
         while self._readers:
             self._readers.pop()[1].close()
 
 
 class _Batch:
-    """
-    Messages collected one by one, to be decoded together.
-
-    """
+    """Messages collected one by one, to be decoded together."""
 
     def __init__(self, decoder: Decoder, feeds: dict[Role, Feed]) -> None:
         self._decoder = decoder
@@ -200,17 +189,11 @@ class _Batch:
 
     @property
     def is_full(self) -> bool:
-        """
-        Whether it is time to decode.
-
-        """
+        """Whether it is time to decode."""
         return self.n_messages >= _BATCH_MESSAGES or self._n_bytes >= _BATCH_BYTES
 
     def add(self, role: Role, log_ns: int, data: bytes) -> None:
-        """
-        Add one message.
-
-        """
+        """Add one message."""
         self._data[role].append(data)
         self._times[role].append((log_ns, self._next_rank))
         self._next_rank += 1
@@ -218,10 +201,7 @@ class _Batch:
         self._n_bytes += len(data)
 
     def take(self) -> Part:
-        """
-        Decode what is there and begin anew.
-
-        """
+        """Decode what is there and begin anew."""
         part: Part = {}
         for role, feed in self._feeds.items():
             if self._data[role]:
@@ -236,10 +216,7 @@ class _Batch:
 
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
-    """
-    Turn whatever a damaged bag makes `rosbags` raise into one line.
-
-    """
+    """Turn whatever a damaged bag makes `rosbags` raise into one line."""
     try:
         yield
     except RecordingError as error:

@@ -5,7 +5,6 @@ Owns the MCAP file being written: chunks with their message indexes, and the sum
 
 The bulk (message records, message indexes) is numpy bytes; the few other records go through the
 `mcap` library's record classes.
-
 """
 
 from __future__ import annotations
@@ -153,15 +152,7 @@ class McapFile:
         return channel.id
 
     def append(self, merged: Merged) -> None:
-        """
-        Add messages; whole chunks are written, the rest waits for more.
-
-        Parameters
-        ----------
-        merged : Merged
-            The messages.
-
-        """
+        """Add messages; whole chunks are written, the rest waits for more."""
         while True:
             waiting = sum(len(stretch.data) for stretch in self._tail)
             stretch = merged.take(self._chunk_bytes - waiting)
@@ -172,10 +163,7 @@ class McapFile:
                 self._close_chunk()
 
     def _close_chunk(self) -> None:
-        """
-        Have the waiting messages compressed, and write what was compressed meanwhile.
-
-        """
+        """Have the waiting messages compressed, and write what was compressed meanwhile."""
         stretch, self._tail = _joined(self._tail), []
         self._packing.append((stretch, self._pool.submit(self._pack, stretch.data)))
         while len(self._packing) > _MAX_PACKING:
@@ -197,10 +185,6 @@ class McapFile:
         custom : mapping of str to str
             The key-value pairs for rosbag2's own metadata record.
 
-        Returns
-        -------
-        FileSummary
-
         """
         if self._tail:
             self._close_chunk()
@@ -216,10 +200,7 @@ class McapFile:
         return summary
 
     def close(self) -> None:
-        """
-        Close the file as it is.
-
-        """
+        """Close the file as it is."""
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._stream.close()
 

@@ -5,7 +5,6 @@ Owns the records of an MCAP file other than its messages: bytes to values, nothi
 
 Each length is checked against the bytes that are there, so no damaged file makes a reader run
 out of bounds or allocate what the file does not hold. Layouts: https://mcap.dev/spec.
-
 """
 
 from __future__ import annotations
@@ -36,18 +35,12 @@ CHUNK_HEAD_BYTES = PREFIX_BYTES + 40
 
 
 class DamagedError(Exception):
-    """
-    Bytes that are not what they should be; the text says what.
-
-    """
+    """Bytes that are not what they should be; the text says what."""
 
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """
-    A message type and its definition.
-
-    """
+    """A message type and its definition."""
 
     name: str
     encoding: str
@@ -56,10 +49,7 @@ class Schema:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """
-    A topic with its type and how its messages are serialized.
-
-    """
+    """A topic with its type and how its messages are serialized."""
 
     topic: str
     type: str
@@ -99,10 +89,7 @@ class ChunkSpan:
 
 @dataclass(slots=True)
 class Statistics:
-    """
-    The counts in a file's summary.
-
-    """
+    """The counts in a file's summary."""
 
     n_messages: int
     start_ns: int
@@ -138,10 +125,7 @@ class Cursor:
         self.at = at
 
     def take(self, n_bytes: int) -> bytes:
-        """
-        Take the next bytes.
-
-        """
+        """Take the next bytes."""
         end = self.at + n_bytes
         if end > len(self.data):
             raise DamagedError('a record is shorter than its content')
@@ -150,10 +134,7 @@ class Cursor:
         return taken
 
     def numbers(self, layout: str) -> tuple[int, ...]:
-        """
-        Take little-endian integers, described as for `struct`.
-
-        """
+        """Take little-endian integers, described as for `struct`."""
         packed = _little_endian(layout)
         at = self.at
         self.at = end = at + packed.size
@@ -162,18 +143,12 @@ class Cursor:
         return packed.unpack_from(self.data, at)
 
     def text(self) -> str:
-        """
-        Take a string with its length in front.
-
-        """
+        """Take a string with its length in front."""
         (length,) = self.numbers('I')
         return self.take(length).decode('utf-8', 'replace')
 
     def pairs(self) -> dict[str, str]:
-        """
-        Take a map of strings.
-
-        """
+        """Take a map of strings."""
         (length,) = self.numbers('I')
         inner = Cursor(self.take(length))
         found: dict[str, str] = {}
@@ -184,20 +159,14 @@ class Cursor:
 
 
 def parse_schema(content: bytes) -> tuple[int, Schema]:
-    """
-    Read a schema record's content.
-
-    """
+    """Read a schema record's content."""
     cursor = Cursor(content)
     (number,) = cursor.numbers('H')
     return number, Schema(cursor.text(), cursor.text(), cursor.text())
 
 
 def parse_channel(content: bytes, schemas: dict[int, Schema]) -> tuple[int, Channel]:
-    """
-    Read a channel record's content.
-
-    """
+    """Read a channel record's content."""
     cursor = Cursor(content)
     number, schema = cursor.numbers('HH')
     topic, encoding = cursor.text(), cursor.text()
@@ -209,19 +178,13 @@ def parse_channel(content: bytes, schemas: dict[int, Schema]) -> tuple[int, Chan
 
 
 def parse_metadata(content: bytes) -> tuple[str, dict[str, str]]:
-    """
-    Read a metadata record's content: its name and its pairs.
-
-    """
+    """Read a metadata record's content: its name and its pairs."""
     cursor = Cursor(content)
     return cursor.text(), cursor.pairs()
 
 
 def parse_statistics(content: bytes) -> Statistics:
-    """
-    Read a statistics record's content.
-
-    """
+    """Read a statistics record's content."""
     cursor = Cursor(content)
     n_messages, _, _, _, _, _, start_ns, end_ns, length = cursor.numbers('QHIIIIQQI')
     inner = Cursor(cursor.take(length))
@@ -233,10 +196,7 @@ def parse_statistics(content: bytes) -> Statistics:
 
 
 def parse_chunk_index(content: bytes) -> ChunkSpan:
-    """
-    Read a chunk index record's content.
-
-    """
+    """Read a chunk index record's content."""
     cursor = Cursor(content)
     start_ns, end_ns, position, length, offsets = cursor.numbers('QQQQI')
     cursor.take(offsets)
@@ -285,13 +245,6 @@ def parse_chunk_head(head: bytes, position: int) -> tuple[ChunkSpan, int, int]:
     if cursor.at + compressed_size != PREFIX_BYTES + content:
         raise DamagedError(f'the chunk at byte {position} has a damaged head')
     span = ChunkSpan(
-        position,
-        PREFIX_BYTES + content,
-        0,
-        start_ns,
-        end_ns,
-        compression,
-        compressed_size,
-        size,
+        position, PREFIX_BYTES + content, 0, start_ns, end_ns, compression, compressed_size, size
     )
     return span, cursor.at, checksum

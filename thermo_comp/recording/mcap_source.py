@@ -7,7 +7,6 @@ Reading order within a file is log time and, for equal log times, the place in t
 ROS player gives. It needs the time spans in the heads of the chunks to be true, which is checked.
 A file with messages outside chunks, or with chunks above 64 MiB, has no such index of times: it
 is read in the order of the file, each ordinary chunk sorted by log time.
-
 """
 
 from __future__ import annotations
@@ -179,10 +178,7 @@ class McapSource:
                             yield RawMessages(channel.topic, channel.type, log_ns, *packed)
 
     def close(self) -> None:
-        """
-        Close the files.
-
-        """
+        """Close the files."""
         if not self._is_closed:
             self._is_closed = True
             self._pool.shutdown(wait=True, cancel_futures=True)
@@ -218,10 +214,7 @@ def _read(
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """
-    Chunks that are read as one, and their place as `Decoder.part` takes it.
-
-    """
+    """Chunks that are read as one, and their place as `Decoder.part` takes it."""
 
     spans: list[ChunkSpan]
     place: int | None
@@ -232,10 +225,7 @@ class _Job:
 
 
 def _grouped(spans: Sequence[ChunkSpan]) -> list[list[ChunkSpan]]:
-    """
-    Put small chunks together: array passes and threads are for many messages at a time.
-
-    """
+    """Put small chunks together: array passes and threads are for many messages at a time."""
     groups: list[list[ChunkSpan]] = []
     size = _GROUP_BYTES
     for span in spans:
@@ -273,10 +263,7 @@ def _in_file_order(survey: Survey, decoder: Decoder) -> Iterator[Part]:
 
 
 def _stretches(survey: Survey) -> Iterator[tuple[Bytes, Messages, int | None]]:
-    """
-    Read a file stretch by stretch, each with its place as `Decoder.part` takes it.
-
-    """
+    """Read a file stretch by stretch, each with its place as `Decoder.part` takes it."""
     for span in survey.spans:
         if isinstance(span, ChunkSpan):
             yield *load_chunk(survey.handle, span, _ignore), None
@@ -294,7 +281,6 @@ def _decoded(
     What one thread has decompressed it decodes, too: then the bytes are in its processor's cache.
     The pool belongs to the source, not to this generator: a generator that is given up is closed
     by the garbage collector, anywhere, where waiting for a thread may be a deadlock.
-
     """
     waiting: deque[tuple[int, Future[Part]]] = deque()
     n_ahead = 0
@@ -322,10 +308,7 @@ def _decode(handle: RandomAccess, decoder: Decoder, job: _Job) -> Part:
 
 
 def _load(handle: RandomAccess, spans: list[ChunkSpan]) -> tuple[Bytes, Messages]:
-    """
-    Read chunks that follow each other in log time as if they were one.
-
-    """
+    """Read chunks that follow each other in log time as if they were one."""
     joined = load_run(handle, spans, _ignore) if len(spans) > 1 else None
     if joined is not None:
         return joined
@@ -353,10 +336,7 @@ def _load(handle: RandomAccess, spans: list[ChunkSpan]) -> tuple[Bytes, Messages
 
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
-    """
-    Say which file it is that is damaged.
-
-    """
+    """Say which file it is that is damaged."""
     try:
         yield
     except DamagedError as error:
@@ -368,7 +348,4 @@ def _translated(path: Path) -> Iterator[None]:
 
 
 def _ignore(opcode: int, content: bytes) -> None:
-    """
-    Pass over a record; the survey has read those that matter.
-
-    """
+    """Pass over a record; the survey has read those that matter."""

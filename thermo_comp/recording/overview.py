@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the look at a recording before a fit: how long, how fast, how warm, how still, how whole.
-
 """
 
 from __future__ import annotations
@@ -58,10 +57,7 @@ class ThermometerSurvey:
 
     @property
     def span(self) -> float:
-        """
-        Highest minus lowest.
-
-        """
+        """Highest minus lowest."""
         return self.highest - self.lowest
 
 
@@ -110,10 +106,7 @@ class Survey:
 
     @property
     def findings(self) -> list[str]:
-        """
-        What stands between this recording and a fit, each with the next step.
-
-        """
+        """What stands between this recording and a fit, each with the next step."""
         found = []
         if self.info.truncated:
             found.append(f'cut off: {self.info.truncated}')
@@ -159,9 +152,7 @@ class Survey:
 
 
 def survey_recording(
-    path: str | Path,
-    topics: Topics | None = None,
-    progress: Callable[[float], None] | None = None,
+    path: str | Path, topics: Topics | None = None, progress: Callable[[float], None] | None = None
 ) -> Survey:
     """
     Read a recording once, in bounded memory, and describe it.
@@ -227,10 +218,7 @@ def survey_recording(
 
 
 class _Stamps:
-    """
-    Counts gaps and disorder while the stamps stream by.
-
-    """
+    """Counts gaps and disorder while the stamps stream by."""
 
     def __init__(self) -> None:
         self.n = 0
@@ -267,10 +255,7 @@ class _Stamps:
 
 
 class _Readings:
-    """
-    Gathers one thermometer; a thermal test has few readings beside its samples.
-
-    """
+    """Gathers one thermometer; a thermal test has few readings beside its samples."""
 
     def __init__(self) -> None:
         self._stamp_ns: list[Ints] = []

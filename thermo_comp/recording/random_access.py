@@ -4,7 +4,6 @@
 Owns the way to the bytes of a file: so many from such a place, from any thread.
 
 A file on this machine is one kind; whoever keeps bags elsewhere brings another.
-
 """
 
 from __future__ import annotations
@@ -43,10 +42,7 @@ class RandomAccess(Protocol):
         ...
 
     def close(self) -> None:
-        """
-        Close the file.
-
-        """
+        """Close the file."""
         ...
 
 
@@ -56,11 +52,6 @@ OpenFile = Callable[[Path], RandomAccess]
 class LocalFile:
     """
     A file of this machine.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
 
     Raises
     ------
@@ -74,15 +65,9 @@ class LocalFile:
         self.size = os.fstat(self._file.fileno()).st_size
 
     def read_at(self, at: int, n_bytes: int) -> bytes:
-        """
-        Read up to so many bytes.
-
-        """
+        """Read up to so many bytes."""
         return os.pread(self._file.fileno(), n_bytes, at)
 
     def close(self) -> None:
-        """
-        Close the file.
-
-        """
+        """Close the file."""
         self._file.close()

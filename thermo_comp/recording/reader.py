@@ -6,7 +6,6 @@ Owns the door to recordings: open a bag of any storage, say what it holds, read 
 Reading order
     The order of a ROS player: log time, and for equal log times the place in the file. The split
     files of one bag follow each other as its metadata.yaml lists them.
-
 """
 
 from __future__ import annotations
@@ -31,10 +30,7 @@ from .topics import select_topics, shown
 
 
 class Source(Protocol):
-    """
-    One opened storage.
-
-    """
+    """One opened storage."""
 
     storage: str
     topics: Mapping[str, tuple[str, int]]
@@ -45,24 +41,15 @@ class Source(Protocol):
     metadata: Mapping[str, str]
 
     def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
-        """
-        Decode the messages of the chosen topics, in reading order.
-
-        """
+        """Decode the messages of the chosen topics, in reading order."""
         ...
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
-        """
-        Give the messages of topics as they are.
-
-        """
+        """Give the messages of topics as they are."""
         ...
 
     def close(self) -> None:
-        """
-        Close the files.
-
-        """
+        """Close the files."""
         ...
 
 
@@ -104,10 +91,7 @@ class RecordingReader:
 
     @property
     def topics(self) -> Mapping[Role, str]:
-        """
-        The bag's own name of each topic that is read.
-
-        """
+        """The bag's own name of each topic that is read."""
         return dict(self._selection)
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
@@ -166,10 +150,7 @@ class RecordingReader:
             ) from error
 
     def _miss(self, topic: str, n_read: int, n_promised: int) -> None:
-        """
-        Say so where fewer messages came than the bag had promised.
-
-        """
+        """Say so where fewer messages came than the bag had promised."""
         loss = _loss(topic, n_read, n_promised)
         if loss and loss not in (self.info.truncated or ''):
             told = '; '.join(filter(None, (self.info.truncated, loss)))
@@ -198,17 +179,11 @@ class RecordingReader:
         yield from self._source.raw(topics)
 
     def close(self) -> None:
-        """
-        Close the files.
-
-        """
+        """Close the files."""
         self._source.close()
 
     def __enter__(self) -> RecordingReader:
-        """
-        Give the open reader.
-
-        """
+        """Give the open reader."""
         return self
 
     def __exit__(
@@ -217,10 +192,7 @@ class RecordingReader:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """
-        Close the files.
-
-        """
+        """Close the files."""
         self.close()
 
 
@@ -244,10 +216,6 @@ def open_recording(
         Which accelerometer topic is read; ``auto`` prefers the counts.
     require : collection of {'accel', 'board', 'case'}, optional
         Roles whose absence is an error; the others' columns are just empty.
-
-    Returns
-    -------
-    RecordingReader
 
     Raises
     ------
@@ -322,10 +290,6 @@ def read_recording(
     path, topics, input, require
         As for `open_recording`.
 
-    Returns
-    -------
-    Recording
-
     Raises
     ------
     RecordingError
@@ -347,10 +311,6 @@ def inspect_recording(path: str | Path, topics: Topics | None = None) -> Recordi
         The bag.
     topics : Topics, optional
         Names of the inputs, to tell `RecordingInfo.input`.
-
-    Returns
-    -------
-    RecordingInfo
 
     Raises
     ------
@@ -392,10 +352,7 @@ def _open_directory(path: Path) -> Source:
 
 
 def _open_described(description: Description) -> Source:
-    """
-    Open the files that a metadata.yaml lists, and hold them against what it promises.
-
-    """
+    """Open the files that a metadata.yaml lists, and hold them against what it promises."""
     if description.compression == 'file':
         return ExpandedSource(description.files, partial(_open_files, description))
     return _open_files(description, description.files, None)
@@ -423,17 +380,11 @@ def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
 
 
 def in_split_order(files: Iterable[Path]) -> list[Path]:
-    """
-    Sort the files of a split bag by the number at the end of their names.
-
-    """
+    """Sort the files of a split bag by the number at the end of their names."""
     return sorted(files, key=_number)
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """
-    Sort key of the files of a split bag: the number at the end of the name.
-
-    """
+    """Sort key of the files of a split bag: the number at the end of the name."""
     digits = file.stem.rpartition('_')[2]
     return (int(digits) if digits.isascii() and digits.isdigit() else 0, file.name)

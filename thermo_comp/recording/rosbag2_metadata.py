@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns rosbag2's metadata.yaml: written as ROS 2 Jazzy does it (version 9), any version read.
-
-"""
+"""Owns rosbag2's metadata.yaml: written as ROS 2 Jazzy does it (version 9), any version read."""
 
 from __future__ import annotations
 
@@ -30,10 +27,7 @@ _COMPRESSIONS: dict[str, Literal['', 'file', 'message']] = {
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """
-    One topic of a finished file.
-
-    """
+    """One topic of a finished file."""
 
     name: str
     type: str
@@ -72,10 +66,6 @@ def information(summary: FileSummary, custom: Mapping[str, str]) -> dict[str, An
         What the file holds.
     custom : mapping of str to str
         Kept as ``custom_data``.
-
-    Returns
-    -------
-    dict
 
     """
     n_messages = sum(topic.n_messages for topic in summary.topics)
@@ -117,18 +107,12 @@ def information(summary: FileSummary, custom: Mapping[str, str]) -> dict[str, An
 
 
 def dump_metadata(summary: FileSummary, custom: Mapping[str, str]) -> str:
-    """
-    Write the text of metadata.yaml.
-
-    """
+    """Write the text of metadata.yaml."""
     return dump_yaml({'rosbag2_bagfile_information': information(summary, custom)})
 
 
 def dump_yaml(content: Any) -> str:
-    """
-    Write YAML in block style with the keys in their order.
-
-    """
+    """Write YAML in block style with the keys in their order."""
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=10_000)
     return text
 
@@ -162,11 +146,6 @@ class Description:
 def read_metadata(directory: Path) -> Description | None:
     """
     Read the metadata.yaml of a bag.
-
-    Parameters
-    ----------
-    directory : Path
-        The bag.
 
     Returns
     -------

@@ -8,7 +8,6 @@ costs some 50 bytes per cell. Two tests, both relative to the bag's own quiet le
 inside a cell (vibration, handling) and the step between neighbouring cells (a turn, a knock that
 left another attitude). A step starts a new interval, because a shift of one microradian is
 already one micro-g.
-
 """
 
 from __future__ import annotations
@@ -216,10 +215,7 @@ class CellAccumulator:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """
-    Find the length of a cell of which a whole number fills the window, or some windows [ns].
-
-    """
+    """Find the length of a cell of which a whole number fills the window, or some windows [ns]."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:
@@ -228,10 +224,7 @@ def _part_of(window_s: float, least: float) -> float:
 
 
 def _quantum_of(samples: Floats) -> Floats:
-    """
-    Step of each axis, from the changes between samples; 0 where they are all different.
-
-    """
+    """Step of each axis, from the changes between samples; 0 where they are all different."""
     result = np.zeros(3)
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
@@ -285,10 +278,7 @@ def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
 
 
 def _is_quiet(cells: Cells, full: Bools) -> Bools:
-    """
-    Compare each cell's variance with the quietest tenth of the bag.
-
-    """
+    """Compare each cell's variance with the quietest tenth of the bag."""
     # A sensor that reads the same number for long is no measure of its noise: toggling between two
     # neighbours has a variance of a quarter step squared.
     floor = 0.25 * cells.quantum**2
@@ -300,10 +290,7 @@ def _is_quiet(cells: Cells, full: Bools) -> Bools:
 
 
 def _is_joined(cells: Cells, quiet: Bools) -> Bools:
-    """
-    Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step in the mean.
-
-    """
+    """Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step in the mean."""
     step = np.diff(cells.mean, axis=0)
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():

@@ -6,7 +6,6 @@ Owns the map of one MCAP file: which stretches hold its messages, its topics, wh
 The data section is gone through record by record from the front, over the heads only; where the
 chunk index of the summary knows a chunk, it is stepped over together with its message indexes.
 So a file without a summary, or cut off anywhere, is mapped by the same walk as a whole one.
-
 """
 
 from __future__ import annotations
@@ -97,10 +96,7 @@ class Survey:
             raise
 
     def close(self) -> None:
-        """
-        Close the file.
-
-        """
+        """Close the file."""
         self.handle.close()
 
     def _map(self) -> None:
@@ -147,10 +143,7 @@ class Survey:
         raise RecordingError('cut off inside its header, there is nothing to read', self.path)
 
     def _read_footer(self, begin: int) -> int | None:
-        """
-        Where the data section ends; None where the file has no footer.
-
-        """
+        """Where the data section ends; None where the file has no footer."""
         at = self._size - mcap.FOOTER_BYTES
         footer = self._read(at, mcap.FOOTER_BYTES) if at >= begin else b''
         if not footer.startswith(b'\x02\x14' + bytes(7)) or not footer.endswith(mcap.MAGIC):
@@ -166,10 +159,7 @@ class Survey:
         return summary
 
     def _read_summary(self, content: Bytes) -> None:
-        """
-        Take what the summary says; a damaged one is as good as none.
-
-        """
+        """Take what the summary says; a damaged one is as good as none."""
         try:
             _, end, _ = walk(content, self._on_summary)
         except DamagedError:
@@ -199,10 +189,7 @@ class Survey:
                 self.metadata.update(pairs)
 
     def _is_indexed(self) -> bool:
-        """
-        Whether the summary tells enough to step over the chunks it knows.
-
-        """
+        """Whether the summary tells enough to step over the chunks it knows."""
         said = self._statistics
         if said is None or sum(said.counts.values()) != said.n_messages:
             self._statistics = None
@@ -210,10 +197,7 @@ class Survey:
         return all(number in self._channel_records for number, n in said.counts.items() if n)
 
     def _walk(self, at: int, end: int) -> None:
-        """
-        Go over the heads of the data section's records.
-
-        """
+        """Go over the heads of the data section's records."""
         pending: ChunkSpan | None = None
         index: Counter[int] = Counter()
         while at < end:
@@ -256,10 +240,7 @@ class Survey:
             self.truncated = words
 
     def _torn(self, at: int, head: bytes) -> None:
-        """
-        Take what is left of a record that is not whole.
-
-        """
+        """Take what is left of a record that is not whole."""
         if self._has_footer:
             raise DamagedError(f'the record at byte {at} is not whole')
         opcode = head[0]
@@ -287,10 +268,7 @@ class Survey:
             raise DamagedError(f'the record at byte {at} has {length} bytes')
 
     def _close_chunk(self, span: ChunkSpan, index: Counter[int]) -> None:
-        """
-        Take a chunk that the walk found, with what its message indexes say.
-
-        """
+        """Take a chunk that the walk found, with what its message indexes say."""
         if not self._add(span):
             return
         self._last_index = index
@@ -313,10 +291,7 @@ class Survey:
         return True
 
     def _loose(self, at: int, end: int) -> int:
-        """
-        Take a stretch of messages outside any chunk; gives where it ends.
-
-        """
+        """Take a stretch of messages outside any chunk; gives where it ends."""
         stretch = StreamSpan(at, end, is_chunk=False, is_torn=not self._has_footer)
         windows = Windows(self.handle, stretch, self._on_record)
         for _, messages in windows:
@@ -327,10 +302,7 @@ class Survey:
         return at + windows.n_walked
 
     def _distrust_last(self, at: int) -> None:
-        """
-        Read a last chunk that zeros follow up to them, as its own end may be zeros too.
-
-        """
+        """Read a last chunk that zeros follow up to them, as its own end may be zeros too."""
         last = self.spans[-1] if self.spans else None
         if (
             isinstance(last, ChunkSpan)
@@ -349,7 +321,6 @@ class Survey:
         Count the last whole chunk of a file without a footer, whose index may be cut off.
 
         One that is not sound is left out.
-
         """
         last = self.spans[-1] if self.spans else None
         if last is None or (isinstance(last, StreamSpan) and (last.is_torn or not last.is_chunk)):
@@ -368,10 +339,7 @@ class Survey:
             self.truncated = f'{self.truncated}; its last chunk is damaged and left out'
 
     def _scan(self) -> int:
-        """
-        Read the chunks that no index describes; gives the number of messages of a torn one.
-
-        """
+        """Read the chunks that no index describes; gives the number of messages of a torn one."""
         n_torn = 0
         for span, is_counted in self._unscanned:
             if isinstance(span, ChunkSpan):
@@ -398,9 +366,6 @@ class Survey:
 
 
 def _index_head(head: bytes, length: int) -> tuple[int, int]:
-    """
-    Channel and number of messages of a message index record.
-
-    """
+    """Channel and number of messages of a message index record."""
     number, n_bytes = mcap.Cursor(head, mcap.PREFIX_BYTES).numbers('HI')
     return number, n_bytes // 16 if n_bytes + 6 == length else 0

@@ -6,7 +6,6 @@ Owns log-time order across chunks whose time spans overlap.
 Chunks come in the order of their first log time. Once the next one begins at time t, whatever
 was read before t is final: nothing that is still to come can stand before it. So only the
 messages of chunks that overlap at one instant are ever held back.
-
 """
 
 from __future__ import annotations
@@ -71,10 +70,7 @@ def in_log_order(parts: Iterable[tuple[Part, int | None]]) -> Iterator[Part]:
 
 
 def _merged(parts: list[Part]) -> Part:
-    """
-    Join the rows of each role in order of log time and place.
-
-    """
+    """Join the rows of each role in order of log time and place."""
     roles: list[Role] = sorted({role for part in parts for role in part})
     merged: Part = {}
     for role in roles:
@@ -86,10 +82,7 @@ def _merged(parts: list[Part]) -> Part:
 
 
 def _split(part: Part, next_ns: int | None) -> tuple[Part, Part]:
-    """
-    Part what stands before a time, ranked from 0, from the rest.
-
-    """
+    """Part what stands before a time, ranked from 0, from the rest."""
     done: Part = {}
     kept: Part = {}
     for role, rows in part.items():

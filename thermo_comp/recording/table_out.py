@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the way out as a table: columns, block by block, to CSV or (extra ``parquet``) Parquet.
-
-"""
+"""Owns the way out as a table: columns, block by block, to CSV or (extra ``parquet``) Parquet."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the search for the inputs' topics in a bag, and the sentences said when one is not there.
-
 """
 
 from __future__ import annotations
@@ -20,12 +19,7 @@ IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 BOOL = 'std_msgs/msg/Bool'
 
-_TYPES = {
-    'counts': VECTOR3_STAMPED,
-    'imu': IMU,
-    'board': TEMPERATURE,
-    'case': TEMPERATURE,
-}
+_TYPES = {'counts': VECTOR3_STAMPED, 'imu': IMU, 'board': TEMPERATURE, 'case': TEMPERATURE}
 _OPTIONS = {key: f'--{key}-topic' for key in _TYPES}
 
 
@@ -92,10 +86,6 @@ def select_topics(
         With ``auto`` the counts are taken where the bag has them, else the Imu messages.
     require : collection of {'accel', 'board', 'case'}
         The roles without which the bag is of no use.
-
-    Returns
-    -------
-    Selection
 
     Raises
     ------
@@ -165,10 +155,7 @@ def _check_type(path: Path, name: str, found: str, key: str) -> None:
 
 
 def _missing(
-    path: Path,
-    present: Mapping[str, tuple[str, int]],
-    topics: Topics,
-    key: str | None,
+    path: Path, present: Mapping[str, tuple[str, int]], topics: Topics, key: str | None
 ) -> RecordingError:
     names = sorted(present)[:_MAX_LISTED]
     listed = ', '.join(f'{shown(name)} ({shown(present[name][0])})' for name in names)

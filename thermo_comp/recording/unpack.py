@@ -5,7 +5,6 @@ Owns decompression of chunks: whole ones at once, large or torn ones as a stream
 
 What a chunk or a frame claims about its size is only ever an upper limit: memory is taken for
 what the reader is willing to hold, and output beyond the claim is damage.
-
 """
 
 from __future__ import annotations
@@ -33,10 +32,7 @@ _STEP_BYTES = 1 << 16
 
 
 def growth_limit(n_packed: int) -> int:
-    """
-    Say how many bytes so many packed ones may hold at most.
-
-    """
+    """Say how many bytes so many packed ones may hold at most."""
     return n_packed * _MAX_GROWTH + _FREE_GROWTH_BYTES
 
 
@@ -121,10 +117,6 @@ def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
     checksum : int
         CRC-32 of the decompressed bytes, 0 where there is none.
 
-    Returns
-    -------
-    ndarray of uint8, shape (size,)
-
     Raises
     ------
     DamagedError
@@ -181,23 +173,14 @@ def _unpack_lz4(packed: Bytes, size: int) -> Bytes:
 
 
 class _CompressionError(DamagedError):
-    """
-    Bytes that do not decompress.
-
-    """
+    """Bytes that do not decompress."""
 
 
 class Stream(Protocol):
-    """
-    Bytes that come in pieces.
-
-    """
+    """Bytes that come in pieces."""
 
     def read(self, n_bytes: int) -> bytes:
-        """
-        Read up to so many bytes; none means the end.
-
-        """
+        """Read up to so many bytes; none means the end."""
         ...
 
 
@@ -220,10 +203,7 @@ class Region:
         self._end = end
 
     def read(self, n_bytes: int = -1) -> bytes:
-        """
-        Read up to so many bytes; none means the end.
-
-        """
+        """Read up to so many bytes; none means the end."""
         left = self._end - self._at
         data = self._handle.read_at(self._at, left if n_bytes < 0 else min(n_bytes, left))
         self._at += len(data)
@@ -231,25 +211,14 @@ class Region:
 
 
 class Lz4Stream:
-    """
-    The content of an lz4 frame as a stream.
-
-    Parameters
-    ----------
-    source : Stream
-        The frame.
-
-    """
+    """The content of an lz4 frame as a stream."""
 
     def __init__(self, source: Stream) -> None:
         self._source = source
         self._decompressor = lz4.frame.LZ4FrameDecompressor()
 
     def read(self, n_bytes: int) -> bytes:
-        """
-        Read up to so many bytes; none means the end.
-
-        """
+        """Read up to so many bytes; none means the end."""
         while not self._decompressor.eof:
             packed = self._source.read(_READ_BYTES) if self._decompressor.needs_input else b''
             if self._decompressor.needs_input and not packed:

@@ -6,7 +6,6 @@ Owns finding the records in decompressed MCAP bytes: with an index as a hint, or
 The index is never trusted. What it points at must be message records that, together with the
 few other records between them, tile the chunk without gap or overlap; where they do not, the
 records are walked from the first to the last, a run of equally long ones at a time.
-
 """
 
 from __future__ import annotations
@@ -102,10 +101,7 @@ def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
 
 
 def locate_run(
-    data: Bytes,
-    areas: list[tuple[int, int]],
-    indexes: list[memoryview],
-    on_record: OnRecord,
+    data: Bytes, areas: list[tuple[int, int]], indexes: list[memoryview], on_record: OnRecord
 ) -> tuple[Messages, Ints] | None:
     """
     Find all messages of several whole chunks at once.
@@ -150,10 +146,7 @@ def locate_run(
 
 
 def _indexed(index: memoryview, size: int) -> Ints | None:
-    """
-    Offsets of all messages by the index records; None where these are not usable.
-
-    """
+    """Offsets of all messages by the index records; None where these are not usable."""
     columns = _index_columns(index)
     if not columns:
         return None
@@ -164,10 +157,7 @@ def _indexed(index: memoryview, size: int) -> Ints | None:
 
 
 def _index_columns(index: memoryview) -> list[Ints] | None:
-    """
-    Offsets of the messages by each index record; None where these are not usable.
-
-    """
+    """Offsets of the messages by each index record; None where these are not usable."""
     columns: list[Ints] = []
     at = 0
     while at + _INDEX_HEAD.size <= len(index):
@@ -188,17 +178,12 @@ def _index_columns(index: memoryview) -> list[Ints] | None:
 
 
 def _checked(
-    data: Bytes,
-    at: Ints,
-    on_record: OnRecord,
-    areas: list[tuple[int, int]],
-    first: list[int],
+    data: Bytes, at: Ints, on_record: OnRecord, areas: list[tuple[int, int]], first: list[int]
 ) -> Messages | None:
     """
     Read the messages at these places if they tile each area with what is between them.
 
     Each area has messages; those of the area k begin with `first[k]`.
-
     """
     head = gather(data, at, MESSAGE_HEAD_BYTES)
     # Unsigned on purpose: a length that is too small wraps around to one that is too large.

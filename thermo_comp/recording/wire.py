@@ -14,7 +14,6 @@ and in ROS 1 a sequence number stands in place of the encapsulation, the string 
 nothing is aligned. Only `frame_id` makes the size vary, so two gathers per message (the fixed
 head, then the numbers) read any mixture of lengths; short messages of one length, the usual case,
 are gathered as a whole.
-
 """
 
 from __future__ import annotations
@@ -78,10 +77,6 @@ def gather(buffer: Bytes, at: Ints, n_bytes: int) -> NDArray[Any]:
         Positions, each at least `n_bytes` before the buffer's end.
     n_bytes : int
         Bytes of a row.
-
-    Returns
-    -------
-    ndarray of void, shape (n,)
 
     """
     kind = np.dtype((np.void, n_bytes))
@@ -164,10 +159,6 @@ def decode_stamped(
         How they are serialized.
     n_wanted : int, optional
         Take only so many leading numbers.
-
-    Returns
-    -------
-    Stamped
 
     Raises
     ------
@@ -266,10 +257,7 @@ def _decode(
 
 
 def _body(frame_size: Size, encoding: Encoding) -> Size:
-    """
-    Say where the numbers begin in a message.
-
-    """
+    """Say where the numbers begin in a message."""
     if encoding != 'cdr':
         return frame_size + HEAD_BYTES
     # (12 + length + 7) // 8 * 8, counted from after the encapsulation
@@ -328,10 +316,7 @@ def frame_runs(buffer: Bytes, messages: Stamped) -> list[tuple[int, str]]:
 
 
 def _all_equal(rows: NDArray[Any], offset: int, size: int) -> bool:
-    """
-    Tell whether all rows have the same bytes at a place, compared word by word.
-
-    """
+    """Tell whether all rows have the same bytes at a place, compared word by word."""
     end = offset + size
     while offset < end:
         width = next(w for w in (8, 4, 2, 1) if offset + w <= end)

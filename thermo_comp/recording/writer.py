@@ -5,7 +5,6 @@ Owns the way out: columns to a rosbag2 directory or a bare MCAP file that other 
 
 Nothing stands under the target's name until `BagWriter.close` has succeeded; an output that was
 there before stays if writing fails.
-
 """
 
 from __future__ import annotations
@@ -371,10 +370,7 @@ class BagWriter:
         self._file = None
 
     def abort(self) -> None:
-        """
-        Drop the unfinished output; what stood under its name before stays.
-
-        """
+        """Drop the unfinished output; what stood under its name before stays."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):
@@ -382,10 +378,7 @@ class BagWriter:
         self._draft.drop()
 
     def __enter__(self) -> BagWriter:
-        """
-        Give the open writer.
-
-        """
+        """Give the open writer."""
         return self
 
     def __exit__(
@@ -394,10 +387,7 @@ class BagWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """
-        Finish the bag, or drop it where the block raised.
-
-        """
+        """Finish the bag, or drop it where the block raised."""
         if kind is None:
             self.close()
         else:

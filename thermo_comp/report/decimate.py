@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the thinning of long series to what a line of some hundred pixels can show.
-
-"""
+"""Owns the thinning of long series to what a line of some hundred pixels can show."""
 
 from __future__ import annotations
 

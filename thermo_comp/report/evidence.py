@@ -6,7 +6,6 @@ Owns what a report is made of: facts, series and statistics, gathered before any
 Figures and page read one value, `Evidence`, whether it came from a fit, from bags with or without
 a calibration, or from a calibration alone; what is missing is None or empty, and its part of the
 page is left out.
-
 """
 
 from __future__ import annotations
@@ -176,20 +175,14 @@ class Evidence:
 
     @property
     def is_seen(self) -> bool:
-        """
-        Whether the calibration was fitted on one of these bags.
-
-        """
+        """Whether the calibration was fitted on one of these bags."""
         sources = () if self.calibration is None else self.calibration.provenance.sources
         known = {source.sha256 for source in sources if source.sha256}
         return self.is_fit or any(bag.sha256 in known for bag in self.bags)
 
     @property
     def headline(self) -> str:
-        """
-        The verdict with its numbers, or why there is none.
-
-        """
+        """The verdict with its numbers, or why there is none."""
         if self.judgement is not None:
             return str(self.judgement)
         if self.calibration is not None:
@@ -200,10 +193,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """
-        How the verdict is to be coloured: valid; with reservations; not; nothing was judged.
-
-        """
+        """How the verdict is to be coloured: valid; with reservations; not; nothing was judged."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -213,10 +203,7 @@ class Evidence:
 
     @property
     def forces(self) -> dict[str, Floats]:
-        """
-        Specific force over the windows by what corrected it; empty where nothing gave one.
-
-        """
+        """Specific force over the windows by what corrected it; empty where nothing gave one."""
         windows = self.windows
         if windows is None or not len(windows):
             return {}
@@ -226,20 +213,14 @@ class Evidence:
 
     @cached_property
     def residuals(self) -> dict[str, Floats]:
-        """
-        ``|f| - g`` of each of `forces` [m/s^2]; empty without gravity.
-
-        """
+        """``|f| - g`` of each of `forces` [m/s^2]; empty without gravity."""
         if self.gravity is None:
             return {}
         return {name: norm_residual(force, self.gravity) for name, force in self.forces.items()}
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """
-        The still positions, with the attitude that the judged rung sees.
-
-        """
+        """The still positions, with the attitude that the judged rung sees."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the figures of a fleet: what is left unit by unit, how units differ, who stands out.
-
-"""
+"""Owns the figures of a fleet: what is left unit by unit, how units differ, who stands out."""
 
 from __future__ import annotations
 
@@ -128,10 +125,7 @@ def draw_shares(curves: Mapping[str, Floats], sheet: Sheet) -> Figure:
 
 
 def draw_spreads(panels: Sequence[Panel], sheet: Sheet) -> Figure:
-    """
-    Draw how the coefficients are spread, as the share of units below each value.
-
-    """
+    """Draw how the coefficients are spread, as the share of units below each value."""
     columns = 1 if sheet.is_narrow else 2
     n_rows = -(-len(panels) // columns)
     figure = new_figure(sheet, 0.4 + 1.75 * n_rows)
@@ -208,10 +202,7 @@ def draw_distances(
 
 
 def draw_lots(title: str, groups: Mapping[str, Floats], sheet: Sheet) -> Figure:
-    """
-    Draw one quantity lot by lot.
-
-    """
+    """Draw one quantity lot by lot."""
     figure = new_figure(sheet, 0.7 + 0.28 * len(groups))
     axes = figure.subplots()
     for row, values in enumerate(groups.values()):

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the figures of the residuals: the paper's Fig. 6 and Fig. 7, and the histograms.
-
-"""
+"""Owns the figures of the residuals: the paper's Fig. 6 and Fig. 7, and the histograms."""
 
 from __future__ import annotations
 
@@ -35,10 +32,7 @@ from .text import number
 
 
 def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
-    """
-    Draw the residual of each axis, without and with the calibration (the paper's Fig. 6).
-
-    """
+    """Draw the residual of each axis, without and with the calibration (the paper's Fig. 6)."""
     shown, facts = shown_bag(evidence)
     unit, name = time_unit(facts.duration_s)
     windows = evidence.windows
@@ -75,10 +69,7 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
 
 
 def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
-    """
-    Draw |g| over time, before and after, and after in detail (the paper's Fig. 7).
-
-    """
+    """Draw |g| over time, before and after, and after in detail (the paper's Fig. 7)."""
     shown, facts = shown_bag(evidence)
     unit, name = time_unit(facts.duration_s)
     windows = evidence.windows
@@ -111,10 +102,7 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
 
 
 def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
-    """
-    Draw how the residuals are distributed: the calibration's by regime, and all by size.
-
-    """
+    """Draw how the residuals are distributed: the calibration's by regime, and all by size."""
     windows = evidence.windows
     residuals = evidence.residuals
     if windows is None or not residuals:
@@ -181,7 +169,6 @@ def _draw_signed(axes: Axes, values: Floats, line: Line) -> None:
 def _size_range(residuals: dict[str, Floats]) -> tuple[float, float]:
     """
     Range of sizes worth showing [micro-g]: all that is large, and the small without its tail.
-
     """
     sizes = [np.abs(residual) / MICRO_G for residual in residuals.values()]
     low = max(min(float(np.quantile(size, 0.02)) for size in sizes), 1e-2)

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the figures of the thermal side: the paper's Fig. 3 and Fig. 4 from the user's bag.
-
-"""
+"""Owns the figures of the thermal side: the paper's Fig. 3 and Fig. 4 from the user's bag."""
 
 from __future__ import annotations
 
@@ -52,10 +49,7 @@ def shown_bag(evidence: Evidence) -> tuple[ShownBag, BagFacts]:
 
 
 def shade_dynamic(axes: Axes, shown: ShownBag, unit: float) -> None:
-    """
-    Shade the time in which the flag says dynamic.
-
-    """
+    """Shade the time in which the flag says dynamic."""
     spans: list[tuple[float, float]] = []
     for stretch in shown.trace.stretches:
         if stretch.regime == Regime.DYNAMIC:
@@ -67,10 +61,7 @@ def shade_dynamic(axes: Axes, shown: ShownBag, unit: float) -> None:
 
 
 def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
-    """
-    Draw the readings of both sensors and the chamber's program (the paper's Fig. 3).
-
-    """
+    """Draw the readings of both sensors and the chamber's program (the paper's Fig. 3)."""
     shown, facts = shown_bag(evidence)
     unit, name = time_unit(facts.duration_s)
     figure = new_figure(sheet, 3.2 if sheet.is_narrow else 2.5)
@@ -97,7 +88,6 @@ def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
 def draw_dynamics(evidence: Evidence, sheet: Sheet) -> Figure:
     """
     Draw the drift of the readings, the temperatures' derivatives and the flag (Fig. 4 a, b, c).
-
     """
     shown, facts = shown_bag(evidence)
     unit, name = time_unit(facts.duration_s)

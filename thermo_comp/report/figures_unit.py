@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the figures of the unit itself: bias, scale, answer to a step, and its positions.
-
-"""
+"""Owns the figures of the unit itself: bias, scale, answer to a step, and its positions."""
 
 from __future__ import annotations
 
@@ -43,10 +40,7 @@ _MOST_LABELS = 24
 
 
 def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
-    """
-    Draw bias and scale over temperature in a soak and in ramps, with their bands.
-
-    """
+    """Draw bias and scale over temperature in a soak and in ramps, with their bands."""
     calibration = _calibration(evidence)
     rows, columns = (6, 1) if sheet.is_narrow else (2, 3)
     figure = new_figure(sheet, 9.6 if sheet.is_narrow else 4.2)
@@ -187,10 +181,7 @@ def _draw_band(axes: Axes, curve: Curve, value: Floats, half: Floats) -> None:
 
 
 def draw_step(evidence: Evidence, sheet: Sheet) -> Figure:
-    """
-    Draw what a step of the temperature does to each axis over time.
-
-    """
+    """Draw what a step of the temperature does to each axis over time."""
     calibration = _calibration(evidence)
     minutes, bias, scale = step_answer(calibration)
     figure = new_figure(sheet, 4.4 if sheet.is_narrow else 2.5)
@@ -234,10 +225,7 @@ def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 
 
 def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:
-    """
-    Draw where the positions point on the sphere, and what is left on each of them.
-
-    """
+    """Draw where the positions point on the sphere, and what is left on each of them."""
     positions = evidence.positions
     if not positions:
         raise ValueError('`evidence` has no positions')

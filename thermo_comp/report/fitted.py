@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the way from a fit's result to a report's evidence.
-
-"""
+"""Owns the way from a fit's result to a report's evidence."""
 
 from __future__ import annotations
 
@@ -84,10 +81,7 @@ def _is_reservation(finding: Finding) -> bool:
 
 
 def _left_out(result: FitResult) -> dict[int, float]:
-    """
-    Give what is left of each position without it, by `Windows.position`.
-
-    """
+    """Give what is left of each position without it, by `Windows.position`."""
     rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     by_rest = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
     return {k: by_rest[rest] for k, rest in enumerate(rests) if rest in by_rest}

@@ -5,7 +5,6 @@ Owns the way from bags, with or without a calibration, to a report's evidence.
 
 Reading and judging are apart, so that a viewer reads a bag once and judges it anew whenever the
 calibration changes.
-
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ _SLOWEST_RAMP_K_MIN = 0.05
 def span_of(bag: ReducedBag) -> tuple[int, int]:
     """
     Give the first and the last stamp of a bag: of its samples, or of its readings without them.
-
     """
     if bag.n_samples:
         return bag.start_ns, bag.end_ns
@@ -265,10 +263,7 @@ def recorded_program(metadata: object) -> Cyclogram | None:
 
 
 def of_calibration(calibration: Calibration) -> tuple[str, ...]:
-    """
-    Give what speaks against a calibration by itself, but for its wish for more positions.
-
-    """
+    """Give what speaks against a calibration by itself, but for its wish for more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     found = [
         f'the dynamic set never saw {name}: its ramps are a guess there'

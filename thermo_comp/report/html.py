@@ -6,7 +6,6 @@ Owns the parts of a page that needs nothing else: the document, its tables, its 
 What comes from a bag or a calibration is text that somebody else wrote: it passes through
 `html.escape` on its way into the page, and the page's own policy forbids it to run or load
 anything.
-
 """
 
 from __future__ import annotations
@@ -118,10 +117,7 @@ def table(
 
 
 def figure(plate: DrawnPlate) -> str:
-    """
-    Write a figure with its caption, for paper and for a phone.
-
-    """
+    """Write a figure with its caption, for paper and for a phone."""
     return (
         f'<figure id="figure-{plate.number}"><div class="wide">{plate.wide}</div>'
         f'<div class="narrow">{plate.narrow}</div>'

@@ -5,7 +5,6 @@ Owns what an accelerometer's error means to an inertial navigator, in metres.
 
 A constant error b of a horizontal axis moves the position by ``b t^2 / 2`` at first; over longer
 times the Schuler oscillation bounds it, with a peak of ``2 b R / g``.
-
 """
 
 from __future__ import annotations

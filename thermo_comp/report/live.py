@@ -7,7 +7,6 @@ The page asks for the version of its files once a second and reloads itself when
 file that cannot be read, as while it is being written, is said above the last good page. Served
 on the loopback interface only, and only under its own names, so that no other site's page can
 reach it through the browser.
-
 """
 
 from __future__ import annotations
@@ -54,10 +53,7 @@ setInterval(async () => {
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """
-    How the viewer reads the bags; see `evidence_of_bags`.
-
-    """
+    """How the viewer reads the bags; see `evidence_of_bags`."""
 
     topics: Topics | None = None
     input: Input = 'auto'
@@ -100,10 +96,7 @@ class LiveReport:
         self._notice = ''
 
     def version(self) -> str:
-        """
-        Tell the state of the files: another text whenever one of them has changed.
-
-        """
+        """Tell the state of the files: another text whenever one of them has changed."""
         return _signature([self._calibration, *self._bags])
 
     def page(self) -> str:
@@ -196,36 +189,24 @@ class LiveServer(ThreadingHTTPServer):
         super().__init__((HOST, port), _Handler)
 
     def verify_request(self, request: Any, client_address: Any) -> bool:  # noqa: ARG002
-        """
-        Take a client if there is a place for it.
-
-        """
+        """Take a client if there is a place for it."""
         return self._places.acquire(blocking=False)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """
-        Answer a client, and give its place to another.
-
-        """
+        """Answer a client, and give its place to another."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """
-        Say nothing of a client that went away.
-
-        """
+        """Say nothing of a client that went away."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 
     @property
     def url(self) -> str:
-        """
-        Where the page is.
-
-        """
+        """Where the page is."""
         return f'http://{HOST}:{self.server_port}/'
 
 
@@ -236,10 +217,7 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ''
 
     def do_GET(self) -> None:
-        """
-        Answer with the page or with its version.
-
-        """
+        """Answer with the page or with its version."""
         name, _, port = self.headers.get('Host', '').partition(':')
         if name not in _NAMES or port != str(self.server.server_port):
             self._answer(HTTPStatus.FORBIDDEN, 'text/plain', 'another host\n')
@@ -266,10 +244,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base's name
-        """
-        Say nothing: a request a second is no news.
-
-        """
+        """Say nothing: a request a second is no news."""
 
 
 def _signature(paths: Sequence[Path]) -> str:
@@ -277,10 +252,7 @@ def _signature(paths: Sequence[Path]) -> str:
 
 
 def _state(path: Path) -> str:
-    """
-    Describe a file, or a bag's files, by what changes when somebody writes them.
-
-    """
+    """Describe a file, or a bag's files, by what changes when somebody writes them."""
     try:
         files = sorted(path.iterdir()) if path.is_dir() else [path]
         found = [(str(file), file.stat()) for file in files]

@@ -5,7 +5,6 @@ Owns the page: evidence, verdict and figures as one HTML document that needs not
 
 Whatever comes from a bag or a calibration is text that somebody else wrote: it is escaped on its
 way into the page.
-
 """
 
 from __future__ import annotations
@@ -102,10 +101,7 @@ def _micro(text: str) -> str:
 
 
 def _seen(evidence: Evidence) -> str:
-    """
-    Say which bags the verdict rests on, and what the flag marked in the one that is shown.
-
-    """
+    """Say which bags the verdict rests on, and what the flag marked in the one that is shown."""
     said = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board

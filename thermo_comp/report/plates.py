@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the list of figures: what each asks, how its answer is read, and when it can be drawn.
-
-"""
+"""Owns the list of figures: what each asks, how its answer is read, and when it can be drawn."""
 
 from __future__ import annotations
 
@@ -74,10 +71,7 @@ class DrawnPlate:
 
 
 def possible_plates(evidence: Evidence) -> list[Plate]:
-    """
-    List the figures that the evidence allows, in order.
-
-    """
+    """List the figures that the evidence allows, in order."""
     return [plate for plate in PLATES if plate.is_possible(evidence)]
 
 

@@ -6,7 +6,6 @@ Owns the look of the figures and their way out: SVG that can stand in a page, PN
 Every line differs from its neighbours by its dashes as well as by its colour, because
 certificates are printed in black and white. Colours are those of Okabe and Ito, which colour-blind
 readers tell apart.
-
 """
 
 from __future__ import annotations
@@ -111,10 +110,7 @@ NARROW = Sheet(3.75, 220, True)
 
 @contextmanager
 def drawing() -> Iterator[None]:
-    """
-    Draw in the report's style, whatever the user's matplotlib settings are.
-
-    """
+    """Draw in the report's style, whatever the user's matplotlib settings are."""
     with mpl.rc_context():
         mpl.rcdefaults()
         settings: Any = mpl.rcParams
@@ -123,10 +119,7 @@ def drawing() -> Iterator[None]:
 
 
 def new_figure(sheet: Sheet, height: float) -> Figure:
-    """
-    Make an empty figure as wide as the sheet.
-
-    """
+    """Make an empty figure as wide as the sheet."""
     return Figure(figsize=(sheet.width, height), layout='constrained')
 
 
@@ -171,10 +164,7 @@ def svg(figure: Figure, name: str, label: str) -> str:
 
 
 def png(figure: Figure) -> bytes:
-    """
-    Write a figure as a PNG file's content.
-
-    """
+    """Write a figure as a PNG file's content."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format='png', dpi=_PNG_DPI, metadata={'Software': None})
     return buffer.getvalue()
@@ -206,10 +196,7 @@ def time_unit(duration_s: float) -> tuple[float, str]:
 
 
 def plot_thinned(axes: Axes, time: Floats, value: Floats, sheet: Sheet, **line: Any) -> None:
-    """
-    Draw a long series with no more points than the sheet has pixels.
-
-    """
+    """Draw a long series with no more points than the sheet has pixels."""
     axes.plot(*thin(time, value, sheet.n_bins), **line)
 
 
@@ -264,18 +251,12 @@ def legend_above(axes: Axes, sheet: Sheet, *, share: float = 1.0, **keys: Any) -
 
 
 def few_ticks(axes: Axes, n: int = 5) -> None:
-    """
-    Keep the y axis of a low panel readable.
-
-    """
+    """Keep the y axis of a low panel readable."""
     axes.yaxis.set_major_locator(MaxNLocator(n))
 
 
 def log_axis(axes: Axes, low: float, high: float) -> None:
-    """
-    Make the x axis logarithmic from `low` to `high`, with enough plain numbers on it.
-
-    """
+    """Make the x axis logarithmic from `low` to `high`, with enough plain numbers on it."""
     axes.set_xscale('log')
     axes.set_xlim(low, high)
     is_short = high < 50.0 * low

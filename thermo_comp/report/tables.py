@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the tables of the model and of the unit: steps, parts, axes, positions.
-
-"""
+"""Owns the tables of the model and of the unit: steps, parts, axes, positions."""
 
 from __future__ import annotations
 
@@ -40,10 +37,7 @@ _GROUPS = {
 
 
 def axes_table(calibration: Calibration | None) -> str:
-    """
-    Tell what the unit is at the reference temperature.
-
-    """
+    """Tell what the unit is at the reference temperature."""
     if calibration is None:
         return ''
     unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
@@ -82,10 +76,7 @@ def axes_table(calibration: Calibration | None) -> str:
 
 
 def steps_table(evidence: Evidence) -> str:
-    """
-    Tell what each step of the model leaves; nothing without a fit.
-
-    """
+    """Tell what each step of the model leaves; nothing without a fit."""
     rows = [
         (
             one.section,
@@ -108,10 +99,7 @@ def steps_table(evidence: Evidence) -> str:
 
 
 def groups_table(calibration: Calibration | None) -> str:
-    """
-    Tell what each part of the model explains; nothing of a calibration without evidence.
-
-    """
+    """Tell what each part of the model explains; nothing of a calibration without evidence."""
     if calibration is None or not calibration.evidence:
         return ''
     return '<h2>What each part of the model explains</h2>' + table(
@@ -134,10 +122,7 @@ def groups_table(calibration: Calibration | None) -> str:
 
 
 def positions_table(evidence: Evidence) -> str:
-    """
-    List the positions with what is left on each.
-
-    """
+    """List the positions with what is left on each."""
     if not evidence.positions:
         return ''
     shown = [*evidence.residuals, *([LEFT_OUT] if evidence.left_out else [])]

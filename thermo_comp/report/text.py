@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns how numbers and other people's names are spelt, the same in page, figures and verdict.
-
-"""
+"""Owns how numbers and other people's names are spelt, the same in page, figures and verdict."""
 
 from __future__ import annotations
 
@@ -11,10 +8,7 @@ import math
 
 
 def number(value: float, digits: int = 3) -> str:
-    """
-    Give a number in significant digits, with no more decimals than those.
-
-    """
+    """Give a number in significant digits, with no more decimals than those."""
     if not math.isfinite(value):
         return '–'
     if value == 0.0:
@@ -28,9 +22,6 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def label_text(value: str, limit: int = 40) -> str:
-    """
-    Make text that others wrote fit for a figure: one line, printable, not too long.
-
-    """
+    """Make text that others wrote fit for a figure: one line, printable, not too long."""
     clean = ''.join(c if c.isprintable() else ' ' for c in value).strip()
     return clean if len(clean) <= limit else f'{clean[: limit - 1]}…'

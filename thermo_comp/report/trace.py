@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the thermal trace of a bag: what the node's own tracker made of the readings, as columns.
-
 """
 
 from __future__ import annotations
@@ -128,10 +127,7 @@ def _row(tracker: ThermalTracker) -> tuple[float, ...]:
 
 
 def _settled(value: Floats, variance: Floats) -> Floats:
-    """
-    Leave out an estimate until it has settled: its sd has come down to thrice the usual.
-
-    """
+    """Leave out an estimate until it has settled: its sd has come down to thrice the usual."""
     known = np.isfinite(value) & np.isfinite(variance)
     if not known.any():
         return np.full(len(value), np.nan)
@@ -141,10 +137,7 @@ def _settled(value: Floats, variance: Floats) -> Floats:
 
 
 class _Feed:
-    """
-    Hands the readings of both sensors to a tracker in the order of their stamps.
-
-    """
+    """Hands the readings of both sensors to a tracker in the order of their stamps."""
 
     def __init__(self, tracker: ThermalTracker, board: Readings, case: Readings) -> None:
         stamps = np.concatenate((board.stamp_ns, case.stamp_ns))
@@ -160,10 +153,7 @@ class _Feed:
         self.flags: list[tuple[int, Regime, int]] = []
 
     def until(self, stamp_ns: int) -> None:
-        """
-        Hand over what was read up to and including a stamp.
-
-        """
+        """Hand over what was read up to and including a stamp."""
         tracker, stamps = self._tracker, self._stamps
         detector = tracker.detector
         k = self._next

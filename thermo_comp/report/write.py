@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the report as files: one HTML page and, if wanted, its figures as PNG.
-
-"""
+"""Owns the report as files: one HTML page and, if wanted, its figures as PNG."""
 
 from __future__ import annotations
 
@@ -19,10 +16,7 @@ from .plates import drawn_plates, png_files
 
 
 def render_report(evidence: Evidence) -> str:
-    """
-    Make a certificate for whoever writes it: the HTML document.
-
-    """
+    """Make a certificate for whoever writes it: the HTML document."""
     return render_page(evidence, drawn_plates(evidence))
 
 

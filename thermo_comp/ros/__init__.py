@@ -2,5 +2,4 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns everything that touches ROS: the node, its parameters and diagnostics, player and recorder.
-
 """

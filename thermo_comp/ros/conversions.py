@@ -11,7 +11,6 @@ and serialization give. A message that does not fit goes through rclpy, with ide
 CDR of a stamped message: 4 bytes of encapsulation (the second one odd: little endian), int32
 seconds, uint32 nanoseconds, uint32 length of the string with its final NUL, the string, and, at
 the next multiple of 8 counted from the end of the encapsulation, float64 values.
-
 """
 
 from __future__ import annotations
@@ -56,7 +55,6 @@ class _Layout:
     Where a sample of one kind holds its values, and the Imu that it becomes.
 
     What is passed on, of an Imu, begins at `passed`; 0 for counts.
-
     """
 
     unpack: Callable[[bytes], tuple[Any, ...]]
@@ -167,10 +165,7 @@ class SampleConverter:
         return layout.write(data, sec, nanosec, result)
 
     def _layout_of(self, data: bytes) -> _Layout | None:
-        """
-        Look up, or learn and check, where this message holds its values.
-
-        """
+        """Look up, or learn and check, where this message holds its values."""
         if len(data) < 16:
             return None
         order = '<' if data[1] & 1 else '>'
@@ -185,10 +180,7 @@ class SampleConverter:
         return self._layouts[key]
 
     def _learn(self, data: bytes, order: str, length: int) -> _Layout | None:
-        """
-        Build the layout of this message; None if rclpy reads or writes anything else.
-
-        """
+        """Build the layout of this message; None if rclpy reads or writes anything else."""
         is_imu = self._message_type is Imu
         padding = -(12 + length) % 8
         skip = 8 * _PASSED if is_imu else 0
@@ -201,13 +193,7 @@ class SampleConverter:
         imu = Struct(f'<4siI{len(head)}s{8 * _PASSED}s12d')
         start = 16 + length + padding
         layout = _Layout(
-            pattern.unpack,
-            data[:4],
-            name,
-            imu.pack,
-            head,
-            start if is_imu else 0,
-            order == '>',
+            pattern.unpack, data[:4], name, imu.pack, head, start if is_imu else 0, order == '>'
         )
         try:
             sec, nanosec, _, *values = pattern.unpack(data)[1:]
@@ -225,10 +211,7 @@ class SampleConverter:
         return layout if is_read and is_written else None
 
     def _convert_message(self, data: bytes, process: Process) -> bytes | None:
-        """
-        Take the ordinary way, for what no layout fits.
-
-        """
+        """Take the ordinary way, for what no layout fits."""
         if len(data) > _LONGEST_MESSAGE:
             self.n_malformed += 1
             return None
@@ -245,10 +228,7 @@ class SampleConverter:
         return self._write_message(message, result)
 
     def _write_message(self, message: Any, result: tuple[float, ...]) -> bytes:
-        """
-        Write the Imu through rclpy; an Imu message is changed on the way.
-
-        """
+        """Write the Imu through rclpy; an Imu message is changed on the way."""
         if self._message_type is Imu:
             imu = message
         else:

@@ -6,7 +6,6 @@ Owns what the node says about itself: the compensator's status as a `DiagnosticS
 The level follows one rule. ERROR: nothing good goes out, or samples are saturated. WARN: what goes
 out is worse than the calibration promises. OK: the rest. The message names every reason, the worst
 first; the key values hold the figures.
-
 """
 
 from __future__ import annotations
@@ -36,10 +35,7 @@ _DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """
-    What the node itself counts, beside the compensator's counters.
-
-    """
+    """What the node itself counts, beside the compensator's counters."""
 
     #: Samples that the driver sent and the node did not get.
     n_lost: int = 0
@@ -121,10 +117,6 @@ def build(
     now, before : Snapshot
         The node now and at the last report; differences tell what happened in between.
 
-    Returns
-    -------
-    diagnostic_msgs.msg.DiagnosticStatus
-
     """
     findings = sorted(_findings(loaded, now, before), key=lambda finding: -finding[0])
     return DiagnosticStatus(
@@ -137,10 +129,7 @@ def build(
 
 
 def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
-    """
-    List everything that is not as it should be, with its level.
-
-    """
+    """List everything that is not as it should be, with its level."""
     error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
     status, new = now.status, _since(now.status.counters, before.status.counters)
     found = _input_findings(now, before)
@@ -203,10 +192,7 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> lis
 
 
 def _input_findings(now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
-    """
-    Say what is wrong with those who send, and with the node itself.
-
-    """
+    """Say what is wrong with those who send, and with the node itself."""
     error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
     found: list[tuple[int, str]] = []
     for k, one in enumerate(now.inputs):
@@ -226,10 +212,7 @@ def _input_findings(now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
 
 
 def _sensor_findings(status: CompensatorStatus) -> list[tuple[int, str]]:
-    """
-    Say what is wrong with the thermometers themselves.
-
-    """
+    """Say what is wrong with the thermometers themselves."""
     found = []
     for name, fault, step in (
         ('board', status.board_fault, status.board_step_k),
@@ -263,10 +246,7 @@ def _sensor_findings(status: CompensatorStatus) -> list[tuple[int, str]]:
 
 
 def _sample_findings(status: CompensatorStatus, new: Counters) -> list[tuple[int, str]]:
-    """
-    Say what is wrong with the samples themselves, and with the calibration for them.
-
-    """
+    """Say what is wrong with the samples themselves, and with the calibration for them."""
     error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
     found = []
     if new.n_stuck:
@@ -299,10 +279,7 @@ def _all_well(now: Snapshot) -> str:
 
 
 def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[tuple[str, str]]:
-    """
-    List the figures, in the order in which a reader wants them.
-
-    """
+    """List the figures, in the order in which a reader wants them."""
     status, counters = now.status, now.status.counters
     state = status.state
     values = [('regime', 'unknown' if state is None else _REGIMES[state.regime])]
@@ -374,7 +351,6 @@ def _since(now: Counters, before: Counters) -> Counters:
 def _sample_rate(now: Snapshot, before: Snapshot) -> float | None:
     """
     Return samples per second of data time since the last report; None where it can't be told.
-
     """
     start_ns, end_ns = before.status.stamp_ns, now.status.stamp_ns
     n_new = now.status.counters.n_in - before.status.counters.n_in

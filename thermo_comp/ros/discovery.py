@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns why a publisher that is there is not heard.
-
-"""
+"""Owns why a publisher that is there is not heard."""
 
 from __future__ import annotations
 

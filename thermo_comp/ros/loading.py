@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the step from the parameter `calibration_file` to a calibration that this node may run.
-
-"""
+"""Owns the step from the parameter `calibration_file` to a calibration that this node may run."""
 
 from __future__ import annotations
 

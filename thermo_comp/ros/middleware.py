@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what the node asks of Fast DDS beyond QoS: a profile, unless the user has one.
-
-"""
+"""Owns what the node asks of Fast DDS beyond QoS: a profile, unless the user has one."""
 
 from __future__ import annotations
 
@@ -23,7 +20,6 @@ def use_profile() -> None:
 
     To be called before the first context is initialised: Fast DDS reads it once. The profile saves
     a quarter of the node's CPU time with reliable subscribers (docs/benchmarks.md).
-
     """
     if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
         os.environ[VARIABLE] = str(PROFILE)

@@ -5,7 +5,6 @@ Owns the node `thermo_comp`: samples and temperatures in, specific force, flag a
 
 It publishes what the offline replay of a bag of the same messages writes, bit for bit. Parameters
 are checked when they are set and change what runs between two wake-ups.
-
 """
 
 from __future__ import annotations
@@ -56,9 +55,7 @@ SAMPLE_QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 TEMPERATURE_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 FLAG_QOS = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 DIAGNOSTICS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -113,10 +110,7 @@ class CompensationNode:
         self._say_calibration()
 
     def _build(self) -> None:
-        """
-        Make all that runs on the ROS node.
-
-        """
+        """Make all that runs on the ROS node."""
         self._config = parameters.declare(self.node)
         self._loaded = load(self._config)
         self._compensator = Compensator(
@@ -150,34 +144,22 @@ class CompensationNode:
                 self._log.warning(f'there is no parameter `{name}`, it has no effect')
 
     def run(self) -> None:
-        """
-        Serve until shutdown or a signal.
-
-        """
+        """Serve until shutdown or a signal."""
         self._loop.run(self._relay.on_data)
 
     def stop(self) -> None:
-        """
-        Make `run` return; callable from any thread.
-
-        """
+        """Make `run` return; callable from any thread."""
         self._loop.stop()
 
     def close(self) -> None:
-        """
-        Destroy the node.
-
-        """
+        """Destroy the node."""
         self._requests.close()
         self._reader.close()
         self._loop.close()
         self.node.destroy_node()
 
     def _open_topics(self) -> Relay:
-        """
-        Create the subscriptions and publishers, and what connects them.
-
-        """
+        """Create the subscriptions and publishers, and what connects them."""
         overridable, compensator = QoSOverridingOptions.with_default_policies(), self._compensator
         samples = self._open_samples(self._config)
         self._thermometers = compensator.thermal.inputs
@@ -249,10 +231,7 @@ class CompensationNode:
         return Input(name, subscription.topic_name, n_publishers, reason)
 
     def _report(self) -> None:
-        """
-        Publish diagnostics; log when the level changes.
-
-        """
+        """Publish diagnostics; log when the level changes."""
         self._count_lost()
         if self._compensator.counters.n_in != self._reported.status.counters.n_in:
             self._last_samples = time.monotonic()
@@ -278,7 +257,6 @@ class CompensationNode:
     def _count_lost(self) -> None:
         """
         Count gaps in the driver's numbering, which mean something only while there is one driver.
-
         """
         samples = self._relay.samples
         n_lost, samples.n_lost = samples.n_lost, 0
@@ -287,10 +265,7 @@ class CompensationNode:
             self._n_lost += n_lost
 
     def _prepare(self, changes: list[Parameter]) -> LoadedCalibration | None:
-        """
-        Read the calibration that a change asks for, beside the samples.
-
-        """
+        """Read the calibration that a change asks for, beside the samples."""
         names = [one.value for one in changes if one.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
@@ -299,10 +274,7 @@ class CompensationNode:
     def _set(
         self, changes: list[Parameter], loaded: LoadedCalibration | None
     ) -> SetParametersResult:
-        """
-        Set what was prepared, between two samples.
-
-        """
+        """Set what was prepared, between two samples."""
         self._read = loaded
         try:
             return self.node.set_parameters_atomically(changes)
@@ -310,10 +282,7 @@ class CompensationNode:
             self._read = None
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
-        """
-        Check a change as a whole and keep what was made on the way.
-
-        """
+        """Check a change as a whole and keep what was made on the way."""
         samples = self._relay.samples
         # A topic that is opened below declares parameters of its own and comes here again.
         loaded, self._read = self._read or self._loaded, None
@@ -331,10 +300,7 @@ class CompensationNode:
         return SetParametersResult(successful=True)
 
     def _post_set(self, _changes: list[Parameter]) -> None:
-        """
-        Apply what `_on_set` checked.
-
-        """
+        """Apply what `_on_set` checked."""
         before, relay = self._config, self._relay
         config, loaded, samples = self._prepared
         if loaded is not self._loaded:

@@ -5,7 +5,6 @@ Owns the node's parameters: one table gives types, defaults, ranges, descriptors
 
 The table is `NodeConfig` itself, a frozen dataclass: what the node runs with at any moment is one
 such object, and a change makes another one or is refused as a whole.
-
 """
 
 from __future__ import annotations
@@ -26,11 +25,7 @@ from .conversions import LONGEST_FRAME
 
 _DEFAULTS = CompensatorConfig()
 
-_TYPES = {
-    str: Parameter.Type.STRING,
-    float: Parameter.Type.DOUBLE,
-    int: Parameter.Type.INTEGER,
-}
+_TYPES = {str: Parameter.Type.STRING, float: Parameter.Type.DOUBLE, int: Parameter.Type.INTEGER}
 
 
 def _parameter(
@@ -128,10 +123,7 @@ class NodeConfig:
     diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
 
     def compensator_config(self) -> CompensatorConfig:
-        """
-        Return the part that the compensator takes.
-
-        """
+        """Return the part that the compensator takes."""
         return CompensatorConfig(
             transition_time_s=self.transition_time,
             temperature_timeout_s=self.temperature_timeout,
@@ -146,10 +138,7 @@ _TABLE: Mapping[str, Field[Any]] = {entry.name: entry for entry in fields(NodeCo
 
 
 class ParameterError(ThermoCompError):
-    """
-    A parameter value that the node can't take; names the parameter, the rule and the value.
-
-    """
+    """A parameter value that the node can't take; names the parameter, the rule and the value."""
 
 
 def declare(node: Node) -> NodeConfig:
@@ -308,10 +297,7 @@ def parameters_help() -> str:
 
 
 def _checked(name: str, value: Any) -> Any:
-    """
-    Return a value in its parameter's type; ParameterError where it does not fit.
-
-    """
+    """Return a value in its parameter's type; ParameterError where it does not fit."""
     entry = _TABLE[name]
     if isinstance(entry.default, str):
         if not isinstance(value, str):

@@ -12,7 +12,6 @@ has acknowledged them, so no more than that is ever under way, which fits into t
 transport, and none is overwritten before it has arrived. Fast DDS asks for acknowledgement with
 every message only while the publisher's history is full, and otherwise every 3 s; hence the small
 histories, which transient-local durability keeps full.
-
 """
 
 from __future__ import annotations
@@ -59,10 +58,7 @@ _ACCEL = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompen
 
 @dataclass(slots=True)
 class PlayReport:
-    """
-    What a player did.
-
-    """
+    """What a player did."""
 
     #: Messages sent, by the topic's full name.
     n_messages: dict[str, int] = field(default_factory=dict)
@@ -155,10 +151,7 @@ def play(
 
 
 class _Player:
-    """
-    A node with the publishers of one bag.
-
-    """
+    """A node with the publishers of one bag."""
 
     def __init__(
         self,
@@ -191,10 +184,7 @@ class _Player:
     def wait_for_subscribers(
         self, wait_s: float, is_found: Callable[[Node, Collection[Role]], bool] | None
     ) -> None:
-        """
-        Wait until every topic has a subscriber which knows of it, or for so long.
-
-        """
+        """Wait until every topic has a subscriber which knows of it, or for so long."""
         deadline = time.monotonic() + wait_s
         while any(self._unheard()) and time.monotonic() < deadline:
             time.sleep(min(NAP, 0.02))
@@ -218,10 +208,7 @@ class _Player:
         return [one for one in self._publishers.values() if not one.get_subscription_count()]
 
     def play_once(self, progress: Callable[[float], None] | None) -> None:
-        """
-        Send the whole bag.
-
-        """
+        """Send the whole bag."""
         start_wall = time.monotonic()
         start_ns: int | None = None
         n_before = sum(self._n_sent.values())
@@ -242,10 +229,7 @@ class _Player:
                 progress(min(1.0, (sum(self._n_sent.values()) - n_before) / max(1, self._total)))
 
     def finish(self) -> PlayReport:
-        """
-        Wait until everything has arrived and account for it.
-
-        """
+        """Wait until everything has arrived and account for it."""
         for role in self._publishers:
             self._await_acknowledgement(role)
         self._report.duration_s = time.monotonic() - self._started
@@ -255,10 +239,7 @@ class _Player:
         return self._report
 
     def _pace(self, start_wall: float, start_ns: int, log_ns: int) -> None:
-        """
-        Sleep until a message is due; tell the time meanwhile.
-
-        """
+        """Sleep until a message is due; tell the time meanwhile."""
         due = start_wall + (log_ns - start_ns) * 1e-9 / self._rate
         while True:
             now = time.monotonic()
@@ -297,10 +278,7 @@ def _qos(depth: int) -> QoSProfile:
 
 
 def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, Role, bytes]]:
-    """
-    Serialize a block's messages in the order of the bag: log time, role, bytes.
-
-    """
+    """Serialize a block's messages in the order of the bag: log time, role, bytes."""
     columns: list[tuple[Role, Any, Any, Iterator[bytes]]] = [
         ('board', block.board_log_ns, block.board_after - 0.5, _readings(block, 'board', topics)),
         ('case', block.case_log_ns, block.case_after - 0.5, _readings(block, 'case', topics)),

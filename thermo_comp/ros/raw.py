@@ -6,7 +6,6 @@ conversion of messages.
 
 Beyond the documented API: the methods `take_message`, `get_publisher_count` and `publish_raw` of
 the handles; `test/test_waitloop.py` fails when any of them changes.
-
 """
 
 from __future__ import annotations

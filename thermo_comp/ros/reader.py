@@ -5,7 +5,6 @@ Owns the reading of calibrations beside the samples, in a process of its own.
 
 A parser holds the interpreter for milliseconds at a time, which no thread can help; and whatever
 a file makes of its reader, the node only hears that it has ended.
-
 """
 
 from __future__ import annotations
@@ -93,7 +92,6 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
 def _allowed(name: str, directory: str) -> Path:
     """
     Resolve a path, symbolic links included; CalibrationError where it leads out of the directory.
-
     """
     path = Path(name).expanduser()
     if not directory:
@@ -107,19 +105,13 @@ def _allowed(name: str, directory: str) -> Path:
 
 
 class Reader:
-    """
-    A process that reads calibrations, begun when the first is asked for.
-
-    """
+    """A process that reads calibrations, begun when the first is asked for."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
     def read(self, name: str, directory: str) -> LoadedCalibration:
-        """
-        Do what the function `read` does, there.
-
-        """
+        """Do what the function `read` does, there."""
         process = self._process = self._process or _start()
         questions, answers = cast('IO[bytes]', process.stdin), cast('IO[bytes]', process.stdout)
         try:
@@ -137,10 +129,7 @@ class Reader:
         return answer
 
     def close(self) -> None:
-        """
-        End the process.
-
-        """
+        """End the process."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()
@@ -150,10 +139,7 @@ class Reader:
 
 
 def serve() -> None:
-    """
-    Read what the process is asked for, until nobody can ask any more.
-
-    """
+    """Read what the process is asked for, until nobody can ask any more."""
     os.nice(NICENESS)
     with suppress(EOFError, BrokenPipeError):
         while True:

@@ -6,7 +6,6 @@ Owns the recorder of the node's output: live topics into a bag that any rosbag2 
 The bag's log time is the stamp of an Imu, and for anything else the newest such stamp before it,
 as in what `replay` writes; so a bag that was played faster than real time is recorded in its own
 time, whatever the clock on the wall says meanwhile.
-
 """
 
 from __future__ import annotations
@@ -82,10 +81,7 @@ class Recorder:
         self._early: dict[str, list[bytes]] = {}
 
     def __enter__(self) -> Recorder:
-        """
-        Start recording.
-
-        """
+        """Start recording."""
         self._writer = BagWriter(self._path, overwrite=self._overwrite)
         self._context = Context()
         rclpy.init(args=['--ros-args', *self._ros_args], context=self._context)
@@ -105,10 +101,7 @@ class Recorder:
         _error: BaseException | None,
         _trace: TracebackType | None,
     ) -> None:
-        """
-        Stop; finish the bag, or drop it after an error.
-
-        """
+        """Stop; finish the bag, or drop it after an error."""
         self._loop.stop()
         self._thread.join()
         self._loop.close()
@@ -123,10 +116,7 @@ class Recorder:
 
     @property
     def counts(self) -> dict[str, int]:
-        """
-        Messages recorded so far, by the relative topic name.
-
-        """
+        """Messages recorded so far, by the relative topic name."""
         with self._changed:
             return dict(self._counts)
 
@@ -203,10 +193,7 @@ class Recorder:
         self._take()
 
     def _take(self) -> None:
-        """
-        Write what has arrived, until that fails.
-
-        """
+        """Write what has arrived, until that fails."""
         if self._failure is None:
             try:
                 self._write()

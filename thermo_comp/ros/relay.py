@@ -8,7 +8,6 @@ order of arrival. So it does not matter how the wake-ups fell.
 
 An input has one source. A message does not tell whose it is, so while there are two nothing of
 that input is used, nor the first messages after it, which may still be of the one that left.
-
 """
 
 from __future__ import annotations
@@ -94,17 +93,11 @@ class Relay:
 
     @property
     def inputs(self) -> list[RawSubscription]:
-        """
-        The samples and the readings, in the order in which they were given.
-
-        """
+        """The samples and the readings, in the order in which they were given."""
         return [self.samples, *[subscription for subscription, _ in self._temperatures]]
 
     def on_data(self) -> None:
-        """
-        Work through everything that has arrived.
-
-        """
+        """Work through everything that has arrived."""
         messages, received_ns = self.samples.drain(is_paced=True)
         for subscription, push in self._temperatures:
             readings, read_ns = subscription.drain()
@@ -119,7 +112,6 @@ class Relay:
     def _is_of_one(self, subscription: RawSubscription, n: int) -> bool:
         """
         Tell whether messages are of an input's only publisher; count them where they are not.
-
         """
         is_contested = subscription.count_publishers() > 1
         if not (is_contested or self._contested):
@@ -168,10 +160,7 @@ class Relay:
                 self._readings.append((received, stamp_ns, celsius, push))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """
-        Relay up to the last reading that came before the last sample; return the rest.
-
-        """
+        """Relay up to the last reading that came before the last sample; return the rest."""
         start = 0
         later: list[_Reading] = []
         for reading in sorted(self._readings, key=lambda one: one[0]):
@@ -206,10 +195,7 @@ class Relay:
             self.n_flags += 1
 
     def _count_unpublished(self) -> None:
-        """
-        Go on after a message that the middleware did not take, but not after the shutdown.
-
-        """
+        """Go on after a message that the middleware did not take, but not after the shutdown."""
         if not self._node.context.ok():
             raise ExternalShutdownException
         self.n_unpublished += 1

@@ -7,7 +7,6 @@ rclpy serves such a request in one go, in the thread of the samples, and a reque
 read ends the node. Here a thread of its own waits for what takes time, the reading of a file; what
 is left for the loop is to exchange one reference. Requests are answered in the order in which they
 came, whatever is wrong with them.
-
 """
 
 from __future__ import annotations
@@ -38,10 +37,7 @@ Apply = Callable[[list[Parameter], Any], SetParametersResult]
 
 
 class RequestError(ThermoCompError):
-    """
-    A request that cannot be taken, whatever it asks for.
-
-    """
+    """A request that cannot be taken, whatever it asks for."""
 
 
 class ParameterRequests:
@@ -74,10 +70,7 @@ class ParameterRequests:
                 loop.serve(service, self._set_together)
 
     def close(self) -> None:
-        """
-        Finish what is being prepared; nothing is applied any more.
-
-        """
+        """Finish what is being prepared; nothing is applied any more."""
         self._waiting.put(None)
         self._thread.join()
 
@@ -98,10 +91,7 @@ class ParameterRequests:
         groups: list[list[ParameterMessage]],
         respond: Callable[[list[SetParametersResult]], None],
     ) -> None:
-        """
-        Let a request wait for its turn.
-
-        """
+        """Let a request wait for its turn."""
         n = sum(len(group) for group in groups)
         try:
             if n > PARAMETERS_LIMIT:
@@ -112,10 +102,7 @@ class ParameterRequests:
             respond([_refusal(reason) for _ in groups])
 
     def _run(self) -> None:
-        """
-        Prepare one request after the other, in the thread.
-
-        """
+        """Prepare one request after the other, in the thread."""
         while (work := self._waiting.get()) is not None:
             work()
 
@@ -137,10 +124,7 @@ class ParameterRequests:
     def _set(
         self, changes: list[Parameter], prepared: Any, results: list[SetParametersResult]
     ) -> None:
-        """
-        Apply one group in the loop's thread; what nobody foresaw is logged there, too.
-
-        """
+        """Apply one group in the loop's thread; what nobody foresaw is logged there, too."""
         try:
             if isinstance(prepared, Exception):
                 raise prepared
@@ -159,7 +143,6 @@ class ParameterRequests:
     def _is_in_force(self, change: Parameter) -> bool:
         """
         Tell whether a change leaves what cannot be set as it is: `param load` of a `param dump`.
-
         """
         node = self._node
         return bool(
@@ -177,10 +160,6 @@ def read_parameter(message: ParameterMessage) -> Parameter:
     ----------
     message : rcl_interfaces.msg.Parameter
         As it came in.
-
-    Returns
-    -------
-    rclpy.parameter.Parameter
 
     Raises
     ------

@@ -7,7 +7,6 @@ Everything on the way is what runs on a robot; only the QoS differs, through the
 for that: subscriptions reliable and without a limit of depth. And the player waits for what comes
 out of the node: a reliable reader that is full lets a sample be sent again, later than the
 temperatures behind it, and the order of arrival would no longer be that of the bag.
-
 """
 
 from __future__ import annotations
@@ -92,10 +91,7 @@ class NodeProcess:
         self._ros_args = ros_args
 
     def __enter__(self) -> NodeProcess:
-        """
-        Start the process.
-
-        """
+        """Start the process."""
         self._folder = tempfile.TemporaryDirectory(prefix='thermo_comp_')
         self._log = Path(self._folder.name, 'log')
         command = [sys.executable, '-m', 'thermo_comp.ros.node', '--ros-args', *self._ros_args]
@@ -109,37 +105,23 @@ class NodeProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """
-        End the process as a launch system does.
-
-        """
+        """End the process as a launch system does."""
         self.stop()
         self._folder.cleanup()
 
     @property
     def is_alive(self) -> bool:
-        """
-        Whether the process still runs.
-
-        """
+        """Whether the process still runs."""
         return self.process.poll() is None
 
     @property
     def said(self) -> str:
-        """
-        What it has written to its standard output and error.
-
-        """
+        """What it has written to its standard output and error."""
         return self._log.read_text(encoding='utf-8', errors='replace').strip()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         """
         Send a signal and wait for the end.
-
-        Parameters
-        ----------
-        number : int, optional
-            The signal.
 
         Returns
         -------
@@ -276,10 +258,7 @@ def _account(recorder: Recorder) -> dict[str, str]:
 
 
 def _is_found(recorder: Recorder, player: Node, roles: Collection[Role]) -> bool:
-    """
-    Tell whether the node has found the player, by what it says itself, and hears it.
-
-    """
+    """Tell whether the node has found the player, by what it says itself, and hears it."""
     account = _account(recorder)
     if any(account.get(_PUBLISHERS[role], '0') == '0' for role in roles):
         return False
@@ -301,7 +280,6 @@ def _is_found(recorder: Recorder, player: Node, roles: Collection[Role]) -> bool
 def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
     """
     Wait until the node has taken all samples and the recorder has all that the node published.
-
     """
     deadline = time.monotonic() + COMPLETION_S
     account: dict[str, str] = {}
@@ -317,10 +295,7 @@ def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
 
 
 class _Throttle:
-    """
-    Makes the player wait for the recorder; what does not come at all counts as dropped.
-
-    """
+    """Makes the player wait for the recorder; what does not come at all counts as dropped."""
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder

@@ -7,7 +7,6 @@ The middleware's own handlers shut the context down from a thread of theirs, und
 using it: seldom, and on a busy machine, that ends in a segmentation fault instead of exit code 0.
 Here the interpreter only notes the signal, whichever thread the system interrupts with it, and
 the loop's thread takes everything down in order.
-
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ class SignalWatch:
 
     To be entered in the main thread. The call comes from another one, so that it also comes while
     the main thread waits in the middleware, where the interpreter runs no handlers.
-
     """
 
     def __init__(self) -> None:
@@ -37,10 +35,7 @@ class SignalWatch:
         self._thread = threading.Thread(target=self._watch, name='signals', daemon=True)
 
     def __enter__(self) -> SignalWatch:
-        """
-        Take the signals over.
-
-        """
+        """Take the signals over."""
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
         self._handlers = {number: signal.signal(number, _noted) for number in SIGNALS}
@@ -54,10 +49,7 @@ class SignalWatch:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """
-        Give the signals back to whom they belonged before.
-
-        """
+        """Give the signals back to whom they belonged before."""
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
@@ -96,7 +88,4 @@ class SignalWatch:
 
 
 def _noted(_number: int, _frame: FrameType | None) -> None:
-    """
-    Stand in for the handler: the interpreter has written the signal's number already.
-
-    """
+    """Stand in for the handler: the interpreter has written the signal's number already."""

@@ -17,7 +17,6 @@ Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), th
 `service_take_request` of a service's handle, `SignalHandlerGuardCondition`, and the node's
 `_parameter_overrides`.
 `test/test_waitloop.py` fails when any of them changes.
-
 """
 
 from __future__ import annotations
@@ -66,7 +65,6 @@ class _Entities:
     """
     A wait set, and what goes into it; the first two guards are those that stop the loop, and the
     first services those that the loop itself serves.
-
     """
 
     wait_set: Any
@@ -75,27 +73,18 @@ class _Entities:
     other_services: range
 
     def fill(self) -> None:
-        """
-        Put everything into the wait set.
-
-        """
+        """Put everything into the wait set."""
         self.wait_set.clear_entities()
         for add, handle in self.content:
             add(handle)
 
     def is_stop_asked(self) -> bool:
-        """
-        Tell whether one of the guards has been triggered.
-
-        """
+        """Tell whether one of the guards has been triggered."""
         is_ready = self.wait_set.is_ready
         return bool(is_ready('guard_condition', 0) or is_ready('guard_condition', 1))
 
     def is_other_ready(self) -> bool:
-        """
-        Tell whether something is ready that the executor serves.
-
-        """
+        """Tell whether something is ready that the executor serves."""
         ready, is_ready = self.wait_set.get_ready_entities, self.wait_set.is_ready
         return bool(
             ready('timer')
@@ -220,10 +209,7 @@ class WaitLoop:
         self._is_stale = True
 
     def call_soon(self, callback: Callable[[], None]) -> None:
-        """
-        Call back in the loop's thread, one callback a wake-up; callable from any thread.
-
-        """
+        """Call back in the loop's thread, one callback a wake-up; callable from any thread."""
         self._soon.append(callback)
         with suppress(InvalidHandle):
             self._look_guard.trigger()
@@ -246,10 +232,7 @@ class WaitLoop:
         self._callback = callback
 
     def stop(self) -> None:
-        """
-        Make `run` return; callable from any thread.
-
-        """
+        """Make `run` return; callable from any thread."""
         self._is_stopping = True
         with suppress(InvalidHandle):
             self._stop_guard.trigger()
@@ -283,10 +266,7 @@ class WaitLoop:
                 raise
 
     def close(self) -> None:
-        """
-        Release the executor and the guard conditions; the node itself stays.
-
-        """
+        """Release the executor and the guard conditions; the node itself stays."""
         self._executor.shutdown()
         self._stop_guard.destroy()
         self._look_guard.destroy()
@@ -295,7 +275,6 @@ class WaitLoop:
     def _collect(self, in_use: ExitStack) -> list[_Entities]:
         """
         Build wait sets: of the hot subscriptions, of what the executor serves, of everything.
-
         """
         node = self._node
         raw = [one.subscription for one in self._raw]
@@ -319,7 +298,6 @@ class WaitLoop:
     def _entities(self, kinds: list[list[Any]], other_subscriptions: range) -> _Entities:
         """
         Build one wait set, for subscriptions, guard conditions, timers, clients and services.
-
         """
         counts = [len(kind) for kind in kinds]
         wait_set = rclpy_implementation.WaitSet(*counts, 0, self._node.context.handle)
@@ -339,10 +317,7 @@ class WaitLoop:
     def _serve(
         self, on_data: Callable[[], None], wait_sets: list[_Entities], rest_ns: int
     ) -> None:
-        """
-        Wait and serve until the entities change or the loop is to stop.
-
-        """
+        """Wait and serve until the entities change or the loop is to stop."""
         hot, others, everything = wait_sets
         wait, is_ready, n_hot = hot.wait_set.wait, hot.wait_set.is_ready, len(self._hot)
         crowd_ns = rest_ns * 3 // 4
@@ -392,10 +367,7 @@ class WaitLoop:
                     time.sleep(left_ns * 1e-9)
 
     def _look_after(self, entities: _Entities) -> None:
-        """
-        Serve one request of each service of this loop, and one other thing that is ready.
-
-        """
+        """Serve one request of each service of this loop, and one other thing that is ready."""
         if entities.is_stop_asked():
             self._is_stopping = True
             return
@@ -408,10 +380,7 @@ class WaitLoop:
             self._is_stale = True
 
     def _guarded(self, callback: Callable[[], None]) -> None:
-        """
-        Call back; samples go on where that fails.
-
-        """
+        """Call back; samples go on where that fails."""
         try:
             callback()
         except ExternalShutdownException:
@@ -422,10 +391,7 @@ class WaitLoop:
             self._note_failure(error)
 
     def _note_failure(self, error: Exception) -> None:
-        """
-        Count an exception, and log it unless another one has just been.
-
-        """
+        """Count an exception, and log it unless another one has just been."""
         self.n_failures += 1
         now = time.monotonic_ns()
         if now - self._logged_ns >= _LOG_PERIOD_NS:
@@ -442,25 +408,16 @@ def _take_request(service: Service, callback: Serve) -> None:
 
 
 def _nothing() -> None:
-    """
-    Stand in for a callback that nobody has asked for.
-
-    """
+    """Stand in for a callback that nobody has asked for."""
 
 
 def _is_event(entity: Any) -> bool:
-    """
-    Leave middleware events to the executor, but neither messages nor requests.
-
-    """
+    """Leave middleware events to the executor, but neither messages nor requests."""
     return not isinstance(entity, Subscription | Service)
 
 
 def _never_called(message: bytes) -> None:
-    """
-    Stand in for the callback that an executor would call.
-
-    """
+    """Stand in for the callback that an executor would call."""
 
 
 def undeclared_overrides(node: Node) -> list[str]:

@@ -13,7 +13,6 @@ Owns the known truth: a unit in a thermal chamber, simulated from the physics up
   white noise, a bias that walks; a charge-balancing converter that carries its remainder.
 
 Nothing here is built from a compensator's regressors, reads a file or a clock.
-
 """
 
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the block's attitudes: well-spread positions, and the handling between them.
-
-"""
+"""Owns the block's attitudes: well-spread positions, and the handling between them."""
 
 from __future__ import annotations
 
@@ -185,11 +182,6 @@ class Attitude:
         ----------
         time : ndarray, shape (m,)
             Seconds from the start of the run.
-
-        Returns
-        -------
-        ndarray of int64, shape (m,)
-            Position, or -1.
 
         """
         passed = np.searchsorted(self.switch_s, time, side='right')

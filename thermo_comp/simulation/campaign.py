@@ -4,7 +4,6 @@
 Owns a whole test in memory: which positions go through which programs, and what they record.
 
 ``arrays(unit_preset('own-lags', 1), plan('chamber-18', 1))`` is 171 h of records in seconds.
-
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ PLAN_NAMES = ('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held
 class Position:
     """
     One position of a test: a name, the chamber's program, the direction of the specific force.
-
     """
 
     name: str
@@ -74,10 +72,7 @@ class Record:
     scale: Floats
 
     def means(self, window_s: float = 60.0) -> Floats:
-        """
-        Return the means of the counts over whole windows, shape (w, 3).
-
-        """
+        """Return the means of the counts over whole windows, shape (w, 3)."""
         per = round(window_s / self.time_s[0])
         n = len(self.counts) // per
         result: Floats = self.counts[: n * per].reshape(n, per, 3).mean(axis=1)
@@ -86,7 +81,6 @@ class Record:
     def corrected_by_truth(self, unit: UnitModel, window_s: float = 60.0) -> Floats:
         """
         Return the specific force that a perfect model makes of the counts, shape (w, 3), m/s^2.
-
         """
         counts, per = self.means(window_s), round(window_s)
         at = slice(0, len(counts) * per)
@@ -216,15 +210,10 @@ def _seconds(stamp_ns: Ints) -> Floats:
 
 
 def _window_means(
-    unit: UnitModel,
-    chamber: Chamber,
-    up: Floats,
-    options: RunOptions,
-    window_s: float,
+    unit: UnitModel, chamber: Chamber, up: Floats, options: RunOptions, window_s: float
 ) -> tuple[Floats, Floats]:
     """
     Return ends and means of whole windows: a window is one long cycle of a converter to match.
-
     """
     per_s, cycles = round(window_s), round(window_s * options.rate_hz)
     n = (len(chamber.bias) - 1) // per_s

@@ -6,7 +6,6 @@ Owns the charge-balancing converter: integer counts per cycle, the remainder car
 The charge left over when a cycle ends stays on the integrator and counts in the next cycle, so the
 sum of the counts follows the integral of the input to within one count for ever. The carry is
 kept in fixed point: a long run loses nothing and blocks of any size give the same counts.
-
 """
 
 from __future__ import annotations
@@ -52,18 +51,12 @@ class Converter:
 
     @property
     def low(self) -> int:
-        """
-        Most negative output, counts.
-
-        """
+        """Most negative output, counts."""
         return -(1 << (self.bits - 1))
 
     @property
     def high(self) -> int:
-        """
-        Most positive output, counts.
-
-        """
+        """Most positive output, counts."""
         return (1 << (self.bits - 1)) - 1
 
     def start(self, seed: int) -> Ints:

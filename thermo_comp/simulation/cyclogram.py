@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the chamber's program: air temperature as ramps and soaks, ready-made, random or typed in.
-
 """
 
 from __future__ import annotations
@@ -67,18 +66,12 @@ class Cyclogram:
 
     @property
     def duration_s(self) -> float:
-        """
-        Length of the program, s.
-
-        """
+        """Length of the program, s."""
         return self.time_s[-1]
 
     @property
     def rates_k_min(self) -> Floats:
-        """
-        Rate of each line between points, shape (n - 1,), K/min; 0 in a soak.
-
-        """
+        """Rate of each line between points, shape (n - 1,), K/min; 0 in a soak."""
         minutes = np.diff(np.array(self.time_s)) / _MINUTE
         rates: Floats = np.diff(np.array(self.temperature_c)) / minutes
         return rates
@@ -142,11 +135,6 @@ def ramps_and_soaks(start: float, soak: float, steps: Sequence[Sequence[float]])
     steps : sequence of (target, rate, soak)
         Target temperature [degC], rate [K/min, its sign is ignored], soak there [minutes].
 
-    Returns
-    -------
-    Cyclogram
-        The program.
-
     Raises
     ------
     ValueError
@@ -187,11 +175,6 @@ def parse_cyclogram(text: str) -> Cyclogram:
     text : str
         The steps, or the name of a preset.
 
-    Returns
-    -------
-    Cyclogram
-        The program.
-
     Raises
     ------
     ValueError
@@ -229,11 +212,6 @@ def cyclogram_preset(name: str) -> Cyclogram:
     ----------
     name : str
         One of `CYCLOGRAM_NAMES`.
-
-    Returns
-    -------
-    Cyclogram
-        The program.
 
     Raises
     ------

@@ -8,7 +8,6 @@ a thermo-EMF or a thermo-elastic stress in the difference between two parts, a c
 joint, a leakage in a die, a load on a supply. Deviations count from the still state in which the
 board's thermometer shows the reference temperature, so bias and scale there are the unit's
 constants.
-
 """
 
 from __future__ import annotations
@@ -48,16 +47,12 @@ class PartHistory:
     step: float
 
     def of(self, part: str) -> Floats:
-        """
-        Return the deviation of one part, shape (m,), K.
-
-        """
+        """Return the deviation of one part, shape (m,), K."""
         return self.deviation[:, self.nodes.index(part)]
 
     def lagged(self, signal: Floats, time_constant: float) -> Floats:
         """
         Return the first-order lag of a signal that is straight on the grid, settled at its start.
-
         """
         kept = np.exp(-self.step / time_constant)
         new = 1.0 - time_constant / self.step * (1.0 - kept)
@@ -90,10 +85,7 @@ class Effect:
         raise NotImplementedError
 
     def change(self, history: PartHistory) -> tuple[Floats, Floats]:
-        """
-        Return the change of the bias [ug] and of the scale [ppm], shape (m, 3).
-
-        """
+        """Return the change of the bias [ug] and of the scale [ppm], shape (m, 3)."""
         first, second = (np.reshape(s, (-1, 1)) for s in self._signals(history))
         bias = first * np.array(self.bias) + second * np.array(self.bias_curvature)
         scale = first * np.array(self.scale) + second * np.array(self.scale_curvature)
@@ -102,10 +94,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class PartEffect(Effect):
-    """
-    Tempco of one part: its deviation [K] and the square of it.
-
-    """
+    """Tempco of one part: its deviation [K] and the square of it."""
 
     part: str
 
@@ -120,7 +109,6 @@ class DifferenceEffect(Effect):
     Stress or voltage between two parts: the difference of their deviations [K] and of the squares.
 
     The squares are those of expansion or Seebeck coefficients that grow with temperature.
-
     """
 
     hot: str
@@ -176,10 +164,7 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class LeakageEffect(Effect):
-    """
-    Leakage of a junction: ``exp(d / growth) - 1`` with the part's deviation `d`.
-
-    """
+    """Leakage of a junction: ``exp(d / growth) - 1`` with the part's deviation `d`."""
 
     part: str
     growth: float
@@ -190,10 +175,7 @@ class LeakageEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """
-    Slow relaxation in a part: follows a quick change of temperature [K], then dies away.
-
-    """
+    """Slow relaxation in a part: follows a quick change of temperature [K], then dies away."""
 
     part: str
     time_constant: float
@@ -210,7 +192,6 @@ class SlipEffect(Effect):
 
     The stress depends on the way, not on the time. It gives way at once at `width` (Jenkins) or
     bit by bit towards it (Dahl, Bouc-Wen); it starts relaxed.
-
     """
 
     part: str
@@ -234,17 +215,13 @@ class SlipEffect(Effect):
 
 @dataclass(frozen=True)
 class DriftModel:
-    """
-    All effects of a unit.
-
-    """
+    """All effects of a unit."""
 
     effects: tuple[Effect, ...] = ()
 
     def evaluate(self, history: PartHistory) -> tuple[Floats, Floats]:
         """
         Return the change of the bias [ug] and the relative change of the scale, shape (m, 3).
-
         """
         bias, ppm = np.zeros((2, len(history.deviation), 3))
         for effect in self.effects:

@@ -6,7 +6,6 @@ Owns the heat paths: lumped parts joined by conductances, self-heating, the ther
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
 parts, then the thermostat's integral and set point; `u` is the air temperature; `p` holds the
 constant powers.
-
 """
 
 from __future__ import annotations
@@ -127,18 +126,12 @@ class ThermalNetwork:
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """
-        Names of the parts in the order of every temperature array.
-
-        """
+        """Names of the parts in the order of every temperature array."""
         return tuple(self.capacity)
 
     @property
     def is_convective(self) -> bool:
-        """
-        Whether a path's flow is no multiple of the difference.
-
-        """
+        """Whether a path's flow is no multiple of the difference."""
         return any(link.exponent != 1.0 for link in self.links)
 
     def system(self) -> tuple[Floats, Floats, Floats]:
@@ -191,7 +184,6 @@ class ThermalNetwork:
     def convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
         """
         Return what convection adds to ``dx/dt`` of one state, and its derivatives by the state.
-
         """
         index = {name: i for i, name in enumerate(self.nodes)}
         flow, slope = np.zeros(len(state)), np.zeros((len(state), len(state)))
@@ -211,10 +203,7 @@ class ThermalNetwork:
         return flow, slope
 
     def settled(self, air: float, drive: Floats) -> Floats:
-        """
-        Return the whole state after an endless soak under a constant drive, shape (k,).
-
-        """
+        """Return the whole state after an endless soak under a constant drive, shape (k,)."""
         A, b, _ = self.system()
         if not self.is_convective:
             return np.asarray(-np.linalg.inv(A) @ (b * air + drive), dtype=np.float64)

@@ -6,7 +6,6 @@ Owns the ready-made units: three instruments, and triads with one kind of physic
 Every seed is another specimen: tempcos, heat paths, misalignment and constants are drawn around
 what such units show. The tables below are physics (watts, joules per kelvin, tempcos of parts);
 nothing in them knows how a compensator would describe the result.
-
 """
 
 from __future__ import annotations
@@ -38,10 +37,7 @@ from .unit import SwitchedLoad, UnitModel
 
 
 class _Specimen:
-    """
-    Draws the constants of one specimen.
-
-    """
+    """Draws the constants of one specimen."""
 
     def __init__(self, name: str, seed: int) -> None:
         self.name = name
@@ -90,10 +86,7 @@ class _Specimen:
         density: float = 5.0,
         **others: Any,
     ) -> UnitModel:
-        """
-        Return the unit, its constants drawn; a quartz one with a charge-balancing converter.
-
-        """
+        """Return the unit, its constants drawn; a quartz one with a charge-balancing converter."""
         K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), others.pop('spread', 0.01))
         bx, by, bz = self.normal(bias_ug)
         parts: dict[str, Any] = {
@@ -154,7 +147,7 @@ def _thermostatted(seed: int) -> UnitModel:
             DifferenceEffect('board', 'reference', bias=draw.normal(3.0)),
             DifferenceEffect('oven', 'head', bias=draw.normal(2.0)),
             CreepEffect('reference', 5.0 * 3600.0, bias=draw.normal(0.02)),
-        ),
+        )
     )
     return draw.unit(network, drift, full_scale_g=11.0, bias_ug=1500.0)
 
@@ -202,7 +195,7 @@ def _bare_quartz(seed: int) -> UnitModel:
             # Stress through the joint to the mounting ring, heavy and slow, bolted to the case.
             DifferenceEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
             CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),
-        ),
+        )
     )
     return draw.unit(network, drift, full_scale_g=11.0, bias_ug=2000.0)
 
@@ -234,7 +227,7 @@ def _mems(seed: int) -> UnitModel:
             ),
             DifferenceEffect('board', 'package', bias=draw.normal(300.0)),
             CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),
-        ),
+        )
     )
     return draw.unit(
         network,
@@ -259,7 +252,6 @@ def _triad(kind: str, seed: int) -> UnitModel:
 
     The heads' tempcos lag with the heads; each kind adds its own. The magnitudes are what such
     errors have: some micro-g per kelvin of bias, tens of ppm per kelvin of scale.
-
     """
     draw = _Specimen(kind, seed)
     heads = [f'head-{axis}' for axis in _AXES] if kind in _OWN_HEADS else ['head']
@@ -427,11 +419,6 @@ def unit_preset(name: str, seed: int = 0) -> UnitModel:
         at all), 'demo' (the sample unit: paper and lags).
     seed : int, optional
         Another specimen for every seed, not negative.
-
-    Returns
-    -------
-    UnitModel
-        The unit.
 
     Raises
     ------

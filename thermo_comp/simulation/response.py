@@ -6,7 +6,6 @@ Owns the heat flow over a program: the network solved exactly, in its modes.
 The air temperature is straight between knots; within such an interval the solution is a straight
 line plus decaying modes, so any instant can be evaluated without integrating up to it. A network
 with convection has no modes and is integrated, interval by interval.
-
 """
 
 from __future__ import annotations
@@ -142,10 +141,7 @@ class ThermalResponse:
         return self._evaluate(time)[0]
 
     def rates(self, time: ArrayLike) -> Floats:
-        """
-        Return the derivative of the whole state, shape (m, k), per second.
-
-        """
+        """Return the derivative of the whole state, shape (m, k), per second."""
         return self._evaluate(time)[1]
 
     def _evaluate(self, time: ArrayLike) -> tuple[Floats, Floats]:

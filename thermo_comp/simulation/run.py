@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns a run: a unit in a chamber over a program, whole or block by block.
-
-"""
+"""Owns a run: a unit in a chamber over a program, whole or block by block."""
 
 from __future__ import annotations
 
@@ -183,10 +180,7 @@ def simulate_blocks(
 
 
 class ThermalTruth:
-    """
-    The temperatures of a run and what they do to bias and scale, on the thermal grid.
-
-    """
+    """The temperatures of a run and what they do to bias and scale, on the thermal grid."""
 
     def __init__(self, unit: UnitModel, cyclogram: Cyclogram, options: RunOptions) -> None:
         knots, air = _knots(cyclogram, options)
@@ -204,12 +198,7 @@ class ThermalTruth:
         self.rates = self.response.rates(self.grid)[:, :n_nodes]
         origin = unit.origin
         bias_ug, scale = unit.drift.evaluate(
-            PartHistory(
-                unit.network.nodes,
-                self.temperatures - origin,
-                origin,
-                options.grid_step,
-            )
+            PartHistory(unit.network.nodes, self.temperatures - origin, origin, options.grid_step)
         )
         self.bias = np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g
         self.scale = 1.0 + scale
@@ -218,7 +207,6 @@ class ThermalTruth:
 class Chamber:
     """
     The whole run prepared: thermal truth on its grid, thermometers read; cycles still to come.
-
     """
 
     def __init__(
@@ -253,10 +241,7 @@ class Chamber:
         )
 
     def blocks(self, block_size: int) -> Iterator[SimulatedRun]:
-        """
-        Return the run in stretches of so many cycles.
-
-        """
+        """Return the run in stretches of so many cycles."""
         unit, options = self._unit, self._options
         seed, rate = options.seed, options.rate_hz
         K = np.array(unit.scale_factor)
@@ -331,10 +316,7 @@ def _knots(cyclogram: Cyclogram, options: RunOptions) -> tuple[Floats, Floats]:
 def _switched(
     unit: UnitModel, knots: Floats, air: Floats, seed: int
 ) -> tuple[Floats, Floats, Floats]:
-    """
-    Return the knots with the switching of the loads among them, and the power between them.
-
-    """
+    """Return the knots with the switching of the loads among them, and the power between them."""
     flips = []
     for number, load in enumerate(unit.loads):
         spells = generator(seed, Stream.LOAD, number).uniform(
@@ -353,7 +335,6 @@ def _switched(
 def _wander(unit: UnitModel, grid: Floats, seed: int) -> Floats:
     """
     Return what the bias does of itself, counts/cycle: another one in each mounting, and a walk.
-
     """
     result = np.zeros((len(grid), 3))
     step_h = grid[1] / 3600.0

@@ -4,7 +4,6 @@
 Owns the random numbers: one independent stream per error source and axis, from one seed.
 
 Switching a source on or off, or asking for other block sizes, leaves every other stream as it was.
-
 """
 
 from __future__ import annotations
@@ -15,10 +14,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """
-    Error sources; the numbers are part of what a seed means and never change.
-
-    """
+    """Error sources; the numbers are part of what a seed means and never change."""
 
     ACCEL_NOISE = 0
     CONVERTER_PHASE = 1

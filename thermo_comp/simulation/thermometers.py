@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the two thermometers as built: rate, noise, quantum, offset, outliers and gaps.
-
-"""
+"""Owns the two thermometers as built: rate, noise, quantum, offset, outliers and gaps."""
 
 from __future__ import annotations
 

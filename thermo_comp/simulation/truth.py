@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns what a run leaves behind: the recorded columns, and the truth on the grid and at each cycle.
-
 """
 
 from __future__ import annotations
@@ -62,18 +61,12 @@ class Truth:
 
     @property
     def bias(self) -> Floats:
-        """
-        Bias of each cycle, shape (n, 3), counts/cycle.
-
-        """
+        """Bias of each cycle, shape (n, 3), counts/cycle."""
         return _on_cycles(self.bias_grid, self.grid_s, self.cycle_s)
 
     @property
     def scale(self) -> Floats:
-        """
-        Scale of each cycle relative to the one at the reference temperature, shape (n, 3).
-
-        """
+        """Scale of each cycle relative to the one at the reference temperature, shape (n, 3)."""
         return _on_cycles(self.scale_grid, self.grid_s, self.cycle_s)
 
     def temperature(self, node: str) -> Floats:
@@ -124,10 +117,7 @@ class SimulatedRun:
 
     @property
     def is_saturated(self) -> Bools:
-        """
-        Cycles with an axis at its rail, shape (n,).
-
-        """
+        """Cycles with an axis at its rail, shape (n,)."""
         converter = self.truth.unit.converter
         at_rail = (self.counts <= converter.low) | (self.counts >= converter.high)
         return np.asarray(np.any(at_rail, axis=1))

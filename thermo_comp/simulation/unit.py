@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the simulated instrument: its parts, its drift, its converter and its thermometers.
-
-"""
+"""Owns the simulated instrument: its parts, its drift, its converter and its thermometers."""
 
 from __future__ import annotations
 
@@ -101,25 +98,18 @@ class UnitModel:
 
     @property
     def counts_per_micro_g(self) -> Floats:
-        """
-        What a micro-g is per axis, shape (3,), counts/cycle.
-
-        """
+        """What a micro-g is per axis, shape (3,), counts/cycle."""
         return np.array(self.scale_factor) * MICRO_G
 
     @property
     def M(self) -> Floats:
-        """
-        Misalignment matrix, shape (3, 3).
-
-        """
+        """Misalignment matrix, shape (3, 3)."""
         return np.array(self.misalignment)
 
     @property
     def origin(self) -> Floats:
         """
         Temperatures of the parts in the still state of the reference, shape (n_parts,), degC.
-
         """
         air = self.network.air_for(self.board.node, self.reference_temperature)
         return self.network.equilibrium(air)
@@ -206,17 +196,11 @@ class UnitModel:
         )
 
     def without_noise(self) -> UnitModel:
-        """
-        Return the unit with no white noise on the axes and the thermometers.
-
-        """
+        """Return the unit with no white noise on the axes and the thermometers."""
         return replace(self.with_thermometers(noise_sd=0.0), noise_density=ZERO)
 
     def without_drift(self) -> UnitModel:
-        """
-        Return the unit with bias and scale that do not depend on temperature.
-
-        """
+        """Return the unit with bias and scale that do not depend on temperature."""
         return replace(self, drift=DriftModel())
 
 

@@ -6,7 +6,6 @@ Owns the thermal memory: lags of the board, lags of the neighbours' gradients, p
 A lag L of an input u obeys ``dL/dt = (u - L) / tau``. Kept is ``m = u - L``; with u linear between
 two readings (first-order hold) its exact step over dt is
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
-
 """
 
 from __future__ import annotations
@@ -87,17 +86,11 @@ class MemorySpec:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """
-        The board and the sensors, in the order of their lags.
-
-        """
+        """The board and the sensors, in the order of their lags."""
         return (BOARD_INPUT, *self.sensors)
 
     def taus(self, name: str) -> tuple[float, ...]:
-        """
-        Return the time constants of the lags of one input [s].
-
-        """
+        """Return the time constants of the lags of one input [s]."""
         return tuple(tau for owner, tau in self.lags if owner == name)
 
 
@@ -158,10 +151,7 @@ class LagBank:
         self.forget()
 
     def forget(self) -> None:
-        """
-        Forget the input: what comes next is the first.
-
-        """
+        """Forget the input: what comes next is the first."""
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
@@ -221,10 +211,7 @@ class LagBank:
         self.extra = result
 
     def note_jump(self, change: float) -> None:
-        """
-        Doubt the lags by a change of the input that was none.
-
-        """
+        """Doubt the lags by a change of the input that was none."""
         if self.taus:
             self.has_extra = True
             self.extra = [variance + change * change for variance in self.extra]
@@ -270,10 +257,7 @@ class LagBank:
         return lagging, [v * e * e for v, e in zip(self.extra, decays, strict=True)]
 
     def start_shares(self, stamp_ns: int) -> list[float]:
-        """
-        Say what is left at a stamp of each lag's start, 1 to 0.
-
-        """
+        """Say what is left at a stamp of each lag's start, 1 to 0."""
         start_ns = self.start_ns
         age = 0.0 if start_ns is None else max(stamp_ns - start_ns, 0) * 1e-9
         return [math.exp(-age / tau) for tau in self.taus]
@@ -316,10 +300,7 @@ class ThermalMemory:
         ]
 
     def forget(self) -> None:
-        """
-        Forget everything.
-
-        """
+        """Forget everything."""
         self.board.forget()
         for bank in self.neighbours:
             bank.forget()
@@ -327,29 +308,20 @@ class ThermalMemory:
             plays.forget()
 
     def board_step(self, stamp_ns: int, board: float) -> None:
-        """
-        Take the next estimate of the board temperature [degC].
-
-        """
+        """Take the next estimate of the board temperature [degC]."""
         bank = self.board
         bank.step(stamp_ns, board)
         for place, plays in self._plays:
             plays.step(board if place < 0 else board - bank.lagging[place])
 
     def note_jump(self, change: float) -> None:
-        """
-        Doubt everything by a change of the board temperature that was none.
-
-        """
+        """Doubt everything by a change of the board temperature that was none."""
         self.board.note_jump(change)
         for bank in self.neighbours:
             bank.note_jump(change)
 
     def at(self, stamp_ns: int, board: float, gradients: list[float]) -> list[float]:
-        """
-        Give (lag [K], extra variance [K^2]) per lag, then each play less its input [K].
-
-        """
+        """Give (lag [K], extra variance [K^2]) per lag, then each play less its input [K]."""
         lagging, variances = self.board.at(stamp_ns, board)
         values, extra = lagging, variances
         for bank, gradient in zip(self.neighbours, gradients, strict=True):
@@ -365,10 +337,7 @@ class ThermalMemory:
         return result
 
     def start_shares(self, stamp_ns: int) -> list[float]:
-        """
-        Say what is left at a stamp of each lag's start, 1 to 0, in the order of the spec.
-
-        """
+        """Say what is left at a stamp of each lag's start, 1 to 0, in the order of the spec."""
         result = self.board.start_shares(stamp_ns)
         for bank in self.neighbours:
             result = result + bank.start_shares(stamp_ns)
@@ -415,10 +384,7 @@ def memory_on_grid(
 
 
 def _recursion(decay: float, driven: Floats) -> Floats:
-    """
-    ``m[k] = decay m[k - 1] + driven[k]``, by doubling: stretches of 2^j steps at a time.
-
-    """
+    """``m[k] = decay m[k - 1] + driven[k]``, by doubling: stretches of 2^j steps at a time."""
     result: Floats = driven.copy()
     shift, factor = 1, decay
     while shift < len(result) and factor > _FADED:

@@ -4,7 +4,6 @@
 Owns the arithmetic of one mode of the thermometer: predict, correct and blend its state.
 
 Plain floats, written out: a matrix library costs more per call than all of this together.
-
 """
 
 from __future__ import annotations

@@ -64,11 +64,7 @@ class OnsetTest:
     """
 
     def __init__(
-        self,
-        sensor: ThermometerSettings,
-        smallest_rate: float,
-        ripple: float,
-        false_alarms: float,
+        self, sensor: ThermometerSettings, smallest_rate: float, ripple: float, false_alarms: float
     ) -> None:
         self._largest_swing = 0.5 * smallest_rate
         self._largest_baseline = LARGEST_BASELINE * smallest_rate
@@ -93,10 +89,7 @@ class OnsetTest:
         self.reset()
 
     def reset(self) -> None:
-        """
-        Forget everything.
-
-        """
+        """Forget everything."""
         self._stamp_ns: int | None = None
         self._n_restarts = -1
         self._filters: list[tuple[float, float, float, float, float]] = []
@@ -138,11 +131,6 @@ class OnsetTest:
     def is_following(self, stamp_ns: int) -> bool:
         """
         Tell whether `rate` is that of the reading with this stamp.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            The stamp, ns.
 
         Returns
         -------
@@ -229,10 +217,7 @@ class OnsetTest:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """
-        Set the thresholds, squared and relative to a filter's own variance of the rate.
-
-        """
+        """Set the thresholds, squared and relative to a filter's own variance of the rate."""
         self._dt = dt
         self._thresholds = []
         squared = 1.0
@@ -302,7 +287,6 @@ class OnsetTest:
     def _follow(self, rate: float, dt: float) -> None:
         """
         Let the baseline follow what the rate has been over a while, at most a swing per memory.
-
         """
         baseline, doubt = self._baseline, self._doubt
         limit = self.swing + doubt
@@ -320,10 +304,7 @@ class OnsetTest:
         self._doubt = doubt - share * doubt
 
     def _learn_swing(self, dt: float) -> None:
-        """
-        Learn how far the rate swings about its trend, from two quick half swings in a row.
-
-        """
+        """Learn how far the rate swings about its trend, from two quick half swings in a row."""
         rate = self.rate
         trend = self._trend
         self._trend = trend = trend + dt / (dt + self._baseline_s) * (rate - trend)

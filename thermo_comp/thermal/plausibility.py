@@ -7,7 +7,6 @@ A board has a heat capacity, so its temperature takes no step. A thermometer has
 readings do not stand still, least of all while the other thermometer moves. The case is nearer to
 the surroundings than the board, so it leads in a ramp. A sensor that breaks such a rule is
 doubted: its readings are left out, or the variance grows by what may be wrong with them.
-
 """
 
 from __future__ import annotations
@@ -52,10 +51,7 @@ _SIGMAS: Final = 6.0
 
 
 class Fault(Enum):
-    """
-    What is wrong with a sensor; values are the words of the diagnostics.
-
-    """
+    """What is wrong with a sensor; values are the words of the diagnostics."""
 
     NONE = 'none'
     #: Its readings are the same to the bit for too long: they count, with a growing variance.
@@ -111,10 +107,7 @@ class SensorGuard:
         self.reset()
 
     def reset(self) -> None:
-        """
-        Forget the past.
-
-        """
+        """Forget the past."""
         self.fault = Fault.NONE
         self.step = 0.0
         self.is_revived = False
@@ -187,7 +180,6 @@ class SensorGuard:
     def watch_other(self) -> None:
         """
         Note how the other sensor has moved since this one last changed; call after its readings.
-
         """
         other = self._other
         now_ns = other.stamp_ns
@@ -227,7 +219,6 @@ class SensorGuard:
     def note_jump(self, stamp_ns: int, change: float) -> None:
         """
         Note that the sensor has begun anew elsewhere: was it wrong before, or is it wrong now?
-
         """
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
@@ -239,17 +230,11 @@ class SensorGuard:
 
     @property
     def is_doubtful(self) -> bool:
-        """
-        Whether `doubt` may give anything but 0.
-
-        """
+        """Whether `doubt` may give anything but 0."""
         return self._n_same >= self._n_doubtful or self._jumped > _SMALLEST_DOUBT
 
     def doubt(self, stamp_ns: int) -> float:
-        """
-        Return the variance that comes to the temperature's: standstills and jumps [K^2].
-
-        """
+        """Return the variance that comes to the temperature's: standstills and jumps [K^2]."""
         doubt = self._jump_at(stamp_ns)
         changed_ns = self.own.changed_ns
         if changed_ns is None or self._n_same < self._n_doubtful:
@@ -314,20 +299,14 @@ class LeadWatch:
         self.reset()
 
     def reset(self) -> None:
-        """
-        Forget the calm and the ramps.
-
-        """
+        """Forget the calm and the ramps."""
         self.is_reversed = False
         self.doubt = 0.0
         self._calm: tuple[float, float] | None = None
         self._n_for = self._n_against = 0
 
     def update(self, is_static: bool) -> None:
-        """
-        Take both sensors' last estimates; call after a reading of the case.
-
-        """
+        """Take both sensors' last estimates; call after a reading of the case."""
         case, board = self._case, self._board
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):

@@ -5,7 +5,6 @@ Owns play operators, the parts of which rate-independent hysteresis is made.
 
 A play of half-width r follows its input v only where that pushes it:
 ``P = min(max(P, v - r), v + r)``.
-
 """
 
 from __future__ import annotations
@@ -27,17 +26,11 @@ class Plays:
         self._held: list[float] = []
 
     def forget(self) -> None:
-        """
-        Begin anew with the next input, in the middle of every play.
-
-        """
+        """Begin anew with the next input, in the middle of every play."""
         self._held = []
 
     def step(self, v: float) -> None:
-        """
-        Take the next value of the input.
-
-        """
+        """Take the next value of the input."""
         held = self._held
         if not held:
             self._held = [v] * len(self.widths)
@@ -48,10 +41,7 @@ class Plays:
         ]
 
     def at(self, v: float) -> list[float]:
-        """
-        Give each play less its input, for a value that is not remembered.
-
-        """
+        """Give each play less its input, for a value that is not remembered."""
         if not self._held:
             return [0.0] * len(self.widths)
         result = []

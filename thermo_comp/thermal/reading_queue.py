@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the readings that wait for the sample at which they take effect, in the order of their stamps.
-
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ class ReadingQueue:
     Readings by stamp; of equal stamps the board first, then by arrival.
 
     So the detector, which the case reading wakes, decides with the newest of both.
-
     """
 
     def __init__(self) -> None:
@@ -43,17 +41,13 @@ class ReadingQueue:
 
     @property
     def next_ns(self) -> int:
-        """
-        Stamp of the first reading; later than any where none waits.
-
-        """
+        """Stamp of the first reading; later than any where none waits."""
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, stamp_ns: int, kind: int, celsius: float) -> int:
         """
         Add a reading; return how many were refused: this one where too many wait, or those that
         wait with stamps which this one shows to be of another clock.
-
         """
         n_before = len(self._entries)
         last_ns, self._last_ns[kind] = self._last_ns.get(kind, -NEVER_NS), stamp_ns
@@ -69,34 +63,22 @@ class ReadingQueue:
         return n_refused
 
     def due(self, stamp_ns: int) -> Iterator[Entry]:
-        """
-        Take the readings up to a stamp, one by one.
-
-        """
+        """Take the readings up to a stamp, one by one."""
         while self._entries and self._entries[0][0] <= stamp_ns:
             yield heapq.heappop(self._entries)
 
     def drop_after(self, stamp_ns: int) -> None:
-        """
-        Drop the readings beyond a stamp.
-
-        """
+        """Drop the readings beyond a stamp."""
         self._entries = [entry for entry in self._entries if entry[0] <= stamp_ns]
         heapq.heapify(self._entries)
 
     def take(self) -> list[Entry]:
-        """
-        Take all readings, in no order.
-
-        """
+        """Take all readings, in no order."""
         entries, self._entries = self._entries, []
         return entries
 
     def ahead(self, stamp_ns: int) -> float:
-        """
-        Say how far the farthest reading lies beyond a stamp [s]; 0 if none waits.
-
-        """
+        """Say how far the farthest reading lies beyond a stamp [s]; 0 if none waits."""
         if not self._entries:
             return 0.0
         return (max(entry[0] for entry in self._entries) - stamp_ns) * 1e-9

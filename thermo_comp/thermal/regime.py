@@ -33,10 +33,7 @@ FIRST_READINGS: Final = 20  # until a noise declared too small is known
 
 
 class Regime(IntEnum):
-    """
-    What the surroundings do to the unit; values are those of the paper's S.
-
-    """
+    """What the surroundings do to the unit; values are those of the paper's S."""
 
     UNKNOWN = -1
     STATIC = 0
@@ -81,10 +78,7 @@ class RegimeDetector:
         self.reset()
 
     def reset(self) -> None:
-        """
-        Back to unknown, as after time has jumped back.
-
-        """
+        """Back to unknown, as after time has jumped back."""
         self.regime = Regime.UNKNOWN
         self.direction = 0
         self.switched_ns: int | None = None
@@ -178,7 +172,6 @@ class RegimeDetector:
     def _turn(self, stamp_ns: int, direction: int) -> None:
         """
         Follow the direction once it has lasted: a reading that is held makes the rate a staircase.
-
         """
         if direction == self.direction or not direction:
             self._turning_ns = None
@@ -206,7 +199,6 @@ class _CalmTest:
     Is the rate of one sensor surely below the relaxed rate, now and half a lag ahead?
 
     Ahead: a rate that moves away from its mean over the last quarter of a lag will go on to do so.
-
     """
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
@@ -229,10 +221,7 @@ class _CalmTest:
     def update(
         self, stamp_ns: int, sensor: Thermometer | None, onset: OnsetTest, lead_swing: float
     ) -> bool:
-        """
-        Follow the rate of the sensor; a lost or stale one has no say.
-
-        """
+        """Follow the rate of the sensor; a lost or stale one has no say."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True
@@ -264,10 +253,7 @@ class _CalmTest:
 
 
 def _obvious(sensor: Thermometer, rate: float) -> int:
-    """
-    Sign of the rate if it is surely beyond a limit, otherwise 0.
-
-    """
+    """Sign of the rate if it is surely beyond a limit, otherwise 0."""
     margin = abs(sensor.rate) - rate
     if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
         return 1 if sensor.rate > 0.0 else -1

@@ -4,7 +4,6 @@
 Owns the settings of thermometers, detector and tracker: what is known of a unit beforehand.
 
 They travel in calibrations and to a fleet's workers.
-
 """
 
 from __future__ import annotations
@@ -74,10 +73,7 @@ class ThermometerSettings:
     lag_s: float = 600.0
 
     def __post_init__(self) -> None:
-        """
-        Refuse values that no sensor has.
-
-        """
+        """Refuse values that no sensor has."""
         refuse_outside(
             self,
             positive=('noise_sd_c', 'fastest_ramp_k_min', 'lag_s'),
@@ -86,18 +82,12 @@ class ThermometerSettings:
 
     @property
     def has_cells(self) -> bool:
-        """
-        Whether the quantum exceeds the noise so far that a reading is a cell, not a value.
-
-        """
+        """Whether the quantum exceeds the noise so far that a reading is a cell, not a value."""
         return self.quantum_c > CELL_SIGMAS * self.noise_sd_c
 
     @property
     def has_wide_cells(self) -> bool:
-        """
-        Whether a cell is so wide that noise alone never carries a reading across it.
-
-        """
+        """Whether a cell is so wide that noise alone never carries a reading across it."""
         return self.quantum_c > WIDE_CELL_SIGMAS * self.noise_sd_c
 
 
@@ -138,10 +128,7 @@ class DetectorSettings:
     board: ThermometerSettings = field(default_factory=ThermometerSettings)
 
     def __post_init__(self) -> None:
-        """
-        Refuse values that contradict each other.
-
-        """
+        """Refuse values that contradict each other."""
         refuse_outside(
             self,
             positive=('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'),
@@ -184,10 +171,7 @@ class ThermalConfig:
     temperature_timeout_s: float = 60.0
 
     def __post_init__(self) -> None:
-        """
-        Refuse values that mean nothing.
-
-        """
+        """Refuse values that mean nothing."""
         refuse_outside(
             self,
             positive=('case_timeout_s', 'board_lag_s', 'temperature_timeout_s'),

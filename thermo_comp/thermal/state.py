@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the thermal state of a unit at one stamp: by name, and as the flat tuple of a sample.
-
-"""
+"""Owns the thermal state of a unit at one stamp: by name, and as the flat tuple of a sample."""
 
 from __future__ import annotations
 
@@ -18,15 +15,7 @@ MEMORY_SETTLED_SD: Final = 0.05
 
 #: Layout of `ThermalTracker.sample`: from `GRADIENT` on (gradient, variance) per sensor, then
 #: (lag, extra variance) per lag, then each play less its input (`Layout` says where).
-(
-    BOARD,
-    VAR_BOARD,
-    RATE,
-    WEIGHT,
-    UNKNOWN,
-    GRADIENT,
-    VAR_GRADIENT,
-) = range(7)
+(BOARD, VAR_BOARD, RATE, WEIGHT, UNKNOWN, GRADIENT, VAR_GRADIENT) = range(7)
 
 
 class Layout:
@@ -62,10 +51,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class ThermalState:
-    """
-    The thermal state at one stamp.
-
-    """
+    """The thermal state at one stamp."""
 
     #: Board temperature [degC], its variance [K^2] and its rate [K/s].
     board: float
@@ -88,16 +74,10 @@ class ThermalState:
 
     @property
     def gradient(self) -> float:
-        """
-        Gradient of the leading sensor [K].
-
-        """
+        """Gradient of the leading sensor [K]."""
         return next(iter(self.gradients.values()))
 
     @property
     def is_settled(self) -> bool:
-        """
-        Whether the memory has forgotten that its start was not seen.
-
-        """
+        """Whether the memory has forgotten that its start was not seen."""
         return all(variance < MEMORY_SETTLED_SD**2 for variance in self.var_lags)

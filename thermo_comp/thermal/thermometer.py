@@ -45,11 +45,6 @@ class Thermometer:
     """
     Causal estimate of one sensor's temperature and its first two derivatives.
 
-    Parameters
-    ----------
-    settings : ThermometerSettings
-        The sensor.
-
     Attributes
     ----------
     stamp_ns : int or None
@@ -101,10 +96,7 @@ class Thermometer:
         self.reset()
 
     def reset(self) -> None:
-        """
-        Forget the readings, as after time has jumped back; what was counted or learnt stays.
-
-        """
+        """Forget the readings, as after time has jumped back; what was counted or learnt stays."""
         self.stamp_ns: int | None = None
         self.changed_ns: int | None = None
         self.reading = nan
@@ -227,13 +219,9 @@ class Thermometer:
         self._quiet = quiet
         self._bent = bent
         self.bending = bending
-        (
-            self.temperature,
-            self.rate,
-            self.var_temperature,
-            self._covariance,
-            self.var_rate,
-        ) = merge(quiet, bent, bending)
+        (self.temperature, self.rate, self.var_temperature, self._covariance, self.var_rate) = (
+            merge(quiet, bent, bending)
+        )
         self.measured = measured
         self.measured_variance = noise
         if reading_c != self.reading:
@@ -251,11 +239,6 @@ class Thermometer:
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
         """
         Extrapolate to a stamp, linearly within a few reading intervals, held beyond them.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            The stamp, ns.
 
         Returns
         -------
@@ -282,10 +265,7 @@ class Thermometer:
         return self.temperature + dt * rate, rate, variance + unknown
 
     def beyond(self, stamp_ns: int) -> float:
-        """
-        Say how far a stamp lies beyond what is extrapolated to [s]; 0 within.
-
-        """
+        """Say how far a stamp lies beyond what is extrapolated to [s]; 0 within."""
         if self.stamp_ns is None or not self.is_ready:
             return 0.0
         ahead = (stamp_ns - self.stamp_ns) * 1e-9
@@ -293,28 +273,19 @@ class Thermometer:
 
     @property
     def acceleration(self) -> float:
-        """
-        Estimate of the second derivative [K/s^2].
-
-        """
+        """Estimate of the second derivative [K/s^2]."""
         return blend(self._quiet, self._bent, self.bending)[2]
 
     @property
     def var_acceleration(self) -> float:
-        """
-        Variance of the second derivative [K^2/s^4].
-
-        """
+        """Variance of the second derivative [K^2/s^4]."""
         if self.stamp_ns is None:
             return inf
         return blend(self._quiet, self._bent, self.bending)[8]
 
     @property
     def noise_factor(self) -> float:
-        """
-        Noise found / noise declared, at least 1.
-
-        """
+        """Noise found / noise declared, at least 1."""
         return sqrt(self._noise_scale)
 
     def _start(self, stamp_ns: int, reading_c: float) -> None:
@@ -336,7 +307,6 @@ class Thermometer:
     ) -> tuple[float, float]:
         """
         Turn a quantized reading into the Gaussian measurement of the temperature it amounts to.
-
         """
         half = 0.5 * self._quantum
         noise = self._noise

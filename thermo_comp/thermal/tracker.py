@@ -6,7 +6,6 @@ Owns the thermal state of a unit at any stamp: its thermometers, regime, memory,
 The compensator, the fit and the report all run this one class, so a regressor means the same
 when it is fitted as when it is applied. It is causal and has no clock: readings go in by stamp,
 a state comes out for a stamp. What it remembers is `memory`'s.
-
 """
 
 from __future__ import annotations
@@ -18,16 +17,7 @@ from .memory import BOARD_INPUT, MemorySpec, ThermalMemory, start_covariance
 from .plausibility import Fault, LeadWatch, SensorGuard
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
-from .state import (
-    BOARD,
-    GRADIENT,
-    RATE,
-    VAR_BOARD,
-    VAR_GRADIENT,
-    WEIGHT,
-    Layout,
-    ThermalState,
-)
+from .state import BOARD, GRADIENT, RATE, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout, ThermalState
 from .thermometer import Thermometer
 
 #: While a sensor is lost its gradient is guessed from the board's rate, this well.
@@ -93,10 +83,7 @@ class ThermalTracker:
         self._target = 0.0
 
     def reset(self) -> None:
-        """
-        Forget everything: time has jumped, or a new recording begins.
-
-        """
+        """Forget everything: time has jumped, or a new recording begins."""
         self.board.reset()
         for sensor in self.sensors:
             sensor.reset()
@@ -108,10 +95,7 @@ class ThermalTracker:
         self._clear()
 
     def reconfigure(self, config: ThermalConfig, stamp_ns: int | None) -> None:
-        """
-        Take over another configuration from a stamp on, without a step in the weight.
-
-        """
+        """Take over another configuration from a stamp on, without a step in the weight."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
@@ -119,10 +103,7 @@ class ThermalTracker:
         self._board_guard.lag_s = config.board_lag_s
 
     def is_live(self, stamp_ns: int, place: int = 0) -> bool:
-        """
-        Whether a sensor, the leading one by default, is there and fresh enough at a stamp.
-
-        """
+        """Whether a sensor, the leading one by default, is there and fresh enough at a stamp."""
         seen = self.sensors[place].stamp_ns
         return seen is not None and (stamp_ns - seen) * 1e-9 <= self._case_timeout_s
 
@@ -184,10 +165,7 @@ class ThermalTracker:
         return True
 
     def _guess_gradients(self, stamp_ns: int) -> None:
-        """
-        Let the lags of a gradient go on while its sensor is lost.
-
-        """
+        """Let the lags of a gradient go on while its sensor is lost."""
         for place, bank in enumerate(self.memory.neighbours):
             if bank.taus and bank.stamp_ns is not None and not self.is_live(stamp_ns, place):
                 gradient, variance = self._lost_gradient(stamp_ns, self.board.rate)
@@ -230,7 +208,6 @@ class ThermalTracker:
     def _may_begin_anew(guard: SensorGuard, stamp_ns: int, patience_s: float) -> bool:
         """
         Let a sensor begin again that has stayed where it cannot have come to for long enough.
-
         """
         seen_ns = guard.own.stamp_ns
         if guard.fault != Fault.STEP or seen_ns is None:
@@ -268,10 +245,7 @@ class ThermalTracker:
         return (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s
 
     def weight_at(self, stamp_ns: int) -> float:
-        """
-        Weight of the dynamic set at a stamp, moving linearly over the transition time.
-
-        """
+        """Weight of the dynamic set at a stamp, moving linearly over the transition time."""
         if self._weight == self._target:
             return self._target
         duration = self.config.transition_time_s
@@ -335,10 +309,7 @@ class ThermalTracker:
             state[VAR_BOARD] += self.lead.doubt
 
     def _lost_gradient(self, stamp_ns: int, rate: float) -> tuple[float, float]:
-        """
-        Guess a gradient from the board's rate, while its sensor is lost.
-
-        """
+        """Guess a gradient from the board's rate, while its sensor is lost."""
         lag = self.config.board_lag_s
         gradient = lag * rate
         # Nor has anybody seen what the case did since the board was last read.
@@ -353,16 +324,6 @@ class ThermalTracker:
     def state_at(self, stamp_ns: int) -> ThermalState:
         """
         Thermal state at a stamp, with names.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            The stamp.
-
-        Returns
-        -------
-        ThermalState
-            The state.
 
         Raises
         ------

@@ -14,7 +14,6 @@ Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
     x_i   = (N_i - bias) / scale
     f     = M x
-
 """
 
 from __future__ import annotations
@@ -47,10 +46,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Unit:
-    """
-    What is calibrated, and in which unit it speaks.
-
-    """
+    """What is calibrated, and in which unit it speaks."""
 
     serial: Annotated[
         str,
@@ -72,10 +68,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class AxisReference:
-    """
-    One axis at the reference temperature.
-
-    """
+    """One axis at the reference temperature."""
 
     scale_factor: Annotated[float, 'K: input units per m/s^2 at the reference temperature.']
     bias: Annotated[float, 'dNs(0): zero offset at the reference, in input units.']
@@ -87,10 +80,7 @@ class AxisReference:
 
 @dataclass(frozen=True)
 class Axes:
-    """
-    The three axes at the reference temperature.
-
-    """
+    """The three axes at the reference temperature."""
 
     x: AxisReference
     y: AxisReference
@@ -99,10 +89,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class AxisSet:
-    """
-    The curves of one axis in one regime (method section 3: items 2 to 4).
-
-    """
+    """The curves of one axis in one regime (method section 3: items 2 to 4)."""
 
     bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
     scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
@@ -128,7 +115,6 @@ class RegimeSet:
     The coefficient set of one regime, with the ranges over which it was fitted.
 
     Outside a range the regressor is held at the range's edge and the covariance grows.
-
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Board temperature [degC].']
@@ -144,19 +130,13 @@ class RegimeSet:
                 raise ValueError(f'`{name}` must be [lower, upper] with lower < upper')
 
     def axes(self) -> tuple[AxisSet, AxisSet, AxisSet]:
-        """
-        Return the three axes in order.
-
-        """
+        """Return the three axes in order."""
         return self.x, self.y, self.z
 
 
 @dataclass(frozen=True)
 class ResponseTerm(Column):
-    """
-    A column of the thermal response with its weights on the three axes.
-
-    """
+    """A column of the thermal response with its weights on the three axes."""
 
     bias: Annotated[Vector, 'Input units per unit of the column.'] = field(kw_only=True)
     scale: Annotated[Vector, 'Relative, per unit of the column.'] = field(kw_only=True)
@@ -164,10 +144,7 @@ class ResponseTerm(Column):
 
 @dataclass(frozen=True)
 class GroupEvidence:
-    """
-    What one group of columns is worth to the data it was fitted on.
-
-    """
+    """What one group of columns is worth to the data it was fitted on."""
 
     group: Annotated[str, 'The group, as in `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Which of the two it corrects.']
@@ -181,10 +158,7 @@ class GroupEvidence:
 
 @dataclass(frozen=True)
 class Source:
-    """
-    One bag that the calibration was fitted on.
-
-    """
+    """One bag that the calibration was fitted on."""
 
     name: str
     sha256: str = ''
@@ -193,10 +167,7 @@ class Source:
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """
-    |g| error of one section of the fitted data, before and after.
-
-    """
+    """|g| error of one section of the fitted data, before and after."""
 
     section: str
     n_windows: int
@@ -207,10 +178,7 @@ class ResidualSummary:
 
 @dataclass(frozen=True)
 class Provenance:
-    """
-    Where the numbers come from.
-
-    """
+    """Where the numbers come from."""
 
     created: str = ''
     tool_version: str = ''
@@ -334,10 +302,7 @@ class Calibration:
                 )
 
     def _smallest_scale(self, regime: str, regime_set: RegimeSet, axis: int) -> float:
-        """
-        Lower bound of the relative scale over a set's ranges, every term at its worst.
-
-        """
+        """Lower bound of the relative scale over a set's ranges, every term at its worst."""
         reference = self.reference_temperature_c
         lower, upper = (edge - reference for edge in regime_set.temperature_range_c)
         result, _ = extreme_values(regime_set.axes()[axis].scale_function, lower, upper)
@@ -354,17 +319,13 @@ class Calibration:
         return result if math.isfinite(result) else -math.inf
 
     def regime_sets(self) -> tuple[RegimeSet, RegimeSet]:
-        """
-        Return the static and the dynamic set.
-
-        """
+        """Return the static and the dynamic set."""
         return self.static, self.dynamic
 
     @property
     def has_uncertainty(self) -> bool:
         """
         Whether the calibration says anything of how well it is known; else it claims nothing.
-
         """
         return (
             self.posterior is not None

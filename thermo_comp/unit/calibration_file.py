@@ -6,7 +6,6 @@ Owns the calibration file: YAML to a validated Calibration and back, and its JSO
 The reader takes any bytes at all and answers with a Calibration or a CalibrationError that names
 the file and the key: size, nesting and the YAML features it accepts are bounded before anything
 is built (no aliases, so no alias bombs; no tags, so no objects; no duplicate keys).
-
 """
 
 from __future__ import annotations
@@ -172,24 +171,15 @@ def save_calibration(
 
 
 def calibration_schema() -> dict[str, Any]:
-    """
-    Return the JSON Schema of the calibration file.
-
-    """
-    return {
-        '$schema': 'https://json-schema.org/draft/2020-12/schema',
-        **json_schema(Calibration),
-    }
+    """Return the JSON Schema of the calibration file."""
+    return {'$schema': 'https://json-schema.org/draft/2020-12/schema', **json_schema(Calibration)}
 
 
 _BASE: type[yaml.SafeDumper] = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 class _Dumper(_BASE):  # type: ignore[valid-type, misc]
-    """
-    Writes every number so that this reader and any YAML 1.1 reader see the same float.
-
-    """
+    """Writes every number so that this reader and any YAML 1.1 reader see the same float."""
 
     def ignore_aliases(self, _data: Any) -> bool:
         return True

@@ -27,7 +27,6 @@ and t at those of the calibrated temperatures. The groups of the bank are its ki
 
 This is the one table of columns: tracker, fit, correction, covariance and file take theirs from
 here, so that another regressor is an entry of `bank` and, if it is of a new kind, of `_value`.
-
 """
 
 from __future__ import annotations
@@ -104,18 +103,12 @@ class Column:
 
     @property
     def is_of_gradient(self) -> bool:
-        """
-        Whether the value is made of the present gradient of `sensor`.
-
-        """
+        """Whether the value is made of the present gradient of `sensor`."""
         return self.kind in ('now', 'even', 'size') or (self.kind == 'square' and not self.tau_s)
 
     @property
     def lag(self) -> tuple[str, float] | None:
-        """
-        Which lag of the memory the value is, or follows: input and time constant [s].
-
-        """
+        """Which lag of the memory the value is, or follows: input and time constant [s]."""
         if self.kind == 'neighbour':
             return self.sensor, self.tau_s
         return (BOARD_INPUT, self.tau_s) if self.tau_s and self.kind != 'even' else None
@@ -277,18 +270,12 @@ class ColumnTable:
         self._sources = list(sources)
 
     def raw(self, state: Sequence[Number]) -> list[Number]:
-        """
-        Evaluate u of each column, not held.
-
-        """
+        """Evaluate u of each column, not held."""
         found = [_value(bend, state[place], width) for bend, place, width in self._sources]
         return [found[source] for source, _, _, _, _ in self._plan]
 
     def held(self, raw: Sequence[Number]) -> list[Number]:
-        """
-        Hold what `raw` gives at the edges of the columns' ranges.
-
-        """
+        """Hold what `raw` gives at the edges of the columns' ranges."""
         return [
             hold(u, lower, upper)
             for u, (_, lower, upper, _, _) in zip(raw, self._plan, strict=True)
@@ -297,10 +284,7 @@ class ColumnTable:
     def excess(
         self, raw: Sequence[Number], held: Sequence[Number], nil: Number, which: Iterable[int]
     ) -> Number:
-        """
-        Say how far the farthest of some columns lies outside its range, in half ranges.
-
-        """
+        """Say how far the farthest of some columns lies outside its range, in half ranges."""
         result = nil
         for k in which:
             _, lower, upper, _, _ = self._plan[k]
@@ -312,16 +296,12 @@ class ColumnTable:
         return result
 
     def values(self, state: Sequence[Number]) -> list[Number]:
-        """
-        Evaluate phi of each column.
-
-        """
+        """Evaluate phi of each column."""
         return self.weighted(self.held(self.raw(state)), state[BOARD], state[WEIGHT])
 
     def weighted(self, factors: Sequence[Number], board: Number, weight: Number) -> list[Number]:
         """
         Multiply a number per column by its power of t and share of its regime; u held makes phi.
-
         """
         powers = self._powers(board)
         rest = 1.0 - weight
@@ -382,10 +362,7 @@ class ColumnTable:
         return self.weighted(inner, board, weight), outer
 
     def _powers(self, board: Number) -> list[Number]:
-        """
-        Raise t to the powers that occur; that of 0 is not used.
-
-        """
+        """Raise t to the powers that occur; that of 0 is not used."""
         t = hold(board - self._reference, *self._t_range)
         powers = [t, t]
         for _ in range(1, self._n_powers):
@@ -394,10 +371,7 @@ class ColumnTable:
 
 
 def _place(column: Column, layout: Layout) -> int:
-    """
-    Find the number of a sample that a column is made of.
-
-    """
+    """Find the number of a sample that a column is made of."""
     if column.kind == 'rate':
         return RATE
     if column.kind == 'play':
@@ -425,10 +399,7 @@ def _sign(x: Number) -> Number:
 
 
 def _tanh(x: Number) -> Number:
-    """
-    Hyperbolic tangent with the same bits for a float and for an array of them.
-
-    """
+    """Hyperbolic tangent with the same bits for a float and for an array of them."""
     if isinstance(x, np.ndarray):
         return np.array([math.tanh(v) for v in x.ravel().tolist()]).reshape(x.shape)
     return math.tanh(x)

@@ -7,7 +7,6 @@ Written once for one float and for arrays of knots, with the same operations in 
 so a stream and a batch get the same bits. Notation as in `calibration`; x is the axis' specific
 force before the misalignment, its error variance is ``v(x) = a + b x + c x^2``. Its part that
 changes slowly is `uncertainty`'s, and comes in ready.
-
 """
 
 from __future__ import annotations
@@ -17,15 +16,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..thermal.state import (
-    BOARD,
-    GRADIENT,
-    UNKNOWN,
-    VAR_BOARD,
-    VAR_GRADIENT,
-    WEIGHT,
-    Layout,
-)
+from ..thermal.state import BOARD, GRADIENT, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
 from .curves import SetCurves
@@ -79,10 +70,7 @@ class Correction:
         self.memory = memory_of(response, calibration.sensors)
         lower, upper = zip(*self._edges, strict=True)
         self.table = ColumnTable(
-            response,
-            self.memory,
-            calibration.reference_temperature_c,
-            (min(lower), max(upper)),
+            response, self.memory, calibration.reference_temperature_c, (min(lower), max(upper))
         )
         self._weights = [Weights(response, axis) for axis in range(3)]
         self._sensitivities = [Sensitivity(response, axis, self.memory) for axis in range(3)]
@@ -156,10 +144,7 @@ class Correction:
         return min(max(given_s, needed), LONGEST_TRANSITION * given_s)
 
     def _largest_gap(self) -> float:
-        """
-        Bound what the two sets differ by at rest [m/s^2].
-
-        """
+        """Bound what the two sets differ by at rest [m/s^2]."""
         lower, upper = zip(*self._edges, strict=True)
         board = np.linspace(min(lower), max(upper), _GAP_TEMPERATURES)
         square, relative = np.zeros_like(board), np.zeros_like(board)
@@ -169,10 +154,7 @@ class Correction:
         return float(np.max(np.sqrt(square) + self._gravity * relative))
 
     def _gaps(self, board: Number) -> list[tuple[Number, Number]]:
-        """
-        Give what the sets differ by at a board temperature: bias / K and relative scale.
-
-        """
+        """Give what the sets differ by at a board temperature: bias / K and relative scale."""
         static, dynamic = self.static.values(board), self.dynamic.values(board)
         return [
             ((bias_d - bias_s) / K, scale_d - scale_s)
@@ -184,7 +166,6 @@ class Correction:
     def relative_excess(self, state: Sequence[Number]) -> Number:
         """
         Say how far a thermal state lies outside the calibrated ranges, in half ranges; 0 inside.
-
         """
         weight = state[WEIGHT]
         raw = self.table.raw(state)
@@ -196,7 +177,6 @@ class Correction:
     def gradient_excess(self, state: Sequence[float]) -> float:
         """
         Say how far the gradients lie outside the calibrated ranges, the farthest, signed [K].
-
         """
         raw = self.table.raw(state)
         over = [0.0]
@@ -282,10 +262,7 @@ class Correction:
     def _with_response(
         self, gaps: list[tuple[Number, Number]], state: Sequence[Number], held: Sequence[Number]
     ) -> list[tuple[Number, Number]]:
-        """
-        Add what the columns that belong to one regime make of the difference of the sets.
-
-        """
+        """Add what the columns that belong to one regime make of the difference of the sets."""
         nil = state[WEIGHT] * 0.0
         of_static = self.table.weighted(held, state[BOARD], nil)
         of_dynamic = self.table.weighted(held, state[BOARD], nil + 1.0)
@@ -300,10 +277,7 @@ class Correction:
 def _with(
     a: Number, b: Number, c: Number, variance: Number, bias: Number, scale: Number
 ) -> tuple[Number, Number, Number]:
-    """
-    Add what an error makes of v(x) that moves the axis by ``bias + scale x`` per unit.
-
-    """
+    """Add what an error makes of v(x) that moves the axis by ``bias + scale x`` per unit."""
     return (
         a + variance * bias * bias,
         b + 2.0 * variance * bias * scale,

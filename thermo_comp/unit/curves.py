@@ -4,7 +4,6 @@
 Owns the curves of one regime: what its set makes of the board temperature alone.
 
 Written once for one float and for arrays, as `correction` says.
-
 """
 
 from __future__ import annotations
@@ -18,10 +17,7 @@ from .functions import Number, hold
 
 
 class Excess(NamedTuple, Generic[Number]):
-    """
-    How far a thermal state lies outside the ranges of a set; 0 inside.
-
-    """
+    """How far a thermal state lies outside the ranges of a set; 0 inside."""
 
     #: [K] and [K/s], signed.
     temperature: Number
@@ -65,10 +61,7 @@ class SetCurves:
         return lower - self._reference, upper - self._reference
 
     def excess(self, state: Sequence[Number]) -> Excess[Number]:
-        """
-        Say how far outside the set's ranges a thermal state lies.
-
-        """
+        """Say how far outside the set's ranges a thermal state lies."""
         t, rate = state[BOARD] - self._reference, state[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         return Excess(
@@ -80,7 +73,6 @@ class SetCurves:
     def values(self, board: Number) -> list[tuple[Number, Number]]:
         """
         Evaluate (bias [input units], relative scale) of each axis at a board temperature [degC].
-
         """
         t = board - self._reference
         held = hold(t, *self._t_range)
@@ -101,18 +93,12 @@ class SetCurves:
         return result
 
     def slopes(self, board: Number) -> list[tuple[Number, Number]]:
-        """
-        Differentiate what `values` gives, by the board temperature [per K].
-
-        """
+        """Differentiate what `values` gives, by the board temperature [per K]."""
         t = hold(board - self._reference, *self._t_range)
         return [(one.bias_function.slope(t), one.scale_function.slope(t)) for one in self._sets]
 
     def bases(self, board: float) -> list[tuple[list[float], list[float]]]:
-        """
-        Give the regressors of each axis' free coefficients, of bias and of relative scale.
-
-        """
+        """Give the regressors of each axis' free coefficients, of bias and of relative scale."""
         t = hold(board - self._reference, *self._t_range)
         return [(one.bias_function.basis(t), one.scale_function.basis(t)) for one in self._sets]
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the extreme values that a function of temperature takes over a range.
-
-"""
+"""Owns the extreme values that a function of temperature takes over a range."""
 
 from __future__ import annotations
 
@@ -50,10 +47,7 @@ def extreme_values(
 
 
 def _extremes(function: Polynomial, lower: float, upper: float) -> Floats:
-    """
-    Find where a polynomial can have its extremes inside a range.
-
-    """
+    """Find where a polynomial can have its extremes inside a range."""
     reach = max(abs(lower), abs(upper), 1.0)
     slope = [power * c for power, c in enumerate(function.coefficients)][1:]
     # A term that cannot move the function by 1e-12 anywhere in the range moves no extreme either,

@@ -8,7 +8,6 @@ same bits for both: only ``+ - * /`` in a fixed order are used, and `math.exp` e
 element. Each is linear in its free coefficients, so `basis` gives both the regressors of the
 fit and the derivatives that carry the parameter covariance (Eq. (9) and (10) of the paper, which
 asks for polynomials, splines and exponentials).
-
 """
 
 from __future__ import annotations
@@ -33,10 +32,7 @@ _FARTHEST_KNOT = 2000.0
 
 
 def hold(value: Number, lower: float, upper: float) -> Number:
-    """
-    Hold a value at the edges of a range, given in its unit.
-
-    """
+    """Hold a value at the edges of a range, given in its unit."""
     if isinstance(value, np.ndarray):
         return np.minimum(np.maximum(value, lower), upper)
     return lower if value < lower else upper if value > upper else value
@@ -70,52 +66,34 @@ class Polynomial:
 
     @property
     def n_free(self) -> int:
-        """
-        Number of free coefficients: all but the value at the reference.
-
-        """
+        """Number of free coefficients: all but the value at the reference."""
         return len(self.coefficients) - 1
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """
-        The free coefficients, in the order of `basis`.
-
-        """
+        """The free coefficients, in the order of `basis`."""
         return self.coefficients[1:]
 
     def with_free(self, values: tuple[float, ...]) -> Polynomial:
-        """
-        Return the same function with other free coefficients.
-
-        """
+        """Return the same function with other free coefficients."""
         return replace(self, coefficients=(self.coefficients[0], *values))
 
     def value(self, t: Number) -> Number:
-        """
-        Evaluate at `t` [K].
-
-        """
+        """Evaluate at `t` [K]."""
         result = t * 0.0 + self.coefficients[-1]
         for coefficient in reversed(self.coefficients[:-1]):
             result = result * t + coefficient
         return result
 
     def slope(self, t: Number) -> Number:
-        """
-        Evaluate the derivative at `t`, per K.
-
-        """
+        """Evaluate the derivative at `t`, per K."""
         result = t * 0.0
         for power in range(len(self.coefficients) - 1, 0, -1):
             result = result * t + power * self.coefficients[power]
         return result
 
     def basis(self, t: Number) -> list[Number]:
-        """
-        Evaluate the derivatives with respect to the free coefficients: t, t^2, ...
-
-        """
+        """Evaluate the derivatives with respect to the free coefficients: t, t^2, ..."""
         result: list[Number] = []
         power = t
         for _ in range(self.n_free):
@@ -169,26 +147,17 @@ class CubicSpline:
 
     @property
     def n_free(self) -> int:
-        """
-        Number of free coefficients: the values at all knots but the reference.
-
-        """
+        """Number of free coefficients: the values at all knots but the reference."""
         return len(self.values) - 1
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """
-        The free coefficients, in the order of `basis`.
-
-        """
+        """The free coefficients, in the order of `basis`."""
         at = self.knots_k.index(0.0)
         return self.values[:at] + self.values[at + 1 :]
 
     def with_free(self, values: tuple[float, ...]) -> CubicSpline:
-        """
-        Return the same knots with other free values.
-
-        """
+        """Return the same knots with other free values."""
         at = self.knots_k.index(0.0)
         return replace(self, values=(*values[:at], self.values[at], *values[at:]))
 
@@ -206,24 +175,15 @@ class CubicSpline:
         return result
 
     def value(self, t: Number) -> Number:
-        """
-        Evaluate at `t` [K].
-
-        """
+        """Evaluate at `t` [K]."""
         return self._evaluate(self._pieces, t, _cubic)
 
     def slope(self, t: Number) -> Number:
-        """
-        Evaluate the derivative at `t`, per K.
-
-        """
+        """Evaluate the derivative at `t`, per K."""
         return self._evaluate(self._pieces, t, _cubic_slope)
 
     def basis(self, t: Number) -> list[Number]:
-        """
-        Evaluate the derivatives with respect to the free values: the cardinal splines.
-
-        """
+        """Evaluate the derivatives with respect to the free values: the cardinal splines."""
         return [self._evaluate(pieces, t, _cubic) for pieces in self._cardinal_pieces]
 
     def _evaluate(
@@ -291,53 +251,35 @@ class Exponential:
 
     @property
     def n_free(self) -> int:
-        """
-        Number of free coefficients: the amplitudes (the e-folds give the shape).
-
-        """
+        """Number of free coefficients: the amplitudes (the e-folds give the shape)."""
         return len(self.amplitudes)
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """
-        The free coefficients, in the order of `basis`.
-
-        """
+        """The free coefficients, in the order of `basis`."""
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...]) -> Exponential:
-        """
-        Return the same shape with other amplitudes and the same value at the reference.
-
-        """
+        """Return the same shape with other amplitudes and the same value at the reference."""
         at_reference = self.constant + math.fsum(self.amplitudes)
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def value(self, t: Number) -> Number:
-        """
-        Evaluate at `t` [K].
-
-        """
+        """Evaluate at `t` [K]."""
         result = t * 0.0 + self.constant
         for amplitude, e_fold in zip(self.amplitudes, self.e_fold_k, strict=True):
             result = result + amplitude * _exp(t / e_fold)
         return result
 
     def slope(self, t: Number) -> Number:
-        """
-        Evaluate the derivative at `t`, per K.
-
-        """
+        """Evaluate the derivative at `t`, per K."""
         result = t * 0.0
         for amplitude, e_fold in zip(self.amplitudes, self.e_fold_k, strict=True):
             result = result + amplitude / e_fold * _exp(t / e_fold)
         return result
 
     def basis(self, t: Number) -> list[Number]:
-        """
-        Evaluate the derivatives with respect to the amplitudes at a fixed reference value.
-
-        """
+        """Evaluate the derivatives with respect to the amplitudes at a fixed reference value."""
         return [_exp(t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 
@@ -356,7 +298,6 @@ def _exp(x: Number) -> Number:
     Exponentiate with the same bits for a float and for an array of them.
 
     numpy's vector exponential rounds differently from libm's in the last place.
-
     """
     if isinstance(x, np.ndarray):
         return np.array([math.exp(v) for v in x.ravel().tolist()]).reshape(x.shape)
@@ -379,7 +320,6 @@ def _natural_pieces(
 
     The second derivatives at the knots solve the usual tridiagonal system with zeros at both
     ends. numpy serves: the node must not load an optimiser, which scipy's interpolation does.
-
     """
     x = np.array(knots)
     y = np.array(values)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns standard gravity, which defines the unit g, and how accelerations are said and read in it.
-
 """
 
 from __future__ import annotations
@@ -26,10 +25,7 @@ _UNITS = {
 
 
 def spoken(acceleration: float) -> str:
-    """
-    Say an error in ug, or from 1 mg on in mg, with two or three digits.
-
-    """
+    """Say an error in ug, or from 1 mg on in mg, with two or three digits."""
     micro_g = acceleration / MICRO_G
     if not abs(micro_g) >= 999.5:
         return f'{micro_g:.2g} ug' if abs(micro_g) < 99.5 else f'{micro_g:.0f} ug'
@@ -45,11 +41,6 @@ def parse_acceleration(text: str) -> float:
     ----------
     text : str
         Number and unit.
-
-    Returns
-    -------
-    float
-        In m/s^2.
 
     Raises
     ------

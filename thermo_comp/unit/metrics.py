@@ -6,7 +6,6 @@ Owns residual statistics: the few numbers that tests, the fit and the report all
 A residual is ``corrected - true``. Of a position of unknown attitude only the norm is known to
 be true, so the residual that every bag gives is ``|f| - g``; where the truth is simulated the
 vector residual is judged too.
-
 """
 
 from __future__ import annotations
@@ -40,20 +39,14 @@ class ResidualStatistics:
     peak: float
 
     def scaled(self, factor: float) -> ResidualStatistics:
-        """
-        Return the statistics in another unit.
-
-        """
+        """Return the statistics in another unit."""
         return ResidualStatistics(
             self.n, self.mean * factor, self.rms * factor, self.peak * abs(factor)
         )
 
     @property
     def micro_g(self) -> ResidualStatistics:
-        """
-        The statistics of residuals in m/s^2, expressed in micro-g.
-
-        """
+        """The statistics of residuals in m/s^2, expressed in micro-g."""
         return self.scaled(1.0 / MICRO_G)
 
 

@@ -4,7 +4,6 @@
 Owns the covariance of all parameters of a calibration, as a factor that fits into its file.
 
 ``covariance = factor @ factor.T + diag(rest)``, single precision in base64.
-
 """
 
 from __future__ import annotations
@@ -61,34 +60,22 @@ class Posterior:
 
     @classmethod
     def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
-        """
-        Encode a factor, shape (n_parameters, rank), and the variances beside it.
-
-        """
+        """Encode a factor, shape (n_parameters, rank), and the variances beside it."""
         return cls(matrix.shape[1], _encoded(matrix), _encoded(variances))
 
     @property
     def n_parameters(self) -> int:
-        """
-        Number of parameters.
-
-        """
+        """Number of parameters."""
         return len(self.variances)
 
     @property
     def matrix(self) -> Floats:
-        """
-        The factor, shape (n_parameters, rank).
-
-        """
+        """The factor, shape (n_parameters, rank)."""
         return self._factor.reshape(-1, self.rank)
 
     @cached_property
     def variances(self) -> Floats:
-        """
-        The variances that stand on the diagonal beside the factor, shape (n_parameters,).
-
-        """
+        """The variances that stand on the diagonal beside the factor, shape (n_parameters,)."""
         return _decoded('rest', self.rest)
 
     @cached_property
@@ -96,10 +83,7 @@ class Posterior:
         return _decoded('factor', self.factor)
 
     def covariance(self) -> Floats:
-        """
-        Return the covariance matrix, shape (n_parameters, n_parameters).
-
-        """
+        """Return the covariance matrix, shape (n_parameters, n_parameters)."""
         result: Floats = self.matrix @ self.matrix.T + np.diag(self.variances)
         return result
 
@@ -111,7 +95,6 @@ class Block:
 
     Each index is that of the first: the level of a set is followed by its function's free
     coefficients, the weights of the response stand from `response` to before `end`.
-
     """
 
     static: int
@@ -127,7 +110,6 @@ class ParameterLayout:
 
     For each axis the bias [input units], then the scale [relative]; then M[1][0], M[2][0],
     M[2][1] from `misalignment` on.
-
     """
 
     bias: tuple[Block, Block, Block]

@@ -7,7 +7,6 @@ In a ramp of rate q that has lasted for s seconds the gradients are the board's 
 of time constant tau stands ``tau q (1 - exp(-s / tau))`` behind the board, and a play has been
 pushed to its end; in a soak (q = 0) all of them are 0. The static set holds in a soak, the
 dynamic one in a ramp. Noise, and what the thermometers do not know, are left out.
-
 """
 
 from __future__ import annotations
@@ -65,10 +64,7 @@ def predicted_sd(calibration: Calibration, temperature: Floats, rate: float) -> 
 
 
 def sd_of_states(calibration: Calibration, states: Floats) -> PredictedSd:
-    """
-    Predict the uncertainty of states, shape (n, width), as `ramp_states` gives them.
-
-    """
+    """Predict the uncertainty of states, shape (n, width), as `ramp_states` gives them."""
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
     forgotten = [0.0] * len(correction.memory.lags)

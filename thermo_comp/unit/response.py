@@ -4,7 +4,6 @@
 Owns the thermal response of one axis: the weighted sum of the columns, and what it is felt by.
 
 Weights of 0 are left out, so that a column that is another axis' leaves no bit of this one.
-
 """
 
 from __future__ import annotations
@@ -52,10 +51,7 @@ class Weights:
         self.present = sorted({k for k, _ in (*self._bias, *self._scale)})
 
     def add(self, bias: Number, scale: Number, columns: Sequence[Number]) -> tuple[Number, Number]:
-        """
-        Add the weighted columns to a bias [input units] and to a relative scale.
-
-        """
+        """Add the weighted columns to a bias [input units] and to a relative scale."""
         for k, weight in self._bias:
             bias = bias + weight * columns[k]
         for k, weight in self._scale:
@@ -107,17 +103,11 @@ class Sensitivity:
         return self._on_power.add(bias, scale, on_power)
 
     def on_gradients(self, on_input: Sequence[Number], nil: Number) -> list[tuple[Number, Number]]:
-        """
-        Differentiate by the gradient of each sensor [per K].
-
-        """
+        """Differentiate by the gradient of each sensor [per K]."""
         return [weights.add(nil, nil, on_input) for weights in self._on_gradients]
 
     def on_lags(self, on_input: Sequence[Number], nil: Number) -> list[tuple[Number, Number]]:
-        """
-        Differentiate by each lag [per K].
-
-        """
+        """Differentiate by each lag [per K]."""
         return [weights.add(nil, nil, on_input) for weights in self._on_lags]
 
 

@@ -7,7 +7,6 @@ Hints are float, int, bool, str, Literal, tuple, dataclass, any of them or None,
 ``Annotated[hint, Bounds(...), 'what it means']``. Nothing is converted but an integer to a float
 and a list to a tuple. What several keys have to do with each other is the dataclass' own matter:
 it raises a ValueError that starts with the key in backticks.
-
 """
 
 from __future__ import annotations
@@ -44,10 +43,7 @@ Value = TypeVar('Value')
 
 
 class SchemaError(ValueError):
-    """
-    A value that does not fit: the key's path, and what was expected there.
-
-    """
+    """A value that does not fit: the key's path, and what was expected there."""
 
     def __init__(self, key: str, message: str) -> None:
         self.key = key
@@ -57,10 +53,7 @@ class SchemaError(ValueError):
 
 @dataclass(frozen=True)
 class Bounds:
-    """
-    Where a number must lie, or how long a text must be.
-
-    """
+    """Where a number must lie, or how long a text must be."""
 
     above: float | None = None
     at_least: float | None = None
@@ -69,10 +62,7 @@ class Bounds:
     longest: int | None = None
 
     def fault(self, value: Any) -> str | None:
-        """
-        Say what is expected of a value that does not comply.
-
-        """
+        """Say what is expected of a value that does not comply."""
         if isinstance(value, str):
             if len(value) < self.shortest:
                 s = '' if self.shortest == 1 else 's'
@@ -89,10 +79,7 @@ class Bounds:
         return None
 
     def keywords(self) -> dict[str, float]:
-        """
-        Return the same in the words of JSON Schema.
-
-        """
+        """Return the same in the words of JSON Schema."""
         words = {
             'exclusiveMinimum': self.above,
             'minimum': self.at_least,
@@ -139,7 +126,6 @@ def build(hint: type[Value], data: Any, key: str = '') -> Value:
 def naming(key: str) -> Iterator[None]:
     """
     Turn a ValueError whose text starts with a key in backticks into a SchemaError of that key.
-
     """
     try:
         yield
@@ -153,10 +139,7 @@ def naming(key: str) -> Iterator[None]:
 
 
 def plain(value: Any) -> Any:
-    """
-    Turn dataclasses and tuples into mappings and lists: the reverse of `build`.
-
-    """
+    """Turn dataclasses and tuples into mappings and lists: the reverse of `build`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         items = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         # `kind` decides how the rest is read, so it stands first.
@@ -165,18 +148,12 @@ def plain(value: Any) -> Any:
 
 
 def required_keys(cls: type) -> tuple[str, ...]:
-    """
-    Return the keys of a dataclass that must be given.
-
-    """
+    """Return the keys of a dataclass that must be given."""
     return _fields(cls)[1]
 
 
 def json_schema(cls: type) -> dict[str, Any]:
-    """
-    Return the JSON Schema of a dataclass and of all that it holds.
-
-    """
+    """Return the JSON Schema of a dataclass and of all that it holds."""
     definitions: dict[str, Any] = {}
     top = _schema(cls, definitions)['$ref'].rpartition('/')[2]
     result = definitions.pop(top)
@@ -221,10 +198,7 @@ def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 @lru_cache(maxsize=256)
 def _fields(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """
-    Return the hints of a dataclass by key, and which keys must be given.
-
-    """
+    """Return the hints of a dataclass by key, and which keys must be given."""
     hints = get_type_hints(cls, include_extras=True)
     fields = dataclasses.fields(cls)
     required = tuple(

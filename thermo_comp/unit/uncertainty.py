@@ -5,7 +5,6 @@ Owns the part of the error variance that changes slowly: parameters, and lags th
 
 It is evaluated for one state at a time, by stream and batch alike, and held in between, so both
 have the same bits whatever library multiplies.
-
 """
 
 from __future__ import annotations
@@ -103,7 +102,6 @@ class SlowUncertainty:
     ) -> tuple[Floats, Floats]:
         """
         Give what multiplies each parameter of bias and of scale, in the order of the posterior.
-
         """
         weight = state[WEIGHT]
         bias: list[float] = []

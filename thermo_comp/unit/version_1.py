@@ -5,7 +5,6 @@ Owns the calibration file of version 1: what it said in its own way becomes resp
 
 There each set had terms of its own in ``T_case - T_board``, in ``dT_board/dt`` and in
 ``T_board - L_k``, and each axis of each set a covariance of its own.
-
 """
 
 from __future__ import annotations
@@ -17,14 +16,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from ..typing import Floats
-from .calibration import (
-    AXES,
-    FORMAT_VERSION,
-    AxisSet,
-    Calibration,
-    ResponseTerm,
-    parameter_layout,
-)
+from .calibration import AXES, FORMAT_VERSION, AxisSet, Calibration, ResponseTerm, parameter_layout
 from .posterior import posterior_of
 from .schema import Positive, SchemaError, build, naming
 
@@ -36,10 +28,7 @@ _Part = TypeVar('_Part')
 
 @dataclass(frozen=True)
 class _Linear:
-    """
-    Coefficients of one regressor.
-
-    """
+    """Coefficients of one regressor."""
 
     bias: float = 0.0
     scale: float = 0.0
@@ -47,10 +36,7 @@ class _Linear:
 
 @dataclass(frozen=True)
 class _Memory:
-    """
-    Coefficients of the lags, one per time constant.
-
-    """
+    """Coefficients of the lags, one per time constant."""
 
     bias: tuple[float, ...] = ()
     scale: tuple[float, ...] = ()
@@ -58,10 +44,7 @@ class _Memory:
 
 @dataclass(frozen=True)
 class _OfAxis:
-    """
-    What an axis of a set had.
-
-    """
+    """What an axis of a set had."""
 
     gradient: _Linear = _Linear()
     rate: _Linear = _Linear()
@@ -77,10 +60,7 @@ class _OfAxis:
 
     @property
     def weights(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """
-        Return the coefficients of gradient, rate and lags on the bias and on the scale.
-
-        """
+        """Return the coefficients of gradient, rate and lags on the bias and on the scale."""
         return (
             (self.gradient.bias, self.rate.bias, *self.memory.bias),
             (self.gradient.scale, self.rate.scale, *self.memory.scale),
@@ -89,10 +69,7 @@ class _OfAxis:
 
 @dataclass(frozen=True)
 class _OfSet:
-    """
-    What a set had.
-
-    """
+    """What a set had."""
 
     gradient_range_k: tuple[float, float] = (-50.0, 50.0)
     memory_range_k: tuple[float, float] = (-50.0, 50.0)
@@ -106,10 +83,7 @@ class _OfSet:
 
 @dataclass(frozen=True)
 class _OfFile:
-    """
-    What the top level had.
-
-    """
+    """What the top level had."""
 
     memory_time_constants_s: tuple[Positive, ...] = ()
 
@@ -177,10 +151,7 @@ def read_version_1(data: dict[str, Any]) -> Calibration:
 
 
 def _cut(data: dict[str, Any], part: type[_Part], *path: str) -> _Part:
-    """
-    Take the keys of a dataclass out of a mapping and build it.
-
-    """
+    """Take the keys of a dataclass out of a mapping and build it."""
     values: Any = data
     for name in path:
         values = values.get(name) if isinstance(values, dict) else None
@@ -198,10 +169,7 @@ def _terms(
     lags: tuple[float, ...],
     calibration: Calibration,
 ) -> list[ResponseTerm]:
-    """
-    List a set's terms: gradient, rate, then one per lag, those without weight as well.
-
-    """
+    """List a set's terms: gradient, rate, then one per lag, those without weight as well."""
     lower, upper = getattr(calibration, regime).rate_range_k_min
     regressors: list[tuple[Literal['now', 'rate', 'board'], float, tuple[float, float]]] = [
         ('now', 0.0, edges.gradient_range_k),
@@ -229,10 +197,7 @@ def _terms(
 
 
 def _matrix(calibration: Calibration, sets: list[tuple[Regime, _OfSet, list[_OfAxis]]]) -> Floats:
-    """
-    Put the covariances of the sets and of the misalignment where they belong.
-
-    """
+    """Put the covariances of the sets and of the misalignment where they belong."""
     layout = parameter_layout(calibration)
     matrix = np.zeros((layout.n_parameters, layout.n_parameters))
     n_terms = len(calibration.response) // 2
