@@ -19,20 +19,10 @@ class ThermoCompError(Exception):
 
 class CalibrationError(ThermoCompError):
     """
-    A calibration that cannot be used, with the file and the key that is wrong.
+    A calibration that cannot be used, with the file and the dotted path of the key that is wrong.
 
-    Parameters
-    ----------
-    message : str
-        What is wrong and what was expected.
-    path : str or Path or None, optional
-        The calibration file.
-    key : str or None, optional
-        The dotted path of the offending key, e.g. ``static.x.scale_function``.
-    rule : str or None, optional
-        What may be said to those who may not read the file, where message or key quote one that
-        is no calibration.
-
+    `rule` is what may be said to those who may not read the file, where message or key quote one
+    that is no calibration.
     """
 
     def __init__(
@@ -50,19 +40,7 @@ class CalibrationError(ThermoCompError):
 
 
 class RecordingError(ThermoCompError):
-    """
-    A recording that cannot be read or written, with the file and the topic.
-
-    Parameters
-    ----------
-    message : str
-        What is wrong and what was expected.
-    path : str or Path or None, optional
-        The bag or table.
-    topic : str or None, optional
-        The topic or column concerned.
-
-    """
+    """A recording that cannot be read or written, with the file and the topic or column."""
 
     def __init__(
         self, message: str, path: str | Path | None = None, topic: str | None = None
@@ -74,17 +52,7 @@ class RecordingError(ThermoCompError):
 
 
 class OutputError(ThermoCompError):
-    """
-    An output that may not or cannot be written, with its name.
-
-    Parameters
-    ----------
-    message : str
-        Why not.
-    path : str or Path
-        The output.
-
-    """
+    """An output that may not or cannot be written, with its name."""
 
     def __init__(self, message: str, path: str | Path) -> None:
         self.message = message

@@ -33,17 +33,11 @@ _INDEX = 'metadata.yaml'
 @dataclass(frozen=True)
 class Kind:
     """
-    What an output is, and how a file of that kind is known.
+    What an output is, by the name that a message calls it, and how a file of that kind is known: a
+    pattern in its first 4 KiB.
 
-    Parameters
-    ----------
-    name : str
-        What a message calls it.
-    mark : bytes
-        Pattern found in the first 4 KiB; an empty file is of any kind.
-    is_folder : bool, optional
-        The mark is found in the name of each file in it, then, and its index is there.
-
+    An empty file is of any kind. Of a folder the mark is found in the name of each file in it, and
+    its index is there.
     """
 
     name: str
@@ -83,20 +77,10 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
     """
-    Tell by the suffix what a bag is to be.
+    Tell by the suffix what a bag is to be: ``*.mcap`` a bare file, a name without a suffix a
+    rosbag2 directory; OutputError for any other.
 
-    Parameters
-    ----------
-    path : str or Path
-        ``*.mcap`` makes a bare file, a name without a suffix a rosbag2 directory.
-    others : str, optional
-        What else may be written there, for the message.
-
-    Raises
-    ------
-    OutputError
-        If it has the suffix of anything else.
-
+    `others` is what else may be written there, for the message.
     """
     suffix = Path(path).suffix
     if suffix == '.mcap':
@@ -117,20 +101,9 @@ def shown_name(path: str | Path) -> str:
 
 def open_regular(path: str | Path) -> BinaryIO:
     """
-    Open a regular file for reading.
+    Open a regular file for reading; OSError if it is none.
 
     A directory, a FIFO or a device is refused before anything is read, so a reader never blocks.
-
-    Returns
-    -------
-    BinaryIO
-        Open, at its beginning.
-
-    Raises
-    ------
-    OSError
-        If it cannot be opened or is not a regular file.
-
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
@@ -144,15 +117,7 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 def read_bounded(path: str | Path, limit: int) -> bytes:
     """
-    Read a regular file of at most `limit` bytes.
-
-    Raises
-    ------
-    OSError
-        If it cannot be opened or read, or is not a regular file.
-    ValueError
-        If it is larger than `limit`.
-
+    Read a regular file, OSError if it is none; ValueError if it is larger than `limit` bytes.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -168,24 +133,10 @@ def check_output(
     path: str | Path, kind: Kind, *, overwrite: bool = False, others: Iterable[str | Path] = ()
 ) -> None:
     """
-    Refuse an output before any work is done for it.
+    Refuse an output before any work is done for it: OutputError.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file or folder to be written.
-    kind : Kind
-        What it will be.
-    overwrite : bool, optional
-        Replace one of that kind.
-    others : iterable of str or Path, optional
-        What the command reads, and what else it writes: never replaced, however it is spelt.
-
-    Raises
-    ------
-    OutputError
-        If it may not be written.
-
+    `others` is what the command reads, and what else it writes: never replaced, however it is
+    spelt.
     """
     target = Path(os.path.realpath(path))
     for other in others:
@@ -208,27 +159,10 @@ def check_output(
 
 class Draft:
     """
-    An output in the making: it stands under a hidden name until it is whole.
+    An output in the making: it stands under a hidden name, `partial`, until it is whole.
 
-    Parameters
-    ----------
-    path : str or Path
-        Its name-to-be; folders above it are made.
-    kind : Kind
-        What it is.
-    overwrite : bool, optional
-        Replace one of that kind.
-
-    Attributes
-    ----------
-    partial : Path
-        Where it is to be written; it has the suffix of `path`, so that tools open it.
-
-    Raises
-    ------
-    OutputError
-        If it may not or cannot be written.
-
+    That name has the suffix of the output, so that tools open it; folders above it are made.
+    OutputError if it may not or cannot be written.
     """
 
     def __init__(self, path: str | Path, kind: Kind, *, overwrite: bool = False) -> None:
@@ -244,13 +178,7 @@ class Draft:
 
     def publish(self) -> None:
         """
-        Give the finished output its name.
-
-        Raises
-        ------
-        OutputError
-            If that fails, or somebody else was first; what bears the name then stays.
-
+        Give the finished output its name; OutputError if somebody else was first, whose stays.
         """
         with _told(self._path):
             if self.partial.is_dir():
@@ -312,11 +240,7 @@ def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterato
     """
     Give a place to write to; what the block leaves there becomes the output, if it succeeds.
 
-    Raises
-    ------
-    OutputError
-        As `Draft`, and for an `OSError` of the block.
-
+    OutputError as `Draft`, and for an `OSError` of the block.
     """
     draft = Draft(path, kind, overwrite=overwrite)
     try:
@@ -333,15 +257,7 @@ def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterato
 def write_atomically(
     path: str | Path, content: bytes, kind: Kind, *, overwrite: bool = True
 ) -> None:
-    """
-    Write a file so that its readers see the old content or the new one, never a part.
-
-    Raises
-    ------
-    OutputError
-        As `Draft`; what bears the name then stays.
-
-    """
+    """Write a file so that its readers see the old content or the new one, never a part."""
     with drafted(path, kind, overwrite=overwrite) as partial:
         partial.write_bytes(content)
 

@@ -28,17 +28,8 @@ _LOADER: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 class PlainYamlError(ValueError):
     """
-    A text that is not YAML of plain values; says what and in which line.
-
-    Parameters
-    ----------
-    problem : str
-        What is wrong; quotes nothing of the text.
-    line : int or None, optional
-        Where, from 1.
-    detail : str, optional
-        More of it; may quote the text.
-
+    A text that is not YAML of plain values: what is wrong, quoting nothing, in which line, and a
+    detail that may quote the text.
     """
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
@@ -52,25 +43,7 @@ def load_plain_yaml(
     text: str | bytes, depth_limit: int = DEPTH_LIMIT, node_limit: int = NODE_LIMIT
 ) -> Any:
     """
-    Read one YAML document of plain values.
-
-    Parameters
-    ----------
-    text : str or bytes
-        The document.
-    depth_limit, node_limit : int, optional
-        The deepest nesting and the most values accepted.
-
-    Returns
-    -------
-    object
-        Mappings, lists, texts, numbers, true, false, null; null of an empty text.
-
-    Raises
-    ------
-    PlainYamlError
-        If it is no YAML or has what is not accepted here.
-
+    Read one YAML document of plain values, null of an empty text; PlainYamlError where it is none.
     """
     try:
         return _load(text, depth_limit, node_limit)

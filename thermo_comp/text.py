@@ -22,13 +22,8 @@ def one_line(text: str) -> str:
 
 def valid_serial(serial: str) -> str:
     """
-    Return a serial that may go into files and onto screens.
-
-    Raises
-    ------
-    ValueError
-        If it is empty, too long, or anything but one printable line.
-
+    Return a serial that may go into files and onto screens; ValueError unless it is one short
+    printable line.
     """
     if not serial or len(serial) > LONGEST_SERIAL or not serial.isprintable():
         shown = one_line(serial[:LONGEST_SERIAL])

@@ -89,32 +89,12 @@ def main(arguments: list[str] | None = None) -> None:
 
     0: done. 1: the data or the result is bad. 2: the command line is wrong. 70: a mistake of this
     program's; its traceback goes into a file. Whatever it is, it is one line on stderr.
-
-    Parameters
-    ----------
-    arguments : list of str or None, optional
-        The command line without the program's name; the process's own by default.
-
     """
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
 def run(arguments: list[str]) -> int:
-    """
-    Run one command and return its exit code.
-
-    Parameters
-    ----------
-    arguments : list of str
-        The command line without the program's name.
-
-    Returns
-    -------
-    int
-        0 done, 1 the data or the result is bad, 2 the command line is wrong, 70 the command
-        itself has failed.
-
-    """
+    """Run a command line without the program's name and return its exit code."""
     arguments, ros_arguments = split_ros_arguments(arguments)
     if not arguments:
         app(['--help'], prog_name='thermo_comp', standalone_mode=False)
@@ -145,18 +125,7 @@ def run(arguments: list[str]) -> int:
 
 def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
     """
-    Take out what stands between ``--ros-args`` and ``--`` (or the end), as ROS 2 does.
-
-    Parameters
-    ----------
-    arguments : list of str
-        The command line.
-
-    Returns
-    -------
-    own, ros : list of str
-        The rest, and what is ROS's; both without the markers.
-
+    Take out what stands between ``--ros-args`` and ``--`` (or the end), as ROS 2 does: own, ROS's.
     """
     own: list[str] = []
     ros: list[str] = []

@@ -137,18 +137,8 @@ def topics_of(counts: str, imu: str, board: str, case: str) -> Topics:
 
 def place(gravity: float | None, latitude: float | None, height: float | None) -> float | None:
     """
-    Return local gravity from what the user gave of it, None where that is nothing.
-
-    Parameters
-    ----------
-    gravity, latitude, height : float or None
-        The options of these names.
-
-    Raises
-    ------
-    typer.BadParameter
-        If latitude or height stands alone, or is out of range.
-
+    Return local gravity from what the user gave of it, None where that is nothing; a usage mistake
+    where latitude or height stands alone.
     """
     if gravity is not None:
         return gravity

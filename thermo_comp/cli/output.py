@@ -32,15 +32,7 @@ Cell = str | int | float | None
 
 class Output:
     """
-    Where one command prints.
-
-    Parameters
-    ----------
-    as_json : bool, optional
-        Print one JSON object instead of tables and sentences.
-    quiet : bool, optional
-        Print errors only (and the JSON object, if asked for).
-
+    Where one command prints: tables and sentences, one JSON object instead, or nothing but errors.
     """
 
     def __init__(self, as_json: bool = False, quiet: bool = False) -> None:
@@ -81,15 +73,7 @@ class Output:
         """
         Print a table: with rules and colour on a terminal, as plain aligned columns in a pipe.
 
-        Parameters
-        ----------
-        columns : sequence of str
-            The headings.
-        rows : sequence of sequence of str, int, float or None
-            The cells; numbers are set flush right, None is a dash.
-        title : str, optional
-            A line above the table.
-
+        Columns of numbers are set flush right, None is a dash.
         """
         if self.as_json or self.quiet:
             return
@@ -115,20 +99,8 @@ class Output:
     @contextmanager
     def progress(self, what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
         """
-        Show a progress bar on a terminal while the body runs.
-
-        Parameters
-        ----------
-        what : str
-            What is being done.
-        total : float or None, optional
-            The amount of work; None where nobody knows.
-
-        Yields
-        ------
-        callable
-            To be called with the total amount done so far.
-
+        Show a progress bar on a terminal; yields what is to be called with the amount done so far,
+        of a total that is None where nobody knows it.
         """
         if self.quiet or not sys.stderr.isatty():
             yield _ignore

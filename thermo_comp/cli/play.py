@@ -85,15 +85,7 @@ def play(
 
 
 def require_ros() -> None:
-    """
-    Say what is missing where there is no ROS.
-
-    Raises
-    ------
-    ThermoCompError
-        If rclpy is not installed.
-
-    """
+    """Raise ThermoCompError, which says what to do, where there is no ROS."""
     if find_spec('rclpy') is None:
         raise ThermoCompError(
             f'this command needs ROS 2 for {sys.executable}: source its setup file, or '

@@ -106,15 +106,8 @@ _UNKNOWN = _Layout(_unpack_nothing, b'', b'', _pack_nothing, b'', 0, False)
 
 class SampleConverter:
     """
-    Turns serialized samples into serialized Imu messages through a compensating function.
-
-    Parameters
-    ----------
-    message_type : type
-        `geometry_msgs.msg.Vector3Stamped` (counts) or `sensor_msgs.msg.Imu`.
-    frame_id : str, optional
-        The frame of the output; empty keeps that of the input.
-
+    Turns serialized Vector3Stamped (counts) or Imu into serialized Imu through a compensating
+    function; an empty `frame_id` keeps that of the input.
     """
 
     def __init__(self, message_type: Any, frame_id: str = '') -> None:
@@ -130,22 +123,7 @@ class SampleConverter:
         self.n_fallback = 0
 
     def convert(self, data: bytes, process: Process) -> bytes | None:
-        """
-        Compensate one sample.
-
-        Parameters
-        ----------
-        data : bytes
-            The serialized sample.
-        process : callable
-            Called once if it is readable, with its stamp [ns] and three components.
-
-        Returns
-        -------
-        bytes or None
-            A serialized Imu; None if the sample is not readable or `process` dropped it.
-
-        """
+        """Compensate one sample; None if it is not readable or `process` dropped it."""
         layout = self._layout
         try:
             encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
@@ -246,20 +224,7 @@ class SampleConverter:
 
 
 def read_temperature(data: bytes) -> tuple[int, float] | None:
-    """
-    Read a serialized `sensor_msgs/Temperature`.
-
-    Parameters
-    ----------
-    data : bytes
-        The serialized message.
-
-    Returns
-    -------
-    tuple of (int, float) or None
-        Stamp [ns] and temperature; None if the bytes are no such message.
-
-    """
+    """Read the stamp [ns] and the temperature of a serialized Temperature; None if it is none."""
     # A node that sleeps between samples pays for each line of code it has not touched for long:
     # rclpy's deserialization costs it as much as several samples.
     if len(data) > _LONGEST_MESSAGE:

@@ -56,19 +56,8 @@ class Traffic:
 @dataclass(frozen=True, slots=True)
 class Input:
     """
-    A topic that the node reads.
-
-    Attributes
-    ----------
-    name : str
-        What comes in there.
-    topic : str
-        Its name, remapped.
-    n_publishers : int
-        Those that the node gets messages from.
-    mismatch : str
-        Why it gets none from a publisher that is there; empty where that is not so.
-
+    A topic that the node reads: what comes in there, its name remapped, the publishers that the
+    node hears, and why it does not hear one that is there.
     """
 
     name: str
@@ -80,19 +69,8 @@ class Input:
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """
-    The node at one moment.
-
-    Attributes
-    ----------
-    status : CompensatorStatus
-    traffic : Traffic
-    variances : tuple of float or None
-        Diagonal of the covariance last published [m^2/s^4].
-    silence_s : float
-        For how long there have been no samples [s].
-    inputs : tuple of Input
-        The samples, the board, the further thermometers.
-
+    The node at one moment: the diagonal of the covariance last published [m^2/s^4], for how long
+    there have been no samples, and the inputs, samples first.
     """
 
     status: CompensatorStatus
@@ -106,17 +84,8 @@ def build(
     name: str, loaded: LoadedCalibration, now: Snapshot, before: Snapshot
 ) -> DiagnosticStatus:
     """
-    Say how the compensation is doing.
-
-    Parameters
-    ----------
-    name : str
-        Full name of the node: two units are two entries.
-    loaded : LoadedCalibration
-        The running calibration.
-    now, before : Snapshot
-        The node now and at the last report; differences tell what happened in between.
-
+    Say how the compensation of a node (two units are two entries) is doing; differences to the
+    last report tell what happened in between.
     """
     findings = sorted(_findings(loaded, now, before), key=lambda finding: -finding[0])
     return DiagnosticStatus(

@@ -11,20 +11,8 @@ from rclpy.subscription import Subscription
 
 def mismatch(node: Node, subscription: Subscription) -> str:
     """
-    Compare a subscription that has no publisher with the publishers of its topic.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        The node of the subscription.
-    subscription : rclpy.subscription.Subscription
-        One that gets nothing.
-
-    Returns
-    -------
-    str
-        What does not fit; empty where nobody publishes, or where all fits.
-
+    Say what does not fit between a subscription that hears nobody and a publisher of its topic;
+    empty where nobody publishes, or where all fits.
     """
     kind = subscription.msg_type
     package = kind.__module__.partition('.')[0]

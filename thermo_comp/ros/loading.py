@@ -11,23 +11,7 @@ from .reader import LoadedCalibration, read
 
 def load(config: NodeConfig) -> LoadedCalibration:
     """
-    Read the calibration that a configuration asks for.
-
-    Parameters
-    ----------
-    config : NodeConfig
-        Names the file, the expected serial number and the input.
-
-    Returns
-    -------
-    LoadedCalibration
-        Parsed, validated, and of the right unit.
-
-    Raises
-    ------
-    CalibrationError
-        If no file is named, if it is not a valid calibration, or if it is not for this unit.
-
+    Read the calibration that a configuration asks for; CalibrationError where it cannot be used.
     """
     if not config.calibration_file:
         raise CalibrationError(
@@ -40,22 +24,7 @@ def load(config: NodeConfig) -> LoadedCalibration:
 
 
 def check(loaded: LoadedCalibration, config: NodeConfig) -> None:
-    """
-    Make sure that a calibration is for the unit and the input of a configuration.
-
-    Parameters
-    ----------
-    loaded : LoadedCalibration
-        A valid calibration.
-    config : NodeConfig
-        Names the expected serial number and the input.
-
-    Raises
-    ------
-    CalibrationError
-        If the serial number or the unit of the input differ.
-
-    """
+    """Make sure that a calibration is for the serial number and the input of a configuration."""
     unit = loaded.calibration.unit
     if config.serial and unit.serial != config.serial:
         raise CalibrationError(

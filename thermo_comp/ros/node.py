@@ -86,18 +86,8 @@ _INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompe
 
 class CompensationNode:
     """
-    The node around one `Compensator`.
-
-    Parameters
-    ----------
-    context : rclpy.context.Context, optional
-        Initialised; the default context if not given.
-
-    Raises
-    ------
-    ThermoCompError
-        If a parameter or the calibration can't be used.
-
+    The node around one `Compensator`; ThermoCompError if a parameter or the calibration can't be
+    used.
     """
 
     def __init__(self, context: Context | None = None) -> None:
@@ -329,18 +319,8 @@ class CompensationNode:
 
 def main(args: list[str] | None = None) -> int:
     """
-    Run the node; the console script `thermo_comp_node`.
-
-    Parameters
-    ----------
-    args : list of str, optional
-        Command line with the program's name first; `sys.argv` if not given.
-
-    Returns
-    -------
-    int
-        Exit code: 0 after an orderly end, 1 if the node could not start, 2 for a wrong usage.
-
+    Run the node and return its exit code: 0 after an orderly end, 1 if it could not start, 2 for a
+    wrong usage.
     """
     args = sys.argv if args is None else args
     try:

@@ -50,16 +50,8 @@ def _parameter(
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
     """
-    The node's parameters, all of them live but `calibration_directory`.
-
-    Attributes
-    ----------
-    calibration_file, calibration_directory, serial, input, frame_id : str
-    transition_time, temperature_timeout, case_timeout, stuck_timeout, diagnostics_period : float
-        Seconds.
-    local_gravity, gravity_tolerance : float
-        Metres per second squared.
-
+    The node's parameters, all of them live but `calibration_directory`; the units are in their
+    descriptions.
     """
 
     calibration_file: str = _parameter(
@@ -143,23 +135,8 @@ class ParameterError(ThermoCompError):
 
 def declare(node: Node) -> NodeConfig:
     """
-    Declare every parameter on a node and return what the user's overrides make of them.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        A node without these parameters.
-
-    Returns
-    -------
-    NodeConfig
-        The values in force.
-
-    Raises
-    ------
-    ParameterError
-        If an override has a wrong type or is out of its range.
-
+    Declare every parameter and return what the user's overrides make of them; ParameterError where
+    one does not fit.
     """
     values: dict[str, Any] = {}
     for name, entry in _TABLE.items():
@@ -173,20 +150,7 @@ def declare(node: Node) -> NodeConfig:
 
 
 def descriptor(name: str) -> ParameterDescriptor:
-    """
-    Describe one parameter as ROS tools show it.
-
-    Parameters
-    ----------
-    name : str
-        A field of `NodeConfig`.
-
-    Returns
-    -------
-    rcl_interfaces.msg.ParameterDescriptor
-        With type, range and description.
-
-    """
+    """Describe one parameter as ROS tools show it: type, range and description."""
     entry = _TABLE[name]
     described = ParameterDescriptor(
         name=name,
@@ -206,20 +170,7 @@ def descriptor(name: str) -> ParameterDescriptor:
 
 
 def coerce(parameters: Iterable[Parameter]) -> list[Parameter]:
-    """
-    Turn whole numbers into floats where a float is wanted (``ros2 param set ... 5``).
-
-    Parameters
-    ----------
-    parameters : iterable of rclpy.parameter.Parameter
-        As they came in.
-
-    Returns
-    -------
-    list of rclpy.parameter.Parameter
-        The same, with integers made floats for this node's float parameters.
-
-    """
+    """Turn whole numbers into floats where this node wants floats (``ros2 param set ... 5``)."""
     return [
         Parameter(one.name, Parameter.Type.DOUBLE, float(one.value))
         if one.type_ == Parameter.Type.INTEGER
@@ -232,40 +183,15 @@ def coerce(parameters: Iterable[Parameter]) -> list[Parameter]:
 
 def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
     """
-    Apply new parameter values to a configuration; others' parameters are passed over.
-
-    Parameters
-    ----------
-    config : NodeConfig
-        What is in force.
-    parameters : iterable of rclpy.parameter.Parameter
-        The values set together.
-
-    Returns
-    -------
-    NodeConfig
-        What would be in force.
-
-    Raises
-    ------
-    ParameterError
-        If a value has a wrong type or is out of its range.
-
+    Apply values set together; others' parameters are passed over, ParameterError where one does
+    not fit.
     """
     values = {one.name: _checked(one.name, one.value) for one in parameters if one.name in _TABLE}
     return replace(config, **values)
 
 
 def parameters_table() -> str:
-    """
-    Write the parameters as a Markdown table for the README.
-
-    Returns
-    -------
-    str
-        Header and one row per parameter, with a final newline.
-
-    """
+    """Write the parameters as a Markdown table for the documentation."""
     rows = ['| parameter | type | default | range | what it does |', '|---|---|---|---|---|']
     for name, entry in _TABLE.items():
         kind = _TYPES[type(entry.default)].name.lower()
@@ -281,15 +207,7 @@ def parameters_table() -> str:
 
 
 def parameters_help() -> str:
-    """
-    Write the parameters as plain text for a terminal.
-
-    Returns
-    -------
-    str
-        Two lines per parameter.
-
-    """
+    """Write the parameters as plain text for a terminal."""
     return '\n'.join(
         f'  {name}:={entry.default!r}\n      {entry.metadata["description"]}'
         for name, entry in _TABLE.items()

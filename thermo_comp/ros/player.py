@@ -89,46 +89,14 @@ def play(
     """
     Publish a bag's samples and temperatures.
 
-    Parameters
-    ----------
-    path : str or Path
-        The bag.
-    rate : float, optional
-        Seconds of the bag per second; 0 = as fast as the subscribers take it.
-    n_loops : int, optional
-        How often the bag is played; 0 = until interrupted.
-    clock : bool, optional
-        Publish `/clock`, the bag's log time.
-    wait_s : float, optional
-        Longest wait for a subscriber on every topic before the start [s].
-    topics : Topics, optional
-        Names of the topics in the bag.
-    input : {'auto', 'counts', 'imu'}, optional
-        Which accelerometer topic of the bag is played.
-    ros_args : sequence of str, optional
-        ROS arguments, such as ``['-r', '__ns:=/imu0']``.
-    is_found : callable, optional
-        Tells whether the subscribers have found the player's topics of these roles; what is sent
-        before that can come late. A little time is given to them if not given.
-    throttle : callable, optional
-        Called with the number of samples sent after each window; may block for a while.
-    progress : callable, optional
-        Called with the fraction done, now and then.
+    At `rate` seconds of the bag per second, 0 as fast as the subscribers take it; `n_loops` times,
+    0 until interrupted; after at most `wait_s` for a subscriber on every topic. `is_found` tells
+    whether the subscribers have found the player's topics of these roles: what is sent before that
+    can come late; a little time is given to them without it. `throttle` gets the number of samples
+    sent after each window and may block for a while.
 
-    Returns
-    -------
-    PlayReport
-        What was sent.
-
-    Raises
-    ------
-    ValueError
-        If `rate` or `n_loops` is negative.
-    RecordingError
-        If the bag can't be read.
-    ThermoCompError
-        If a reliable subscriber stopped taking messages.
-
+    ValueError if `rate` or `n_loops` is negative, RecordingError if the bag can't be read,
+    ThermoCompError if a reliable subscriber stopped taking messages.
     """
     if not rate >= 0.0:
         raise ValueError(f'`rate` must be zero or positive, got {rate}')

@@ -24,13 +24,7 @@ DRAIN_LIMIT = 4096
 
 class RawSubscription:
     """
-    A subscription read in serialized form by whoever runs the loop, not by an executor.
-
-    Parameters
-    ----------
-    subscription : rclpy.subscription.Subscription
-        Created by `WaitLoop.subscribe`.
-
+    A subscription of `WaitLoop.subscribe`, read by whoever runs the loop and not by an executor.
     """
 
     def __init__(self, subscription: Subscription) -> None:
@@ -50,21 +44,12 @@ class RawSubscription:
 
     def drain(self, *, is_paced: bool = False) -> tuple[list[bytes], list[int]]:
         """
-        Take what waits in the queue, oldest first, at most `DRAIN_LIMIT` messages.
+        Take what waits in the queue, oldest first: at most `DRAIN_LIMIT` serialized messages, and
+        when the middleware got each [ns], comparable between subscriptions.
 
-        Parameters
-        ----------
-        is_paced : bool, optional
-            Do not look whether there is another message before its turn, going by the last two:
-            one that comes early is there at the next wake-up. For subscriptions that wake.
-
-        Returns
-        -------
-        messages : list of bytes
-            Serialized.
-        received_ns : list of int
-            When the middleware got each of them; comparable between subscriptions.
-
+        Where it is paced, for subscriptions that wake, it does not look whether there is another
+        message before its turn, going by the last two: one that comes early is there at the next
+        wake-up.
         """
         messages: list[bytes] = []
         received_ns: list[int] = []
@@ -96,15 +81,7 @@ class RawSubscription:
 
 
 class RawPublisher:
-    """
-    A publisher of serialized messages.
-
-    Parameters
-    ----------
-    publisher : rclpy.publisher.Publisher
-        An ordinary publisher of the node.
-
-    """
+    """A publisher of the node for messages that are serialized already."""
 
     def __init__(self, publisher: Publisher) -> None:
         self.publisher = publisher

@@ -31,16 +31,7 @@ NICENESS = 5
 @dataclass(frozen=True, slots=True)
 class LoadedCalibration:
     """
-    A calibration and the file it stands for.
-
-    Attributes
-    ----------
-    calibration : Calibration
-    path : str
-        As the user gave it.
-    sha256 : str
-        Of the very bytes that were parsed.
-
+    A calibration, its file as the user named it, and the hash of the very bytes that were parsed.
     """
 
     calibration: Calibration
@@ -50,26 +41,10 @@ class LoadedCalibration:
 
 def read(name: str, directory: str = '') -> LoadedCalibration:
     """
-    Read a calibration, for whichever unit.
+    Read a calibration of whichever unit, from under a directory if one is given.
 
-    Parameters
-    ----------
-    name : str
-        Path of the file.
-    directory : str, optional
-        Where it must lie, symbolic links followed; anywhere if empty.
-
-    Returns
-    -------
-    LoadedCalibration
-        Parsed and validated.
-
-    Raises
-    ------
-    CalibrationError
-        If it is not a valid calibration; names the path as given and the rule, and quotes nothing
-        of a file that is no calibration.
-
+    The CalibrationError names the path as given and the rule, and quotes nothing of a file that is
+    no calibration.
     """
     try:
         content = read_bounded(_allowed(name, directory), SIZE_LIMIT)
@@ -90,9 +65,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
 
 
 def _allowed(name: str, directory: str) -> Path:
-    """
-    Resolve a path, symbolic links included; CalibrationError where it leads out of the directory.
-    """
+    """Resolve a path, links included; CalibrationError where it leads out of the directory."""
     path = Path(name).expanduser()
     if not directory:
         return path

@@ -40,24 +40,8 @@ _STAMP = Struct('<iI')
 
 class Recorder:
     """
-    Records topics in a thread of its own for as long as the context lasts.
-
-    Parameters
-    ----------
-    path : str or Path
-        The bag; ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
-    topics : mapping of str to type, optional
-        Relative topic names and message classes; the node's outputs if not given.
-    ros_args : sequence of str, optional
-        ROS arguments, such as ``['-r', '__ns:=/imu0']``.
-    overwrite : bool, optional
-        Replace a bag that is there.
-
-    Raises
-    ------
-    OutputError
-        If the bag can't be written.
-
+    Records topics in a thread of its own for as long as the context lasts; ``*.mcap`` makes a bare
+    file, anything else a rosbag2 directory.
     """
 
     def __init__(
@@ -122,18 +106,8 @@ class Recorder:
 
     def newest(self, name: str) -> Any | None:
         """
-        Return the newest message of a topic, recorded or still waiting for a stamp.
-
-        Parameters
-        ----------
-        name : str
-            The relative topic name.
-
-        Returns
-        -------
-        message or None
-            None before there is any.
-
+        Return the newest message of a topic, recorded or still waiting for a stamp; None before
+        any.
         """
         data = self._newest.get(name)
         return None if data is None else deserialize_message(data, self._topics[name])
@@ -142,20 +116,8 @@ class Recorder:
         self, timeout_s: float, while_true: Callable[[], bool] = lambda: True
     ) -> bool:
         """
-        Wait until every topic has a publisher.
-
-        Parameters
-        ----------
-        timeout_s : float
-            Longest wait [s].
-        while_true : callable, optional
-            The wait ends when this says False.
-
-        Returns
-        -------
-        bool
-            False if they did not come.
-
+        Wait until every topic has a publisher; False after the time-out or once `while_true` says
+        False.
         """
         deadline = time.monotonic() + timeout_s
         ends = [one.subscription for one in self._subscriptions.values()]
@@ -166,22 +128,7 @@ class Recorder:
         return True
 
     def wait_until(self, is_done: Callable[[Mapping[str, int]], bool], timeout_s: float) -> bool:
-        """
-        Wait until the counts are as wanted.
-
-        Parameters
-        ----------
-        is_done : callable
-            Gets the counts after each change.
-        timeout_s : float
-            Longest time without a new message [s].
-
-        Returns
-        -------
-        bool
-            False after the time-out.
-
-        """
+        """Wait until the counts are as wanted; False after so long without a new message [s]."""
         with self._changed:
             while not is_done(self._counts):
                 if self._failure is not None or not self._changed.wait(timeout_s):

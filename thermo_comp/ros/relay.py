@@ -42,23 +42,8 @@ _Reading = tuple[int, int, float, Push]
 
 class Relay:
     """
-    What stands between the node's inputs and its outputs.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Whose context tells whether a message that could not go out is an end.
-    compensator : Compensator
-        Gets readings and samples.
-    converter : SampleConverter
-        From and to the bytes of messages.
-    samples : RawSubscription
-        The raw samples.
-    temperatures : sequence of (RawSubscription, callable)
-        The readings, and who takes them.
-    imu, flag : rclpy.publisher.Publisher
-        The outputs.
-
+    What stands between the node's inputs and its outputs; each thermometer comes with who takes
+    its readings.
     """
 
     def __init__(
@@ -129,12 +114,8 @@ class Relay:
         """
         Let readings take effect that no sample will come to, so that the flag stays alive.
 
-        Parameters
-        ----------
-        silence_ns : int
-            How long there have been no samples: a reading cannot be newer than the last one by
-            much more, whatever its stamp says.
-
+        After so long without samples a reading cannot be newer than the last one by much more,
+        whatever its stamp says.
         """
         if self._newest_reading_ns is None:
             return

@@ -42,17 +42,8 @@ class RequestError(ThermoCompError):
 
 class ParameterRequests:
     """
-    What answers `set_parameters` and `set_parameters_atomically` of a node.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        With parameter services.
-    loop : WaitLoop
-        Serves the node.
-    prepare, apply : callable
-        The two halves of a change; their exceptions are refusals.
-
+    What answers the parameter services of a node; exceptions of the two halves of a change are
+    refusals.
     """
 
     def __init__(self, node: Node, loop: WaitLoop, prepare: Prepare, apply: Apply) -> None:
@@ -153,20 +144,7 @@ class ParameterRequests:
 
 
 def read_parameter(message: ParameterMessage) -> Parameter:
-    """
-    Read a parameter off the network.
-
-    Parameters
-    ----------
-    message : rcl_interfaces.msg.Parameter
-        As it came in.
-
-    Raises
-    ------
-    RequestError
-        If it has no name, or a value of a type that there is not.
-
-    """
+    """Read a parameter off the network; RequestError if it has no name, or a value of no type."""
     if not message.name:
         # rclpy takes it for declared.
         raise RequestError('a parameter without a name')

@@ -58,18 +58,7 @@ _INPUTS = ('accel/counts', 'imu/uncompensated', 'temperature/board', 'temperatur
 
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
-    """
-    The account of a round trip.
-
-    Attributes
-    ----------
-    played : PlayReport
-    recorded : dict of str to int
-        Messages recorded, by the relative topic name.
-    account : dict of str to str
-        The node's last diagnostics: samples in, out, dropped for which reason, and all the rest.
-
-    """
+    """What was played, what was recorded by topic, and the node's last diagnostics."""
 
     played: PlayReport
     recorded: dict[str, int]
@@ -77,15 +66,7 @@ class RoundTrip:
 
 
 class NodeProcess:
-    """
-    The node as a process of its own, for as long as the context lasts.
-
-    Parameters
-    ----------
-    ros_args : sequence of str
-        What follows ``--ros-args``.
-
-    """
+    """The node as a process of its own, for as long as the context lasts."""
 
     def __init__(self, *ros_args: str) -> None:
         self._ros_args = ros_args
@@ -120,15 +101,7 @@ class NodeProcess:
         return self._log.read_text(encoding='utf-8', errors='replace').strip()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
-        """
-        Send a signal and wait for the end.
-
-        Returns
-        -------
-        int
-            Exit code.
-
-        """
+        """Send a signal, wait for the end, return the exit code."""
         if self.is_alive:
             self.process.send_signal(number)
         try:
@@ -140,18 +113,8 @@ class NodeProcess:
 
 def lossless(namespace: str = '') -> list[str]:
     """
-    Give the ROS arguments under which the node loses nothing, at the price of latency.
-
-    Parameters
-    ----------
-    namespace : str, optional
-        Of the node, such as ``/imu0``.
-
-    Returns
-    -------
-    list of str
-        To be put behind ``--ros-args``.
-
+    Give the ROS arguments under which a node of this namespace loses nothing, at the price of
+    latency.
     """
     overrides = [
         *(f'{topic}.subscription.reliability:=reliable' for topic in _INPUTS),
@@ -180,41 +143,10 @@ def round_trip(
     progress: Callable[[float], None] | None = None,
 ) -> RoundTrip:
     """
-    Play a bag into a node of its own and record what comes out.
+    Play a bag into a node of its own and record what comes out, in a namespace of its own that no
+    other node hears, if none is given.
 
-    Parameters
-    ----------
-    bag : str or Path
-        The bag.
-    calibration : str or Path
-        The node's calibration file.
-    output : str or Path
-        The bag to write.
-    rate : float, optional
-        Seconds of the bag per second; 0 = as fast as the node takes it.
-    topics : Topics, optional
-        Names of the topics in the bag.
-    input : {'auto', 'counts', 'imu'}, optional
-        Which accelerometer topic of the bag is played.
-    node_args : sequence of str, optional
-        Further ROS arguments of the node, such as its parameters.
-    namespace : str, optional
-        Where all this happens; one of its own, which no other node hears, if not given.
-    overwrite : bool, optional
-        Replace an output that is there.
-    progress : callable, optional
-        Called with the fraction done, now and then.
-
-    Returns
-    -------
-    RoundTrip
-        What was sent and what was recorded.
-
-    Raises
-    ------
-    ThermoCompError
-        If a bag can't be read or written, or the node did not start or did not last.
-
+    ThermoCompError if a bag can't be read or written, or the node did not start or did not last.
     """
     namespace = f'/round_trip_{os.getpid()}' if namespace is None else namespace
     ros_args = ['-r', f'__ns:={namespace}'] if namespace else []

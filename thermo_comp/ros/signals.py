@@ -59,13 +59,7 @@ class SignalWatch:
 
     def on_signal(self, stop: Callable[[], None]) -> None:
         """
-        Say what is to be called; it is called at once where a signal has come already.
-
-        Parameters
-        ----------
-        stop : callable
-            Called from the watching thread or from here.
-
+        Say what is to be called, by the watching thread; at once where a signal has come already.
         """
         with self._changed:
             self._stop = stop

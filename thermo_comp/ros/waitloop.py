@@ -96,19 +96,12 @@ class _Entities:
 
 class WaitLoop:
     """
-    A loop over a node: raw subscriptions for the caller, the rest for an executor.
+    A loop over a node, which is in no other executor: raw subscriptions for the caller, the rest
+    for an executor.
 
-    The node's entities are made before `run` or in a callback while it runs.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        The node to serve. It must not be added to another executor.
-    rest_s : float, optional
-        Messages of a best-effort subscription gather until so long after each wake-up [s], where
-        they come often enough for it: four within three such times, so that a rest is not for one
-        alone.
-
+    The node's entities are made before `run` or in a callback while it runs. Messages of a
+    best-effort subscription gather until `rest_s` after each wake-up [s], where they come often
+    enough for it: four within three such times, so that a rest is not for one alone.
     """
 
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
@@ -140,25 +133,10 @@ class WaitLoop:
         self, message_type: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
     ) -> RawSubscription:
         """
-        Subscribe to a topic in serialized form, QoS overridable through parameters.
+        Subscribe in serialized form, QoS overridable through parameters.
 
-        Parameters
-        ----------
-        message_type : type
-            The ROS message class.
-        topic : str
-            Relative topic name.
-        qos : rclpy.qos.QoSProfile
-            The default quality of service.
-        is_hot : bool, optional
-            Whether each message wakes the loop; otherwise it may be `OTHERS_PERIOD_NS` late while
-            others flow.
-
-        Returns
-        -------
-        RawSubscription
-            Whose `drain` gives the messages.
-
+        Each message of a hot one wakes the loop; others may be `OTHERS_PERIOD_NS` late while those
+        flow.
         """
         subscription = self._node.create_subscription(
             message_type,
@@ -177,15 +155,7 @@ class WaitLoop:
         return raw
 
     def unsubscribe(self, raw: RawSubscription) -> None:
-        """
-        Destroy a subscription of this loop.
-
-        Parameters
-        ----------
-        raw : RawSubscription
-            From `subscribe`.
-
-        """
+        """Destroy a subscription of this loop."""
         self._raw.remove(raw)
         if raw in self._hot:
             self._hot.remove(raw)
@@ -195,14 +165,6 @@ class WaitLoop:
     def serve(self, service: Service, callback: Serve) -> None:
         """
         Take a service of the node over from the executor, whose callback has to answer at once.
-
-        Parameters
-        ----------
-        service : rclpy.service.Service
-            Of this node.
-        callback : callable
-            Called with each request and with what sends the answer, now or later.
-
         """
         service.callback_group = self._reserved
         self._services.append((service, callback))
@@ -216,16 +178,8 @@ class WaitLoop:
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
         """
-        Call back at regular times, in place of the last such callback; for a timer of rclpy the
-        executor does ten times the work.
-
-        Parameters
-        ----------
-        period_s : float
-            From one call to the next, and from now to the first [s].
-        callback : callable
-            What to call, between two wake-ups.
-
+        Call back at regular times [s], in place of the last such callback; for a timer of rclpy
+        the executor does ten times the work.
         """
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
@@ -239,13 +193,8 @@ class WaitLoop:
 
     def run(self, on_data: Callable[[], None]) -> None:
         """
-        Wait and serve until the context shuts down, a signal arrives or `stop` is called.
-
-        Parameters
-        ----------
-        on_data : callable
-            Called after a wake-up; drains all raw subscriptions.
-
+        Serve until the context shuts down, a signal arrives or `stop` is called; `on_data` is
+        called after a wake-up and drains all raw subscriptions.
         """
         try:
             while not self._is_stopping:
@@ -421,18 +370,5 @@ def _never_called(message: bytes) -> None:
 
 
 def undeclared_overrides(node: Node) -> list[str]:
-    """
-    Name the parameters that the user gave and the node does not have: misspelt, most likely.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        With all its parameters declared.
-
-    Returns
-    -------
-    list of str
-        Their names, sorted.
-
-    """
+    """Name the parameters that the user gave and the node does not have: misspelt, most likely."""
     return sorted(name for name in node._parameter_overrides if not node.has_parameter(name))  # noqa: SLF001
