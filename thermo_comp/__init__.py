@@ -3,7 +3,13 @@
 """
 Thermal-drift compensation of a three-axis accelerometer, after Golovach (2016).
 
-This page owns the conventions; every other docstring relies on them.
+    import thermo_comp as tc
+
+    cal = tc.load('unit42.yaml')
+    out = cal.correct(time_s, counts, board=board, case=case)
+    out.specific_force, out.covariance, out.dynamic
+
+This page owns the public names and the conventions; every other docstring relies on them.
 
 Units
     SI and degrees Celsius. Temperature differences and rates are in K and K/s. A name carries a
@@ -37,4 +43,51 @@ References
 
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .arrays import Columns, Corrected, Temperature, correct, fit, read
+    from .errors import ThermoCompError
+    from .online.compensator import Compensator
+    from .online.status import CompensatorConfig
+    from .unit.calibration import Calibration
+    from .unit.calibration_file import load_calibration as load
+    from .unit.calibration_file import save_calibration as save
+
 __version__ = '0.2.0'
+
+__all__ = [
+    'Calibration',
+    'Columns',
+    'Compensator',
+    'CompensatorConfig',
+    'Corrected',
+    'Temperature',
+    'ThermoCompError',
+    'correct',
+    'fit',
+    'load',
+    'read',
+    'save',
+]
+
+# Where public names are at home, so that each is imported only when it is asked for.
+_HOMES = {
+    'Calibration': 'unit.calibration',
+    'Compensator': 'online.compensator',
+    'CompensatorConfig': 'online.status',
+    'ThermoCompError': 'errors',
+    'load': 'unit.calibration_file:load_calibration',
+    'save': 'unit.calibration_file:save_calibration',
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name."""
+    if name not in __all__:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    module, _, own = _HOMES.get(name, 'arrays').partition(':')
+    value = getattr(import_module(f'.{module}', __name__), own or name)
+    globals()[name] = value
+    return value

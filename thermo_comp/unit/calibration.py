@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
@@ -31,6 +31,11 @@ from .extremes import extreme_values
 from .functions import TemperatureFunction
 from .posterior import Block, ParameterLayout, Posterior
 from .schema import Bounds, NotNegative, Positive
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from .. import Corrected, Temperature
 
 #: The version of the file's layout that this code writes.
 FORMAT_VERSION = 2
@@ -317,6 +322,16 @@ class Calibration:
                 except OverflowError:
                     result = -math.inf
         return result if math.isfinite(result) else -math.inf
+
+    def correct(
+        self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature, **others: Any
+    ) -> Corrected:
+        """
+        Correct arrays of samples: `thermo_comp.correct` says what it takes, and gives.
+        """
+        from .. import correct
+
+        return correct(self, time_s, counts, board=board, **others)
 
     def regime_sets(self) -> tuple[RegimeSet, RegimeSet]:
         """Return the static and the dynamic set."""

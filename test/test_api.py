@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The library as a script uses it: arrays in and out, with the bits of the compensator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import GRAVITY, SECOND_NS, calibration, rich_calibration
+from test_layers import loaded_after
+
+import thermo_comp as tc
+from thermo_comp.recording import Topics, read_recording
+from thermo_comp.replay import replay
+
+UNIQUE = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+
+
+@pytest.fixture(scope='module')
+def fitted(root: Path) -> tc.Calibration:
+    bags = sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]
+    return tc.fit(bags, gravity=9.80665, model='golovach')
+
+
+@pytest.fixture
+def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Make two minutes at 10 Hz with a reading of each thermometer beside every tenth sample."""
+    time_s = np.arange(1200) * 0.1
+    given = np.arange(1200) % 10 == 0
+    board = np.where(given, 20.0 + 0.01 * time_s + rng.normal(0.0, 0.01, 1200), np.nan)
+    case = np.where(given, 20.5 + 0.02 * time_s + rng.normal(0.0, 0.01, 1200), np.nan)
+    counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (1200, 3)).round()
+    return {'time_s': time_s, 'counts': counts, 'board': board, 'case': case}
+
+
+def test_the_root_is_light_and_knows_its_names() -> None:
+    # What a script imports first must not cost it the libraries of a fit.
+    heavy = ('numpy', 'scipy', 'yaml', 'rosbags', 'mcap', 'matplotlib')
+    assert loaded_after('import thermo_comp', *heavy) == []
+    assert all(getattr(tc, name) is not None for name in tc.__all__)
+    with pytest.raises(AttributeError, match="'thermo_comp' has no attribute 'lode'"):
+        _ = tc.lode  # type: ignore[attr-defined]
+
+
+def test_arrays_have_the_bits_of_a_replayed_bag(
+    root: Path, tmp_path: Path, fitted: tc.Calibration
+) -> None:
+    bag = root / 'bags' / 'held_out.mcap'
+    recording = tc.read(bag)
+    out = fitted.correct(recording.time_s, recording.counts, **recording.temperatures)
+    result = replay(bag, fitted, tmp_path / 'out.mcap')
+    written = read_recording(
+        tmp_path / 'out.mcap', Topics(imu='imu/data_raw'), 'imu', require=['accel']
+    ).columns
+    np.testing.assert_array_equal(out.specific_force, written.accel)
+    np.testing.assert_array_equal(
+        out.covariance.reshape(-1, 9), written.imu.linear_acceleration_covariance
+    )
+    assert out.counters == result.counters
+    stamps = recording.start_ns + np.rint(recording.time_s * 1e9).astype(np.int64)
+    np.testing.assert_array_equal(stamps, written.accel_stamp_ns)
+    changes = np.flatnonzero(np.diff(out.dynamic)) + 1
+    switches = [stamp for stamp, _ in result.switches[1:]]
+    np.testing.assert_array_equal(changes, np.searchsorted(stamps, switches))
+
+
+def test_arrays_have_the_bits_of_the_compensator(arrays: dict[str, np.ndarray]) -> None:
+    unit = rich_calibration()
+    out = unit.correct(**arrays)
+    compensator = tc.Compensator(unit)
+    for k, stamp in enumerate(np.rint(arrays['time_s'] * SECOND_NS).astype(int).tolist()):
+        for name in ('board', 'case'):
+            if not np.isnan(arrays[name][k]):
+                compensator.push(name, stamp, float(arrays[name][k]))
+        row = compensator.process(stamp, *arrays['counts'][k].tolist())
+        assert row is not None
+        np.testing.assert_array_equal(out.specific_force[k], row[:3])
+        np.testing.assert_array_equal(out.covariance[k][UNIQUE], row[3:])
+
+
+def test_readings_beside_the_samples_are_those_at_times_of_their_own(
+    arrays: dict[str, np.ndarray],
+) -> None:
+    unit = rich_calibration()
+    out = unit.correct(**arrays)
+    pairs = {
+        name: (arrays['time_s'][here], arrays[name][here])
+        for name in ('board', 'case')
+        for here in [~np.isnan(arrays[name])]
+    }
+    again = unit.correct(arrays['time_s'], arrays['counts'], **pairs)
+    # Filled up between the readings, as a table that was merged has it.
+    filled = {
+        name: np.repeat(arrays[name][~np.isnan(arrays[name])], 10) for name in ('board', 'case')
+    }
+    third = unit.correct(arrays['time_s'], arrays['counts'], **filled)
+    for other in (again, third):
+        np.testing.assert_array_equal(other.specific_force, out.specific_force)
+        np.testing.assert_array_equal(other.covariance, out.covariance)
+
+
+def test_any_origin_and_any_kind_of_array_will_do(arrays: dict[str, np.ndarray]) -> None:
+    unit = rich_calibration()
+    out = unit.correct(**arrays)
+    lists = {name: value.tolist() for name, value in arrays.items()}
+    dates = np.datetime64('2026-03-01T12:00', 'ns') + (arrays['time_s'] * 1e9).round().astype(
+        'timedelta64[ns]'
+    )
+
+    class Column:
+        """What a pandas or xarray object is to numpy."""
+
+        def __init__(self, value: np.ndarray) -> None:
+            self.value = value
+
+        def __array__(self, dtype: object = None, copy: object = None) -> np.ndarray:
+            return np.array(self.value, dtype=dtype)  # type: ignore[call-overload]
+
+    for given in (
+        lists,
+        {**arrays, 'time_s': dates},
+        {name: Column(value) for name, value in arrays.items()},
+    ):
+        same = unit.correct(**given)
+        np.testing.assert_array_equal(same.specific_force, out.specific_force)
+        np.testing.assert_array_equal(same.covariance, out.covariance)
+
+
+def test_objects_of_pandas_and_xarray(arrays: dict[str, np.ndarray]) -> None:
+    pandas = pytest.importorskip('pandas')
+    unit = rich_calibration()
+    out = unit.correct(**arrays)
+    frame = pandas.DataFrame(arrays['counts'], columns=list('xyz'))
+    frame['board'], frame['case'] = arrays['board'], arrays['case']
+    frame.index = pandas.to_timedelta(arrays['time_s'], unit='s')
+    same = unit.correct(frame.index, frame[list('xyz')], board=frame['board'], case=frame['case'])
+    np.testing.assert_array_equal(same.specific_force, out.specific_force)
+    xarray = pytest.importorskip('xarray')
+    data = {name: xarray.DataArray(value) for name, value in arrays.items()}
+    np.testing.assert_array_equal(unit.correct(**data).specific_force, out.specific_force)
+
+
+def test_data_are_no_exceptions_but_rows_of_nan(arrays: dict[str, np.ndarray]) -> None:
+    counts = arrays['counts'].copy()
+    counts[7, 1], counts[9, 2] = np.nan, 32767.0
+    board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
+    out = calibration().correct(arrays['time_s'], counts, board=board, case=arrays['case'])
+    # The first reading of the board is that beside the sample at 1 s.
+    assert np.isnan(out.specific_force[:10]).all()
+    assert np.isnan(out.covariance[:10]).all()
+    assert np.isfinite(out.specific_force[10:]).all()
+    assert (out.counters.n_no_temperature, out.counters.n_out) == (10, 1190)
+    late = calibration().correct(arrays['time_s'], counts, board=arrays['board'])
+    assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
+    assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
+    assert not late.dynamic.any()
+
+
+def test_nothing_in_is_nothing_out() -> None:
+    out = calibration().correct([], np.empty((0, 3)), board=[])
+    assert out.specific_force.shape == (0, 3)
+    assert out.covariance.shape == (0, 3, 3)
+    assert out.dynamic.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        ({'time_s': [[0.0, 1.0]]}, r'`time_s` must have one dimension, got the shape \(1, 2\)'),
+        ({'time_s': [0.0, 1.0, 1.0]}, r'`time_s` must rise, got 1.0 at 1 and then 1.0'),
+        ({'time_s': [0.0, np.nan, 2.0]}, r'must be finite seconds, or datetime64, got nan at 1'),
+        ({'time_s': [0, 10**18, 2 * 10**18]}, r'must be finite seconds, .* got 1e\+18 at 1'),
+        ({'time_s': ['a', 'b', 'c']}, r'`time_s` must be numbers: could not convert'),
+        ({'time_s': np.array(['2026-01-01', 'NaT', '2026-01-03'], 'M8[ns]')}, 'got one at 1'),
+        ({'counts': np.zeros((2, 3))}, r'`counts` must have the shape \(3, 3\), .* got \(2, 3\)'),
+        ({'counts': np.zeros((3, 2))}, r'`counts` must have the shape \(3, 3\), .* got \(3, 2\)'),
+        ({'board': [20.0, 20.0]}, r'`board` must have a value for each of the 3 times'),
+        ({'board': ([0.0, 1.0], [20.0])}, r'`board` must have as many values as times, 2'),
+        ({'board': ([1.0, 0.0], [20.0, 20.0])}, r'`board time_s` must rise, got 1.0 at 0'),
+        ({'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])}, 'of the kind of `time_s`'),
+        ({'lid': [20.0] * 3}, r'`lid` is no thermometer of this calibration: it has board, case'),
+    ],
+)
+def test_a_slip_is_said(change: dict[str, object], said: str) -> None:
+    given = {'time_s': [0.0, 1.0, 2.0], 'counts': np.ones((3, 3)), 'board': [20.0] * 3, **change}
+    with pytest.raises(ValueError, match=said):
+        calibration().correct(**given)
+
+
+def test_a_fit_of_arrays_is_the_fit_of_their_bags(
+    root: Path, tmp_path: Path, fitted: tc.Calibration
+) -> None:
+    bags = sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]
+    again = tc.fit([tc.read(bag) for bag in bags], gravity=9.80665, model='golovach')
+    assert again.unit.serial == 'demo-0007'
+    assert replace(again, provenance=fitted.provenance) == fitted
+    tc.save(again, tmp_path / 'unit.yaml')
+    assert tc.load(tmp_path / 'unit.yaml') == again
+
+
+def test_a_further_thermometer_goes_in_by_its_name(arrays: dict[str, np.ndarray]) -> None:
+    unit = replace(calibration(), sensors=('case', 'lid'))
+    out = unit.correct(**arrays, lid=arrays['case'] + 1.0)
+    assert np.isfinite(out.specific_force).all()
+    assert np.linalg.norm(out.specific_force.mean(axis=0)) == pytest.approx(GRAVITY, rel=1e-3)
+
+
+def test_arrays_that_cannot_be_fitted_are_refused() -> None:
+    columns = tc.Columns(np.arange(5.0), np.zeros((4, 3)), {})
+    with pytest.raises(ValueError, match=r'`counts` must have the shape \(5, 3\), got \(4, 3\)'):
+        tc.fit(columns, gravity=9.8)
+    with pytest.raises(ValueError, match='`gravity` must be positive'):
+        tc.fit([], gravity=0.0)
+    with pytest.raises(tc.ThermoCompError, match='no bag was given'):
+        tc.fit([], gravity=9.8)

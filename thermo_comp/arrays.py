@@ -1,0 +1,364 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the way of arrays: a bag read into them, their correction, and a calibration fitted to them.
+
+Times are seconds since an origin of the caller's, or datetime64. Whatever numpy makes an array of
+will do: lists, columns of pandas, arrays of xarray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from .files import shown_name
+from .online.batch import process_block
+from .online.compensator import Compensator
+from .online.status import CompensatorConfig, Counters
+from .typing import Bools, Floats, Ints
+from .unit.calibration import Calibration
+
+if TYPE_CHECKING:
+    from .fitting import FitSource
+    from .recording import Topics
+
+#: A temperature: one value for each sample, or (time_s, value) of readings of their own.
+Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
+
+#: `Columns.start_ns` is a multiple of this, so that times count from a whole minute.
+MINUTE_NS = 60_000_000_000
+#: A temperature that is given for each sample, and stays, is a reading again after this.
+REPEAT_NS = 10_000_000_000
+#: Farther from their origin than this times are not in seconds [s].
+LONGEST_S = 4e9
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """
+    A recording as arrays: what `read` gives, and what `fit` takes.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (n,)
+        Time of each sample since `start_ns` [s].
+    counts : ndarray, shape (n, 3)
+        The raw samples: counts per conversion cycle, or m/s^2 from a unit that reports these.
+    temperatures : dict of str to (ndarray, ndarray)
+        Of each thermometer, by name, the times since `start_ns` [s] and the readings [degC].
+    start_ns : int, optional
+        The stamp that times count from: the whole minute before the first message [ns].
+    serial : str or None, optional
+        The unit's, where the recording says it.
+    name : str, optional
+        What messages call the recording.
+
+    """
+
+    time_s: Floats
+    counts: Floats
+    temperatures: Mapping[str, tuple[Floats, Floats]]
+    start_ns: int = 0
+    serial: str | None = None
+    name: str = 'arrays'
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """
+    What `Calibration.correct` gives, one row for each sample.
+
+    Attributes
+    ----------
+    specific_force : ndarray, shape (n, 3)
+        Corrected specific force [m/s^2]; NaN where the node would publish nothing.
+    covariance : ndarray, shape (n, 3, 3)
+        Of that sample [m^2/s^4]; NaN as above.
+    dynamic : ndarray of bool, shape (n,)
+        Whether the regime was dynamic; False while it is unknown.
+    counters : Counters
+        How many samples and readings were used, and why others were not.
+
+    """
+
+    specific_force: Floats
+    covariance: Floats
+    dynamic: Bools
+    counters: Counters = field(default_factory=Counters)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """What `process_block` takes."""
+
+    accel_stamp_ns: Ints
+    accel: Floats
+    temperatures: dict[str, tuple[Ints, Floats, Ints]]
+
+
+def correct(
+    calibration: Calibration,
+    time_s: npt.ArrayLike,
+    counts: npt.ArrayLike,
+    *,
+    board: Temperature,
+    config: CompensatorConfig | None = None,
+    **sensors: Temperature,
+) -> Corrected:
+    """
+    Correct arrays of samples, with the bits of the node and of ``thermo_comp replay``.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The unit's; ``calibration.correct(time_s, ...)`` is the same.
+    time_s : array_like, shape (n,)
+        Time of each sample, rising: seconds since any origin, or datetime64.
+    counts : array_like, shape (n, 3)
+        The raw samples, in the calibration's input unit.
+    board : array_like, shape (n,), or (array_like, array_like)
+        Board temperature [degC]: beside the samples (NaN where it was not read), or as
+        (time_s, value) at times of its own. A reading counts from the first sample not before it.
+    config : CompensatorConfig or None, optional
+        The node's settings.
+    **sensors : as `board`
+        The other thermometers that the calibration names: ``case`` in most.
+
+    Returns
+    -------
+    Corrected
+        A row for each sample.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, times do not rise, or the calibration has no such thermometer.
+
+    """
+    stamps = _stamps('time_s', time_s)
+    samples = _numbers('counts', counts)
+    if samples.shape != (len(stamps), 3):
+        raise ValueError(
+            f'`counts` must have the shape ({len(stamps)}, 3), a row for each time, '
+            f'got {samples.shape}'
+        )
+    unknown = sorted(set(sensors) - set(calibration.sensors))
+    if unknown:
+        known = ', '.join(('board', *calibration.sensors))
+        raise ValueError(f'`{unknown[0]}` is no thermometer of this calibration: it has {known}')
+    readings = {
+        name: _readings(name, value, stamps, _is_date(time_s))
+        for name, value in {'board': board, **sensors}.items()
+    }
+    compensator = Compensator(calibration, config)
+    block = process_block(compensator, _Block(stamps, samples, readings))
+    force = np.full((len(stamps), 3), np.nan)
+    covariance = np.full((len(stamps), 3, 3), np.nan)
+    force[block.index] = block.specific_force
+    covariance[block.index] = block.covariance.reshape(-1, 3, 3)
+    flags = compensator.take_flags()
+    switched = np.array([stamp for stamp, _ in flags], dtype=np.int64)
+    regimes = np.array([False, *(is_dynamic for _, is_dynamic in flags)])
+    dynamic = regimes[np.searchsorted(switched, stamps, 'right')]
+    return Corrected(force, covariance, dynamic, compensator.counters)
+
+
+def read(path: str | Path, topics: Topics | None = None) -> Columns:
+    """
+    Read a bag into arrays.
+
+    Parameters
+    ----------
+    path : str or Path
+        A rosbag2 folder, ``*.mcap``, ``*.db3`` or a ROS 1 ``*.bag``.
+    topics : recording.Topics or None, optional
+        Names of the topics, where they are not the usual ones.
+
+    Returns
+    -------
+    Columns
+        Samples and readings, in the order of the recording.
+
+    Raises
+    ------
+    RecordingError
+        If the bag cannot be read, or holds no samples.
+
+    """
+    from .recording import read_recording
+
+    recording = read_recording(path, topics, require=['accel'])
+    block = recording.columns
+    readings = {name: one for name, one in block.temperatures.items() if len(one[0])}
+    stamps = [block.accel_stamp_ns, *(one[0] for one in readings.values())]
+    first_ns = min((int(one.min()) for one in stamps if len(one)), default=0)
+    start_ns = first_ns // MINUTE_NS * MINUTE_NS
+    return Columns(
+        time_s=_seconds(block.accel_stamp_ns, start_ns),
+        counts=block.accel,
+        temperatures={
+            name: (_seconds(stamps, start_ns), value)
+            for name, (stamps, value, _) in readings.items()
+        },
+        start_ns=start_ns,
+        serial=recording.info.metadata.get('serial'),
+        name=shown_name(path),
+    )
+
+
+def _seconds(stamps: Ints, start_ns: int) -> Floats:
+    return np.multiply(stamps - start_ns, 1e-9, dtype=np.float64)
+
+
+def fit(
+    recordings: str | Path | Columns | Sequence[str | Path | Columns],
+    *,
+    gravity: float,
+    **options: Any,
+) -> Calibration:
+    """
+    Fit a calibration to recordings of a thermal test, at rest in several positions.
+
+    Parameters
+    ----------
+    recordings : str, Path or Columns, or sequence of them
+        The bags, or arrays with the temperatures ``'board'`` and ``'case'``.
+    gravity : float
+        Local gravity [m/s^2].
+    **options
+        As the fields of `fitting.FitOptions`: `serial`, `model`, `prior`, ...; `input` is
+        ``'m/s^2'`` for arrays in this unit.
+
+    Returns
+    -------
+    Calibration
+        The unit's; `save` writes its file, `Calibration.correct` applies it.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of its range, or arrays do not fit together.
+    RecordingError
+        If a bag cannot be read.
+    FitError
+        If the data cannot carry a fit.
+
+    """
+    from .fitting import FitOptions
+    from .fitting import fit as run
+    from .fitting.fit_sources import fit_sources
+
+    items = [recordings] if isinstance(recordings, (str, Path, Columns)) else list(recordings)
+    paths = [item for item in items if not isinstance(item, Columns)]
+    sources, kind = fit_sources(paths, serial=options.get('serial'))
+    if paths:
+        options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
+    sources += [_source(item) for item in items if isinstance(item, Columns)]
+    return run(sources, FitOptions(gravity=gravity, **options)).calibration
+
+
+def _source(columns: Columns) -> FitSource:
+    from .fitting import ArrayBlock, FitSource
+
+    stamps = _stamps('time_s', columns.time_s)
+    samples = _numbers('counts', columns.counts)
+    if samples.shape != (len(stamps), 3):
+        raise ValueError(f'`counts` must have the shape ({len(stamps)}, 3), got {samples.shape}')
+    empty: tuple[list[float], list[float]] = ([], [])
+    board, case = (
+        _readings(name, columns.temperatures.get(name, empty), stamps, _is_date(columns.time_s))
+        for name in ('board', 'case')
+    )
+    start = columns.start_ns
+    block = ArrayBlock(
+        stamps + start, samples, board[0] + start, board[1], case[0] + start, case[1]
+    )
+    return FitSource(columns.name, lambda: [block], serial=columns.serial)
+
+
+def _is_date(value: object) -> bool:
+    return np.asarray(value).dtype.kind in 'Mm'
+
+
+def _numbers(name: str, value: npt.ArrayLike) -> Floats:
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'`{name}` must be numbers: {error}') from error
+
+
+def _stamps(name: str, value: npt.ArrayLike) -> Ints:
+    """Turn times into nanoseconds, strictly rising."""
+    given = np.asarray(value)
+    if given.ndim != 1:
+        raise ValueError(f'`{name}` must have one dimension, got the shape {given.shape}')
+    if given.dtype.kind in 'Mm':
+        if np.isnat(given).any():
+            raise ValueError(f'`{name}` must not hold NaT, got one at {np.isnat(given).argmax()}')
+        unit = 'datetime64[ns]' if given.dtype.kind == 'M' else 'timedelta64[ns]'
+        stamps: Ints = given.astype(unit).astype(np.int64)
+    else:
+        seconds = _numbers(name, given)
+        wrong = ~(np.abs(seconds) <= LONGEST_S)
+        if wrong.any():
+            raise ValueError(
+                f'`{name}` must be finite seconds, or datetime64, got {seconds[wrong][0]} '
+                f'at {wrong.argmax()}'
+            )
+        stamps = np.rint(seconds * 1e9).astype(np.int64)
+    falls = np.flatnonzero(np.diff(stamps) <= 0)
+    if len(falls):
+        at = int(falls[0])
+        raise ValueError(f'`{name}` must rise, got {given[at]} at {at} and then {given[at + 1]}')
+    return stamps
+
+
+def _readings(
+    name: str, value: Temperature, stamps: Ints, is_date: bool
+) -> tuple[Ints, Floats, Ints]:
+    """Give stamps and values of a thermometer's readings; a reading waits for its sample."""
+    if isinstance(value, tuple) and len(value) == 2:
+        if _is_date(value[0]) != is_date:
+            raise ValueError(f'the times of `{name}` must be of the kind of `time_s`')
+        own = _stamps(f'{name} time_s', value[0])
+        values = _numbers(name, value[1])
+        if values.shape != own.shape:
+            raise ValueError(
+                f'`{name}` must have as many values as times, {len(own)}, got {values.shape}'
+            )
+    else:
+        values = _numbers(name, cast('npt.ArrayLike', value))
+        if values.shape != stamps.shape:
+            raise ValueError(
+                f'`{name}` must have a value for each of the {len(stamps)} times, or be a pair '
+                f'(time_s, value), got {values.shape}'
+            )
+        own, values = _as_read(stamps, values)
+    return own, values, np.zeros(len(own), dtype=np.int64)
+
+
+def _as_read(stamps: Ints, values: Floats) -> tuple[Ints, Floats]:
+    """
+    Take a column beside the samples apart into readings: NaN is none, nor is a repetition.
+
+    What is filled up to the rate of the samples would look like a thermometer that stands still.
+    """
+    here = ~np.isnan(values)
+    stamps, values = stamps[here], values[here]
+    is_new = np.ones(len(values), dtype=bool)
+    is_new[1:] = values[1:] != values[:-1]
+    kept: list[int] = []
+    edges = [*np.flatnonzero(is_new).tolist(), len(values)]
+    for begin, end in pairwise(edges):
+        at = begin
+        while at < end:
+            kept.append(at)
+            at += int(np.searchsorted(stamps[at:end], stamps[at] + REPEAT_NS))
+    return stamps[kept], values[kept]
