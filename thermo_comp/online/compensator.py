@@ -35,17 +35,7 @@ Corrected = _Nine
 
 
 class Compensator:
-    """
-    Corrects one unit's samples, one by one.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-    config : CompensatorConfig, optional
-        The user's settings.
-
-    """
+    """Corrects one unit's samples, one by one."""
 
     def __init__(self, calibration: Calibration, config: CompensatorConfig | None = None) -> None:
         self.config = config or CompensatorConfig()
@@ -68,38 +58,18 @@ class Compensator:
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """
-        Queue a temperature; it takes effect at the first sample not before it.
-
-        Parameters
-        ----------
-        name : str
-            ``'board'`` or one of the calibration's sensors; another one is left out.
-        stamp_ns : int
-            When it was measured.
-        celsius : float
-            The reading [degC].
-
+        Queue a reading [degC] of ``'board'`` or of a sensor of the calibration's, others are left
+        out; it takes effect at the first sample not before it.
         """
         self.thermal.push(name, stamp_ns, celsius)
         self._event_ns = min(self._event_ns, stamp_ns)
 
     def process(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
         """
-        Correct one sample.
+        Correct one sample in the calibration's input unit.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Its stamp.
-        x, y, z : float
-            The raw sample, in the calibration's input unit.
-
-        Returns
-        -------
-        tuple of 9 floats or None
-            Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4];
-            None where nothing must be published, with the reason counted in `counters`.
-
+        Returns specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4];
+        None where nothing must be published, with the reason counted in `counters`.
         """
         if not self.last_ns < stamp_ns < self._event_ns:
             return self._process_first(stamp_ns, x, y, z)

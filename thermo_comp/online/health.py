@@ -39,25 +39,9 @@ REFUTING_SIGMAS: Final = 5.0
 
 class GravityMonitor:
     """
-    Compare |f| with gravity over still windows.
-
-    Parameters
-    ----------
-    gravity : float
-        Local gravity where the platform stands [m/s^2].
-    tolerance : float, optional
-        What |f| may miss it by before the calibration is refuted [m/s^2]; 0 = anything.
-
-    Attributes
-    ----------
-    is_refuted : bool
-        Whether the last still windows all missed gravity by more than the tolerance.
-
-    Raises
-    ------
-    ValueError
-        If `gravity` is not positive.
-
+    Compare |f| with gravity over still windows; `is_refuted` tells whether the last of them all
+    missed it by more than the tolerance [m/s^2], 0 = anything. Raises ValueError if gravity is not
+    positive.
     """
 
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
@@ -95,19 +79,8 @@ class GravityMonitor:
         noise_variance: float,
     ) -> None:
         """
-        Take one corrected sample.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Its stamp.
-        force : sequence of 3 floats
-            Specific force [m/s^2].
-        covariance : sequence of 6 floats
-            xx, xy, xz, yy, yz, zz of the sample [m^2/s^4].
-        noise_variance : float
-            The part of the trace of the covariance that is noise of one sample [m^2/s^4].
-
+        Take a corrected sample [m/s^2], its covariance xx, xy, xz, yy, yz, zz and the part of the
+        trace that is noise of one sample [m^2/s^4].
         """
         start = self._window_ns
         x, y, z = force

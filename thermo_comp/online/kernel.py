@@ -22,18 +22,8 @@ PIECE = 12288
 
 class Lines:
     """
-    The coefficients of the segments of a block, spread over samples on demand.
-
-    Parameters
-    ----------
-    start_ns : ndarray of int64, shape (n,)
-        Where each segment begins.
-    columns : list of ndarray, each of shape (n,)
-        Per axis bias, its change per second, scale, its change per second; then per axis a, b, c
-        of the error variance.
-    counts : ndarray of int64, shape (n,)
-        Samples of each segment.
-
+    The coefficients of the segments of a block, as `segments.lay_lines` gives them, spread over
+    the samples on demand.
     """
 
     def __init__(self, start_ns: Ints, columns: list[Floats], counts: Ints) -> None:
@@ -93,28 +83,10 @@ def correct(
     lines: Lines, misalignment: tuple[float, ...], stamps: Stamps, samples: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Correct the samples that stand in segments, and find the extremes of each axis on the way.
+    Correct the samples (n, 3) of segments, and find the extremes of each axis on the way.
 
-    Parameters
-    ----------
-    lines : Lines
-        The segments, which cover the samples.
-    misalignment : tuple of float
-        yx, zx, zy and their variances.
-    stamps : ndarray of int64, shape (n,)
-        When they were taken.
-    samples : ndarray, shape (n, 3)
-        In the calibration's input unit.
-
-    Returns
-    -------
-    force : ndarray, shape (n, 3)
-        [m/s^2].
-    covariance : ndarray, shape (n, 9)
-        [m^2/s^4].
-    lowest, highest : ndarray, shape (3,)
-        The extremes of the samples, in their unit; NaN where a sample is.
-
+    Returns force (n, 3) [m/s^2], covariance (n, 9) [m^2/s^4], and the lowest and the highest
+    sample of each axis, NaN where one is.
     """
     n = len(stamps)
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)

@@ -36,13 +36,8 @@ _NEVER_NS: Final = 1 << 62
 
 class StuckWatch:
     """
-    Counts equal samples in a row; one object serves the stream and the batch.
-
-    Parameters
-    ----------
-    timeout_s : float
-        Time after which equal samples are not believed [s]; 0 = never.
-
+    Counts equal samples in a row, in stream and batch; beyond the time-out [s] they are not
+    believed, with 0 they always are.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -68,20 +63,7 @@ class StuckWatch:
 
     def find(self, stamps: Ints, samples: Floats) -> Bools | None:
         """
-        Find the samples of a batch that the stream would call stuck.
-
-        Parameters
-        ----------
-        stamps : ndarray of int64, shape (n,)
-            At least one.
-        samples : ndarray, shape (n, 3)
-            The samples.
-
-        Returns
-        -------
-        ndarray of bool, shape (n,), or None
-            None where there are none.
-
+        Find the samples (n, 3) of a batch, n > 0, that the stream would call stuck; None if none.
         """
         if len(stamps) < 2 * STUCK_SAMPLES or _may_stand_still(samples):
             return self._find(stamps, samples)
@@ -145,18 +127,8 @@ class RateWatch:
     """
     Compares the rate of the samples with the calibrated one, at the start of each segment.
 
-    Parameters
-    ----------
-    cycle_s : float
-        The calibrated conversion cycle [s].
-
-    Attributes
-    ----------
-    is_too_fast : bool
-        Whether more samples have come than conversions can make.
-    ratio : float
-        Samples per calibrated cycle over the last second or so.
-
+    `is_too_fast`: more samples have come than conversions can make; `ratio`: samples per
+    calibrated cycle over the last second or so.
     """
 
     def __init__(self, cycle_s: float) -> None:
@@ -173,17 +145,7 @@ class RateWatch:
         self._window = (0, 0)
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """
-        Take the count of samples before a stamp.
-
-        Parameters
-        ----------
-        n_seen : int
-            Samples with other stamps so far.
-        stamp_ns : int
-            The stamp.
-
-        """
+        """Take the count of samples, of different stamps, before a stamp."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:

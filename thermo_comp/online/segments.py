@@ -42,16 +42,6 @@ EVER_NS: Final = -(1 << 62)
 class ThermalSide:
     """
     What stream and batch share: readings, thermal state, and the gate that they open for samples.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-    config : CompensatorConfig
-        The user's settings.
-    counters : Counters
-        Where readings, and samples without a temperature, are counted.
-
     """
 
     def __init__(
@@ -181,22 +171,8 @@ class ThermalSide:
 
     def open(self, start_ns: int, n_seen: int, stamp_ns: int) -> bool:
         """
-        Check the rate at a segment's first sample; False if the segment only goes on.
-
-        Parameters
-        ----------
-        start_ns : int
-            Where the segment begins.
-        n_seen : int
-            Samples in order that came before.
-        stamp_ns : int
-            Stamp of its first sample.
-
-        Returns
-        -------
-        bool
-            Whether it is a new segment, not one that a block's end has cut.
-
+        Check the rate at a segment's first sample, `n_seen` samples after the first one; False if
+        a block's end has cut the segment, so that it only goes on.
         """
         key = (self._n_applied, start_ns)
         if key == self._segment_key:
@@ -238,25 +214,10 @@ def lay_lines(
     noise_excess: Number,
 ) -> list[Number]:
     """
-    Lay a line from the beginning of a segment, or of many, to the end.
+    Lay a line from the beginning of a segment, or of many as arrays, to the end.
 
-    Parameters
-    ----------
-    correction : Correction
-        The unit's.
-    start, end : tuple of float or of ndarray
-        Thermal states at both ends.
-    slow : sequence of (a, b, c)
-        Of each axis (`ThermalSide.slow_at`).
-    noise_excess : float or ndarray
-        `ThermalSide.noise_excess`.
-
-    Returns
-    -------
-    list of float or of ndarray
-        Per axis bias, its change per second, scale, its change per second; then per axis a, b, c
-        of the error variance.
-
+    Returns per axis bias, its change per second, scale, its change per second; then per axis a, b,
+    c of the error variance.
     """
     at_start = correction.bias_scale(start)
     at_end, variances = correction.evaluate(end, slow)

@@ -37,24 +37,11 @@ _FADED: Final = 1e-18
 @dataclass(frozen=True)
 class MemorySpec:
     """
-    What a tracker remembers.
+    What a tracker remembers: thermometers by name, the first of which leads the detector; lags as
+    (``'board'`` or a sensor, whose gradient it is; time constant [s]), in the order of `inputs`;
+    plays as (time constant of the board's lag that it follows, 0 for the board; half-width [K]).
 
-    Parameters
-    ----------
-    sensors : tuple of str
-        Names of the thermometers beside the board; the first leads the regime detector.
-    lags : tuple of (str, float)
-        Input (``'board'`` or a sensor, whose gradient it is) and time constant [s]; those of the
-        board first, then sensor by sensor.
-    plays : tuple of (float, float)
-        Time constant of the board's lag that a play follows [s], one of `lags`, or 0 for the
-        board itself; and its half-width [K].
-
-    Raises
-    ------
-    ValueError
-        If there is no sensor, a name comes twice, or a lag or play has no input.
-
+    Raises ValueError if there is no sensor, a name comes twice, or a lag or play has no input.
     """
 
     sensors: tuple[str, ...] = ('case',)
@@ -96,22 +83,11 @@ class MemorySpec:
 
 def start_covariance(lags: Sequence[tuple[str, float]]) -> Floats:
     """
-    Say what is not known of lags whose input nobody has seen before.
+    Say what is not known of lags whose input nobody has seen before: covariance (n, n) [K^2].
 
-    The input is taken for a random walk around what is seen first, so that
-    ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` between the lags of one input and 0 between those
-    of two. From then on it decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
-
-    Parameters
-    ----------
-    lags : sequence of (str, float)
-        As `MemorySpec.lags`.
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-        Covariance of ``T - L`` of the board and of L of the gradients [K^2].
-
+    The input is taken for a random walk around what is seen first, so that ``P_kl = D tau_k tau_l
+    / (tau_k + tau_l)`` between the lags of one input and 0 between those of two. From then on it
+    decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
     tau = np.array([tau for _, tau in lags])
     names = np.array([name for name, _ in lags])
@@ -125,22 +101,8 @@ def start_covariance(lags: Sequence[tuple[str, float]]) -> Floats:
 
 class LagBank:
     """
-    The lags of one input.
-
-    Parameters
-    ----------
-    taus : tuple of float
-        Time constants [s].
-
-    Attributes
-    ----------
-    stamp_ns : int or None
-        Of the last input, None before the first.
-    start_ns : int or None
-        Of the first input since the lags were last forgotten.
-    has_extra : bool
-        Whether anything but the start is unknown of the lags.
-
+    The lags of one input; `start_ns` is the first stamp since they were last forgotten,
+    `has_extra` tells whether anything but the start is unknown of them.
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
@@ -161,17 +123,8 @@ class LagBank:
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
         """
-        Take the next value of the input [K]; it moved there in a straight line.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            When.
-        value : float
-            The value [K].
-        sd : float, optional
-            What the value may have been wrong by since the last one [K].
-
+        Take the next value of the input [K]; it moved there in a straight line, and may have been
+        wrong by `sd` since the last one [K].
         """
         seen_ns = self.stamp_ns
         if seen_ns is None:
@@ -228,20 +181,8 @@ class LagBank:
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
         """
-        Give what the input has left its lags behind by at a stamp, and the variances beyond start.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            The stamp.
-        value : float
-            The input at it [K].
-
-        Returns
-        -------
-        tuple of list of float
-            ``u - L`` [K] and its extra variance [K^2], one per time constant.
-
+        Give ``u - L`` [K] of each lag at a stamp where the input is `value`, and variances beyond
+        start.
         """
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
@@ -264,22 +205,7 @@ class LagBank:
 
 
 class ThermalMemory:
-    """
-    All that a tracker remembers.
-
-    Parameters
-    ----------
-    spec : MemorySpec
-        What that is.
-
-    Attributes
-    ----------
-    board : LagBank
-        The lags of the board.
-    neighbours : list of LagBank
-        Those of each sensor's gradient.
-
-    """
+    """All that a tracker remembers: lags of the board and of each gradient, plays."""
 
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
@@ -350,22 +276,7 @@ def memory_on_grid(
     """
     Remember whole columns at once: what `ThermalMemory` gives on a uniform grid, but for rounding.
 
-    Parameters
-    ----------
-    spec : MemorySpec
-        What to remember.
-    step_s : float
-        Step of the grid [s].
-    board : ndarray, shape (n,)
-        Board temperature [degC].
-    gradients : sequence of ndarray, each of shape (n,)
-        ``T_s - T_board`` of each sensor [K].
-
-    Returns
-    -------
-    ndarray, shape (n, 2 * n_lags + n_plays)
-        (lag [K], 0) per lag, then each play less its input [K].
-
+    Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
     columns: list[Floats] = []

@@ -19,22 +19,8 @@ NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)
 
 def mix(quiet: State, bent: State, to_quiet: float, to_bent: float) -> tuple[State, State]:
     """
-    Blend each of two states with the other one: what they differ by is worked out once.
-
-    Parameters
-    ----------
-    quiet, bent : tuple of float
-        The states.
-    to_quiet : float
-        Share of the bent state in the new quiet one, 0..1.
-    to_bent : float
-        Share of the quiet state in the new bent one, 0..1.
-
-    Returns
-    -------
-    quiet, bent : tuple of float
-        ``blend(quiet, bent, to_quiet)`` and ``blend(bent, quiet, to_bent)``, to the bit.
-
+    Blend each of two states with the other one: what they differ by is worked out once. Gives
+    ``blend(quiet, bent, to_quiet)`` and ``blend(bent, quiet, to_bent)``, to the bit.
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = quiet
     u, w, b, r00, r01, r02, r11, r12, r22 = bent
@@ -72,24 +58,8 @@ def mix(quiet: State, bent: State, to_quiet: float, to_bent: float) -> tuple[Sta
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
     """
-    Carry a state over a time step: constant acceleration that decays and wanders.
-
-    Parameters
-    ----------
-    state : tuple of float
-        Temperature, rate, acceleration and the upper triangle of their covariance.
-    dt : float
-        The step, s.
-    lag : float
-        Decay time of the acceleration, s; infinite = none.
-    power : float
-        Spectral density of the white noise that drives the acceleration, K^2/s^5.
-
-    Returns
-    -------
-    tuple of float
-        The state at the end of the step.
-
+    Carry a state over `dt` [s]: the acceleration decays with `lag` [s] and is driven by white
+    noise of the spectral density `power` [K^2/s^5].
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     half = 0.5 * dt * dt
@@ -115,26 +85,8 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
 
 def correct(state: State, measured: float, variance: float) -> tuple[State, float, float]:
     """
-    Let a state learn from one measurement of the temperature.
-
-    Parameters
-    ----------
-    state : tuple of float
-        Temperature, rate, acceleration and the upper triangle of their covariance.
-    measured : float
-        The measured temperature, degC.
-    variance : float
-        Its variance, K^2.
-
-    Returns
-    -------
-    state : tuple of float
-        The corrected state.
-    innovation : float
-        Measured minus expected, K.
-    spread : float
-        Variance of the innovation, K^2.
-
+    Let a state learn from a temperature [degC] of known variance [K^2]; give it, the innovation
+    [K] and the variance of this.
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     spread = p00 + variance
@@ -162,22 +114,8 @@ def correct(state: State, measured: float, variance: float) -> tuple[State, floa
 
 def merge(one: State, other: State, share: float) -> tuple[float, float, float, float, float]:
     """
-    Mix two states as `blend` does, without what concerns the acceleration.
-
-    That is asked for rarely, and this is done for each reading.
-
-    Parameters
-    ----------
-    one, other : tuple of float
-        The states.
-    share : float
-        Share of the other one, 0..1.
-
-    Returns
-    -------
-    tuple of float
-        Temperature, rate; then P00, P01, P11.
-
+    Mix two states as `blend` does, but for the acceleration, which is asked for rarely:
+    temperature, rate; then P00, P01, P11.
     """
     t, v, _, p00, p01, _, p11, _, _ = one
     u, w, _, r00, r01, _, r11, _, _ = other
@@ -195,20 +133,7 @@ def merge(one: State, other: State, share: float) -> tuple[float, float, float, 
 
 def blend(one: State, other: State, share: float) -> State:
     """
-    Mix two states: mean and covariance of the mixture.
-
-    Parameters
-    ----------
-    one, other : tuple of float
-        The states.
-    share : float
-        Share of the other one, 0..1.
-
-    Returns
-    -------
-    tuple of float
-        The mixture; its covariance contains the distance of the two.
-
+    Mix two states by the share of the other one: the covariance contains the distance of the two.
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = one
     u, w, b, r00, r01, r02, r11, r12, r22 = other

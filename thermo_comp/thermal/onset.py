@@ -43,24 +43,8 @@ class OnsetTest:
     """
     Baseline, swing and departure of the rate of one sensor.
 
-    Parameters
-    ----------
-    sensor : ThermometerSettings
-        The sensor.
-    smallest_rate : float
-        Rate of the smallest ramp that must be seen, K/s.
-    ripple : float
-        Amplitude of the surroundings' temperature in a soak, K.
-    false_alarms : float
-        Allowed rate of departures by noise alone, 1/s.
-
-    Attributes
-    ----------
-    rate : float
-        The rate, of the filter with the longer memory, K/s.
-    swing : float
-        How far the rate of a soak is known to go from its baseline, K/s.
-
+    `rate` [K/s] is that of the filter with the longer memory, `swing` [K/s] how far the rate of a
+    soak is known to go from its baseline.
     """
 
     def __init__(
@@ -114,62 +98,25 @@ class OnsetTest:
 
     def settle(self, sensor: Thermometer, least_doubt: float = 0.0) -> None:
         """
-        Begin a soak: what the rate is now is its baseline.
-
-        Parameters
-        ----------
-        sensor : Thermometer
-            The sensor.
-        least_doubt : float, optional
-            How far the baseline may be off at the least, K/s; it fades with the soak.
-
+        Begin a soak: what the rate is now is its baseline, give or take `least_doubt` [K/s] at the
+        least.
         """
         self._baseline = self.rate
         self._doubt = max(self.swing, least_doubt, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # edges that were crossed before the soak tell of the ramp
 
     def is_following(self, stamp_ns: int) -> bool:
-        """
-        Tell whether `rate` is that of the reading with this stamp.
-
-        Returns
-        -------
-        bool
-            False while the test starts, or follows nothing.
-
-        """
+        """Tell whether `rate` is that of the reading with this stamp."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
-        """
-        Tell whether the rate is within a swing of the baseline.
-
-        Returns
-        -------
-        bool
-            True when nothing is left of a departure.
-
-        """
+        """Tell whether the rate is within a swing of the baseline."""
         return abs(self.rate - self._baseline) < self.swing + self._doubt
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
-        Take the sensor's last used reading.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Its stamp, ns.
-        sensor : Thermometer
-            The sensor.
-        pace : float
-            How fast the baseline may follow the rate: 1 in a soak, 0 in a ramp.
-
-        Returns
-        -------
-        int
-            Sign of the departure from the baseline, 0 = none.
-
+        Take the sensor's last used reading; the baseline follows at `pace`, 1 in a soak, 0 in a
+        ramp. Returns the sign of the departure from the baseline, 0 = none.
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9

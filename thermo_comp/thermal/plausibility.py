@@ -68,28 +68,8 @@ _NO_FAULT = Fault.NONE
 
 class SensorGuard:
     """
-    Judges one sensor's readings by its past and by the other sensor.
-
-    Parameters
-    ----------
-    own : Thermometer
-        The sensor's estimator; the guard only looks at it.
-    other : Thermometer
-        That of the other sensor.
-    lag_s : float
-        How slowly this sensor follows the other one [s]; 0 for the one that leads.
-
-    Attributes
-    ----------
-    own : Thermometer
-        The sensor's estimator.
-    fault : Fault
-        What is wrong at the moment.
-    step : float
-        Size of the last step that was not believed [K].
-    is_revived : bool
-        Whether the reading just admitted ends a standstill: what was before counts no more.
-
+    Judges one sensor's readings by its past and by the other sensor, which it follows by `lag_s`;
+    0 for the one that leads. `is_revived`: the reading just admitted ends a standstill.
     """
 
     def __init__(self, own: Thermometer, other: Thermometer, lag_s: float) -> None:
@@ -121,22 +101,7 @@ class SensorGuard:
         self._seen_ns: int | None = None
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
-        """
-        Judge a reading before it is used.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Its stamp.
-        celsius : float
-            The reading [degC].
-
-        Returns
-        -------
-        bool
-            Whether the estimator may have it.
-
-        """
+        """Judge a reading [degC] before it is used: whether the estimator may have it."""
         own = self.own
         own_ns, fault = own.stamp_ns, self.fault
         self.is_revived = False
@@ -246,20 +211,7 @@ class SensorGuard:
 
 
 def still_readings(settings: ThermometerSettings) -> int:
-    """
-    How many equal readings in a row are more than chance.
-
-    Parameters
-    ----------
-    settings : ThermometerSettings
-        The sensor; only one without cells has such a number.
-
-    Returns
-    -------
-    int
-        At least `STILL_READINGS`.
-
-    """
+    """How many equal readings in a row are more than chance, of a sensor without cells."""
     same = erf(settings.quantum_c / (2.0 * sqrt(2.0) * settings.noise_sd_c))
     if not 0.0 < same < 1.0:
         return STILL_READINGS
@@ -273,21 +225,7 @@ class LeadWatch:
     The movements since the last calm are compared while both sensors move in one direction. Heat
     that comes from outside moves the case first; where the board leads, the two topics are
     swapped, or the heat comes from inside, and in both cases the gradient terms do not hold.
-
-    Parameters
-    ----------
-    case, board : Thermometer
-        The estimators.
-    calm_k_min : float
-        It is calm while both rates are below this, K/min.
-
-    Attributes
-    ----------
-    is_reversed : bool
-        Whether the board has led in the last ramp that told.
-    doubt : float
-        Square of the lead that the board may have had in this ramp [K^2].
-
+    `doubt` is the square of the lead that the board may have had in this ramp [K^2].
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:

@@ -11,15 +11,7 @@ from __future__ import annotations
 
 
 class Plays:
-    """
-    Play operators on one input.
-
-    Parameters
-    ----------
-    widths : tuple of float
-        Half-widths [K].
-
-    """
+    """Play operators of some half-widths [K] on one input."""
 
     def __init__(self, widths: tuple[float, ...]) -> None:
         self.widths = widths

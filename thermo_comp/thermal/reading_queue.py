@@ -86,20 +86,9 @@ class ReadingQueue:
 
 def refused_readings(stamps: Stamps, kinds: Ints, arrival: Ints, effect: Ints) -> Bools | None:
     """
-    Find what a queue refuses of many readings, as a later one is of another clock.
-
-    Parameters
-    ----------
-    stamps, kinds : ndarray of int64, shape (n,)
-        The readings, those of each kind in order of arrival.
-    arrival, effect : ndarray of int64, shape (n,)
-        Samples before each reading comes, and before it takes effect.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,), or None
-        None where there are none.
-
+    Find what a queue refuses of many readings, those of each kind in order of arrival, as a later
+    one is of another clock; None if nothing. `arrival`, `effect`: samples before a reading comes,
+    and before it takes effect.
     """
     refused = np.zeros(len(stamps), dtype=np.bool_)
     for kind in range(int(kinds.max(initial=-1)) + 1):

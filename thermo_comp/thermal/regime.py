@@ -44,20 +44,7 @@ class RegimeDetector:
     """
     State machine over the estimates of the case and the board.
 
-    Parameters
-    ----------
-    settings : DetectorSettings
-        Thresholds in physical terms.
-
-    Attributes
-    ----------
-    regime : Regime
-        The state.
-    direction : int
-        In the dynamic state -1 cooling, +1 heating, 0 not yet sure; otherwise 0.
-    switched_ns : int or None
-        Stamp of the last switch.
-
+    `direction` in the dynamic state: -1 cooling, +1 heating, 0 not yet sure; otherwise 0.
     """
 
     def __init__(self, settings: DetectorSettings) -> None:
@@ -94,20 +81,8 @@ class RegimeDetector:
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
         """
-        Decide after an accepted reading of the leading sensor.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Stamp of that reading, ns.
-        case, board : Thermometer or None
-            The two estimates; None for a sensor that is lost. The case leads while it is there.
-
-        Returns
-        -------
-        Regime
-            The regime from this stamp on.
-
+        Decide after an accepted reading of the leading sensor, the case while it is there; None
+        for a sensor that is lost.
         """
         if case is not None:
             lead, onset = case, self._case_onset

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import inf
-from typing import Final
+from typing import Annotated, Final
 
 CELL_SIGMAS: Final = 2.5  # a quantum above this many noise sds has cells ...
 WIDE_CELL_SIGMAS: Final = 8.5  # ... that noise never crosses: six sds of a difference
@@ -21,20 +21,7 @@ def refuse_outside(
     settings: object, *, positive: tuple[str, ...], not_negative: tuple[str, ...]
 ) -> None:
     """
-    Refuse settings that are outside their range.
-
-    Parameters
-    ----------
-    settings : object
-        Whatever has them as attributes.
-    positive, not_negative : tuple of str
-        The names of those that must be above zero, and of those that may be zero.
-
-    Raises
-    ------
-    ValueError
-        If one is outside its range or not finite.
-
+    Refuse attributes that are not above zero, or not at least zero, or not finite: ValueError.
     """
     for name in (*positive, *not_negative):
         value = getattr(settings, name)
@@ -47,30 +34,18 @@ def refuse_outside(
 class ThermometerSettings:
     """
     What is known of one temperature sensor, in physical terms; its keys are the file's keys.
-
-    Parameters
-    ----------
-    noise_sd_c : float
-        Standard deviation of the white noise of one reading, before quantization, K.
-    quantum_c : float
-        Step of the readings, K; 0 for a continuous sensor.
-    fastest_ramp_k_min : float
-        Rate of the fastest ramps it will see, K/min.
-    lag_s : float
-        Thermal lag between the surroundings and the sensor, s. Together with the ramp it says how
-        sharply the temperature bends: an onset is an acceleration of ``ramp / lag``.
-
-    Raises
-    ------
-    ValueError
-        If a value is not finite or outside its range.
-
     """
 
-    noise_sd_c: float = 0.005
-    quantum_c: float = 0.0
-    fastest_ramp_k_min: float = 3.0
-    lag_s: float = 600.0
+    noise_sd_c: Annotated[
+        float, 'Standard deviation of the white noise of one reading, before quantization, K.'
+    ] = 0.005
+    quantum_c: Annotated[float, 'Step of the readings, K; 0 for a continuous sensor.'] = 0.0
+    fastest_ramp_k_min: Annotated[float, 'Rate of the fastest ramps it will see, K/min.'] = 3.0
+    lag_s: Annotated[
+        float,
+        'Thermal lag between the surroundings and the sensor, s. Together with the ramp it says '
+        'how sharply the temperature bends: an onset is an acceleration of ``ramp / lag``.',
+    ] = 600.0
 
     def __post_init__(self) -> None:
         """Refuse values that no sensor has."""
@@ -95,37 +70,31 @@ class ThermometerSettings:
 class DetectorSettings:
     """
     What must be seen and what must not; its keys are the calibration file's `detector` section.
-
-    Parameters
-    ----------
-    smallest_ramp_k_min : float
-        The slowest ramp that must never be missed, K/min.
-    false_alarms_per_hour : float
-        How often the sensor's noise alone may open the dynamic state, per hour of soak.
-    ripple_c : float
-        Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K.
-        Through the lag it makes a rate of at most ``ripple_c / lag_s``, which is no onset.
-    relaxed_rate_k_min : float
-        The lag has died when every sensor's rate is surely below this, K/min.
-    dwell_s : float
-        How long it must have been below, and the shortest dynamic state, s.
-    case, board : ThermometerSettings
-        The two sensors.
-
-    Raises
-    ------
-    ValueError
-        If a value is not finite, outside its range, or contradicts another one.
-
     """
 
-    smallest_ramp_k_min: float = 0.2
-    false_alarms_per_hour: float = 0.02
-    ripple_c: float = 0.1
-    relaxed_rate_k_min: float = 0.05
-    dwell_s: float = 60.0
-    case: ThermometerSettings = field(default_factory=ThermometerSettings)
-    board: ThermometerSettings = field(default_factory=ThermometerSettings)
+    smallest_ramp_k_min: Annotated[float, 'The slowest ramp that must never be missed, K/min.'] = (
+        0.2
+    )
+    false_alarms_per_hour: Annotated[
+        float, "How often the sensor's noise alone may open the dynamic state, per hour of soak."
+    ] = 0.02
+    ripple_c: Annotated[
+        float,
+        "Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K. "
+        'Through the lag it makes a rate of at most ``ripple_c / lag_s``, which is no onset.',
+    ] = 0.1
+    relaxed_rate_k_min: Annotated[
+        float, "The lag has died when every sensor's rate is surely below this, K/min."
+    ] = 0.05
+    dwell_s: Annotated[
+        float, 'How long it must have been below, and the shortest dynamic state, s.'
+    ] = 60.0
+    case: Annotated[ThermometerSettings, 'The two sensors.'] = field(
+        default_factory=ThermometerSettings
+    )
+    board: Annotated[ThermometerSettings, 'The two sensors.'] = field(
+        default_factory=ThermometerSettings
+    )
 
     def __post_init__(self) -> None:
         """Refuse values that contradict each other."""
@@ -144,25 +113,10 @@ class DetectorSettings:
 @dataclass(frozen=True)
 class ThermalConfig:
     """
-    How the tracker behaves where the unit's calibration has no say.
-
-    Parameters
-    ----------
-    transition_time_s : float
-        Time over which the sets cross over after a switch [s]; 0 = the paper's hard switch.
-    case_timeout_s : float
-        Age at which the case temperature counts as lost [s].
-    board_lag_s : float
-        Time constant of the board behind the case, for the gradient while the case is lost [s].
-    temperature_timeout_s : float
-        Age of the board temperature at which the unit counts as unmeasured: only after that does
-        a sensor that has taken an impossible step start anew [s].
-
-    Raises
-    ------
-    ValueError
-        If a value is out of its range.
-
+    How the tracker behaves where the unit's calibration has no say [s]: cross-over of the sets, 0
+    = the paper's hard switch; age at which the case temperature is lost; the board's time constant
+    behind the case, for the gradient while it is; age of the board temperature at which the unit
+    is unmeasured, and only after which a sensor that has taken an impossible step starts anew.
     """
 
     transition_time_s: float = 30.0

@@ -20,24 +20,8 @@ MEMORY_SETTLED_SD: Final = 0.05
 
 class Layout:
     """
-    Where in a sample what stands.
-
-    Parameters
-    ----------
-    spec : MemorySpec
-        Of the tracker that gives the samples.
-
-    Attributes
-    ----------
-    gradients : dict of str to int
-        Place of each sensor's gradient; its variance comes behind it.
-    lags : dict of (str, float) to int
-        Place of each lag; its extra variance comes behind it.
-    plays : dict of (float, float) to int
-        Place of each play.
-    first_lag, first_play, width : int
-        Where they begin, and the length of a sample.
-
+    Where in a sample what stands: by name each gradient, lag and play; a variance comes behind
+    each gradient and lag. `width` is the length of a sample.
     """
 
     def __init__(self, spec: MemorySpec) -> None:

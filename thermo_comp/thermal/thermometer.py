@@ -43,36 +43,14 @@ NOISE_MEMORY: Final = 200.0  # surprises over which the declared noise is judged
 
 class Thermometer:
     """
-    Causal estimate of one sensor's temperature and its first two derivatives.
+    Causal estimate of one sensor's temperature [degC], its rate [K/s] and acceleration [K/s^2].
 
-    Attributes
-    ----------
-    stamp_ns : int or None
-        Stamp of the last used reading.
-    changed_ns : int or None
-        Stamp at which the reading last changed; it stands still on a frozen sensor.
-    temperature, rate, acceleration : float
-        The estimate at `stamp_ns`, degC, K/s, K/s^2; NaN before the first reading.
-    var_temperature, var_rate, var_acceleration : float
-        Its variances, K^2, K^2/s^2, K^2/s^4; infinite before the first reading.
-    interval_s : float
-        Typical interval between readings, s; NaN before the second one.
-    n_in_row : int
-        Readings used since the last start.
-    is_ready : bool
-        Whether there are two of them, so that there is a rate.
-    measured, measured_variance : float
-        What the last used reading said of the temperature at its stamp, degC and K^2: the
-        reading itself, or its equivalent for a sensor with cells. Infinite variance: nothing.
-    noise_factor : float
-        Noise found / noise declared, at least 1; it already widens the variances.
-    bending : float
-        Probability of the bending mode.
-    reading : float
-        The last used reading, degC.
-    n_used, n_rejected, n_restarts : int
-        Counters: readings used, readings not used, fresh starts after a gap or a step.
-
+    They hold at `stamp_ns`, the last used reading's; NaN, with infinite variances, before the
+    first. `changed_ns` is when the reading last changed, `interval_s` the typical interval,
+    `n_in_row` the readings since the last start, `n_restarts` the fresh starts after a gap or a
+    step. `is_ready`: there are two readings, so there is a rate. `measured` and its variance are
+    what the last reading said of the temperature: itself, or its equivalent for a sensor with
+    cells; infinite variance: nothing. `bending` is the probability of that mode.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:
@@ -116,20 +94,8 @@ class Thermometer:
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
-        Take one reading.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            When it was measured, ns.
-        reading_c : float
-            The reading, degC.
-
-        Returns
-        -------
-        bool
-            False when it was not used: no temperature, not newer than the last one, an outlier.
-
+        Take one reading [degC]; False when it was not used: no temperature, not newer than the
+        last one, an outlier.
         """
         if not COLDEST <= reading_c <= HOTTEST:
             self.n_rejected += 1
@@ -238,14 +204,9 @@ class Thermometer:
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
         """
-        Extrapolate to a stamp, linearly within a few reading intervals, held beyond them.
-
-        Returns
-        -------
-        tuple of float
-            Temperature [degC], rate [K/s] and variance of the temperature [K^2];
-            ``(nan, nan, inf)`` before the first reading.
-
+        Extrapolate to a stamp, linearly within a few reading intervals, held beyond them:
+        temperature [degC], rate [K/s], variance of the temperature [K^2]; ``(nan, nan, inf)``
+        before the first reading.
         """
         if self.stamp_ns is None:
             return nan, nan, inf

@@ -28,17 +28,8 @@ UNWATCHED_SHARE: Final = 0.25
 
 class ThermalTracker:
     """
-    Thermal state from stamped readings of the board and of the thermometers beside it.
-
-    Parameters
-    ----------
-    detector : DetectorSettings
-        Thermometers and detector, as the coefficient sets were fitted under.
-    memory : MemorySpec, optional
-        The sensors by name, and what is remembered of them.
-    config : ThermalConfig, optional
-        Cross-over, time-out and stand-in.
-
+    Thermal state from stamped readings of the board and of the thermometers beside it, under the
+    detector's settings that the coefficient sets were fitted under.
     """
 
     def __init__(
@@ -109,23 +100,9 @@ class ThermalTracker:
 
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
         """
-        Take one reading.
-
-        Parameters
-        ----------
-        name : str
-            ``'board'``, or the name of a sensor; one of the leading sensor decides the regime.
-        stamp_ns : int
-            Its stamp.
-        celsius : float
-            The reading [degC].
-
-        Returns
-        -------
-        bool
-            Whether the reading was used; False for one that is not finite, not newer than the
-            last, an outlier, or not plausible.
-
+        Take one reading [degC] of ``'board'`` or of a sensor, the leading one of which decides the
+        regime; False for one that is not finite, not newer than the last, an outlier, or not
+        plausible.
         """
         if name == BOARD_INPUT:
             return self._read_board(stamp_ns, celsius)
@@ -258,21 +235,13 @@ class ThermalTracker:
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
-        Thermal state at a stamp as a flat tuple, in the layout of `BOARD` .. `VAR_GRADIENT`.
+        Thermal state at a stamp as a flat tuple, in the order of `state.Layout`; the board must
+        have been read at least once.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            The stamp; the board must have been read at least once.
-
-        Returns
-        -------
-        tuple of float
-            Board temperature [degC], its variance [K^2], its rate [K/s], weight, 1.0 while the
-            regime is unknown; (gradient [K], variance from the sensor's side [K^2]) per sensor;
-            (lag [K], variance beyond that of its start [K^2]) per lag: ``T - L`` of the board, L
-            of a gradient; play less its input [K] per play.
-
+        Board temperature [degC], its variance [K^2], its rate [K/s], weight, 1.0 while the regime
+        is unknown; (gradient [K], variance from the sensor's side [K^2]) per sensor; (lag [K],
+        variance beyond that of its start [K^2]) per lag: ``T - L`` of the board, L of a gradient;
+        play less its input [K].
         """
         board, rate, var_board = self.board.at(stamp_ns)
         decided_ns = self._decided_ns
@@ -323,13 +292,7 @@ class ThermalTracker:
 
     def state_at(self, stamp_ns: int) -> ThermalState:
         """
-        Thermal state at a stamp, with names.
-
-        Raises
-        ------
-        ValueError
-            If the board thermometer has not been read yet.
-
+        Thermal state at a stamp, with names. ValueError before the first reading of the board.
         """
         if self.board.stamp_ns is None:
             raise ValueError('`state_at` needs a board temperature first')
