@@ -65,7 +65,7 @@ def check_compressed(data: bytes) -> None:
 
 def _read(path: Path, n_bytes: int) -> None:
     with open_recording(path, require=()) as reader:
-        n = sum(len(block) + len(block.board) + len(block.case) for block in reader.blocks())
+        n = sum(block.n_messages for block in reader.blocks())
     assert n <= MOST_PER_BYTE * n_bytes, n
 
 

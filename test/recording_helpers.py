@@ -195,19 +195,17 @@ def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
 def assert_columns(block: Block, messages: list[Message]) -> None:
     """Check that the block holds exactly these messages in this order."""
     expected = columns_of(messages)
-    for role in ('accel', 'board', 'case'):
-        for name in ('stamp_ns', 'log_ns'):
-            found = getattr(block, f'{role}_{name}')
+    accel = (block.accel_stamp_ns, block.accel, np.arange(len(block)))
+    for role, (stamp_ns, values, after) in {'accel': accel, **block.temperatures}.items():
+        for name, found in (('stamp_ns', stamp_ns), ('log_ns', block.log_ns[role])):
             assert found.dtype == np.int64
             assert found.tolist() == expected[f'{role}_{name}'], (role, name)
-        values = getattr(block, role)
+        assert after.tolist() == expected[f'{role}_after']
         assert values.dtype == np.float64
         # Bits, not values: a NaN with its payload must come through.
         shape = (-1, 3) if role == 'accel' else (-1,)
         wanted = np.array(expected[f'{role}_values'], np.float64).reshape(shape)
         assert np.ascontiguousarray(values).tobytes() == wanted.tobytes(), role
-    assert block.board_after.tolist() == expected['board_after']
-    assert block.case_after.tolist() == expected['case_after']
 
 
 def regular_messages(n: int = 40, accel: str = ACCEL, every: int = 8) -> list[Message]:

@@ -82,11 +82,12 @@ def test_round_trip_through_the_bag(tmp_path: Path) -> None:
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
     # A held value is one message: 4 levels of the case, 10 of the board, each when it came.
-    assert block.case.tolist() == [20.0, 20.5, 21.0, 21.5]
-    assert block.case_stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
-    assert len(block.board) == report.board_messages == 10
+    case, board = block.temperatures['case'], block.temperatures['board']
+    assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
+    assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
+    assert len(board.celsius) == report.board_messages == 10
     # A reading stands before the sample of its own stamp: a node has it when the sample comes.
-    assert block.case_after.tolist() == [0, 100, 200, 300]
+    assert case.after.tolist() == [0, 100, 200, 300]
     assert (report.rows, report.accel_messages) == (400, 400)
     assert report.rate_hz == pytest.approx(100.0)
     assert report.duration_s == pytest.approx(3.99)
@@ -149,7 +150,7 @@ def test_every_odd_row_is_accounted_for(tmp_path: Path) -> None:
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
     # The log time keeps the file's order, where the stamps do not.
-    assert (np.diff(block.accel_log_ns) >= 0).all()
+    assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 
 def test_a_fixed_rate_gathers_no_rounding(tmp_path: Path) -> None:
@@ -167,8 +168,10 @@ def test_runs_of_rows_make_no_difference(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr('thermo_comp.convert.log._RUN_ROWS', 64)
     write_log(table_log(path, column_map()), tmp_path / 'parts')
     whole, parts = (read_recording(tmp_path / name).columns for name in ('whole', 'parts'))
-    for name in ('accel_stamp_ns', 'accel', 'board', 'board_after', 'case', 'case_after'):
+    for name in ('accel_stamp_ns', 'accel'):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
+    for name, readings in whole.temperatures.items():
+        np.testing.assert_array_equal(readings, parts.temperatures[name])
 
 
 @pytest.mark.parametrize(
@@ -181,7 +184,7 @@ def test_temperature_units(tmp_path: Path, unit: str, celsius: float) -> None:
     path.write_text(text)
     board = {'column': 'board', 'unit': unit, **raw}
     write_log(table_log(path, column_map(board=board)), tmp_path / 'bag')
-    first = float(read_recording(tmp_path / 'bag').columns.board[0])
+    first = float(read_recording(tmp_path / 'bag').columns.temperatures['board'].celsius[0])
     # 300 K, the boiling point of water, 160 steps of 1/16 K above 20 degC.
     assert first == pytest.approx({'K': 26.85, 'degF': 100.0, 'raw': 30.0, 'degC': 30.0}[unit])
 
@@ -380,8 +383,8 @@ class TestFreezer:
         assert report.stillness.magnitude == pytest.approx(1.02, abs=0.03)
         block = read_recording(tmp_path / 'bag').columns
         assert len(block) == 24514
-        assert block.case.min() == pytest.approx(-17.8, abs=0.1)
-        assert block.board.min() == pytest.approx(3.6, abs=0.5)
+        assert block.temperatures['case'].celsius.min() == pytest.approx(-17.8, abs=0.1)
+        assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
         # The air sensor holds its value between readings of its own: fewer messages than rows.
         assert report.case_messages < 0.75 * report.rows
 

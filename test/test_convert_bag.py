@@ -82,8 +82,12 @@ def test_topics_of_any_name_become_ours(tmp_path, rng, ros):
     np.testing.assert_array_equal(found.columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
     # The thermometer in the Imu's namespace is the board's; temperatures begin at the name's
     # length here.
-    np.testing.assert_array_equal(found.columns.board, len('/mpu/die') + np.arange(8))
-    np.testing.assert_array_equal(found.columns.case, len('/baro/air') + np.arange(8))
+    np.testing.assert_array_equal(
+        found.columns.temperatures['board'].celsius, len('/mpu/die') + np.arange(8)
+    )
+    np.testing.assert_array_equal(
+        found.columns.temperatures['case'].celsius, len('/baro/air') + np.arange(8)
+    )
     assert found.info.metadata['topic_board'] == '/mpu/die'
 
 

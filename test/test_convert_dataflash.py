@@ -96,10 +96,12 @@ def test_new_instances(tmp_path, rng, imu, baro):
     # 0.3 passed through a float32.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
     # The chip's temperature stands still for ten samples: only its changes are messages.
-    np.testing.assert_array_equal(bag.board, 30.0 + imu + 0.25 * np.arange(N // 10))
+    np.testing.assert_array_equal(
+        bag.temperatures['board'].celsius, 30.0 + imu + 0.25 * np.arange(N // 10)
+    )
     # The barometer's is stored in hundredths of a degree.
     hundredths = (2000 + np.arange(0, N, 10)) if baro == 0 else (1500 - np.arange(0, N, 10))
-    np.testing.assert_allclose(bag.case, hundredths / 100, rtol=1e-15)
+    np.testing.assert_allclose(bag.temperatures['case'].celsius, hundredths / 100, rtol=1e-15)
 
 
 def test_old_types_are_the_instances(tmp_path, rng):

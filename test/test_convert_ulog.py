@@ -104,8 +104,8 @@ def test_log_arrives_in_the_bag(flight, tmp_path, imu):
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
     # The chip changes at every sample; the barometer is the second, slower thermometer.
-    np.testing.assert_array_equal(bag.board, truth['celsius'][imu])
-    np.testing.assert_array_equal(bag.case, 20 + 0.5 * np.arange(12))
+    np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
+    np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
     assert recording.info.metadata['px4_hardware'] == 'TESTB'
 

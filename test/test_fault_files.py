@@ -146,8 +146,8 @@ def rewritten(torn: Path, whole: Path) -> None:
     """Write what can be read of a torn bag as a whole one."""
     found = read_recording(torn).columns
     with BagWriter(whole) as bag:
-        bag.write_temperature('temperature/board', found.board_stamp_ns, found.board)
-        bag.write_temperature('temperature/case', found.case_stamp_ns, found.case)
+        bag.write_temperature('temperature/board', *found.temperatures['board'][:2])
+        bag.write_temperature('temperature/case', *found.temperatures['case'][:2])
         bag.write_counts('accel/counts', found.accel_stamp_ns, found.accel, found.frame_id)
 
 

@@ -45,7 +45,7 @@ def test_seeds_are_behind_the_first_checks() -> None:
         with open_mcap([Path('seed.mcap')], lambda _, file=file: file, require=()) as reader:
             assert reader.info.truncated is None
             (block,) = reader.blocks()
-        assert (len(block), len(block.board)) == (3, 3)
+        assert (len(block), len(block.log_ns['board'])) == (3, 3)
     before = targets.COMPENSATOR.counters.n_out
     TARGETS['cdr'].check(TARGETS['cdr'].seeds[0])
     assert targets.COMPENSATOR.counters.n_out == before + 1

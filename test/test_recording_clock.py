@@ -33,7 +33,12 @@ def blocks_of(path: Path, stamp_ns: np.ndarray, reading_ns: np.ndarray) -> list[
 
 
 def joined(blocks: list[Block], name: str) -> np.ndarray:
-    return np.concatenate([getattr(block, name) for block in blocks])
+    return np.concatenate(
+        [
+            block.accel_stamp_ns if name == 'accel' else block.temperatures[name].stamp_ns
+            for block in blocks
+        ]
+    )
 
 
 @pytest.mark.parametrize('jump_ns', [YEAR_NS, -YEAR_NS, -START_NS + 5, 2 * LONGEST_PAUSE_NS])
@@ -45,21 +50,21 @@ def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path: Path, jump_ns: int)
     )
     # A reading stands before the sample of its log time: the jump is before reading 5.
     hour = LONGEST_PAUSE_NS * after
-    found = joined(blocks, 'accel_stamp_ns') - true_ns
+    found = joined(blocks, 'accel') - true_ns
     assert found[:500].tolist() == [0] * 500
-    steps = np.diff(joined(blocks, 'accel_stamp_ns'))
+    steps = np.diff(joined(blocks, 'accel'))
     assert np.delete(steps, 499).tolist() == [STEP_NS] * 998
     assert abs(int(steps[499]) - LONGEST_PAUSE_NS) <= STEP_NS
     for role in ('board', 'case'):
-        moved = joined(blocks, f'{role}_stamp_ns') - true_ns[::100]
+        moved = joined(blocks, role) - true_ns[::100]
         assert np.abs(moved - hour[::100]).max() <= STEP_NS
 
 
 def test_without_a_jump_nothing_is_touched(tmp_path: Path) -> None:
     stamp_ns = START_NS + np.cumsum(np.tile([STEP_NS, 10**9, LONGEST_PAUSE_NS, -(10**9)], 50))
     blocks = blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
-    assert joined(blocks, 'accel_stamp_ns').tolist() == stamp_ns.tolist()
-    assert joined(blocks, 'board_stamp_ns').tolist() == stamp_ns[::10].tolist()
+    assert joined(blocks, 'accel').tolist() == stamp_ns.tolist()
+    assert joined(blocks, 'board').tolist() == stamp_ns[::10].tolist()
 
 
 def test_what_jumps_all_the_time_is_no_clock(tmp_path: Path) -> None:

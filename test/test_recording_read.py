@@ -211,8 +211,9 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path: Path
     before, n_accel = 0, 0
     for block in blocks:
         # Each reading's place counts within its own block, so it can never exceed the block.
-        assert ((block.board_after >= 0) & (block.board_after <= len(block))).all()
-        before += len(block.board)
+        after = block.temperatures['board'].after
+        assert ((after >= 0) & (after <= len(block))).all()
+        before += len(after)
         n_accel += len(block)
     assert (before, n_accel) == (8, 60)
     assert_columns(read(tmp_path / 'bag.mcap').columns, messages)
@@ -235,7 +236,7 @@ def test_overlapping_chunks_of_single_topics_are_merged(tmp_path: Path) -> None:
 def test_too_many_overlapping_chunks_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr('thermo_comp.recording.sweep._MAX_HELD', 300)
+    monkeypatch.setattr('thermo_comp.recording.mcap_source._MAX_HELD_BYTES', 4000)
     messages = regular_messages(200)
     # Each chunk holds every 40th message, so all of them span the whole time.
     combed = [message for begin in range(40) for message in messages[begin::40]]
@@ -308,17 +309,6 @@ def test_a_bare_database_and_one_without_metadata(tmp_path: Path) -> None:
     assert_columns(read(tmp_path / 'bare.db3').columns, messages)
 
 
-def test_large_chunks_are_streamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('thermo_comp.recording.survey.MAX_CHUNK_BYTES', 2000)
-    monkeypatch.setattr('thermo_comp.recording.chunk.WINDOW_BYTES', 700)
-    messages = regular_messages(300)
-    for compression in ('none', 'lz4', 'zstd'):
-        write_mcap(
-            tmp_path / f'{compression}.mcap', messages, chunk_size=6000, compression=compression
-        )
-        assert_columns(read(tmp_path / f'{compression}.mcap').columns, messages)
-
-
 def test_info_is_known_before_the_messages_are_read(tmp_path: Path) -> None:
     messages = regular_messages(40)
     write_mcap(tmp_path / 'bag.mcap', [*messages, Message(OTHER, START_NS + 10**9)])
@@ -353,7 +343,7 @@ def test_a_topic_is_found_under_its_namespace(tmp_path: Path) -> None:
 
 
 def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('thermo_comp.recording.assemble.BLOCK_MESSAGES', 100)
+    monkeypatch.setattr('thermo_comp.recording.columns.BLOCK_MESSAGES', 100)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
@@ -365,14 +355,13 @@ def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_blocks_have_the_size_that_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr('thermo_comp.recording.mcap_source._GROUP_BYTES', 0)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     whole = read(path).columns
     with open_recording(path) as reader:
         few, many = (list(reader.blocks(n_messages=n)) for n in (100, 500))
     for blocks, n_messages in ((few, 100), (many, 500)):
-        sizes = [len(block) + len(block.board) + len(block.case) for block in blocks]
+        sizes = [block.n_messages for block in blocks]
         assert min(sizes[:-1]) >= n_messages
         assert np.concatenate([block.accel for block in blocks]).tobytes() == whole.accel.tobytes()
     assert len(few) > 2 * len(many)
@@ -397,7 +386,7 @@ def test_readers_that_are_given_up_leave_no_threads(
     one that then waited for its threads stopped the process for good. PROMISE: threads belong to
     the open recording and end with it.
     """
-    monkeypatch.setattr('thermo_comp.recording.assemble.BLOCK_MESSAGES', 10)
+    monkeypatch.setattr('thermo_comp.recording.columns.BLOCK_MESSAGES', 10)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(400), chunk_size=500)
     before = threading.active_count()

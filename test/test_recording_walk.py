@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Finding records: the walk over many at a time equals a walk one by one, whatever bytes there are.
+Finding records: by an index or without, as a plain loop finds them, whatever bytes there are.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.recording.mcap_records import DamagedError
-from thermo_comp.recording.walk import Messages, locate, locate_run, walk
+from thermo_comp.recording.chunks import Messages, locate, walk
+from thermo_comp.recording.unpack import DamagedError
 
 MESSAGE, CHANNEL = 5, 4
 
@@ -47,7 +47,7 @@ def one_by_one(data: bytes) -> tuple[list[tuple[int, int, int, int]], list[bytes
 
 
 def listed(messages: Messages) -> list[tuple[int, int, int, int]]:
-    columns = (messages.at, messages.size, messages.channel, messages.log_ns)
+    columns = (messages.start - 31, messages.size, messages.channel, messages.log_ns)
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
@@ -120,50 +120,6 @@ def test_a_false_index_changes_nothing(data: bytes, drawn: st.DataObject) -> Non
     )
     assert listed(messages) == wanted
     assert others == wanted_others
-
-
-@given(
-    st.lists(records(), min_size=1, max_size=4),
-    st.sampled_from([b'', b'\x05' * 40, bytes(12)]),
-    st.data(),
-)
-@settings(max_examples=60, deadline=None)
-def test_several_chunks_at_once_are_as_one_after_the_other(
-    chunks: list[bytes], between: bytes, drawn: st.DataObject
-) -> None:
-    whole = [one_by_one(chunk) for chunk in chunks]
-    assume(all(messages for messages, _, _ in whole))
-    assume(all(end == len(chunk) for (_, _, end), chunk in zip(whole, chunks, strict=True)))
-    data, areas, places = b'', [], []
-    for chunk, (messages, _, _) in zip(chunks, whole, strict=True):
-        data += between
-        areas.append((len(data), len(data) + len(chunk)))
-        places.append([at for at, _, _, _ in messages])
-        data += chunk
-    expected = [
-        (at + begin, *rest)
-        for (begin, _), (messages, _, _) in zip(areas, whole, strict=True)
-        for at, *rest in messages
-    ]
-    is_false = drawn.draw(st.booleans())
-    if is_false:
-        # One chunk's index lacks a message, or names a place in its neighbour or nowhere.
-        wrong = drawn.draw(st.sampled_from(places))
-        wrong[drawn.draw(st.integers(0, len(wrong) - 1))] = drawn.draw(
-            st.integers(0, len(data)) | st.sampled_from([2**63, 2**64 - 1])
-        )
-    indexes = [memoryview(index_of([(at, 0, 1, 0) for at in offsets])) for offsets in places]
-    seen: list[bytes] = []
-    found = locate_run(
-        np.frombuffer(data, np.uint8), areas, indexes, lambda _, content: seen.append(content)
-    )
-    if found is None:
-        assert is_false
-        return
-    messages, first = found
-    assert listed(messages) == expected
-    assert first.tolist() == np.cumsum([0, *map(len, places)])[:-1].tolist()
-    assert seen == [content for _, others, _ in whole for content in others]
 
 
 def test_what_is_no_sequence_of_records() -> None:

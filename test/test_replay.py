@@ -123,7 +123,7 @@ def test_equals_the_stream_bit_for_bit(tmp_path: Path) -> None:
     block, found_flags = output_of(tmp_path / 'out')
     expected = np.array([row[1:] for row in published])
     assert block.accel_stamp_ns.tolist() == [row[0] for row in published]
-    assert block.accel_log_ns.tolist() == block.accel_stamp_ns.tolist()
+    assert block.log_ns['accel'].tolist() == block.accel_stamp_ns.tolist()
     assert block.accel.tobytes() == np.ascontiguousarray(expected[:, :3]).tobytes()
     assert block.imu is not None
     full = expected[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]]

@@ -30,7 +30,6 @@ from .online.status import CompensatorConfig, Counters
 from .recording import (
     BagWriter,
     Block,
-    ImuColumns,
     Input,
     RawMessages,
     RecordingInfo,
@@ -39,7 +38,6 @@ from .recording import (
     open_recording,
 )
 from .recording.table_out import TABLES, WriteRows, table_writer
-from .typing import Ints
 from .unit.calibration import Calibration
 
 OUTPUT_TOPIC = 'imu/data_raw'
@@ -294,14 +292,14 @@ def _messages_of(
                 corrected.specific_force,
                 corrected.covariance,
                 frame_id or block.frame_id,
-                imu=None if block.imu is None else _rows(block.imu, corrected.index),
+                imu=None if block.imu is None else block.imu.take(corrected.index),
             )
         if item.flags:
             stamps, values = zip(*item.flags, strict=True)
             writer.write_bool(REGIME_TOPIC, np.array(stamps, dtype=np.int64), np.array(values))
         _write_inputs(writer, block, reader)
-        if len(block.accel_log_ns):
-            copy(block.accel_log_ns[-1])
+        if len(block):
+            copy(block.log_ns['accel'][-1])
         writer.flush()
 
     with bag as writer:
@@ -343,24 +341,12 @@ def _others(reader: RecordingReader) -> Iterator[RawMessages]:
     return reader.raw({topic for topic in reader.info.topics if topic.strip('/') not in taken})
 
 
-def _rows(imu: ImuColumns, index: Ints) -> ImuColumns:
-    return ImuColumns(
-        imu.orientation[index],
-        imu.orientation_covariance[index],
-        imu.angular_velocity[index],
-        imu.angular_velocity_covariance[index],
-        imu.linear_acceleration_covariance[index],
-    )
-
-
 def _write_inputs(writer: BagWriter, block: Block, reader: RecordingReader) -> None:
     """Copy the inputs; their log time becomes their stamp, as that of the outputs is."""
-    stamps = {
-        reader.topics.get('accel'): block.accel_stamp_ns,
-        reader.topics.get('board'): block.board_stamp_ns,
-        reader.topics.get('case'): block.case_stamp_ns,
-    }
+    stamps = {name: one.stamp_ns for name, one in block.temperatures.items()}
+    stamps['accel'] = block.accel_stamp_ns
+    roles = {topic: role for role, topic in reader.topics.items()}
     for raw in block.raw:
-        times = stamps[raw.topic]
+        times = stamps[roles[raw.topic]]
         copy = RawMessages(raw.topic, raw.type, times, raw.data, raw.ends)
         writer.write_raw(raw.topic, raw.type, times, copy, reader.definitions.get(raw.type))

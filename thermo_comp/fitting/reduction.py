@@ -164,8 +164,8 @@ def reduce_source(
     n_samples = 0
     for block in source.blocks():
         cells.add(block.accel_stamp_ns, block.accel)
-        board.add(block.board_stamp_ns, block.board)
-        case.add(block.case_stamp_ns, block.case)
+        board.add(*block.temperatures['board'][:2])
+        case.add(*block.temperatures['case'][:2])
         n_samples += len(block.accel_stamp_ns)
     found = cells.finish()
     ranges = still_intervals(found, min_still_s)

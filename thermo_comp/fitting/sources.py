@@ -9,9 +9,9 @@ simulated runs provide it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from ..typing import Floats, Ints
 
@@ -28,20 +28,8 @@ class SourceBlock(Protocol):
         """Counts, or m/s^2, shape (n, 3)."""
 
     @property
-    def board_stamp_ns(self) -> Ints:
-        """Stamps of the board readings, shape (m,)."""
-
-    @property
-    def board(self) -> Floats:
-        """Board temperature, shape (m,)."""
-
-    @property
-    def case_stamp_ns(self) -> Ints:
-        """Stamps of the case readings, shape (k,)."""
-
-    @property
-    def case(self) -> Floats:
-        """Case temperature, shape (k,)."""
+    def temperatures(self) -> Mapping[str, tuple[Ints, Floats, Any]]:
+        """Stamps and readings by the name of their thermometer."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +56,14 @@ class ArrayBlock:
     board: Floats
     case_stamp_ns: Ints
     case: Floats
+
+    @property
+    def temperatures(self) -> Mapping[str, tuple[Ints, Floats, Any]]:
+        """Stamps and readings by the name of their thermometer."""
+        return {
+            'board': (self.board_stamp_ns, self.board, None),
+            'case': (self.case_stamp_ns, self.case, None),
+        }
 
 
 def _nothing() -> str | None:

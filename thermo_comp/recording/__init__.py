@@ -8,17 +8,7 @@ The only package that knows `rosbags` and `mcap`.
 
 from __future__ import annotations
 
-from .columns import (
-    ROLES,
-    Block,
-    ImuColumns,
-    Input,
-    RawMessages,
-    Recording,
-    RecordingInfo,
-    Role,
-    Topics,
-)
+from .columns import ROLES, Block, ImuColumns, Input, RawMessages, Recording, RecordingInfo, Role
 from .random_access import LocalFile, OpenFile, RandomAccess
 from .reader import (
     RecordingReader,
@@ -28,6 +18,7 @@ from .reader import (
     open_recording,
     read_recording,
 )
+from .topics import Topics
 from .writer import STAMP_END_NS, BagWriter
 
 __all__ = [

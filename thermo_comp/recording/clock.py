@@ -29,36 +29,22 @@ _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 def without_jumps(blocks: Iterable[Block]) -> Iterator[Block]:
     """
-    Take the jumps out of the stamps.
+    Take the jumps out of the stamps of blocks: behind a jump all are moved, by the same.
 
-    Parameters
-    ----------
-    blocks : iterable of Block
-        In reading order.
-
-    Yields
-    ------
-    Block
-        The same messages; behind a jump their stamps are moved, all by the same.
-
-    Raises
-    ------
-    RecordingError
-        Stamps that jump all the time, or hold hardly a message a minute.
-
+    Raises RecordingError for stamps that jump all the time, or hold hardly a message a minute.
     """
     last_ns: int | None = None
     offset = 0
     n_jumps = n_messages = span_ns = 0
     for block in blocks:
-        n = len(block.accel_stamp_ns)
-        after = np.concatenate((block.board_after, block.case_after, np.arange(n)))
-        stamps = np.concatenate((block.board_stamp_ns, block.case_stamp_ns, block.accel_stamp_ns))
+        thermometers = block.temperatures.values()
+        # Reading order; a reading stands before the sample that it counts for.
+        places = [*(one.after for one in thermometers), np.arange(len(block))]
+        stamps = np.concatenate([*(one.stamp_ns for one in thermometers), block.accel_stamp_ns])
         if not len(stamps):
             yield block
             continue
-        # Reading order; a reading stands before the sample that it counts for.
-        order = np.argsort(after, kind='stable')
+        order = np.argsort(np.concatenate(places), kind='stable')
         read: Ints = stamps[order]
         steps = np.diff(read, prepend=read[0] if last_ns is None else last_ns)
         is_jump = np.abs(steps) > LONGEST_PAUSE_NS
@@ -81,10 +67,12 @@ def without_jumps(blocks: Iterable[Block]) -> Iterator[Block]:
             continue
         offsets = np.empty_like(moved)
         offsets[order] = moved
-        board, case, accel = np.split(offsets, np.cumsum((len(block.board), len(block.case))))
+        parts = np.split(offsets, np.cumsum([len(one.after) for one in thermometers]))
         yield replace(
             block,
-            accel_stamp_ns=block.accel_stamp_ns + accel,
-            board_stamp_ns=block.board_stamp_ns + board,
-            case_stamp_ns=block.case_stamp_ns + case,
+            accel_stamp_ns=block.accel_stamp_ns + parts[-1],
+            temperatures={
+                name: one._replace(stamp_ns=one.stamp_ns + by)
+                for (name, one), by in zip(block.temperatures.items(), parts, strict=False)
+            },
         )

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the columns: what a bag becomes once it is read, and the words that describe the bag.
+Owns the block: what a stretch of a bag becomes once it is read, and the words that describe a bag.
 
 A column is a numpy array with one row per message. All times are integer nanoseconds: the
 ``stamp`` is the message's own header stamp, the ``log`` is when the recorder got it.
@@ -9,32 +9,24 @@ A column is a numpy array with one row per message. All times are integer nanose
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
+
+import numpy as np
 
 from ..typing import Bytes, Floats, Ints
 
 Input = Literal['auto', 'counts', 'imu']
-Role = Literal['accel', 'board', 'case']
+#: ``accel``, or the name of a thermometer.
+Role = str
 
 ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 
-
-@dataclass(frozen=True, slots=True)
-class Topics:
-    """
-    Where the three inputs stand in a bag.
-
-    A name matches with or without its leading slash and, where only one topic of the bag fits,
-    with any namespace in front: ``accel/counts`` finds ``/imu0/accel/counts``.
-    """
-
-    counts: str = 'accel/counts'
-    imu: str = 'imu/uncompensated'
-    board: str = 'temperature/board'
-    case: str = 'temperature/case'
+#: A block is given out once it has so many messages, where nobody wants another number; a chunk
+#: of usual size has more.
+BLOCK_MESSAGES = 1 << 13
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,16 +74,8 @@ class ImuColumns:
     """
     What a sensor_msgs/Imu carries beside its stamp and its linear acceleration.
 
-    Attributes
-    ----------
-    orientation : ndarray, shape (n, 4)
-        Quaternion x, y, z, w.
-    orientation_covariance : ndarray, shape (n, 9)
-    angular_velocity : ndarray, shape (n, 3)
-        rad/s.
-    angular_velocity_covariance : ndarray, shape (n, 9)
-    linear_acceleration_covariance : ndarray, shape (n, 9)
-
+    The orientation is a quaternion x, y, z, w, shape (n, 4); the rates [rad/s] have shape (n, 3),
+    each covariance (n, 9).
     """
 
     orientation: Floats
@@ -100,21 +84,17 @@ class ImuColumns:
     angular_velocity_covariance: Floats
     linear_acceleration_covariance: Floats
 
+    def take(self, rows: Ints) -> ImuColumns:
+        """Choose some messages."""
+        return ImuColumns(*(getattr(self, one.name)[rows] for one in fields(self)))
+
 
 @dataclass(frozen=True, slots=True)
 class RawMessages:
     """
     Serialized messages of one topic, as they stand in the bag.
 
-    Attributes
-    ----------
-    topic, type : str
-    log_ns : ndarray of int64, shape (n,)
-    data : ndarray of uint8
-        The messages' bytes, one after the other.
-    ends : ndarray of int64, shape (n,)
-        Where each message ends in `data`.
-
+    `data` are their bytes, one after the other, `ends` where each ends, shape (n,).
     """
 
     topic: str
@@ -124,6 +104,21 @@ class RawMessages:
     ends: Ints
 
 
+class Readings(NamedTuple):
+    """
+    What one thermometer said, shape (m,) each.
+
+    `after` counts how many of the block's accelerometer messages stand before each reading.
+    """
+
+    stamp_ns: Ints
+    celsius: Floats
+    after: Ints
+
+
+NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
+
+
 @dataclass(frozen=True, slots=True)
 class Block:
     """
@@ -131,38 +126,28 @@ class Block:
 
     Attributes
     ----------
-    accel_stamp_ns, accel_log_ns : ndarray of int64, shape (n,)
+    accel_stamp_ns : ndarray of int64, shape (n,)
     accel : ndarray, shape (n, 3)
         Counts per cycle, or m/s^2 where the input is sensor_msgs/Imu.
     frame_id : str
         Of the accelerometer messages; a block ends where it changes.
     imu : ImuColumns or None
         The rest of the message where the input is sensor_msgs/Imu.
-    board_stamp_ns, board_log_ns : ndarray of int64, shape (m,)
-    board : ndarray, shape (m,)
-        degC.
-    board_after : ndarray of int64, shape (m,)
-        How many of THIS block's accelerometer messages stand before each reading, 0..n.
-    case_stamp_ns, case_log_ns, case, case_after
-        The same for the case sensor.
+    temperatures : mapping of str to Readings
+        By the name of the thermometer; empty for those that the bag lacks.
+    log_ns : mapping of str to ndarray of int64
+        Log times of the messages by role.
     raw : tuple of RawMessages
-        The very messages, where the caller asked for them.
+        The very messages, where the caller asked for them; one for each topic.
 
     """
 
     accel_stamp_ns: Ints
-    accel_log_ns: Ints
     accel: Floats
     frame_id: str
     imu: ImuColumns | None
-    board_stamp_ns: Ints
-    board_log_ns: Ints
-    board: Floats
-    board_after: Ints
-    case_stamp_ns: Ints
-    case_log_ns: Ints
-    case: Floats
-    case_after: Ints
+    temperatures: Mapping[str, Readings]
+    log_ns: Mapping[Role, Ints]
     raw: tuple[RawMessages, ...] = ()
 
     def __len__(self) -> int:
@@ -170,26 +155,84 @@ class Block:
         return len(self.accel_stamp_ns)
 
     @property
-    def temperatures(self) -> dict[str, tuple[Ints, Floats, Ints]]:
-        """Readings by the name of their thermometer: stamps, degC, samples before."""
-        return {
-            'board': (self.board_stamp_ns, self.board, self.board_after),
-            'case': (self.case_stamp_ns, self.case, self.case_after),
-        }
+    def n_messages(self) -> int:
+        """Count the messages of all roles."""
+        return sum(map(len, self.log_ns.values()))
+
+
+def empty_block(names: Iterable[str]) -> Block:
+    """Make a block without messages, for these thermometers."""
+    temperatures = dict.fromkeys(names, NO_READINGS)
+    log_ns = dict.fromkeys(('accel', *temperatures), NO_READINGS.stamp_ns)
+    return Block(NO_READINGS.stamp_ns, np.empty((0, 3)), '', None, temperatures, log_ns)
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """
-    A whole bag in memory.
-
-    Attributes
-    ----------
-    info : RecordingInfo
-    columns : Block
-        All messages as one block; its `frame_id` is that of the first accelerometer message.
-
-    """
+    """A whole bag in memory, as one block with the `frame_id` of the first sample."""
 
     info: RecordingInfo
     columns: Block
+
+
+def gathered(blocks: Iterable[Block], n_messages: int = 0) -> Iterator[Block]:
+    """Put blocks together until each has so many messages, or the `frame_id` changes."""
+    waiting: list[Block] = []
+    frame_id: str | None = None
+    n_wanted = n_messages or BLOCK_MESSAGES
+    for block in blocks:
+        if len(block):
+            if frame_id not in {None, block.frame_id}:
+                yield joined(waiting)
+                waiting = []
+            frame_id = block.frame_id
+        waiting.append(block)
+        if sum(one.n_messages for one in waiting) >= n_wanted:
+            yield joined(waiting)
+            waiting, frame_id = [], None
+    if waiting:
+        yield joined(waiting)
+
+
+def joined(blocks: Sequence[Block]) -> Block:
+    """Put blocks, at least one, behind each other as one, with the first sample's `frame_id`."""
+    if len(blocks) == 1:
+        return blocks[0]
+    begins = np.cumsum([0, *map(len, blocks)])
+    temperatures = {}
+    for name in blocks[0].temperatures:
+        each = [block.temperatures[name] for block in blocks]
+        after = [one.after + begin for one, begin in zip(each, begins, strict=False)]
+        temperatures[name] = Readings(
+            np.concatenate([one.stamp_ns for one in each]),
+            np.concatenate([one.celsius for one in each]),
+            np.concatenate(after),
+        )
+    imus = [block.imu for block in blocks if block.imu is not None]
+    raws: dict[str, list[RawMessages]] = {}
+    for raw in (raw for block in blocks for raw in block.raw):
+        raws.setdefault(raw.topic, []).append(raw)
+    return Block(
+        np.concatenate([block.accel_stamp_ns for block in blocks]),
+        np.concatenate([block.accel for block in blocks]),
+        next((block.frame_id for block in blocks if len(block)), ''),
+        ImuColumns(
+            *(np.concatenate([getattr(imu, own.name) for imu in imus]) for own in fields(imus[0]))
+        )
+        if imus
+        else None,
+        temperatures,
+        {role: np.concatenate([b.log_ns[role] for b in blocks]) for role in blocks[0].log_ns},
+        tuple(map(_joined_raw, raws.values())),
+    )
+
+
+def _joined_raw(pieces: Sequence[RawMessages]) -> RawMessages:
+    begins = np.cumsum([0, *(len(one.data) for one in pieces)])
+    return RawMessages(
+        pieces[0].topic,
+        pieces[0].type,
+        np.concatenate([one.log_ns for one in pieces]),
+        np.concatenate([one.data for one in pieces]),
+        np.concatenate([one.ends + at for one, at in zip(pieces, begins, strict=False)]),
+    )

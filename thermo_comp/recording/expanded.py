@@ -6,16 +6,15 @@ Owns bags whose files rosbag2 has compressed as a whole: expanded beside, then r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from ..errors import RecordingError
-from .assemble import Part
-from .columns import RawMessages, Role
-from .mcap_records import DamagedError
+from .columns import Block, RawMessages, Role
+from .mcap_file import translated
 from .unpack import expand
 
 if TYPE_CHECKING:
@@ -24,20 +23,10 @@ if TYPE_CHECKING:
 
 class ExpandedSource:
     """
-    A bag of compressed files.
+    A bag of ``.zstd`` files, in the order in which they follow each other.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Its ``.zstd`` files, in the order in which they follow each other.
-    open_files : callable
-        Opens the expanded files, given what is missing of them.
-
-    Raises
-    ------
-    RecordingError
-        A file that holds more than it may, or what `open_files` raises.
-
+    `open_files` opens the expanded ones, given what is missing of them. Raises RecordingError for
+    a file that holds more than it may, and what `open_files` raises.
     """
 
     def __init__(
@@ -51,10 +40,8 @@ class ExpandedSource:
             with self._named():
                 for name, file in self._files.items():
                     expanded.append(Path(self._folder.name, name))
-                    try:
+                    with translated(file):
                         notes.append(expand(file, expanded[-1]))
-                    except DamagedError as error:
-                        raise RecordingError(f'damaged: {error}', file) from error
                 self._source = open_files(expanded, '; '.join(filter(None, notes)) or None)
         except BaseException:
             self._folder.cleanup()
@@ -66,10 +53,12 @@ class ExpandedSource:
         self.truncated = self._source.truncated
         self.metadata = self._source.metadata
 
-    def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
-        """Decode the messages of the chosen topics, in reading order."""
+    def blocks(
+        self, selection: Mapping[Role, str], names: Collection[str], *, raw: bool
+    ) -> Iterator[Block]:
+        """Read the topic of each role, in reading order."""
         with self._named():
-            yield from self._source.parts(selection, raw=raw)
+            yield from self._source.blocks(selection, names, raw=raw)
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
         """Read topics as they are, about in order of log time."""

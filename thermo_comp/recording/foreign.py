@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
-from .assemble import Part
-from .columns import RawMessages, Role
+from .chunks import Messages
+from .columns import Block, RawMessages, Role
 from .decode import Decoder, Feed
 from .unpack import unpack_message
 from .wire import Encoding
@@ -30,24 +30,11 @@ _BATCH_BYTES = 1 << 23
 
 class ForeignSource:
     """
-    Files that `rosbags` reads, one after the other.
+    Files that `rosbags` reads, one after the other: ``.db3``, ``.mcap`` or one ROS 1 ``.bag``.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        ``.db3``, ``.mcap`` or one ROS 1 ``.bag``.
-    metadata : mapping of str to str, optional
-        Key-value pairs that stand beside the files.
-    note : str or None, optional
-        What is missing beside them.
-    is_packed : bool, optional
-        Whether rosbag2 has compressed message by message.
-
-    Raises
-    ------
-    RecordingError
-        Whatever `rosbags` cannot open.
-
+    `metadata` are key-value pairs that stand beside them, `note` what is missing beside them;
+    `is_packed` where rosbag2 has compressed message by message. Raises RecordingError for
+    whatever `rosbags` cannot open.
     """
 
     def __init__(
@@ -104,23 +91,10 @@ class ForeignSource:
         self.start_ns = min((start for start, _ in spans), default=0)
         self.end_ns = max((end for _, end in spans), default=0)
 
-    def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
-        """
-        Read the chosen topics.
-
-        Parameters
-        ----------
-        selection : dict of role to str
-            Topic per role.
-        raw : bool
-            Keep the serialized messages too.
-
-        Raises
-        ------
-        RecordingError
-            Damaged storage or messages.
-
-        """
+    def blocks(
+        self, selection: Mapping[Role, str], names: Collection[str], *, raw: bool
+    ) -> Iterator[Block]:
+        """Read the topic of each role, in reading order."""
         if not self._readers:
             raise RecordingError('the recording is closed', self._path)
         roles = {topic: role for role, topic in selection.items()}
@@ -130,41 +104,46 @@ class ForeignSource:
                 if found.topic in roles:
                     feed = Feed(found.topic, found.msgtype, self._encoding)
                     feeds.setdefault(roles[found.topic], feed)
-        batch = _Batch(Decoder(feeds, {}, raw), feeds)
-        for file, reader in self._readers:
-            chosen = [c for c in reader.connections if c.topic in roles]
-            if not chosen:
-                continue
+        numbers = {feed.topic: number for number, feed in enumerate(feeds.values())}
+        decoder = Decoder(feeds, dict(enumerate(feeds)), names, raw)
+        for file, _ in self._readers:
             with _translated(file):
-                for connection, log_ns, data in reader.messages(connections=chosen):
-                    message = unpack_message(data) if self._is_packed else data
-                    batch.add(roles[connection.topic], log_ns, message)
-                    if batch.is_full:
-                        yield batch.take()
-                if batch.n_messages:
-                    yield batch.take()
+                for batch in self._batches(file, numbers):
+                    yield from decoder.blocks(batch)
+
+    def _batches(self, file: Path, numbers: Mapping[str, int]) -> Iterator[Messages]:
+        """Collect messages to be decoded together; their channel is the number of the topic."""
+        found: list[tuple[int, int]] = []
+        pieces: list[bytes] = []
+        n_bytes = 0
+        for topic, _, log_ns, data in self._messages(file, numbers):
+            found.append((numbers[topic], log_ns))
+            pieces.append(data)
+            n_bytes += len(data)
+            if len(pieces) >= _BATCH_MESSAGES or n_bytes >= _BATCH_BYTES:
+                yield _messages_of(found, pieces)
+                found, pieces, n_bytes = [], [], 0
+        if pieces:
+            yield _messages_of(found, pieces)
+
+    def _messages(
+        self, file: Path, topics: Collection[str]
+    ) -> Iterator[tuple[str, str, int, bytes]]:
+        """Topic, type, log time and bytes of the messages of topics, one by one."""
+        reader = dict(self._readers)[file]
+        chosen = [one for one in reader.connections if one.topic in topics]
+        for one, log_ns, data in reader.messages(connections=chosen) if chosen else ():
+            yield one.topic, one.msgtype, log_ns, unpack_message(data) if self._is_packed else data
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
-        """
-        Read topics as they are, in the order of log time.
-
-        Raises
-        ------
-        RecordingError
-            Damaged storage, or a ROS 1 bag, whose messages are no CDR.
-
-        """
+        """Read topics as they are; not those of a ROS 1 bag, whose messages are no CDR."""
         if self._encoding != 'cdr':
             raise RecordingError('its messages are those of ROS 1: convert the bag', self._path)
-        for file, reader in self._readers:
-            chosen = [c for c in reader.connections if c.topic in topics]
+        for file, _ in self._readers:
             with _translated(file):
-                for one, log_ns, data in reader.messages(connections=chosen) if chosen else ():
-                    message = unpack_message(data) if self._is_packed else data
-                    times, ends = (np.array([n], np.int64) for n in (log_ns, len(message)))
-                    yield RawMessages(
-                        one.topic, one.msgtype, times, np.frombuffer(message, np.uint8), ends
-                    )
+                for topic, kind, log_ns, data in self._messages(file, topics):
+                    times, ends = (np.array([n], np.int64) for n in (log_ns, len(data)))
+                    yield RawMessages(topic, kind, times, np.frombuffer(data, np.uint8), ends)
 
     def close(self) -> None:
         """Close the files."""
@@ -172,46 +151,11 @@ class ForeignSource:
             self._readers.pop()[1].close()
 
 
-class _Batch:
-    """Messages collected one by one, to be decoded together."""
-
-    def __init__(self, decoder: Decoder, feeds: dict[Role, Feed]) -> None:
-        self._decoder = decoder
-        self._feeds = feeds
-        self._next_rank = 0
-        self._clear()
-
-    def _clear(self) -> None:
-        self.n_messages = 0
-        self._n_bytes = 0
-        self._data: dict[Role, list[bytes]] = {role: [] for role in self._feeds}
-        self._times: dict[Role, list[tuple[int, int]]] = {role: [] for role in self._feeds}
-
-    @property
-    def is_full(self) -> bool:
-        """Whether it is time to decode."""
-        return self.n_messages >= _BATCH_MESSAGES or self._n_bytes >= _BATCH_BYTES
-
-    def add(self, role: Role, log_ns: int, data: bytes) -> None:
-        """Add one message."""
-        self._data[role].append(data)
-        self._times[role].append((log_ns, self._next_rank))
-        self._next_rank += 1
-        self.n_messages += 1
-        self._n_bytes += len(data)
-
-    def take(self) -> Part:
-        """Decode what is there and begin anew."""
-        part: Part = {}
-        for role, feed in self._feeds.items():
-            if self._data[role]:
-                data = np.frombuffer(b''.join(self._data[role]), np.uint8)
-                size = np.fromiter(map(len, self._data[role]), np.int64, len(self._data[role]))
-                log_ns, rank = np.array(self._times[role], np.int64).T
-                start = np.cumsum(size) - size
-                part[role] = self._decoder.rows(feed, role, data, start, size, log_ns, rank)
-        self._clear()
-        return part
+def _messages_of(found: list[tuple[int, int]], pieces: list[bytes]) -> Messages:
+    size = np.fromiter(map(len, pieces), np.int64, len(pieces))
+    channel, log_ns = np.array(found, np.int64).T
+    data = np.frombuffer(b''.join(pieces), np.uint8)
+    return Messages(data, np.cumsum(size) - size, size, channel.astype(np.uint16), log_ns)
 
 
 @contextmanager

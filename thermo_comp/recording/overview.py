@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from ..typing import Floats, Ints
-from .columns import RecordingInfo, Topics
+from .columns import RecordingInfo
 from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
+from .topics import Topics
 
 # What is advised for one unit's bags together.
 ADVISED_SPAN_K = 25.0
@@ -188,8 +189,8 @@ def survey_recording(
             stamps.add(block.accel_stamp_ns)
             n_not_finite += int((~np.isfinite(block.accel).all(axis=1)).sum())
             cells.add(block.accel_stamp_ns, block.accel)
-            board.add(block.board_stamp_ns, block.board)
-            case.add(block.case_stamp_ns, block.case)
+            board.add(*block.temperatures['board'][:2])
+            case.add(*block.temperatures['case'][:2])
             if progress is not None and total:
                 progress(stamps.n / total)
         info = reader.info

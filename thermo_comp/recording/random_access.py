@@ -17,28 +17,12 @@ from ..files import open_regular
 
 
 class RandomAccess(Protocol):
-    """
-    An open file that is read at places, by several threads at once.
-
-    Attributes
-    ----------
-    size : int
-        Bytes in it.
-
-    """
+    """An open file of `size` bytes that is read at places, by several threads at once."""
 
     size: int
 
     def read_at(self, at: int, n_bytes: int) -> bytes:
-        """
-        Read up to so many bytes; fewer only where the file ends.
-
-        Raises
-        ------
-        OSError
-            If they cannot be read.
-
-        """
+        """Read up to so many bytes, fewer only where the file ends; OSError where it cannot."""
         ...
 
     def close(self) -> None:
@@ -50,15 +34,7 @@ OpenFile = Callable[[Path], RandomAccess]
 
 
 class LocalFile:
-    """
-    A file of this machine.
-
-    Raises
-    ------
-    OSError
-        If it cannot be opened, or is a FIFO or a device: these would never end.
-
-    """
+    """A file of this machine; OSError if it is a FIFO or a device: these would never end."""
 
     def __init__(self, path: Path) -> None:
         self._file = open_regular(path)

@@ -18,15 +18,25 @@ from types import TracebackType
 from typing import Protocol
 
 from ..errors import RecordingError
-from .assemble import Part, assemble, join_blocks
 from .clock import without_jumps
-from .columns import ROLES, Block, Input, RawMessages, Recording, RecordingInfo, Role, Topics
+from .columns import (
+    ROLES,
+    Block,
+    Input,
+    RawMessages,
+    Recording,
+    RecordingInfo,
+    Role,
+    empty_block,
+    gathered,
+    joined,
+)
 from .expanded import ExpandedSource
 from .foreign import ForeignSource
 from .mcap_source import McapSource
 from .random_access import OpenFile
 from .rosbag2_metadata import Description, read_metadata
-from .topics import select_topics, shown
+from .topics import Topics, select_topics, shown
 
 
 class Source(Protocol):
@@ -40,8 +50,10 @@ class Source(Protocol):
     truncated: str | None
     metadata: Mapping[str, str]
 
-    def parts(self, selection: dict[Role, str], *, raw: bool) -> Iterator[Part]:
-        """Decode the messages of the chosen topics, in reading order."""
+    def blocks(
+        self, selection: Mapping[Role, str], names: Collection[str], *, raw: bool
+    ) -> Iterator[Block]:
+        """Decode the topic of each role, in reading order, with these thermometers in all."""
         ...
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
@@ -61,6 +73,8 @@ class RecordingReader:
     ----------
     info : RecordingInfo
         What the bag says of itself; once all blocks are read, `truncated` names what did not come.
+    topics : mapping of str to str
+        The bag's own name of each role's topic.
     definitions : mapping of str to (str, str)
         Encoding and text of each message type's definition, where the bag carries it.
 
@@ -76,7 +90,8 @@ class RecordingReader:
     ) -> None:
         selection = select_topics(path, source.topics, topics, input, require)
         self._source = source
-        self._selection = dict(selection.topics)
+        self._names = selection.thermometers
+        self.topics: Mapping[Role, str] = dict(selection.topics)
         self.definitions = source.definitions
         self.info = RecordingInfo(
             path=path,
@@ -89,11 +104,6 @@ class RecordingReader:
             input=selection.input,
         )
 
-    @property
-    def topics(self) -> Mapping[Role, str]:
-        """The bag's own name of each topic that is read."""
-        return dict(self._selection)
-
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         """
         Read the bag from its beginning in bounded memory.
@@ -105,42 +115,30 @@ class RecordingReader:
         n_messages : int, optional
             About how many messages make a block; 0 = as few as are read at good speed.
 
-        Yields
-        ------
-        Block
-            In reading order; of limited size.
-
         Raises
         ------
         RecordingError
             Damaged data.
 
         """
-        names = {role: (name, self.info.topics[name][0]) for role, name in self._selection.items()}
-        parts = self._source.parts(self._selection, raw=raw)
-        is_imu = self.info.input == 'imu'
-        n_read = dict.fromkeys(names, 0)
-        for block in assemble(parts, is_imu=is_imu, names=names, n_messages=n_messages):
-            for role in names:
-                n_read[role] += len(getattr(block, f'{role}_stamp_ns'))
-            yield block
-        for role, (name, _) in names.items():
-            self._miss(name, n_read[role], self.info.topics[name][1])
+        n_read = dict.fromkeys(self.topics, 0)
+        source = self._source.blocks(self.topics, self._names, raw=raw)
+        for block in gathered(source, n_messages):
+            for role in n_read:
+                n_read[role] += len(block.log_ns[role])
+            if block.n_messages:
+                yield block
+        for role, topic in self.topics.items():
+            loss = _loss(topic, n_read[role], self.info.topics[topic][1])
+            if loss and loss not in (self.info.truncated or ''):
+                told = '; '.join(filter(None, (self.info.truncated, loss)))
+                self.info = replace(self.info, truncated=told)
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
         """
-        Read the bag for whoever walks its time: jumps of its clock are taken out.
+        Read the bag for whoever walks its time: jumps of its clock are taken out, see `clock`.
 
-        Yields
-        ------
-        Block
-            As `blocks` gives them; see `clock` for the stamps behind a jump.
-
-        Raises
-        ------
-        RecordingError
-            As for `blocks`, and stamps that are no clock.
-
+        Raises RecordingError as `blocks` does, and for stamps that are no clock.
         """
         try:
             yield from without_jumps(self.blocks())
@@ -149,32 +147,11 @@ class RecordingReader:
                 error.message, error.path or self.info.path, error.topic
             ) from error
 
-    def _miss(self, topic: str, n_read: int, n_promised: int) -> None:
-        """Say so where fewer messages came than the bag had promised."""
-        loss = _loss(topic, n_read, n_promised)
-        if loss and loss not in (self.info.truncated or ''):
-            told = '; '.join(filter(None, (self.info.truncated, loss)))
-            self.info = replace(self.info, truncated=told)
-
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
         """
-        Read topics as they are, a stretch of one topic at a time, about in order of log time.
+        Read topics, by the bag's own names, as they are, about in order of log time.
 
-        Parameters
-        ----------
-        topics : collection of str
-            The bag's own names.
-
-        Yields
-        ------
-        RawMessages
-            Of limited size.
-
-        Raises
-        ------
-        RecordingError
-            Damaged data, or messages that are no CDR.
-
+        Raises RecordingError for damaged data, or messages that are no CDR.
         """
         yield from self._source.raw(topics)
 
@@ -229,11 +206,7 @@ def open_recording(
         source = _open_source(path)
     except OSError as error:
         raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
-    try:
-        return RecordingReader(path, source, topics or Topics(), input, require)
-    except BaseException:
-        source.close()
-        raise
+    return _reader(path, source, topics, input, require)
 
 
 def open_mcap(
@@ -245,31 +218,23 @@ def open_mcap(
     require: Collection[Role] = ROLES,
 ) -> RecordingReader:
     """
-    Open the MCAP files of one bag that lie where only the caller can read.
+    Open the MCAP files of one bag, in their order, that lie where only the caller can read.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Their names, in the order in which they follow each other.
-    open_file : callable
-        Opens one of them for reading at places; `OSError` where it cannot.
-    topics, input, require
-        As for `open_recording`.
-
-    Returns
-    -------
-    RecordingReader
-        Whose path is that of the first file.
-
-    Raises
-    ------
-    RecordingError
-        As for `open_recording`.
-
+    `open_file` opens one of them for reading at places, `OSError` where it cannot; the others and
+    the errors are those of `open_recording`. The reader's path is that of the first file.
     """
-    source = McapSource(files, open_file=open_file)
+    return _reader(files[0], McapSource(files, open_file=open_file), topics, input, require)
+
+
+def _reader(
+    path: Path,
+    source: Source,
+    topics: Topics | None,
+    input: Input,  # noqa: A002
+    require: Collection[Role],
+) -> RecordingReader:
     try:
-        return RecordingReader(files[0], source, topics or Topics(), input, require)
+        return RecordingReader(path, source, topics or Topics(), input, require)
     except BaseException:
         source.close()
         raise
@@ -282,43 +247,14 @@ def read_recording(
     *,
     require: Collection[Role] = ROLES,
 ) -> Recording:
-    """
-    Read a whole bag into memory.
-
-    Parameters
-    ----------
-    path, topics, input, require
-        As for `open_recording`.
-
-    Raises
-    ------
-    RecordingError
-        As for `open_recording`, and damaged data.
-
-    """
+    """Read a whole bag into memory; as `open_recording`, and RecordingError for damaged data."""
     with open_recording(path, topics, input, require=require) as reader:
-        columns = join_blocks(reader.blocks(), reader.info.input == 'imu')
-        return Recording(reader.info, columns)
+        blocks = list(reader.blocks())
+        return Recording(reader.info, joined(blocks or [empty_block(ROLES[1:])]))
 
 
 def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
-    """
-    Say what a bag holds without reading its messages.
-
-    Parameters
-    ----------
-    path : str or Path
-        The bag.
-    topics : Topics, optional
-        Names of the inputs, to tell `RecordingInfo.input`.
-
-    Raises
-    ------
-    RecordingError
-        Missing file, not a bag, damaged file.
-
-    """
-    path = Path(path)
+    """Say what a bag holds without reading its messages; raises as `open_recording` does."""
     with open_recording(path, topics, require=()) as reader:
         return reader.info
 
@@ -340,7 +276,9 @@ def _open_source(path: Path) -> Source:
 def _open_directory(path: Path) -> Source:
     description = read_metadata(path)
     if description is not None:
-        return _open_described(description)
+        if description.compression == 'file':
+            return ExpandedSource(description.files, partial(_open_files, description))
+        return _open_files(description, description.files, None)
     for suffix in ('.mcap', '.db3'):
         files = in_split_order(
             file for file in path.iterdir() if file.suffix == suffix and file.is_file()
@@ -351,14 +289,8 @@ def _open_directory(path: Path) -> Source:
     raise RecordingError('not a bag: the directory has no metadata.yaml', path)
 
 
-def _open_described(description: Description) -> Source:
-    """Open the files that a metadata.yaml lists, and hold them against what it promises."""
-    if description.compression == 'file':
-        return ExpandedSource(description.files, partial(_open_files, description))
-    return _open_files(description, description.files, None)
-
-
 def _open_files(description: Description, files: Sequence[Path], note: str | None) -> Source:
+    """Open the files that a metadata.yaml lists, and hold them against what it promises."""
     is_packed = description.compression == 'message'
     source: Source
     if description.storage == 'mcap' and not is_packed:
@@ -381,10 +313,9 @@ def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
 
 def in_split_order(files: Iterable[Path]) -> list[Path]:
     """Sort the files of a split bag by the number at the end of their names."""
-    return sorted(files, key=_number)
 
+    def number(file: Path) -> tuple[int, str]:
+        digits = file.stem.rpartition('_')[2]
+        return (int(digits) if digits.isascii() and digits.isdigit() else 0, file.name)
 
-def _number(file: Path) -> tuple[int, str]:
-    """Sort key of the files of a split bag: the number at the end of the name."""
-    digits = file.stem.rpartition('_')[2]
-    return (int(digits) if digits.isascii() and digits.isdigit() else 0, file.name)
+    return sorted(files, key=number)

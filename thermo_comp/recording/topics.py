@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..errors import RecordingError
-from .columns import Input, Role, Topics
+from .columns import Input, Role
 
 VECTOR3_STAMPED = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'
@@ -21,27 +21,37 @@ BOOL = 'std_msgs/msg/Bool'
 
 _TYPES = {'counts': VECTOR3_STAMPED, 'imu': IMU, 'board': TEMPERATURE, 'case': TEMPERATURE}
 _OPTIONS = {key: f'--{key}-topic' for key in _TYPES}
-
+#: What the node gives out is no input of it.
+_OUTPUT = '/imu/data_raw'
 
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
+#: The topics of a bag with their type and number of messages.
+Present = Mapping[str, tuple[str, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """
+    Where the inputs stand in a bag.
+
+    A name matches with or without its leading slash and, where only one topic of the bag fits,
+    with any namespace in front: ``accel/counts`` finds ``/imu0/accel/counts``. Where a usual name
+    is not there, the bag's only topic of the type is taken.
+    """
+
+    counts: str = 'accel/counts'
+    imu: str = 'imu/uncompensated'
+    board: str = 'temperature/board'
+    case: str = 'temperature/case'
+
+
+_USUAL = Topics()
+
 
 def shown(name: str) -> str:
-    """
-    Make a name that comes from a bag fit for one line of text.
-
-    Parameters
-    ----------
-    name : str
-        Whatever stands in the bag.
-
-    Returns
-    -------
-    str
-        Without control characters, shortened.
-
-    """
+    """Make a name that comes from a bag fit for one line: no control characters, not too long."""
     short = name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...'
     return ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in short)
 
@@ -49,50 +59,29 @@ def shown(name: str) -> str:
 @dataclass(frozen=True, slots=True)
 class Selection:
     """
-    Which topics of a bag feed which role.
+    Which topics of a bag feed which role, as far as they have messages.
 
-    Attributes
-    ----------
-    topics : mapping of {'accel', 'board', 'case'} to str
-        The bag's own name of each topic that is there and has messages.
-    input : {'counts', 'imu'} or None
-        What the accelerometer topic is; None where the bag has none.
-
+    `thermometers` are the names of all of them; `input` says what the accelerometer's topic is.
     """
 
     topics: Mapping[Role, str]
+    thermometers: tuple[str, ...]
     input: Literal['counts', 'imu'] | None
 
 
 def select_topics(
     path: Path,
-    present: Mapping[str, tuple[str, int]],
+    present: Present,
     topics: Topics,
     input: Input,  # noqa: A002 - the parameter's public name
     require: Collection[Role],
 ) -> Selection:
     """
-    Find the topics of the accelerometer and of the two thermometers.
+    Find the topics of the accelerometer and of the thermometers.
 
-    Parameters
-    ----------
-    path : Path
-        The bag, for the error's text.
-    present : mapping of str to (str, int)
-        The bag's topics with their type and number of messages.
-    topics : Topics
-        The names looked for.
-    input : {'auto', 'counts', 'imu'}
-        With ``auto`` the counts are taken where the bag has them, else the Imu messages.
-    require : collection of {'accel', 'board', 'case'}
-        The roles without which the bag is of no use.
-
-    Raises
-    ------
-    RecordingError
-        Empty bag; a required topic that is missing, ambiguous or without messages; a topic of
-        another type than expected.
-
+    With ``auto`` the counts are taken where the bag has them, else the Imu messages. Raises
+    RecordingError for an empty bag, and for a topic that is required but missing, ambiguous or
+    without messages, or of another type than expected.
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages', path)
@@ -100,22 +89,27 @@ def select_topics(
     accel = _accel_key(path, present, topics, input)
     keys: dict[Role, str | None] = {'accel': accel, 'board': 'board', 'case': 'case'}
     for role, key in keys.items():
-        name = None if key is None else _find(path, present, getattr(topics, key), key)
+        name = None if key is None else _find(path, present, topics, key)
         if name is None or key is None:
             if role in require:
                 raise _missing(path, present, topics, key)
             continue
-        _check_type(path, name, present[name][0], key)
+        if present[name][0] != _TYPES[key]:
+            raise RecordingError(
+                f'the topic has type {shown(present[name][0])}, expected {_TYPES[key]}',
+                path,
+                shown(name),
+            )
         if present[name][1]:
             found[role] = name
         elif role in require:
             raise RecordingError('the topic has no messages', path, shown(name))
-    return Selection(found, accel if 'accel' in found else None)
+    return Selection(found, ('board', 'case'), accel if 'accel' in found else None)
 
 
 def _accel_key(
     path: Path,
-    present: Mapping[str, tuple[str, int]],
+    present: Present,
     topics: Topics,
     input: Input,  # noqa: A002
 ) -> Literal['counts', 'imu'] | None:
@@ -123,7 +117,7 @@ def _accel_key(
         return input
     empty: Literal['counts', 'imu'] | None = None
     for key in ('counts', 'imu'):
-        name = _find(path, present, getattr(topics, key), key)
+        name = _find(path, present, topics, key)
         if name is not None:
             if present[name][1]:
                 return key
@@ -131,7 +125,8 @@ def _accel_key(
     return empty
 
 
-def _find(path: Path, present: Mapping[str, tuple[str, int]], wanted: str, key: str) -> str | None:
+def _find(path: Path, present: Present, topics: Topics, key: str) -> str | None:
+    wanted: str = getattr(topics, key)
     bare = wanted.strip('/')
     exact = [name for name in present if name.strip('/') == bare]
     if exact:
@@ -144,19 +139,24 @@ def _find(path: Path, present: Mapping[str, tuple[str, int]], wanted: str, key: 
             path,
             wanted,
         )
-    return spaced[0] if spaced else None
+    if spaced:
+        return spaced[0]
+    # A case is no board, and a bag without a case's thermometer is an ordinary one.
+    if key == 'case' or wanted != getattr(_USUAL, key):
+        return None
+    taken = {getattr(topics, other).strip('/') for other in _TYPES if other != key}
+    only = [
+        name
+        for name, (kind, count) in present.items()
+        if count
+        and kind == _TYPES[key]
+        and not name.endswith(_OUTPUT)
+        and not any(('/' + name.strip('/')).endswith('/' + other) for other in taken)
+    ]
+    return only[0] if len(only) == 1 else None
 
 
-def _check_type(path: Path, name: str, found: str, key: str) -> None:
-    if found != _TYPES[key]:
-        raise RecordingError(
-            f'the topic has type {shown(found)}, expected {_TYPES[key]}', path, shown(name)
-        )
-
-
-def _missing(
-    path: Path, present: Mapping[str, tuple[str, int]], topics: Topics, key: str | None
-) -> RecordingError:
+def _missing(path: Path, present: Present, topics: Topics, key: str | None) -> RecordingError:
     names = sorted(present)[:_MAX_LISTED]
     listed = ', '.join(f'{shown(name)} ({shown(present[name][0])})' for name in names)
     if len(present) > len(names):

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from ..errors import RecordingError
 from ..typing import Bytes, Floats, Ints
-from .columns import ImuColumns
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED
 
 Encoding = Literal['cdr', 'ros1']
@@ -329,31 +328,3 @@ def _all_equal(rows: NDArray[Any], offset: int, size: int) -> bool:
 
 def _text(characters: bytes) -> str:
     return characters.rstrip(b'\0').decode('utf-8', 'replace')
-
-
-def imu_columns(numbers: Floats) -> ImuColumns:
-    """
-    Name the numbers of sensor_msgs/Imu.
-
-    Parameters
-    ----------
-    numbers : ndarray, shape (n, 37)
-        As they follow the header.
-
-    Returns
-    -------
-    ImuColumns
-        Views.
-
-    """
-    return ImuColumns(
-        orientation=numbers[:, 0:4],
-        orientation_covariance=numbers[:, 4:13],
-        angular_velocity=numbers[:, 13:16],
-        angular_velocity_covariance=numbers[:, 16:25],
-        linear_acceleration_covariance=numbers[:, 28:37],
-    )
-
-
-#: Where the linear acceleration stands among the numbers of sensor_msgs/Imu.
-IMU_ACCELERATION = slice(25, 28)

@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -248,10 +248,12 @@ def _qos(depth: int) -> QoSProfile:
 def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, Role, bytes]]:
     """Serialize a block's messages in the order of the bag: log time, role, bytes."""
     columns: list[tuple[Role, Any, Any, Iterator[bytes]]] = [
-        ('board', block.board_log_ns, block.board_after - 0.5, _readings(block, 'board', topics)),
-        ('case', block.case_log_ns, block.case_after - 0.5, _readings(block, 'case', topics)),
-        ('accel', block.accel_log_ns, np.arange(len(block)), _samples(block, topics)),
+        (name, block.log_ns[name], one.after - 0.5, _readings(block, name, topics))
+        for name, one in block.temperatures.items()
     ]
+    columns.append(
+        ('accel', block.log_ns['accel'], np.arange(len(block)), _samples(block, topics))
+    )
     log_ns = np.concatenate([times for _, times, _, _ in columns])
     places = np.concatenate([place for _, _, place, _ in columns])
     which = np.repeat(np.arange(len(columns)), [len(times) for _, times, _, _ in columns])
@@ -280,16 +282,10 @@ def _samples(block: Block, topics: Mapping[Role, str]) -> Iterator[bytes]:
     return _rows(stamped_payloads(block.accel_stamp_ns, block.frame_id, numbers))
 
 
-def _readings(
-    block: Block, role: Literal['board', 'case'], topics: Mapping[Role, str]
-) -> Iterator[bytes]:
+def _readings(block: Block, role: Role, topics: Mapping[Role, str]) -> Iterator[bytes]:
     if block.raw:
         return _raw(block, topics.get(role))
-    stamps, celsius = (
-        (block.board_stamp_ns, block.board)
-        if role == 'board'
-        else (block.case_stamp_ns, block.case)
-    )
+    stamps, celsius, _ = block.temperatures[role]
     numbers = np.stack([celsius, np.zeros_like(celsius)], axis=1)
     return _rows(stamped_payloads(stamps, '', numbers))
 
