@@ -31,10 +31,9 @@ from typing import Any
 import numpy as np
 
 from thermo_comp.fitting import FitOptions
-from thermo_comp.fleet import FleetOptions, fit_fleet
-from thermo_comp.fleet.discovery import find_units
-from thermo_comp.fleet.engine import Job, connected, run
-from thermo_comp.fleet.row import Row
+from thermo_comp.fleet import FleetOptions, Row, fit_fleet
+from thermo_comp.fleet.cluster import connected, run
+from thermo_comp.fleet.discovery import FoundUnit, find_units
 from thermo_comp.fleet.storage import Storage
 from thermo_comp.recording import BagWriter
 from thermo_comp.simulation import (
@@ -85,10 +84,10 @@ def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
     return folder
 
 
-def jobs_of(folder: Path, n_units: int) -> list[Job]:
+def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
     """Find the units of a fleet; each comes again under another name where there are too few."""
     found = find_units(Storage(str(folder)))
-    return [Job(found[i % len(found)]) for i in range(n_units)]
+    return [found[i % len(found)] for i in range(n_units)]
 
 
 @dataclass(frozen=True)
@@ -132,18 +131,18 @@ class Measured:
 
 def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -> Measured:
     """Fit units on a cluster that has started and fitted before."""
-    jobs = jobs_of(folder, n_units)
+    units = units_of(folder, n_units)
     with connected(None, n_workers) as client:
         count_bytes()
         client.run(count_bytes)
-        list(run(client, str(folder), jobs[: 2 * n_workers], options))
+        list(run(client, str(folder), units[: 2 * n_workers], options))
         client.get_task_stream()
         cpu, began = process_cpu(), time.perf_counter()
         time.sleep(_REST_S)
         rest_cpu = (process_cpu() - cpu) / (time.perf_counter() - began)
         before = bytes_written() + sum(client.run(bytes_written).values())
         cpu, began, started = process_cpu(), time.perf_counter(), time.time()
-        outcomes = list(run(client, str(folder), jobs, options))
+        outcomes = list(run(client, str(folder), units, options))
         seconds, own = time.perf_counter() - began, process_cpu() - cpu
         n_bytes = bytes_written() + sum(client.run(bytes_written).values()) - before
         tasks = tuple(
@@ -154,8 +153,8 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
         )
     assert len(outcomes) == n_units
     assert len(tasks) == n_units
-    assert all(one is not None and one.calibration for _, one in outcomes)
-    cpu_s = sum(float(one.row['cpu_s'] or 0.0) for _, one in outcomes if one is not None)
+    assert all(one.calibration for _, one in outcomes)
+    cpu_s = sum(float(one.row['cpu_s'] or 0.0) for _, one in outcomes)
     return Measured(seconds, tasks, own, rest_cpu, n_bytes, cpu_s)
 
 
@@ -225,10 +224,10 @@ def overhead(folder: Path, n_units: int) -> None:
     Measure what is lost between the tasks of many small units, and what follows for many workers.
     """
     write_fleet(folder / 'small', 20, SMALL_BAGS, SMALL_PROGRAM)
-    fit = FitOptions(gravity=STANDARD_GRAVITY, model='quadratic')
+    fit = FitOptions(gravity=STANDARD_GRAVITY, model='golovach')
     found = measure(folder / 'small', n_units, 2, FleetOptions(fit, certificates=False))
     busy = sum(found.tasks)
-    print(f'{n_units} units x {SMALL_BAGS} bags, model quadratic, 2 workers; load {loads()}')
+    print(f'{n_units} units x {SMALL_BAGS} bags, model golovach, 2 workers; load {loads()}')
     print(f'elapsed {found.seconds:.1f} s, tasks {busy:.1f} s on both workers')
     print(f'idle workers: {100.0 * (1.0 - busy / (2.0 * found.seconds)):.2f} % of their time')
     print(
@@ -323,7 +322,7 @@ def main() -> int:
     parser.add_argument('part', choices=['scaling', 'overhead', 'kill'])
     parser.add_argument('--units', type=int, help='instead of 16, 500 and 200')
     parser.add_argument('--repeats', type=int, default=3)
-    parser.add_argument('--model', default='auto', help='of scaling and kill')
+    parser.add_argument('--model', default='response', help='of scaling and kill')
     parser.add_argument('--folder', type=Path, help='where the bags are kept')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:

@@ -12,7 +12,13 @@ import numpy as np
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet import FleetOptions
 from thermo_comp.recording import BagWriter
-from thermo_comp.simulation import STANDARD_GRAVITY, parse_cyclogram, positions, simulate
+from thermo_comp.simulation import (
+    STANDARD_GRAVITY,
+    UnitModel,
+    parse_cyclogram,
+    positions,
+    simulate,
+)
 from thermo_comp.simulation import unit_preset as preset
 
 #: Half an hour over 36 K; the ramps of a freezer, not of a chamber.
@@ -26,6 +32,7 @@ def write_unit(
     seed: int,
     n_bags: int = 6,
     *,
+    unit: UnitModel | None = None,
     serial: str | None = None,
     test: int = 0,
     metadata: dict[str, str] | None = None,
@@ -35,7 +42,7 @@ def write_unit(
     """
     Simulate one thermal test of one unit, one bag per position; its thermometers may be exchanged.
     """
-    unit = preset('mems', seed)
+    unit = unit or preset('mems', seed)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for number, up in enumerate(positions(n_bags, 1)):

@@ -1,27 +1,28 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet's bags are found wherever they lie, read by ranges, and each byte of them only once."""
+"""A fleet's bags are found, and read, wherever they lie."""
 
 from __future__ import annotations
 
-import hashlib
-from collections import Counter
+import shutil
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
-import numpy as np
 import pytest
 from fleet_helpers import OPTIONS, damage, write_unit
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from thermo_comp.errors import FleetError
 from thermo_comp.fitting.fit_sources import digest
-from thermo_comp.fleet.bag import FoundBag, group_files, reduce_found
-from thermo_comp.fleet.discovery import find_units
-from thermo_comp.fleet.storage import HashingFile, Storage, StoredFile
+from thermo_comp.fleet.discovery import FoundBag, FoundUnit, find_units, group_files
+from thermo_comp.fleet.storage import Storage, StoredFile
+from thermo_comp.fleet.unit import process_unit
+from thermo_comp.unit.calibration_file import parse_calibration
 
 fsspec = pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
 
@@ -34,7 +35,7 @@ def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def memory() -> Iterator[tuple[object, str]]:
+def memory() -> Iterator[tuple[Any, str]]:
     """Give an empty folder of fsspec's memory file system, and its URL."""
     fs = fsspec.filesystem('memory')
     name = f'/{uuid4().hex}'
@@ -43,115 +44,66 @@ def memory() -> Iterator[tuple[object, str]]:
         fs.rm(name, recursive=True)
 
 
-class _Bytes:
-    """A file that counts how often each of its bytes was read."""
-
-    def __init__(self, content: bytes) -> None:
-        self.content, self.size = content, len(content)
-        self.times = np.zeros(self.size, dtype=np.int64)
-
-    def read_at(self, at: int, n_bytes: int) -> bytes:
-        self.times[at : at + n_bytes] += 1
-        return self.content[at : at + n_bytes]
-
-    def close(self) -> None:
-        pass
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    content=st.binary(max_size=3000),
-    reads=st.lists(st.tuples(st.integers(0, 3200), st.integers(0, 1500)), max_size=12),
-)
-def test_a_file_is_hashed_in_whatever_order_it_is_read(
-    content: bytes, reads: list[tuple[int, int]]
-) -> None:
-    file = HashingFile(_Bytes(content))
-    for at, n_bytes in reads:
-        assert file.read_at(at, n_bytes) == content[at : at + n_bytes]
-    assert file.digest() == hashlib.sha256(content).hexdigest()
-
-
-def test_the_hash_needs_no_second_reading(rng: np.random.Generator) -> None:
-    content = rng.bytes(10_000)
-    inner = _Bytes(content)
-    file = HashingFile(inner)
-    for piece in rng.permutation(10):
-        file.read_at(1000 * int(piece), 1000)
-    assert file.digest() == hashlib.sha256(content).hexdigest()
-    assert inner.times.tolist() == [1] * 10_000
+def to_sqlite(path: Path, target: Path) -> None:
+    """Write a bag anew in the other storage of rosbag2."""
+    with (
+        Reader(path) as reader,
+        Writer(target, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer,
+    ):
+        store = get_typestore(Stores.ROS2_JAZZY)
+        connections = {
+            one.topic: writer.add_connection(one.topic, one.msgtype, typestore=store)
+            for one in reader.connections
+        }
+        for connection, stamp_ns, data in reader.messages():
+            writer.write(connections[connection.topic], stamp_ns, data)
 
 
 class TestElsewhere:
-    def test_a_bag_in_memory_gives_the_bits_of_one_on_disk(
-        self, unit: Path, memory: tuple[object, str]
+    def test_a_fleet_in_memory_gives_the_bits_of_one_on_disk(
+        self, unit: Path, memory: tuple[Any, str]
     ) -> None:
         fs, url = memory
         fs.put(f'{unit}/', f'{url}/unit/', recursive=True)
-        here = find_units(Storage(str(unit.parent)))
-        there = find_units(Storage(url))
-        assert [one.name for one in there] == [one.name for one in here] == ['unit']
-        for local, remote in zip(here[0].bags, there[0].bags, strict=True):
-            assert local.name == remote.name
-            one, other = (
-                reduce_found(where, bag, OPTIONS.fit, None, 'auto')
-                for where, bag in ((str(unit.parent), local), (url, remote))
-            )
-            assert one.sha256 == other.sha256 == digest(unit.parent / local.name)
-            assert one.reduced is not None
-            assert other.reduced is not None
-            for a, b in zip(one.reduced.intervals, other.reduced.intervals, strict=True):
-                assert a.mean.tobytes() == b.mean.tobytes()
-            assert one.reduced.board.value.tobytes() == other.reduced.board.value.tobytes()
-
-    @pytest.mark.parametrize('block', [1 << 18, 1 << 10])
-    def test_each_byte_comes_once(
-        self, block: int, unit: Path, memory: tuple[object, str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr('thermo_comp.fleet.storage._BLOCK_BYTES', block)
-        fs, url = memory
-        path = f'{url}/unit/01.mcap'
-        content = (unit / '01.mcap').read_bytes()
-        fs.pipe_file(path, content)
-        fetched = Counter()
-        plain = type(fs).cat_file
-
-        def counting(self: object, name: str, start: int, end: int, **keys: object) -> bytes:
-            fetched.update({'bytes': end - start})
-            return plain(self, name, start=start, end=end, **keys)
-
-        monkeypatch.setattr(type(fs), 'cat_file', counting)
-        (found,) = find_units(Storage(url))
-        result = reduce_found(url, found.bags[0], OPTIONS.fit, None, 'auto')
-        assert result.sha256 == hashlib.sha256(content).hexdigest()
-        # Small blocks stand for a large file: those that hold heads of records overlap a chunk.
-        assert (
-            len(content) <= fetched['bytes'] <= len(content) + (block < len(content)) * 8 * block
+        (here,), (there,) = find_units(Storage(str(unit.parent))), find_units(Storage(url))
+        assert [bag.name for bag in here.bags] == [bag.name for bag in there.bags]
+        one, other = (
+            process_unit(here, str(unit.parent), OPTIONS),
+            process_unit(there, url, OPTIONS),
         )
+        first, second = (parse_calibration(text.calibration.encode()) for text in (one, other))
+        # The date of the fit is all that differs.
+        assert replace(first, provenance=second.provenance) == second
+        assert first.provenance.sources == second.provenance.sources
+        assert other.hashes == {bag.name: digest(unit.parent / bag.name) for bag in here.bags}
 
-    def test_a_rosbag2_folder_in_memory(self, tmp_path: Path, memory: tuple[object, str]) -> None:
+    @pytest.mark.parametrize('name', ['pos1', 'pos1.db3'])
+    def test_any_storage_is_read_from_elsewhere_and_leaves_no_copy(
+        self, name: str, tmp_path: Path, memory: tuple[Any, str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         fs, url = memory
-        write_unit(tmp_path / 'unit', 1, 1, names=['pos1'])
-        fs.put(f'{tmp_path}/', f'{url}/', recursive=True)
+        (path,) = write_unit(tmp_path / 'bags' / 'unit', 1, 1, names=['pos1'])
+        if name == 'pos1.db3':
+            to_sqlite(path, tmp_path / 'other')
+            (tmp_path / 'other' / 'other.db3').rename(path.with_name(name))
+            shutil.rmtree(path)
+        fs.put(f'{tmp_path}/bags/', f'{url}/', recursive=True)
         (found,) = find_units(Storage(url))
-        assert [bag.name for bag in found.bags] == ['unit/pos1']
-        result = reduce_found(url, found.bags[0], OPTIONS.fit, None, 'auto')
-        assert result.problem == ''
-        assert result.sha256 == digest(tmp_path / 'unit' / 'pos1')
+        assert [bag.name for bag in found.bags] == [f'unit/{name}']
+        (tmp_path / 'scratch').mkdir()
+        monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'scratch'))
+        outcome = process_unit(found, url, OPTIONS)
+        assert outcome.row['left_out'] == ''
+        assert outcome.hashes == {f'unit/{name}': digest(path.with_name(name))}
+        assert list((tmp_path / 'scratch').iterdir()) == []
 
-    def test_what_needs_a_file_of_this_machine_is_said(self, memory: tuple[object, str]) -> None:
-        fs, url = memory
-        fs.pipe_file(f'{url}/unit/old.bag', b'#ROSBAG V2.0')
-        (found,) = find_units(Storage(url))
-        result = reduce_found(url, found.bags[0], OPTIONS.fit, None, 'auto')
-        assert 'unit/old.bag: only MCAP is read from a distance' in result.problem
-
-    def test_a_file_that_vanishes_may_come_back(self, memory: tuple[object, str]) -> None:
+    def test_a_file_that_vanishes_may_come_back(self, memory: tuple[Any, str]) -> None:
         _, url = memory
         gone = FoundBag('unit/a.mcap', (StoredFile('unit/a.mcap', 5, ''),))
-        result = reduce_found(url, gone, OPTIONS.fit, None, 'auto')
-        assert result.is_passing
-        assert result.problem.startswith('unit/a.mcap: ')
+        outcome = process_unit(FoundUnit('unit', '', (gone,)), url, OPTIONS)
+        assert not outcome.is_final
+        assert outcome.row['verdict'] == 'failed'
+        assert str(outcome.row['left_out']).startswith('unit/a.mcap: ')
 
     def test_a_protocol_that_nobody_knows(self) -> None:
         with pytest.raises(FleetError, match='nowhere://x: Protocol not known'):
@@ -201,6 +153,15 @@ class TestDiscovery:
             'f.mcap': ['f.mcap'],
         }
 
+    def test_names_that_somebody_chose_stand_on_one_line(self, tmp_path: Path) -> None:
+        write_unit(tmp_path / 'lot\x1b[31m' / 'a\nb', 1, 1)
+        write_unit(tmp_path, 1, 1, serial='S1\nCAL_ACC0_ID 7', names=['loose.mcap'])
+        found = find_units(Storage(str(tmp_path)))
+        assert [one.name for one in found] == ['S1\\nCAL_ACC0_ID 7', 'lot\\x1b[31m/a\\nb']
+        for one in found:
+            row = process_unit(one, str(tmp_path), OPTIONS).row
+            assert all(cell.isprintable() for cell in row.values() if isinstance(cell, str))
+
     def test_links_are_followed_but_not_in_circles(self, tmp_path: Path) -> None:
         (tmp_path / 'store' / 'u1').mkdir(parents=True)
         (tmp_path / 'store' / 'u1' / '1.mcap').touch()
@@ -232,11 +193,7 @@ def test_damage_is_the_bag_s_not_the_file_system_s(tmp_path: Path) -> None:
     (path,) = write_unit(tmp_path / 'u', 1, 1)
     damage(path)
     (found,) = find_units(Storage(str(tmp_path)))
-    result = reduce_found(str(tmp_path), found.bags[0], OPTIONS.fit, None, 'auto')
-    assert result.reduced is None
-    assert result.problem.startswith('u/01.mcap: damaged: ')
-    assert not result.is_passing
-    assert result.sha256 == digest(path)
-    assert replace(result, cpu_s=0.0) == replace(
-        reduce_found(str(tmp_path), found.bags[0], OPTIONS.fit, None, 'auto'), cpu_s=0.0
-    )
+    outcome = process_unit(found, str(tmp_path), OPTIONS)
+    assert outcome.is_final
+    assert str(outcome.row['left_out']).startswith('u/01.mcap: damaged: ')
+    assert outcome.hashes == {'u/01.mcap': digest(path)}

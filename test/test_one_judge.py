@@ -58,11 +58,11 @@ def test_fleet_and_evaluate_agree(cli, tmp_path: Path) -> None:
 
     bags = write_unit(tmp_path / 'fleet' / 'unit1', 1)
     (unit,) = find_units(Storage(str(tmp_path / 'fleet')))
-    outcome = process_unit(str(tmp_path / 'fleet'), unit, OPTIONS)
+    outcome = process_unit(unit, str(tmp_path / 'fleet'), OPTIONS)
     assert outcome is not None
     row = outcome.row
     calibration = tmp_path / 'unit.yaml'
-    calibration.write_bytes(outcome.calibration)
+    calibration.write_text(outcome.calibration)
     found = json.loads(cli('evaluate', *bags, '-c', calibration, '--json', code=None).stdout)
     assert row['verdict'] == found['verdict']
     assert row['reason'] == found['reason']

@@ -47,6 +47,12 @@ def fit(
         int | None, typer.Option(help='Processes on this machine; all processors.', min=1)
     ] = None,
     certificates: Annotated[bool, typer.Option(help='Write a certificate for each unit.')] = True,
+    with_prior: Annotated[
+        bool,
+        typer.Option(
+            '--with-prior', help='Fit the units that lack data again with what the others share.'
+        ),
+    ] = False,
     earlier: Annotated[
         list[Path] | None,
         typer.Option(help='fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
@@ -76,7 +82,8 @@ def fit(
     Each folder of bags is one thermal test of one unit; bags that lie in
     DIR itself are sorted by the serial in them. Results go to OUT/units,
     the table of all to OUT/fleet.parquet and .csv, what it tells to
-    OUT/fleet.html. A second run does only what is missing or has changed.
+    OUT/fleet.html, what the units that hold have in common to OUT/prior.yaml,
+    a prior as `thermo_comp prior` makes it. A second run does only what is missing or has changed.
     Exit code 1 if a unit has no valid calibration, or not of all of its bags.
 
     Example:
@@ -111,17 +118,18 @@ def fit(
             folder,
             output,
             settings,
+            with_prior=with_prior,
             scheduler=scheduler,
             n_workers=workers,
             earlier=before,
             tell=lambda n, total, _row: done(n / total),
         )
-    _say(out, result)
+    _say(out, result, with_prior)
     if not result.is_whole:
         raise typer.Exit(1)
 
 
-def _say(out: Output, result: FleetResult) -> None:
+def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
     summary = result.summary
     out.table(
         ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
@@ -156,8 +164,10 @@ def _say(out: Output, result: FleetResult) -> None:
                 f'- {drift.serial}: {worst.label} changed by {worst.change:+.4g} {worst.unit} '
                 f'(sd {worst.sd:.2g}) from {drift.earlier} to {drift.later}'
             )
-    for effect in summary.lot_effects:
-        out.line(f'- lots differ in {effect.label} (by chance: {effect.probability:.1g})')
+    if result.prior is not None:
+        out.line(f'{result.prior}: what the units that hold have in common')
+    elif with_prior:
+        out.line(f'- fitted without a prior: {result.no_prior}')
     out.line(
         f'{result.page}: {result.n_fitted} of {len(result.rows)} tests calibrated, '
         f'{result.n_done} of them in this run'
@@ -170,10 +180,10 @@ def _say(out: Output, result: FleetResult) -> None:
             'verdicts': summary.verdicts,
             'outliers': summary.outliers,
             'drifts': summary.drifts,
-            'lot_effects': summary.lot_effects,
             'parquet': result.parquet,
             'csv': result.csv,
             'page': result.page,
+            'prior': result.prior,
         }
     )
 

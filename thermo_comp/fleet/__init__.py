@@ -3,27 +3,12 @@
 """
 Owns fleets: hundreds of units, each fitted where a worker is free, and what they tell together.
 
-- `fit_fleet` finds the units, does what is missing on Dask, writes table and page.
+- `fit_fleet` finds the units, does what is missing on Dask, writes table, prior and page.
 - The only package that knows `dask`, `distributed` and `fsspec`: the extra ``fleet``.
 """
 
-from __future__ import annotations
-
-from .row import COLUMNS, Column, Row, is_fitted
 from .run import FleetResult, fit_fleet
-from .summary import Summary, summarise
-from .table import read_parquet
+from .table import COLUMNS, Row, read_parquet
 from .unit import FleetOptions
 
-__all__ = [
-    'COLUMNS',
-    'Column',
-    'FleetOptions',
-    'FleetResult',
-    'Row',
-    'Summary',
-    'fit_fleet',
-    'is_fitted',
-    'read_parquet',
-    'summarise',
-]
+__all__ = ['COLUMNS', 'FleetOptions', 'FleetResult', 'Row', 'fit_fleet', 'read_parquet']

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns which bags belong to which unit: a folder per unit, or the serials that the bags carry.
+Owns which files make a bag, and which bags a unit: a folder per unit, or the serials in the bags.
 
 ``DIR/[LOT/]UNIT/BAG``: the bags of one folder are one thermal test of one unit, so a unit that was
 tested twice has two folders and comes out twice. Bags that lie in DIR itself are sorted by the
@@ -16,11 +16,25 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from ..errors import FleetError, RecordingError
-from .bag import FoundBag, group_files, open_bag
-from .storage import Storage
+from ..recording import open_recording
+from ..text import one_line
+from .storage import Storage, StoredFile
 
-# A listing of many bags on a far file system waits, it does not compute.
+# To ask many bags on a far file system is to wait, not to compute.
 _N_READERS = 16
+
+
+@dataclass(frozen=True)
+class FoundBag:
+    """One bag: its place below the fleet's folder, and its files, several for a directory."""
+
+    name: str
+    files: tuple[StoredFile, ...]
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of its files."""
+        return sum(file.size for file in self.files)
 
 
 @dataclass(frozen=True)
@@ -28,15 +42,8 @@ class FoundUnit:
     """
     The bags of one thermal test of one unit.
 
-    Parameters
-    ----------
-    name : str
-        Its folder below the fleet's, or its serial.
-    lot : str
-        The folder above it; empty where there is none.
-    bags : tuple of FoundBag
-        In the order of their names.
-
+    `name` is its folder below the fleet's, or its serial, and `lot` the folder above it or empty;
+    both are fit to be shown.
     """
 
     name: str
@@ -46,17 +53,7 @@ class FoundUnit:
 
 def find_units(storage: Storage) -> list[FoundUnit]:
     """
-    Find the units of a fleet.
-
-    Parameters
-    ----------
-    storage : Storage
-        The fleet's folder.
-
-    Returns
-    -------
-    list of FoundUnit
-        In the order of their names.
+    Find the units of a fleet, in the order of their names.
 
     Raises
     ------
@@ -71,39 +68,53 @@ def find_units(storage: Storage) -> list[FoundUnit]:
             'is .mcap, .db3, .bag or a rosbag2 directory'
         )
     by_folder: dict[str, list[FoundBag]] = defaultdict(list)
-    loose: list[FoundBag] = []
     for bag in bags:
-        folder = str(PurePosixPath(bag.name).parent)
-        if folder == '.':
-            loose.append(bag)
-        else:
-            by_folder[folder].append(bag)
-    units = [FoundUnit(name, _lot(name), tuple(found)) for name, found in by_folder.items()]
-    units += _by_serial(storage, loose, {unit.name for unit in units})
+        by_folder[str(PurePosixPath(bag.name).parent)].append(bag)
+    loose = by_folder.pop('.', [])
+    by_serial: dict[str, list[FoundBag]] = defaultdict(list)
+    with ThreadPoolExecutor(_N_READERS) as pool:
+        for bag, serial in zip(loose, pool.map(lambda b: _serial(storage, b), loose), strict=True):
+            by_serial[f'{serial} (in {storage.name})' if serial in by_folder else serial] += [bag]
+    units = [FoundUnit(one_line(n), _lot(n), tuple(found)) for n, found in by_folder.items()]
+    units += [FoundUnit(one_line(n), '', tuple(found)) for n, found in by_serial.items()]
     return sorted(units, key=lambda unit: unit.name)
+
+
+def group_files(files: list[StoredFile]) -> list[FoundBag]:
+    """Put the files of a fleet together to bags, in the order of their names."""
+    by_folder: dict[str, list[StoredFile]] = defaultdict(list)
+    for file in files:
+        by_folder[str(PurePosixPath(file.name).parent)].append(file)
+    bags = []
+    for folder, inside in by_folder.items():
+        stored = [one for one in inside if one.name.endswith(('.mcap', '.db3', '.bag'))]
+        if stored and folder != '.' and _is_bag_folder(PurePosixPath(folder).name, inside, stored):
+            bags.append(FoundBag(folder, tuple(inside)))
+        else:
+            bags += [FoundBag(one.name, (one,)) for one in stored]
+    return sorted(bags, key=lambda bag: bag.name)
+
+
+def _is_bag_folder(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
+    """Whether a folder is a rosbag2 directory; one whose recorder was killed has no metadata."""
+    if any(PurePosixPath(file.name).name == 'metadata.yaml' for file in inside):
+        return True
+    stems = [PurePosixPath(file.name).stem for file in stored]
+    return all(
+        stem.startswith(f'{folder}_') and stem.rpartition('_')[2].isdigit() for stem in stems
+    )
 
 
 def _lot(name: str) -> str:
     first, _, rest = name.partition('/')
-    return first if rest else ''
+    return one_line(first) if rest else ''
 
 
-def _by_serial(storage: Storage, bags: list[FoundBag], taken: set[str]) -> list[FoundUnit]:
-    """Sort the bags that lie in the fleet's folder itself."""
-
-    def serial_of(bag: FoundBag) -> str:
-        try:
-            with open_bag(storage, bag, require=()) as reader:
-                return reader.info.metadata.get('serial') or storage.name
-        except RecordingError:
-            # Nobody knows whose it is: it becomes a unit of its own, which says what is wrong.
-            return bag.name
-
-    groups: dict[str, list[FoundBag]] = defaultdict(list)
-    with ThreadPoolExecutor(_N_READERS) as pool:
-        for bag, serial in zip(bags, pool.map(serial_of, bags), strict=True):
-            groups[serial].append(bag)
-    return [
-        FoundUnit(name if name not in taken else f'{name} (in {storage.name})', '', tuple(found))
-        for name, found in groups.items()
-    ]
+def _serial(storage: Storage, bag: FoundBag) -> str:
+    """Ask a bag that lies in the fleet's folder itself whose it is."""
+    try:
+        with storage.here(bag.name, bag.files) as path, open_recording(path, require=()) as reader:
+            return reader.info.metadata.get('serial') or storage.name
+    except (RecordingError, OSError):
+        # Nobody knows whose it is: it becomes a unit of its own, which says what is wrong.
+        return bag.name

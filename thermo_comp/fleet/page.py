@@ -6,56 +6,39 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Callable, Sequence
+from functools import partial
 from html import escape
 from urllib.parse import quote
 
 import numpy as np
 
 from .. import __version__
+from ..report.figures_fleet import draw_distances, draw_plate, draw_shares
 from ..report.html import document, figure, table
+from ..report.plates import DrawnPlate
 from ..report.text import number
-from .plates import fleet_plates
-from .row import Cell, Row, is_fitted, is_valid
 from .summary import Summary
+from .table import Cell, Row, is_fitted, is_valid
 
 # A list longer than this is for the table's readers.
 _MOST_ROWS = 60
-_MOST_LOTS = 24
 
 
 def render_fleet(
-    rows: Sequence[Row], summary: Summary, certificate_of: Callable[[str], str] | None = None
+    rows: Sequence[Row], summary: Summary, certificate_of: Callable[[Row], str]
 ) -> str:
-    """
-    Write the page.
-
-    Parameters
-    ----------
-    rows : sequence of mapping
-        The fleet table.
-    summary : Summary
-        What it tells.
-    certificate_of : callable or None, optional
-        Gives the path of a unit's certificate beside the page; empty where it has none.
-
-    Returns
-    -------
-    str
-        The HTML document.
-
-    """
+    """Write the page; `certificate_of` gives a certificate's path beside it, or nothing."""
     fitted = [row for row in rows if is_fitted(row)]
-    plates = fleet_plates(fitted, summary)
+    plates = _figures(fitted, summary)
     return document(
         'Fleet report',
         [
             '<h1>Fleet report</h1>',
             f'<p class="under">{len(rows)} thermal tests</p>',
             _box(rows, summary),
-            _refused(rows, summary),
+            _refused(rows),
             _outliers(summary),
             _drifts(summary),
-            _lots(summary),
             '<h2>Figures</h2>' if plates else '',
             *(figure(plate) for plate in plates),
             _spreads(summary),
@@ -80,12 +63,6 @@ def _box(rows: Sequence[Row], summary: Summary) -> str:
             f'{len(summary.drifts)} units were tested again: '
             f'{n_drifted or "none"} changed by more than chance.'
         )
-    if len(summary.lots) > 1:
-        facts.append(
-            f'{len(summary.lots)} lots: they differ in '
-            + (', '.join(one.label for one in summary.lot_effects) or 'nothing')
-            + '.'
-        )
     n_left_out = sum(int(row['n_left_out'] or 0) for row in rows)
     if n_left_out:
         facts.append(f'{n_left_out} bags were left out.')
@@ -102,23 +79,17 @@ def _said(n: int, one: str, several: str, rest: str) -> str:
     return f'{n or "No"} {one if n == 1 else several} {rest}.'
 
 
-def _refused(rows: Sequence[Row], summary: Summary) -> str:
+def _refused(rows: Sequence[Row]) -> str:
     without = [row for row in rows if not is_fitted(row)]
     if not without:
         return ''
-    reasons = ''
-    if len(summary.problems) < len(without):
-        reasons = table(('reason', 'tests'), [(reason, str(n)) for reason, n in summary.problems])
-    listed = table(
+    columns = ('problem', 'name', 'serial', 'verdict')
+    return '<h2>Not calibrated</h2>' + table(
         ('reason', 'test', 'serial', 'verdict'),
-        [
-            tuple(str(row[name]) for name in ('problem', 'name', 'serial', 'verdict'))
-            for row in without[:_MOST_ROWS]
-        ],
+        [tuple(str(row[name]) for name in columns) for row in without[:_MOST_ROWS]],
         texts=4,
         caption=_more(len(without)),
     )
-    return f'<h2>Not calibrated</h2>{reasons}{listed}'
 
 
 def _more(n: int) -> str:
@@ -152,7 +123,7 @@ def _outliers(summary: Summary) -> str:
 def _drifts(summary: Summary) -> str:
     if not summary.drifts:
         return ''
-    ordered = summary.surest_drifts
+    ordered = summary.drifts
     return '<h2>Tested again</h2>' + table(
         ('serial', 'earlier', 'later', 'surest change in', 'days', 'change', 'unit', 'sd', 'real'),
         [
@@ -176,23 +147,38 @@ def _drifts(summary: Summary) -> str:
     )
 
 
-def _lots(summary: Summary) -> str:
-    if not summary.lot_effects:
-        return ''
-    lots = list(summary.lots)[:_MOST_LOTS]
-    return '<h2>Lots that differ</h2>' + table(
-        ('quantity', 'by chance', *(f'{lot} ({summary.lots[lot]})' for lot in lots)),
-        [
-            (
-                f'{one.label}, {one.unit}',
-                f'{one.probability:.1e}',
-                *(number(one.medians[lot]) if lot in one.medians else '–' for lot in lots),
-            )
-            for one in summary.lot_effects
-        ],
-        caption='Median of each lot (number of units); probability that units dealt out by chance '
-        'differ as much, after Kruskal and Wallis.',
-    )
+def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnPlate]:
+    if not fitted:
+        return []
+    curves = {
+        section: np.array([v for row in fitted if isinstance(v := row[f'{section}_ug'], float)])
+        for section in ('raw', 'static', 'dynamic')
+    }
+    drawn = [
+        draw_plate(
+            1,
+            'residuals',
+            'What is left of |g|, unit by unit?',
+            'Share of the units whose residual at rest is below the value: raw (constants at the '
+            'reference temperature), and with each unit’s calibration. Steep is alike; a tail to '
+            'the right is a unit to look at.',
+            partial(draw_shares, curves),
+        )
+    ]
+    if len(fitted) > 2:
+        labels, z, names = zip(
+            *((one.quantity.label, one.z, one.names) for one in summary.spreads), strict=True
+        )
+        plate = draw_plate(
+            2,
+            'distances',
+            'Which units stand out, and in what?',
+            'Each stroke is a unit: its distance from the fleet’s median in robust standard '
+            'deviations. Diamonds beyond the dashed lines are the units listed above.',
+            partial(draw_distances, labels, z, names, summary.limit),
+        )
+        drawn.append(plate)
+    return drawn
 
 
 def _spreads(summary: Summary) -> str:
@@ -218,12 +204,8 @@ def _spreads(summary: Summary) -> str:
     )
 
 
-def _units(rows: Sequence[Row], certificate_of: Callable[[str], str] | None) -> str:
+def _units(rows: Sequence[Row], certificate_of: Callable[[Row], str]) -> str:
     columns = ('static_ug', 'dynamic_ug', 'peak_ug')
-    links = [
-        certificate_of(str(row['name'])) if certificate_of and is_fitted(row) else ''
-        for row in rows
-    ]
     return '<h2>All tests</h2>' + table(
         (
             *('test', 'serial', 'lot', 'verdict', 'model'),
@@ -244,7 +226,7 @@ def _units(rows: Sequence[Row], certificate_of: Callable[[str], str] | None) -> 
         'on each unit’s own bags; '
         'calibrated board temperatures; still positions. All columns with all digits: '
         'fleet.parquet and fleet.csv.',
-        links=[quote(link) for link in links],
+        links=[quote(certificate_of(row)) if is_fitted(row) else '' for row in rows],
     )
 
 

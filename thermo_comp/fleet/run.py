@@ -1,27 +1,30 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a run over a fleet: find, do what is missing, write the table and the page."""
+"""Owns a run over a fleet: find, do what is missing, learn the type, write the table and page."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import FleetError
+from ..errors import FitError, FleetError
 from ..files import PAGE as PAGE_FILE
 from ..files import write_atomically
+from ..fitting.priors import population
+from ..unit.calibration import Calibration
+from ..unit.calibration_file import load_calibration, save_calibration
+from .cluster import connected, require_libraries, run
 from .discovery import FoundUnit, find_units
-from .engine import Job, connected, n_tasks, require_libraries, run
-from .ledger import Ledger
-from .row import Row, is_fitted, is_valid
+from .results import Results
 from .storage import Storage
 from .summary import Summary, summarise
-from .table import write_tables
+from .table import FAILED, Row, is_fitted, is_valid, write_tables
 from .unit import FleetOptions
 
-PAGE = 'fleet.html'
+PAGE, PRIOR = 'fleet.html', 'prior.yaml'
 Tell = Callable[[int, int, Row], None]
 
 
@@ -37,9 +40,13 @@ class FleetResult:
     summary : Summary
         What it tells.
     n_done : int
-        Units that this run did; the others were there.
+        Fits of this run; the others were there.
     parquet, csv, page : Path
         The files.
+    prior : Path or None
+        What the units that hold have in common; None where that cannot be said.
+    no_prior : str
+        Why not.
 
     """
 
@@ -49,6 +56,8 @@ class FleetResult:
     parquet: Path
     csv: Path
     page: Path
+    prior: Path | None
+    no_prior: str
 
     @property
     def n_fitted(self) -> int:
@@ -68,6 +77,7 @@ def fit_fleet(
     output: str | Path,
     options: FleetOptions,
     *,
+    with_prior: bool = False,
     scheduler: str | None = None,
     n_workers: int | None = None,
     client: Any = None,
@@ -85,21 +95,17 @@ def fit_fleet(
         Folder of the results on this machine.
     options : FleetOptions
         What the user said.
-    scheduler : str or None, optional
-        Address of a Dask scheduler; None makes a cluster of this machine.
-    n_workers : int or None, optional
-        Processes of the own cluster.
+    with_prior : bool, optional
+        Fit the units whose bags do not tell all of them again, with what the others have in
+        common.
+    scheduler, n_workers : optional
+        As for `cluster.connected`.
     client : distributed.Client or None, optional
         A client that is there already, instead of the two.
     earlier : sequence of mapping, optional
         Rows of earlier fleet tables, for the drift.
     tell : callable or None, optional
-        Told, after each unit: units done, units in all, its row.
-
-    Returns
-    -------
-    FleetResult
-        The table and what it tells.
+        Told, after each fit: units done, units in all, its row.
 
     Raises
     ------
@@ -112,47 +118,83 @@ def fit_fleet(
     require_libraries()
     storage = Storage(url)
     units = find_units(storage)
-    ledger = Ledger(Path(output))
-    _refuse_alike(units, ledger)
-    rows: dict[str, Row] = {}
-    jobs = []
-    for unit in units:
-        known = ledger.look_up(unit, options)
-        if known is not None and known.is_current:
-            rows[unit.name] = known.row
-        else:
-            jobs.append(Job(unit, known.key if known is not None else ''))
+    results = Results(Path(output))
+    _refuse_alike(units, results)
+    n_done = 0
+    with ExitStack() as stack:
 
-    def work(on: Any) -> None:
-        for unit, outcome in run(on, storage.address, jobs, options):
-            row = ledger.store(unit, options, outcome)
-            rows[unit.name] = row
-            if tell is not None:
-                tell(len(rows), len(units), row)
+        def fitted(some: Sequence[FoundUnit], how: FleetOptions) -> dict[str, Row]:
+            nonlocal client, n_done
+            known = {unit.name: results.look_up(unit, how) for unit in some}
+            rows = {name: row for name, row in known.items() if row is not None}
+            missing = [unit for unit in some if unit.name not in rows]
+            if missing and client is None:
+                client = stack.enter_context(connected(scheduler, n_workers, len(some)))
+            n_done += len(missing)
+            for unit, outcome in run(client, storage.address, missing, how) if missing else ():
+                rows[unit.name] = results.store(unit, how, outcome)
+                if tell is not None:
+                    tell(len(rows), len(some), rows[unit.name])
+            return rows
 
-    if jobs and client is not None:
-        work(client)
-    elif jobs:
-        with connected(scheduler, n_workers, n_tasks(jobs)) as own:
-            work(own)
+        rows = fitted(units, options)
+        prior, no_prior = _common(list(rows.values()), results)
+        if with_prior and prior is not None:
+            rest = [unit for unit in units if not _speaks(rows[unit.name])]
+            others = [unit for unit in rest if rows[unit.name]['verdict'] != FAILED]
+            again = fitted(others, replace(options, fit=replace(options.fit, prior=prior)))
+            for name, row in again.items():
+                rows[name] = row if is_fitted(row) else _unhelped(rows[name], row)
     ordered = tuple(rows[unit.name] for unit in units)
-    return _written(ordered, summarise(ordered, earlier), len(jobs), ledger)
+    summary = summarise(ordered, earlier)
+    parquet, csv = write_tables(ordered, results.folder)
+    page = _write_page(ordered, summary, results)
+    prior_path = None if prior is None else results.folder / PRIOR
+    return FleetResult(ordered, summary, n_done, parquet, csv, page, prior_path, no_prior)
 
 
-def _refuse_alike(units: Sequence[FoundUnit], ledger: Ledger) -> None:
+def _refuse_alike(units: Sequence[FoundUnit], results: Results) -> None:
     """Refuse two units whose results would lie in one folder."""
     seen: dict[Path, str] = {}
     for unit in units:
-        other = seen.setdefault(ledger.folder_of(unit.name), unit.name)
-        if other != unit.name:
-            raise FleetError(f'{unit.name} and {other} are too much alike: rename one')
+        folder = results.folder_of(unit.name)
+        if folder in seen:
+            raise FleetError(f'{unit.name} and {seen[folder]} are too much alike: rename one')
+        seen[folder] = unit.name
 
 
-def _written(rows: tuple[Row, ...], summary: Summary, n_done: int, ledger: Ledger) -> FleetResult:
+def _speaks(row: Row) -> bool:
+    """Whether a unit may speak for its type: all of it was seen, and holds."""
+    return is_valid(row) and row['is_whole'] == 1
+
+
+def _unhelped(row: Row, again: Row) -> Row:
+    """Say that a unit stays as it was fitted by itself."""
+    said = f'not fitted with the prior: {again["problem"]}'
+    return {**row, 'reservations': '; '.join(str(s) for s in (row['reservations'], said) if s)}
+
+
+def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
+    """Write what the units that hold have in common; else say why there is nothing."""
+    # A unit that was tested twice is one unit: the later test speaks.
+    tests = sorted((row for row in rows if _speaks(row)), key=lambda row: str(row['start']))
+    latest = {row['serial']: row for row in tests}
+    units = [load_calibration(results.files_of(row)[0]) for row in latest.values()]
+    try:
+        prior = population(sorted(units, key=lambda one: one.unit.serial))
+    except FitError as error:
+        return None, str(error)
+    save_calibration(prior, results.folder / PRIOR, overwrite=True)
+    return prior, ''
+
+
+def _write_page(rows: Sequence[Row], summary: Summary, results: Results) -> Path:
     from .page import render_fleet
 
-    parquet, csv = write_tables(rows, ledger.folder)
-    page = ledger.folder / PAGE
-    content = render_fleet(rows, summary, ledger.certificate_of)
-    write_atomically(page, content.encode(), PAGE_FILE)
-    return FleetResult(rows, summary, n_done, parquet, csv, page)
+    def certificate_of(row: Row) -> str:
+        path = results.files_of(row)[1]
+        return path.relative_to(results.folder).as_posix() if path.is_file() else ''
+
+    page = results.folder / PAGE
+    write_atomically(page, render_fleet(rows, summary, certificate_of).encode(), PAGE_FILE)
+    return page

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a fleet table tells: spreads, units that stand out, drift, lots that differ.
+Owns what a fleet table tells: spreads, units that stand out, drift.
 
 Spreads are robust (median and median absolute deviation), because the units that stand out are in
 them. Every limit is set so that a fleet without anything to find raises an alarm once in twenty.
@@ -9,9 +9,8 @@ them. Every limit is set so that a fleet without anything to find raises an alar
 
 from __future__ import annotations
 
-import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
@@ -21,11 +20,11 @@ import numpy as np
 from ..judging import Verdict
 from ..typing import Floats
 from ..unit.calibration import AXES
-from .row import Row, is_fitted
+from .table import Row, is_fitted
 
 _FALSE_ALARMS = 0.05
-# Fewer units have no spread to stand out of, fewer of a lot no middle.
-_UNITS_NEEDED, _LOT_NEEDED = 8, 4
+# Fewer units have no spread to stand out of.
+_UNITS_NEEDED = 8
 # A median absolute deviation knows the spread as well as 0.37 n values do with their squares.
 _MAD_EFFICIENCY = 0.37
 
@@ -33,21 +32,10 @@ _MAD_EFFICIENCY = 0.37
 @dataclass(frozen=True)
 class Quantity:
     """
-    What units are compared in.
+    What units are compared in: columns of the fleet table with their standard deviations.
 
-    Parameters
-    ----------
-    column : str
-        Column of the fleet table.
-    label, unit : str
-        For people; the unit is that of what is compared.
-    is_relative : bool, optional
-        Compared as the deviation from the fleet's median in ppm.
-    is_size : bool, optional
-        Positive by nature: compared by its logarithm.
-    sd : str, optional
-        Column of its standard deviation.
-
+    `is_relative`: as the deviation from the fleet's median in ppm. `is_size`: positive by nature,
+    compared by its logarithm.
     """
 
     column: str
@@ -82,22 +70,11 @@ QUANTITIES: tuple[Quantity, ...] = (
 @dataclass(frozen=True)
 class Spread:
     """
-    How a quantity is spread over the fleet.
+    How a quantity is spread over the units that have it.
 
-    Parameters
-    ----------
-    quantity : Quantity
-        Which.
-    names : tuple of str
-        The units that have it.
-    values : ndarray, shape (n,)
-        In the quantity's unit.
-    middle, sd : float
-        Median, and 1.4826 times the median absolute deviation (of a size: that of its logarithm,
-        times the median).
-    z : ndarray, shape (n,)
-        Distance of each unit from the middle in standard deviations; 0 where there is no spread.
-
+    `sd` is 1.4826 times the median absolute deviation from `middle`, the median (of a size: that
+    of its logarithm, times the median); `z`, shape (n,), the distances from the middle in it, 0
+    where there is no spread.
     """
 
     quantity: Quantity
@@ -110,21 +87,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Outlier:
-    """
-    A unit that stands out.
-
-    Parameters
-    ----------
-    name, serial : str
-        Which.
-    label : str
-        In what.
-    value, middle, z : float
-        Its value, the fleet's median, and the distance in standard deviations.
-    unit : str
-        Of value and middle.
-
-    """
+    """A unit that stands out by `z` standard deviations from the fleet's `middle`."""
 
     name: str
     serial: str
@@ -137,17 +100,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Change:
-    """
-    One quantity between two tests of a unit.
-
-    Parameters
-    ----------
-    label, unit : str
-        Which quantity.
-    change, sd : float
-        The later minus the earlier, and what the two fits say of its uncertainty.
-
-    """
+    """One quantity, the later test minus the earlier, with the sd that both fits claim."""
 
     label: str
     unit: str
@@ -163,19 +116,9 @@ class Change:
 @dataclass(frozen=True)
 class Drift:
     """
-    What changed between two tests of one unit.
+    What changed between two tests of one unit; significant where that is more than chance.
 
-    Parameters
-    ----------
-    serial, earlier, later : str
-        The unit, and the names of its tests.
-    days : float
-        Between their starts; NaN where one is not known.
-    changes : tuple of Change
-        By quantity.
-    is_significant : bool
-        Whether one of them is more than chance.
-
+    `days` is NaN where a start is not known.
     """
 
     serial: str
@@ -192,86 +135,24 @@ class Drift:
 
 
 @dataclass(frozen=True)
-class LotEffect:
-    """
-    A quantity in which lots differ.
-
-    Parameters
-    ----------
-    label, unit : str
-        Which quantity.
-    probability : float
-        That units dealt out by chance would differ as much (Kruskal and Wallis).
-    medians : dict of str to float
-        Median of each lot.
-
-    """
-
-    label: str
-    unit: str
-    probability: float
-    medians: dict[str, float]
-
-
-@dataclass(frozen=True)
 class Summary:
     """
     What a fleet table tells.
 
-    Parameters
-    ----------
-    verdicts : dict of str to int
-        Units by verdict.
-    problems : tuple of (str, int)
-        Reasons for no calibration, the frequent first; figures are left out of them.
-    spreads : tuple of Spread
-        By quantity.
-    limit : float
-        Distance in standard deviations beyond which a unit stands out; infinite in a fleet too
-        small to tell.
-    outliers : tuple of Outlier
-        The farthest first.
-    drifts : tuple of Drift
-        By serial and time.
-    lots : dict of str to int
-        Calibrated units by lot, each once.
-    lot_effects : tuple of LotEffect
-        The surest first.
-
+    Units by verdict; spreads by quantity; the `limit` in standard deviations beyond which a unit
+    stands out, infinite in a fleet too small to tell; outliers, the farthest first; drifts, the
+    surest first.
     """
 
     verdicts: dict[str, int]
-    problems: tuple[tuple[str, int], ...]
     spreads: tuple[Spread, ...]
     limit: float
     outliers: tuple[Outlier, ...]
     drifts: tuple[Drift, ...]
-    lots: dict[str, int]
-    lot_effects: tuple[LotEffect, ...]
-
-    @property
-    def surest_drifts(self) -> list[Drift]:
-        """Sort the drifts by their surest change."""
-        return sorted(self.drifts, key=lambda one: -abs(one.worst.z))
 
 
 def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
-    """
-    Look at a fleet as a whole.
-
-    Parameters
-    ----------
-    rows : sequence of mapping
-        The fleet table.
-    earlier : sequence of mapping, optional
-        Rows of earlier tables, to see what drifted.
-
-    Returns
-    -------
-    Summary
-        What there is to see.
-
-    """
+    """Look at a fleet as a whole; rows of earlier tables tell what drifted."""
     fitted = [row for row in rows if is_fitted(row)]
     spreads = tuple(spread for one in QUANTITIES if (spread := spread_of(one, fitted)) is not None)
     limit = outlier_limit(len(fitted), len(spreads))
@@ -282,40 +163,17 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         for name, value, z in zip(one.names, one.values.tolist(), one.z.tolist(), strict=True)
         if abs(z) > limit
     ]
-    # A unit that was tested twice is still one unit of its lot.
-    latest = {str(row['serial']): row for row in sorted(fitted, key=lambda row: str(row['start']))}
-    lots = Counter(str(row['lot']) for row in latest.values() if row['lot'])
     return Summary(
         verdicts=dict(Counter(_kind(str(row['verdict'])) for row in rows)),
-        problems=tuple(
-            Counter(_pattern(str(row['problem'])) for row in rows if row['problem']).most_common()
-        ),
         spreads=spreads,
         limit=limit,
         outliers=tuple(sorted(outliers, key=lambda one: -abs(one.z))),
         drifts=tuple(_drifts(fitted, [row for row in earlier if is_fitted(row)])),
-        lots=dict(sorted(lots.items())),
-        lot_effects=tuple(_lot_effects(list(latest.values()), spreads)),
     )
 
 
 def spread_of(quantity: Quantity, rows: Sequence[Row]) -> Spread | None:
-    """
-    Measure the spread of a quantity.
-
-    Parameters
-    ----------
-    quantity : Quantity
-        Which.
-    rows : sequence of mapping
-        Calibrated units.
-
-    Returns
-    -------
-    Spread or None
-        None where no unit has it.
-
-    """
+    """Measure the spread of a quantity over calibrated units; None where no unit has it."""
     pairs = [(str(row['name']), _number(row[quantity.column])) for row in rows]
     pairs = [(name, value) for name, value in pairs if np.isfinite(value)]
     if not pairs:
@@ -340,19 +198,9 @@ def spread_of(quantity: Quantity, rows: Sequence[Row]) -> Spread | None:
 
 def outlier_limit(n_units: int, n_quantities: int) -> float:
     """
-    Distance beyond which a unit stands out.
+    Return the distance, in standard deviations, beyond which a unit stands out.
 
-    Parameters
-    ----------
-    n_units, n_quantities : int
-        How many are compared in how much.
-
-    Returns
-    -------
-    float
-        Standard deviations: of Student's t, because the spread is itself estimated; infinite for
-        fewer than eight units.
-
+    Of Student's t, because the spread is itself estimated; infinite for fewer than eight units.
     """
     from scipy.stats import t
 
@@ -363,6 +211,8 @@ def outlier_limit(n_units: int, n_quantities: int) -> float:
 
 
 def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Drift]:
+    from scipy.stats import norm
+
     by_serial: dict[str, list[tuple[str, str, Row]]] = defaultdict(list)
     for source, found in (('earlier ', earlier), ('', rows)):
         for row in found:
@@ -376,7 +226,7 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Drift]:
         if before[2]['calibration_sha256'] != after[2]['calibration_sha256']
     ]
     compared = [quantity for quantity in QUANTITIES if quantity.sd]
-    limit = _normal_limit(len(pairs) * len(compared))
+    limit = norm.isf(0.5 * _FALSE_ALARMS / max(len(pairs) * len(compared), 1))
     drifts = []
     for serial, (_, name, old), (_, later, new) in pairs:
         changes = tuple(_change(quantity, old, new) for quantity in compared)
@@ -390,7 +240,7 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Drift]:
                 any(abs(one.z) > limit for one in changes),
             )
         )
-    return drifts
+    return sorted(drifts, key=lambda one: -abs(one.worst.z))
 
 
 def _change(quantity: Quantity, old: Row, new: Row) -> Change:
@@ -408,34 +258,6 @@ def _days(old: Row, new: Row) -> float:
     return (starts[1] - starts[0]).total_seconds() / 86400.0
 
 
-def _lot_effects(rows: Sequence[Row], spreads: Iterable[Spread]) -> list[LotEffect]:
-    from scipy.stats import kruskal
-
-    lot_of = {str(row['name']): str(row['lot']) for row in rows if row['lot']}
-    found = []
-    tested = 0
-    for one in spreads:
-        groups: dict[str, list[float]] = defaultdict(list)
-        for name, value in zip(one.names, one.values.tolist(), strict=True):
-            if name in lot_of:
-                groups[lot_of[name]].append(value)
-        groups = {lot: group for lot, group in groups.items() if len(group) >= _LOT_NEEDED}
-        if len(groups) < 2 or not one.sd > 0.0:
-            continue
-        tested += 1
-        probability = float(kruskal(*groups.values()).pvalue)
-        medians = {lot: float(np.median(group)) for lot, group in sorted(groups.items())}
-        found.append(LotEffect(one.quantity.label, one.quantity.unit, probability, medians))
-    sure = [one for one in found if one.probability < _FALSE_ALARMS / tested]
-    return sorted(sure, key=lambda one: one.probability)
-
-
-def _normal_limit(n: int) -> float:
-    from scipy.stats import norm
-
-    return float(norm.isf(0.5 * _FALSE_ALARMS / n)) if n else float('inf')
-
-
 def _kind(verdict: str) -> str:
     """Leave the amount out of a verdict, so that like ones count together."""
     wide = Verdict.WIDE.value
@@ -444,8 +266,3 @@ def _kind(verdict: str) -> str:
 
 def _number(cell: object) -> float:
     return float(cell) if isinstance(cell, (int, float)) else float('nan')
-
-
-def _pattern(problem: str) -> str:
-    """Leave the figures out of a sentence, so that like reasons count together."""
-    return re.sub(r'\d+(?:\.\d+)?', '#', problem)

@@ -1,22 +1,18 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of a fleet: what is left unit by unit, how units differ, who stands out."""
+"""Owns the figures of a fleet: what is left unit by unit, and who stands out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from ..typing import Floats
 from .plates import DrawnPlate
 from .style import (
-    AXIS_LINES,
     BLACK,
-    BLUE,
     DYNAMIC_LINE,
     GREY,
     NARROW,
@@ -27,7 +23,6 @@ from .style import (
     Line,
     Sheet,
     drawing,
-    few_ticks,
     legend_above,
     log_axis,
     new_figure,
@@ -44,25 +39,6 @@ _SECTION_LINES: dict[str, Line] = {
     'static': STATIC_LINE,
     'dynamic': DYNAMIC_LINE,
 }
-
-
-@dataclass(frozen=True)
-class Panel:
-    """
-    One quantity of all units, axis by axis.
-
-    Parameters
-    ----------
-    title, unit : str
-        What it is.
-    values : sequence of ndarray, shape (n,)
-        Of x, y and z.
-
-    """
-
-    title: str
-    unit: str
-    values: Sequence[Floats]
 
 
 def draw_plate(number: int, name: str, question: str, reading: str, draw: Draw) -> DrawnPlate:
@@ -124,27 +100,6 @@ def draw_shares(curves: Mapping[str, Floats], sheet: Sheet) -> Figure:
     return figure
 
 
-def draw_spreads(panels: Sequence[Panel], sheet: Sheet) -> Figure:
-    """Draw how the coefficients are spread, as the share of units below each value."""
-    columns = 1 if sheet.is_narrow else 2
-    n_rows = -(-len(panels) // columns)
-    figure = new_figure(sheet, 0.4 + 1.75 * n_rows)
-    grid = np.atleast_1d(figure.subplots(n_rows, columns)).ravel()
-    for axes, panel in zip(grid, panels, strict=False):
-        for axis, values, line in zip('xyz', panel.values, AXIS_LINES, strict=True):
-            share = (np.arange(len(values)) + 0.5) / max(len(values), 1) * 100.0
-            axes.step(np.sort(values), share, where='mid', label=axis, **line)
-        axes.set_xlabel(f'{panel.title}, {panel.unit}')
-        axes.set_ylabel('units, %')
-        axes.set_ylim(0.0, 100.0)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        few_ticks(axes, 4)
-    for axes in grid[len(panels) :]:
-        axes.set_axis_off()
-    legend_above(grid[0], sheet, share=1.0 / columns)
-    return figure
-
-
 def draw_distances(
     labels: Sequence[str],
     distances: Sequence[Floats],
@@ -198,61 +153,4 @@ def draw_distances(
     axes.set_yticks(range(len(labels)), labels)
     axes.grid(visible=True, axis='x')
     axes.set_xlabel('distance from the median, standard deviations')
-    return figure
-
-
-def draw_lots(title: str, groups: Mapping[str, Floats], sheet: Sheet) -> Figure:
-    """Draw one quantity lot by lot."""
-    figure = new_figure(sheet, 0.7 + 0.28 * len(groups))
-    axes = figure.subplots()
-    for row, values in enumerate(groups.values()):
-        axes.plot(values, np.full(len(values), row), '|', color=GREY, markersize=8)
-        axes.plot([float(np.median(values))], [row], 'D', color=BLUE, markersize=4.5)
-    axes.set_yticks(range(len(groups)), [label_text(lot, 18) for lot in groups])
-    axes.set_ylim(len(groups) - 0.5, -0.5)
-    axes.set_xlabel(title)
-    axes.xaxis.set_major_locator(MaxNLocator(6))
-    return figure
-
-
-def draw_changes(
-    labels: Sequence[str], panels: Mapping[str, tuple[Floats, Floats]], sheet: Sheet
-) -> Figure:
-    """
-    Draw what changed between two tests of each unit, axis by axis, with two sd on either side.
-
-    Parameters
-    ----------
-    labels : sequence of str
-        The units.
-    panels : mapping of str to (ndarray, ndarray), shape (n, 3)
-        Changes and standard deviations, by the words of the axis.
-    sheet : Sheet
-        The paper.
-
-    """
-    columns = 1 if sheet.is_narrow else len(panels)
-    height = 0.8 + 0.3 * len(labels)
-    figure = new_figure(sheet, height * (len(panels) if sheet.is_narrow else 1))
-    grid = np.atleast_1d(figure.subplots(len(panels) // columns, columns, sharey=True)).ravel()
-    rows = np.arange(len(labels))
-    marks = ('o', 's', '^')
-    for axes, (words, (change, sd)) in zip(grid, panels.items(), strict=True):
-        for i, axis in enumerate('xyz'):
-            axes.errorbar(
-                change[:, i],
-                rows + 0.2 * (i - 1),
-                xerr=2.0 * sd[:, i],
-                fmt=marks[i],
-                color=AXIS_LINES[i]['color'],
-                markersize=3.5,
-                linewidth=1.0,
-                label=axis,
-            )
-        axes.axvline(0.0, color=BLACK, linewidth=0.5)
-        axes.set_xlabel(words)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-    grid[0].set_yticks(rows, [label_text(label, 18) for label in labels])
-    grid[0].set_ylim(len(labels) - 0.4, -0.6)
-    legend_above(grid[0], sheet, share=1.0 / columns)
     return figure

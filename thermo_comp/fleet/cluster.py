@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns the way onto Dask: a cluster of this machine or of others, and what its accidents mean."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from .. import __version__
+from ..errors import FleetError
+from .discovery import FoundUnit
+from .table import FAILED, empty_row
+from .unit import FleetOptions, UnitOutcome, process_unit
+
+_HINT = "a fleet needs Dask: pip install 'thermo_comp[fleet]'"
+_WAIT_S = 30.0
+
+
+def dask_setup(_worker: object) -> None:
+    """
+    Leave Ctrl-C, which a terminal sends to all processes, to the one that was started in it.
+
+    Dask calls it in each worker process that it starts with this module as its preload.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+
+
+def require_libraries() -> None:
+    """
+    Say at once what is missing.
+
+    Raises
+    ------
+    FleetError
+        If a library of the extra `fleet` is not installed.
+
+    """
+    try:
+        import distributed
+        import fsspec
+        import pyarrow as pa
+    except ImportError as error:
+        raise FleetError(f'{_HINT} ({error.name} is not installed)') from error
+    del distributed, fsspec, pa
+
+
+@contextmanager
+def connected(
+    scheduler: str | None = None, n_workers: int | None = None, most: int = 1 << 30
+) -> Iterator[Any]:
+    """
+    Give a client of a cluster with at least one worker.
+
+    Parameters
+    ----------
+    scheduler : str or None, optional
+        Address of a running one, e.g. ``tcp://host:8786``; None makes one on this machine, and
+        ends it at the end.
+    n_workers : int or None, optional
+        Processes of the own cluster; None takes one per processor.
+    most : int, optional
+        What there is to do at a time: more processes than that are not started.
+
+    Raises
+    ------
+    FleetError
+        If nobody answers, there is no worker, or they run another version.
+
+    """
+    import dask
+    from distributed import Client, LocalCluster
+
+    # What a worker does on its way down is in the fleet table, in words that its reader knows.
+    settings = {'logging.distributed': 'critical', 'distributed.scheduler.http.routes': []}
+    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    with dask.config.set(settings):
+        if scheduler is None:
+            with (
+                LocalCluster(
+                    n_workers=min(n_workers or os.cpu_count() or 1, most),
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address='127.0.0.1:0',
+                    host='127.0.0.1',
+                    preload=[__name__],
+                ) as cluster,
+                Client(cluster) as client,
+            ):
+                yield client
+            return
+        try:
+            client = Client(scheduler, timeout=_WAIT_S)
+        except (OSError, ValueError, TypeError) as error:
+            raise FleetError(f'{scheduler}: no Dask scheduler answers there') from error
+        with client:
+            _check_workers(client, scheduler)
+            yield client
+
+
+def _check_workers(client: Any, scheduler: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=_WAIT_S)
+    except TimeoutError as error:
+        raise FleetError(f'{scheduler}: has no worker') from error
+    try:
+        versions = client.run(version)
+    except Exception as error:  # whatever an import fails with over there
+        raise FleetError(f'{scheduler}: a worker lacks thermo_comp {__version__}') from error
+    for worker, found in versions.items():
+        if found != __version__:
+            raise FleetError(
+                f'{scheduler}: worker {worker} runs thermo_comp {found}, not {__version__}'
+            )
+
+
+def version() -> str:
+    """Return the version of whoever is asked."""
+    return __version__
+
+
+def run(
+    client: Any, url: str, units: Sequence[FoundUnit], options: FleetOptions
+) -> Iterator[tuple[FoundUnit, UnitOutcome]]:
+    """Do units, and yield each as it is done; one whose task failed comes with the reason."""
+    from distributed import as_completed
+
+    futures = client.map(process_unit, units, url=url, options=options, pure=False, batch_size=256)
+    unit_of = {future.key: unit for future, unit in zip(futures, units, strict=True)}
+    done = as_completed(futures)
+    del futures
+    for future in done:
+        unit = unit_of.pop(future.key)
+        yield unit, outcome_of(future, unit)
+        future.release()
+
+
+def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
+    """Take a task's result, or the words for what became of it: a failure to be done again."""
+    from distributed import KilledWorker
+
+    if future.status == 'finished':
+        result: UnitOutcome = future.result()
+        return result
+    problem = 'the scheduler was lost'
+    if future.status == 'error':
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            n_died = error.allowed_failures + 1
+            problem = f'its worker died {n_died} times at it: too little memory?'
+        else:
+            problem = f'{type(error).__name__}: {" ".join(str(error).split())}'
+    row = empty_row(
+        name=unit.name,
+        serial=unit.name.rpartition('/')[2],
+        lot=unit.lot,
+        verdict=FAILED,
+        problem=problem,
+        n_bags=len(unit.bags),
+        n_bytes=sum(bag.n_bytes for bag in unit.bags),
+        tool_version=__version__,
+    )
+    return UnitOutcome(row, {}, is_final=False)
