@@ -211,32 +211,21 @@ def test_a_table_of_words_is_refused(tmp_path: Path) -> None:
 
 
 class TestThinning:
-    stamps = np.arange(10, dtype=np.int64) * 10**9
+    def kept(self, values: list[float], step_s: int = 1) -> list[int]:
+        stamps = np.arange(len(values), dtype=np.int64) * step_s * 10**9
+        return (thin(Readings(stamps, np.array(values))).stamp_ns // 10**9).tolist()
 
-    def kept(self, values: list[float], publish: str, **more: float) -> list[int]:
-        readings = Readings(self.stamps[: len(values)], np.array(values))
-        result = thin(readings, publish, more.get('heartbeat_s', 1e9), more.get('period_s'))
-        return (result.stamp_ns // 10**9).tolist()
-
-    def test_change(self) -> None:
-        assert self.kept([1, 1, 2, 2, 2, 1], 'change') == [0, 2, 5]
-
-    def test_heartbeat(self) -> None:
-        assert self.kept([1] * 10, 'change', heartbeat_s=4.0) == [0, 4, 8]
-
-    def test_period(self) -> None:
-        assert self.kept([1, 2, 3, 4, 5, 6], 'period', period_s=2.0) == [0, 2, 4]
-
-    def test_all(self) -> None:
-        assert self.kept([1, 1, 1], 'all') == [0, 1, 2]
+    def test_a_change_or_ten_seconds_without_one(self) -> None:
+        assert self.kept([1, 1, 2, 2, 2, 1]) == [0, 2, 5]
+        assert self.kept([1] * 10, step_s=4) == [0, 12, 24, 36]
 
     def test_missing_cells_are_no_readings(self) -> None:
-        assert self.kept([float('nan'), 1, float('nan'), 1, 2], 'change') == [1, 4]
-        assert self.kept([float('nan')] * 3, 'change') == []
+        assert self.kept([float('nan'), 1, float('nan'), 1, 2]) == [1, 4]
+        assert self.kept([float('nan')] * 3) == []
 
     def test_a_clock_that_starts_anew_is_worth_a_message(self) -> None:
         readings = Readings(np.array([5, 6, 1, 2]) * 10**9, np.full(4, 20.0))
-        assert (thin(readings, 'change', 1e6).stamp_ns // 10**9).tolist() == [5, 1]
+        assert (thin(readings).stamp_ns // 10**9).tolist() == [5, 1]
 
 
 class TestColumnMap:
@@ -302,7 +291,7 @@ class TestColumnMap:
                 'board',
                 'needs `degc_at_zero`',
             ),
-            ({'board': {'column': 'b', 'publish': 'period'}}, 'board', 'needs `period_s`'),
+            ({'board': {'column': 'b', 'publish': 'all'}}, 'board.publish', 'unknown key'),
             (
                 {
                     'accel': {'columns': [0, 1, 2], 'unit': 'counts', 'output': 'counts'},

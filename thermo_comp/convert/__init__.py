@@ -5,8 +5,7 @@ Owns the way from other people's logs to bags: tables with a column map, PX4, Ar
 """
 
 from .bag import bag_log
-from .columnar import table_log
-from .columns import ColumnMap, load_column_map
+from .columns import ColumnMap, load_column_map, table_log
 from .dataflash import dataflash_log
 from .log import ConversionReport, ForeignLog, write_log
 from .ulog import ulog_log

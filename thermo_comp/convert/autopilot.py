@@ -19,38 +19,22 @@ import numpy.typing as npt
 
 from ..errors import RecordingError
 from ..typing import Bools, Floats, Ints
-from .columnar import origin
-from .log import ForeignLog, Readings, thin
+from .log import ForeignLog, Readings, origin, thin
 from .table import NO_STAMP
 from .units import find_stillness
 
 T = TypeVar('T')
 
-# A thermometer that stands still says so this often, so that nobody takes it for lost.
-_HEARTBEAT_S = 10.0
 _CENTURY_US = 100 * 366 * 86400 * 10**6
 
 
 @dataclass(frozen=True)
 class ImuRows:
     """
-    One IMU's rows in an autopilot's log.
+    One IMU's rows in an autopilot's log: stamps since its start, m/s^2, rad/s, degC or NaN.
 
-    Parameters
-    ----------
-    stamp_ns : ndarray of int64, shape (n,)
-        Stamps since the autopilot's start.
-    accel : ndarray, shape (n, 3)
-        Specific force [m/s^2].
-    gyro : ndarray, shape (n, 3), or None
-        Angular rate [rad/s].
-    celsius : ndarray, shape (n,)
-        Temperature in the IMU; NaN where there is none.
-    serial : str
-        What tells this sensor from another; empty where the log does not say.
-    n_short : int
-        Rows that the file holds in part only.
-
+    `serial` tells this sensor from another where the log does, `n_short` counts rows that the file
+    holds in part only.
     """
 
     stamp_ns: Ints
@@ -63,21 +47,7 @@ class ImuRows:
 
 @dataclass(frozen=True)
 class AutopilotLog:
-    """
-    What an autopilot's log says of its inertial sensors.
-
-    Parameters
-    ----------
-    path : str
-        The log.
-    imus : dict of {int: ImuRows}
-        By instance.
-    baros : dict of {int: Readings}
-        Temperatures of the barometers, by instance.
-    metadata : dict of {str: str}
-        What the log says of itself.
-
-    """
+    """What an autopilot's log says of its IMUs and barometers, by instance, and of itself."""
 
     path: str
     imus: dict[int, ImuRows]
@@ -87,21 +57,7 @@ class AutopilotLog:
 
 def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = None) -> ForeignLog:
     """
-    Take one IMU and one barometer out of an autopilot's log.
-
-    Parameters
-    ----------
-    log : AutopilotLog
-        The log.
-    imu : int or None, optional
-        Instance; None takes the lowest.
-    baro : int or None, optional
-        Instance; None takes the lowest with a temperature, if there is one.
-
-    Returns
-    -------
-    ForeignLog
-        Ready to be written as a bag.
+    Take one IMU and one barometer out of an autopilot's log; None takes the lowest instance.
 
     Raises
     ------
@@ -124,8 +80,8 @@ def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = No
         stamp_ns=rows.stamp_ns,
         accel=rows.accel,
         gyro=rows.gyro,
-        board=_thinned(board),
-        case=None if case is None else _thinned(case),
+        board=thin(board) if len(board.celsius) else None,
+        case=None if case is None or not len(case.celsius) else thin(case),
         line=np.arange(1, len(rows.stamp_ns) + 1),
         serial=rows.serial,
         n_short=rows.n_short,
@@ -137,16 +93,7 @@ def stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
     """
     Turn microseconds since the autopilot's start into stamps.
 
-    Parameters
-    ----------
-    microseconds : ndarray of int, shape (n,)
-        As logged.
-
-    Returns
-    -------
-    ndarray of int64, shape (n,)
-        `NO_STAMP` where the number is no time: beyond a century, from a damaged file.
-
+    `NO_STAMP` where the number is no time: beyond a century, from a damaged file.
     """
     whole = np.asarray(microseconds)
     size = whole.astype(np.float64)
@@ -170,12 +117,6 @@ def _reported(readings: Readings) -> Readings:
     if not readings.celsius[use].any():
         use = np.zeros(len(use), dtype=np.bool_)
     return Readings(readings.stamp_ns[use], readings.celsius[use])
-
-
-def _thinned(readings: Readings) -> Readings | None:
-    if not len(readings.celsius):
-        return None
-    return thin(readings, 'change', _HEARTBEAT_S)
 
 
 def _refuse_noiseless(path: str, rows: ImuRows) -> None:

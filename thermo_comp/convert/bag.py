@@ -16,15 +16,12 @@ from typing import Literal
 
 import numpy as np
 
-from .. import __version__
 from ..errors import RecordingError
-from ..files import shown_name
-from ..fitting.fit_sources import digest
 from ..recording import Topics, inspect_recording, read_recording
 from ..recording.columns import Role
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
-from .log import ForeignLog, Readings
+from .log import ForeignLog, Readings, origin
 
 _IMU = 'sensor_msgs/msg/Imu'
 _TEMPERATURE = 'sensor_msgs/msg/Temperature'
@@ -45,19 +42,7 @@ def bag_log(
     """
     Read a bag with an Imu topic and its thermometers, whatever they are called.
 
-    Parameters
-    ----------
-    path : str or Path
-        A rosbag2 directory, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
-    imu, board, case : str or None, optional
-        Topics; None finds them by type and neighbourhood.
-    unit : {'m/s^2', 'g', 'mg'}, optional
-        What the driver publishes as linear acceleration.
-
-    Returns
-    -------
-    ForeignLog
-        Ready to be written as a bag with the usual topics and units.
+    Topics that are None are found by type and neighbourhood; `unit` is what the driver publishes.
 
     Raises
     ------
@@ -91,10 +76,7 @@ def bag_log(
         missing=recording.info.truncated,
         metadata={
             **{f'topic_{role}': name for role, name in found.items() if name},
-            'converted_from': shown_name(path),
-            'converted_from_sha256': digest(path),
-            'converted_by': f'thermo_comp {__version__}',
-            **({'serial': serial} if serial else {}),
+            **origin(path, serial),
         },
     )
 
@@ -103,21 +85,8 @@ def find_topics(
     path: Path, present: Present, imu: str | None, board: str | None, case: str | None
 ) -> dict[str, str | None]:
     """
-    Tell the Imu, the board's and the case's thermometer among a bag's topics.
-
-    Parameters
-    ----------
-    path : Path
-        The bag, for the error's sake.
-    present : mapping of {str: (str, int)}
-        The bag's topics with their type and number of messages.
-    imu, board, case : str or None
-        What the user chose.
-
-    Returns
-    -------
-    dict
-        Keys ``imu``, ``board``, ``case``; None where there is no such thermometer.
+    Tell ``imu``, ``board`` and ``case`` among a bag's topics; None where there is no such
+    thermometer.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the column map: which column of a table is what, in which unit, and how it becomes a message.
+Owns tables with a column map: which column is what, in which unit, and how it becomes a message.
 
 A map is a small YAML file beside the log; config/columns/ has examples.
 """
@@ -12,12 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
+
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import load_plain_yaml
+from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
-from .table import Column
+from .log import ForeignLog, Readings, origin, thin
+from .table import NO_STAMP, Column, Table, read_parquet, read_text
 
 #: A map takes some kB.
 _SIZE_LIMIT = 1 << 20
@@ -109,26 +113,20 @@ class Thermometer:
     """
     One temperature column; unit raw: ``degC = reading * degc_per_count + degc_at_zero``.
 
-    Slow sensors hold their last value between readings of their own. `publish` says which rows
-    become messages: ``change`` (the value differs from the last one, or `heartbeat_s` is over),
-    ``period`` (every `period_s`) or ``all``.
+    Slow sensors hold their last value between readings of their own: a row becomes a message where
+    the value differs from the last one, or after ten seconds.
     """
 
     column: Column
     unit: Literal['degC', 'K', 'degF', 'raw'] = 'degC'
     degc_per_count: float | None = None
     degc_at_zero: float | None = None
-    publish: Literal['change', 'period', 'all'] = 'change'
-    heartbeat_s: Positive = 10.0
-    period_s: Positive | None = None
 
     def __post_init__(self) -> None:
         if (self.unit == 'raw') != (self.degc_per_count is not None):
             raise ValueError('unit raw needs `degc_per_count`, the other units forbid it')
         if (self.unit == 'raw') != (self.degc_at_zero is not None):
             raise ValueError('unit raw needs `degc_at_zero`, the other units forbid it')
-        if (self.publish == 'period') != (self.period_s is not None):
-            raise ValueError('publish: period needs `period_s`, the other ways forbid it')
 
     @property
     def linear(self) -> tuple[float, float]:
@@ -185,3 +183,79 @@ def load_column_map(path: str | Path) -> ColumnMap:
         return build(ColumnMap, data)
     except SchemaError as failure:
         raise RecordingError(failure.message, path=path, topic=failure.key or None) from failure
+
+
+def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
+    """
+    Read all rows of a table as its column map says, with the temperatures thinned.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read or lacks a column.
+
+    """
+    path = Path(path)
+    wanted, stamp = _wanted(columns), columns.stamp
+    if path.suffix.lower() in ('.parquet', '.pq'):
+        table = read_parquet(path, wanted, stamp.column, stamp.exponent)
+    else:
+        separated = columns.format
+        table = read_text(
+            path, wanted, stamp.column, stamp.exponent, separated.character, separated.header
+        )
+    stamp_ns = _stamps(table, columns)
+    gyro = None
+    if columns.gyro is not None:
+        gyro = _stack(table, columns.gyro.columns)
+        if columns.gyro.unit == 'deg/s':
+            gyro = np.radians(gyro)
+    return ForeignLog(
+        path=str(path),
+        input=columns.accel.output,
+        unit=columns.accel.unit,
+        factor=columns.accel.factor,
+        stamp_ns=stamp_ns,
+        accel=_stack(table, columns.accel.columns),
+        gyro=gyro,
+        board=_readings(table, stamp_ns, columns.board),
+        case=_readings(table, stamp_ns, columns.case),
+        line=table.line,
+        counts_per_g=columns.accel.counts_per_g,
+        clip=columns.accel.clip,
+        frame_id=columns.frame_id,
+        serial=columns.serial or '',
+        n_short=table.n_short,
+        metadata=origin(path, columns.serial),
+    )
+
+
+def _wanted(columns: ColumnMap) -> list[Column]:
+    wanted = list(columns.accel.columns)
+    if columns.gyro is not None:
+        wanted += columns.gyro.columns
+    wanted += [t.column for t in (columns.board, columns.case) if t is not None]
+    return list(dict.fromkeys(wanted))
+
+
+def _stack(table: Table, names: tuple[Column, Column, Column]) -> Floats:
+    return np.column_stack([table.values[name] for name in names])
+
+
+def _stamps(table: Table, columns: ColumnMap) -> Ints:
+    if table.stamp_ns is not None:
+        return table.stamp_ns
+    rate = columns.stamp.rate_hz or 1.0
+    start_ns = round(columns.stamp.start_s * 1e9)
+    # Each stamp from its own number, so that no rounding adds up.
+    steps = np.rint(np.arange(len(table.line)) * (1e9 / rate))
+    return np.asarray(start_ns + steps.astype(np.int64))
+
+
+def _readings(table: Table, stamp_ns: Ints, thermometer: Thermometer | None) -> Readings | None:
+    if thermometer is None:
+        return None
+    slope, offset = thermometer.linear
+    known = stamp_ns != NO_STAMP
+    celsius = table.values[thermometer.column][known] * slope + offset
+    return thin(Readings(stamp_ns[known], celsius))

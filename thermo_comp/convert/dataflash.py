@@ -47,29 +47,16 @@ def dataflash_log(
     allow_compensated: bool = False,
 ) -> ForeignLog:
     """
-    Read one IMU and one barometer of an ArduPilot log.
+    Read one IMU and one barometer of an ArduPilot log; None takes the lowest instance.
 
-    Parameters
-    ----------
-    path : str or Path
-        The ``.BIN`` file.
-    imu : int or None, optional
-        Instance, counted from 0 (the old type ``IMU2`` is 1); None takes the lowest.
-    baro : int or None, optional
-        Instance of the barometer; None takes the lowest.
-    allow_compensated : bool, optional
-        Take a log whose thermal drift ArduPilot has already corrected.
-
-    Returns
-    -------
-    ForeignLog
-        Ready to be written as a bag.
+    IMUs are counted from 0: the old type ``IMU2`` is 1. `allow_compensated` takes a log whose
+    thermal drift ArduPilot has already corrected.
 
     Raises
     ------
     RecordingError
-        If pymavlink is not installed, the file is no DataFlash log, it holds no such instance,
-        its drift is already corrected, or its accelerometer has no noise.
+        If pymavlink is not installed, the file is no DataFlash log, it holds no such instance, its
+        drift is already corrected, or its accelerometer has no noise.
 
     """
     log, parameters = read_dataflash(path)
@@ -85,27 +72,7 @@ def dataflash_log(
 
 
 def read_dataflash(path: str | Path) -> tuple[AutopilotLog, dict[str, float]]:
-    """
-    Read the inertial sensors of an ArduPilot log.
-
-    Parameters
-    ----------
-    path : str or Path
-        The ``.BIN`` file.
-
-    Returns
-    -------
-    log : AutopilotLog
-        All instances.
-    parameters : dict of {str: float}
-        The autopilot's parameters at the log's end.
-
-    Raises
-    ------
-    RecordingError
-        If pymavlink is not installed or the file is no DataFlash log.
-
-    """
+    """Read the inertial sensors of an ArduPilot log, and its parameters at the log's end."""
     try:
         from pymavlink.DFReader import DFReader_binary
     except ImportError as failure:

@@ -49,15 +49,7 @@ _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
 @dataclass(frozen=True)
 class ParameterFile:
     """
-    An export.
-
-    Parameters
-    ----------
-    text : str
-        The parameter file.
-    notes : tuple of str
-        What the autopilot cannot express, one line each, with what it costs.
-
+    A parameter file, and what the autopilot cannot express, one line each with what it costs.
     """
 
     text: str
@@ -74,22 +66,8 @@ def export_px4(
     """
     Write a calibration's static set as PX4 parameters (QGroundControl's format).
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-    instance : int, optional
-        Which ``TC_An``, 0..3.
-    device_id : int, optional
-        The sensor's device id, ``TC_An_ID``; PX4 applies the set to the sensor of that id.
-    up : tuple of float or None, optional
-        Attitude at which the drift of the scale is folded into the offset, as a unit vector; None
-        leaves it out.
-
-    Returns
-    -------
-    ParameterFile
-        Text and notes.
+    `instance` is the ``n`` of ``TC_An``, `device_id` the sensor's id, by which PX4 matches the
+    set. At the attitude `up`, a unit vector, the drift of the scale is folded into the offset.
 
     Raises
     ------
@@ -121,21 +99,7 @@ def export_ardupilot(
     calibration: Calibration, *, imu: int = 1, up: tuple[float, float, float] | None = None
 ) -> ParameterFile:
     """
-    Write a calibration's static set as ArduPilot parameters.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-    imu : int, optional
-        Which ``INS_TCALn``, 1..3.
-    up : tuple of float or None, optional
-        As in `export_px4`.
-
-    Returns
-    -------
-    ParameterFile
-        Text and notes.
+    Write a calibration's static set as ArduPilot parameters; `imu` is the ``n`` of ``INS_TCALn``.
 
     Raises
     ------
@@ -175,27 +139,15 @@ def import_parameters(
     """
     Read PX4 or ArduPilot parameters as a calibration of a unit that speaks m/s^2.
 
-    Parameters
-    ----------
-    text : str
-        A parameter file: QGroundControl's, Mission Planner's, MAVProxy's or ``NAME=VALUE``.
-    serial : str
-        Serial to give the unit.
-    number : int or None, optional
-        Which instance (PX4, from 0) or IMU (ArduPilot, from 1); None takes the only one there is.
-    gravity, cycle_time_s, full_scale, noise_density : float, optional
-        What parameter files do not say of the unit.
-
-    Returns
-    -------
-    Calibration
-        Scale 1, no misalignment, the same set in both regimes.
+    The text is QGroundControl's, Mission Planner's, MAVProxy's or ``NAME=VALUE``. `number` chooses
+    an instance (PX4, from 0) or IMU (ArduPilot, from 1); None takes the only one there is. The
+    result has scale 1, no misalignment and the same set in both regimes.
 
     Raises
     ------
     CalibrationError
-        If the text holds no thermal parameters, several sets and none was chosen, an incomplete
-        or disabled one, or an empty temperature range.
+        If the text holds no thermal parameters, several sets and none was chosen, an incomplete or
+        disabled one, or an empty temperature range.
 
     """
     values = _parse(text)

@@ -15,7 +15,10 @@ from typing import Literal
 
 import numpy as np
 
+from .. import __version__
 from ..errors import RecordingError
+from ..files import shown_name
+from ..fitting.fit_sources import digest
 from ..recording import STAMP_END_NS, BagWriter, ImuColumns, Topics
 from ..text import valid_serial
 from ..typing import Bools, Floats, Ints
@@ -24,6 +27,8 @@ from .units import Stillness, believed_unit, contradiction, find_stillness
 
 # No sensor on a circuit board is read outside this range; kelvins and raw counts are.
 _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
+# A thermometer that stands still says so this often, so that nobody takes it for lost.
+_HEARTBEAT_NS = 10 * 10**9
 # Messages are written in runs of this many rows: bounded memory in the writer.
 _RUN_ROWS = 100_000
 _EXAMPLES = 5
@@ -32,17 +37,7 @@ _OUT_OF_RANGE = 'before 1970 or after January 2038, which no ROS message can hol
 
 @dataclass(frozen=True)
 class Readings:
-    """
-    One thermometer's readings.
-
-    Parameters
-    ----------
-    stamp_ns : ndarray of int64, shape (n,)
-        Stamps, in file order.
-    celsius : ndarray, shape (n,)
-        Temperatures.
-
-    """
+    """One thermometer's readings [degC] with their stamps, shape (n,), in file order."""
 
     stamp_ns: Ints
     celsius: Floats
@@ -57,10 +52,8 @@ class ForeignLog:
     ----------
     path : str
         The log.
-    input : {'counts', 'imu'}
-        What the accelerometer's messages become.
-    unit : {'counts', 'm/s^2', 'g', 'mg'}
-        The unit that the log states.
+    input, unit : str
+        What the accelerometer's messages become, and the unit that the log states.
     factor : float
         From that unit to the message's.
     stamp_ns : ndarray of int64, shape (n,)
@@ -69,20 +62,12 @@ class ForeignLog:
         Readings in the stated unit; NaN where a cell is no number.
     gyro : ndarray, shape (n, 3), or None
         Angular rate [rad/s].
-    board, case : Readings or None
-        The two thermometers.
     line : ndarray of int64, shape (n,)
         Where each row stands in the file.
-    counts_per_g : float or None
-        The sensitivity that the log states.
-    clip : (float, float) or None
-        Readings at and beyond which the sensor saturates, in the stated unit.
-    frame_id, serial : str
-        For the messages and for the bag.
+    counts_per_g, clip : optional
+        The stated sensitivity; readings at and beyond which the sensor saturates.
     n_short : int
         Rows that were left out because they are too short.
-    metadata : dict of {str: str}
-        What the bag shall say about its origin.
     missing : str or None
         What of the log could not be read.
 
@@ -109,17 +94,7 @@ class ForeignLog:
 
 @dataclass(frozen=True)
 class Finding:
-    """
-    Something that some rows have in common.
-
-    Parameters
-    ----------
-    count : int
-        How many rows.
-    lines : tuple of int
-        Where the first few stand in the file.
-
-    """
+    """Something that `count` rows have in common, the first few of which stand in `lines`."""
 
     count: int
     lines: tuple[int, ...]
@@ -130,30 +105,9 @@ class ConversionReport:
     """
     What came in, what went out, and what was seen on the way.
 
-    Parameters
-    ----------
-    source, output : str
-        The log and the bag.
-    rows : int
-        Rows of the log.
-    accel_messages, board_messages, case_messages : int
-        Messages in the bag.
-    input : {'counts', 'imu'}
-        What the accelerometer's messages are.
-    rate_hz, duration_s : float
-        Median rate and length of the log.
-    short_rows, non_numeric, out_of_range, backwards, repeated, clipped : Finding
-        Rows left out because they are too short, hold no numbers or a stamp that ROS has not; rows
-        kept whose time goes back, stands still, or whose reading is clipped.
-    unit, believed : str
-        The unit stated, and what the readings at rest speak for.
-    stillness : Stillness
-        Where the log rests and what it reads there.
-    start_ns : int
-        First stamp.
-    missing : str or None
-        What of the log could not be read.
-
+    Rows are left out that are short, hold no numbers, or a stamp that ROS has not; rows whose time
+    goes back or stands still, or whose reading is clipped, are kept. `unit` is the one stated,
+    `believed` what the readings at rest speak for.
     """
 
     source: str
@@ -178,44 +132,28 @@ class ConversionReport:
     missing: str | None
 
 
-def thin(
-    readings: Readings, publish: str, heartbeat_s: float, period_s: float | None = None
-) -> Readings:
-    """
-    Keep the readings that say something new.
-
-    Parameters
-    ----------
-    readings : Readings
-        All of them; those that are not finite are left out.
-    publish : {'change', 'period', 'all'}
-        On a change (or after `heartbeat_s` without one), every `period_s`, or all.
-    heartbeat_s : float
-        Longest silence of an unchanged value [s].
-    period_s : float or None, optional
-        For ``period`` [s].
-
-    Returns
-    -------
-    Readings
-        The kept ones.
-
-    """
+def thin(readings: Readings) -> Readings:
+    """Keep the finite readings that say something new: a change, or ten seconds without one."""
     finite = np.isfinite(readings.celsius)
     stamp_ns, celsius = readings.stamp_ns[finite], readings.celsius[finite]
-    if publish == 'all' or not len(stamp_ns):
-        return Readings(stamp_ns, celsius)
-    every_ns = round((heartbeat_s if publish == 'change' else period_s or 0.0) * 1e9)
-    on_change = publish == 'change'
     kept: list[int] = []
     last_ns, last = 0, float('nan')
     for i, (now_ns, value) in enumerate(zip(stamp_ns.tolist(), celsius.tolist(), strict=True)):
         # A stamp before the last one is a restart of the log's clock, and worth a message.
-        silent = not kept or now_ns - last_ns >= every_ns or now_ns < last_ns
-        if silent or (on_change and value != last):
+        if value != last or now_ns - last_ns >= _HEARTBEAT_NS or now_ns < last_ns:
             kept.append(i)
             last_ns, last = now_ns, value
     return Readings(stamp_ns[kept], celsius[kept])
+
+
+def origin(path: str | Path, serial: str | None) -> dict[str, str]:
+    """Return what a converted bag says about where it comes from."""
+    return {
+        'converted_from': shown_name(path),
+        'converted_from_sha256': digest(Path(path)),
+        'converted_by': f'thermo_comp {__version__}',
+        **({'serial': serial} if serial else {}),
+    }
 
 
 def write_log(
@@ -225,23 +163,7 @@ def write_log(
     progress: Callable[[float], None] | None = None,
 ) -> ConversionReport:
     """
-    Check a log and write it as a bag.
-
-    Parameters
-    ----------
-    log : ForeignLog
-        The log.
-    output : str or Path
-        The bag; ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
-    force : bool, optional
-        Overwrite a bag that is there.
-    progress : callable, optional
-        Called with the fraction of rows written.
-
-    Returns
-    -------
-    ConversionReport
-        The account.
+    Check a log and write it as a bag: ``*.mcap`` makes a bare file, else a rosbag2 directory.
 
     Raises
     ------

@@ -10,6 +10,7 @@ digits, because nanoseconds since 1970 do not fit a float.
 from __future__ import annotations
 
 import csv
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from decimal import Decimal, InvalidOperation
 from io import TextIOWrapper
 from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +31,9 @@ Column = str | int
 # A row is parsed in one go with this many others: bounded memory for text, one array each.
 _CHUNK_ROWS = 65536
 _SNIFF_BYTES = 65536
+#: What packs numbers more tightly holds no measurement.
+_MOST_ROWS_PER_BYTE = 1000
+_STAMP_UNITS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 
 @dataclass(frozen=True)
@@ -38,14 +43,12 @@ class Table:
 
     Parameters
     ----------
-    path : str
-        The file.
     line : ndarray of int64, shape (n,)
         Line of each row in the file, counted from 1 (the row number for Parquet).
     values : dict of {str or int: ndarray, shape (n,)}
         The columns asked for; NaN where a cell is no number.
     stamp_ns : ndarray of int64, shape (n,), or None
-        The stamp column; the smallest int64 where a cell is no number.
+        The stamp column; `NO_STAMP` where a cell is no number.
     n_short : int
         Rows with too few cells (the last line of a log that was cut off), left out.
 
@@ -70,22 +73,11 @@ def read_text(
     has_header: bool | None = None,
 ) -> Table:
     """
-    Read some columns of a table of text.
+    Read some columns of a table of text, by their headings or numbers counted from 0.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    columns : sequence of str or int
-        Headings, or numbers counted from 0.
-    stamp : str or int or None, optional
-        The column of time stamps.
-    stamp_exponent : int, optional
-        Power of ten from the stamp's unit to nanoseconds: 9 for s, 6 for ms, 3 for us, 0 for ns.
-    delimiter : str or None, optional
-        One character, or a blank for any run of white space; found out by default.
-    has_header : bool or None, optional
-        Whether the first line holds headings; found out by default.
+    `stamp_exponent` is the power of ten from the stamp's unit to nanoseconds. The delimiter, a
+    blank for any run of white space, and whether there are headings are found out where they are
+    not said.
 
     Raises
     ------
@@ -117,16 +109,7 @@ def sniff(head: str) -> str:
     """
     Return the delimiter of a text table: the one that splits most lines alike.
 
-    Parameters
-    ----------
-    head : str
-        The beginning of the file.
-
-    Returns
-    -------
-    str
-        One of comma, semicolon, tab, bar, or a blank for any run of white space.
-
+    One of comma, semicolon, tab, bar, or a blank for any run of white space.
     """
     lines = [line for line in head.splitlines()[:50] if line.strip() and line.lstrip()[0] != '#']
     best, best_score = ' ', 0
@@ -211,23 +194,7 @@ def _collect(
 
 def place(path: Path, name: Column, headings: Sequence[str], width: int) -> int:
     """
-    Return the number of a column.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for the error's sake.
-    name : str or int
-        Heading, or number counted from 0.
-    headings : sequence of str
-        The table's headings; empty where it has none.
-    width : int
-        How many columns the table has.
-
-    Returns
-    -------
-    int
-        Counted from 0.
+    Return the number of a column, counted from 0.
 
     Raises
     ------
@@ -273,20 +240,9 @@ _WHOLE = re.compile(r'\s*[+-]?\d{1,19}\s*')
 
 def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
     """
-    Return stamps in nanoseconds, exact to the last digit.
+    Return stamps in nanoseconds, exact to the last digit, of decimal numbers in 10^`exponent` ns.
 
-    Parameters
-    ----------
-    cells : sequence of str
-        Decimal numbers in some power-of-ten unit.
-    exponent : int
-        Power of ten from that unit to nanoseconds.
-
-    Returns
-    -------
-    ndarray of int64
-        `NO_STAMP` where a cell is no finite number or out of range.
-
+    `NO_STAMP` where a cell is no finite number or out of range.
     """
     factor = 10**exponent
     stamps = np.full(len(cells), NO_STAMP, dtype=np.int64)
@@ -303,4 +259,83 @@ def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
             value = round(number * factor)
         if abs(value) < 2**63:
             stamps[i] = value
+    return stamps
+
+
+def read_parquet(
+    path: Path, columns: Sequence[Column], stamp: Column | None, stamp_exponent: int
+) -> Table:
+    """
+    Read some columns of a Parquet file, as `read_text` does of text.
+
+    A stamp column of Parquet's own timestamp type states its unit itself.
+
+    Raises
+    ------
+    RecordingError
+        If pyarrow is not installed, the file is no Parquet file, is empty, or lacks a column.
+
+    """
+    try:
+        from pyarrow import parquet as pq
+    except ImportError as failure:
+        raise RecordingError(
+            "a Parquet file needs pyarrow: pip install 'thermo_comp[parquet]'", path=path
+        ) from failure
+    try:
+        with open_regular(path) as file:
+            found = pq.ParquetFile(file)
+            if found.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
+                raise RecordingError(f'it claims {found.metadata.num_rows} rows', path=path)
+            headings = list(found.schema_arrow.names)
+            names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
+            places = {name: place(path, name, headings, len(headings)) for name in names}
+            table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
+    except RecordingError:
+        raise
+    except Exception as failure:  # a damaged file surfaces there as nearly any exception type
+        reason = ' '.join(str(failure).split())
+        raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
+    if not table.num_rows:
+        raise RecordingError('the table is empty', path=path)
+    column = {name: table.column(headings[i]) for name, i in places.items()}
+    return Table(
+        path=str(path),
+        line=np.arange(1, table.num_rows + 1, dtype=np.int64),
+        values={name: _parquet_floats(path, name, column[name]) for name in columns},
+        stamp_ns=None
+        if stamp is None
+        else _parquet_stamps(path, stamp, column[stamp], stamp_exponent),
+        n_short=0,
+    )
+
+
+def _parquet_floats(path: Path, name: Column, column: Any) -> Floats:
+    import pyarrow as pa
+
+    try:
+        values = column.cast(pa.float64(), safe=False).to_numpy()
+    except (pa.ArrowException, ValueError) as failure:
+        raise RecordingError(f'column {name!r} holds {column.type}', path=path) from failure
+    return np.asarray(values, dtype=np.float64)
+
+
+def _parquet_stamps(path: Path, name: Column, column: Any, exponent: int) -> Ints:
+    import pyarrow as pa
+
+    known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)
+    if pa.types.is_timestamp(column.type):
+        exponent = _STAMP_UNITS[column.type.unit]
+        column = column.cast(pa.int64())
+    if pa.types.is_integer(column.type):
+        values = column.fill_null(0).to_numpy()
+        limit = (2**63 - 1) // 10**exponent
+        known &= (values <= limit) & (values >= -limit if values.dtype.kind == 'i' else True)
+        factor = 10**exponent
+    else:
+        factor = 1
+        values = np.rint(_parquet_floats(path, name, column) * 10.0**exponent)
+        known &= np.abs(values) < 2.0**63
+    stamps = np.full(len(values), NO_STAMP, dtype=np.int64)
+    stamps[known] = values[known].astype(np.int64) * factor
     return stamps

@@ -35,21 +35,7 @@ _AXES = ('x', 'y', 'z')
 
 def ulog_log(path: str | Path, imu: int | None = None, baro: int | None = None) -> ForeignLog:
     """
-    Read one IMU and one barometer of a PX4 log.
-
-    Parameters
-    ----------
-    path : str or Path
-        The ``.ulg`` file.
-    imu : int or None, optional
-        Instance of ``sensor_accel``; None takes the lowest.
-    baro : int or None, optional
-        Instance of ``sensor_baro``; None takes the lowest.
-
-    Returns
-    -------
-    ForeignLog
-        Ready to be written as a bag.
+    Read one IMU and one barometer of a PX4 log; None takes the lowest instance.
 
     Raises
     ------
@@ -62,25 +48,7 @@ def ulog_log(path: str | Path, imu: int | None = None, baro: int | None = None) 
 
 
 def read_ulog(path: str | Path) -> AutopilotLog:
-    """
-    Read the inertial sensors of a PX4 log.
-
-    Parameters
-    ----------
-    path : str or Path
-        The ``.ulg`` file.
-
-    Returns
-    -------
-    AutopilotLog
-        All instances.
-
-    Raises
-    ------
-    RecordingError
-        If pyulog is not installed or the file is no ULog.
-
-    """
+    """Read the inertial sensors of a PX4 log."""
     try:
         from pyulog import ULog
     except ImportError as failure:

@@ -39,17 +39,9 @@ class Stillness:
     """
     Where a recording rests, and what it reads there.
 
-    Parameters
-    ----------
-    magnitude : float
-        Median |a| over the quiet windows, in the input's unit; NaN where there are none.
-    noise : float
-        Median standard deviation per axis in the quiet windows, in the input's unit.
-    still_s : float
-        How long it rests in all [s].
-    moving_ns : tuple of (int, int)
-        First and last stamp of each part in which it is moved.
-
+    Median |a| over the quiet windows, NaN where there are none, and their median sd per axis, in
+    the input's unit; how long it rests in all; first and last stamp of each part in which it is
+    moved.
     """
 
     magnitude: float
@@ -62,18 +54,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     """
     Find where a recording rests, from its noise alone, whatever its unit.
 
-    Parameters
-    ----------
-    stamp_ns : ndarray of int64, shape (n,)
-        Stamps, rising.
-    accel : ndarray, shape (n, 3)
-        Readings, finite.
-
-    Returns
-    -------
-    Stillness
-        Quiet level and moving parts.
-
+    Stamps rise, shape (n,); readings are finite, shape (n, 3).
     """
     step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
     length = max(_WINDOW_SAMPLES, round(_WINDOW_S * 1e9 / step)) if step > 0 else _WINDOW_SAMPLES
@@ -110,22 +91,7 @@ def _merge(start: Ints, end: Ints) -> tuple[tuple[int, int], ...]:
 
 
 def believed_unit(magnitude: float) -> tuple[str, str]:
-    """
-    Say which unit a still |a| speaks for.
-
-    Parameters
-    ----------
-    magnitude : float
-        |a| at rest.
-
-    Returns
-    -------
-    unit : str
-        ``g``, ``m/s^2``, ``mg``, ``counts`` or ``unknown``.
-    reason : str
-        Why, in a few words.
-
-    """
+    """Say which unit a still |a| speaks for (``counts`` and ``unknown`` among them), and why."""
     for unit, gravity in _UNITS.items():
         if abs(magnitude / gravity - 1.0) <= _TOLERANCE:
             return unit, f'|a| at rest is {magnitude:.4g}, gravity is {gravity:.4g} {unit}'
@@ -140,24 +106,7 @@ def believed_unit(magnitude: float) -> tuple[str, str]:
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
-    """
-    Say why a stated unit cannot be true, or None where nothing speaks against it.
-
-    Parameters
-    ----------
-    stated : str
-        ``g``, ``m/s^2``, ``mg`` or ``counts``.
-    magnitude : float
-        |a| at rest; NaN where the recording never rests.
-    counts_per_g : float or None
-        The stated sensitivity of counts.
-
-    Returns
-    -------
-    str or None
-        The contradiction.
-
-    """
+    """Say why a stated unit cannot be true, or None where nothing speaks against it."""
     if not np.isfinite(magnitude):
         return None
     believed, reason = believed_unit(magnitude)
