@@ -6,19 +6,32 @@ Owns what every test shares: an own DDS domain per test process, seeds, the comm
 
 from __future__ import annotations
 
+import fcntl
+import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import warnings
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
 import pytest
 from hypothesis import settings
 
+if TYPE_CHECKING:
+    import numpy as np
+
 ROOT = Path(__file__).resolve().parent.parent
+
+# Threads of their own for many small matrices wait for each other on a machine that is busy. What
+# reads this is numpy, which is imported behind it.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Every worker of every test run on this machine talks in a DDS domain of its own, and none of them
 # beyond this machine. The run id keeps two runs apart, the worker's number two workers.
@@ -41,7 +54,7 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
 class Cli(Protocol):
-    """Run ``thermo_comp`` as a user does, in a process of its own."""
+    """Run ``thermo_comp`` as a user does."""
 
     def __call__(
         self, *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
@@ -50,6 +63,8 @@ class Cli(Protocol):
 
 @pytest.fixture
 def rng() -> np.random.Generator:
+    import numpy as np
+
     return np.random.default_rng(20161)
 
 
@@ -67,8 +82,19 @@ def real_data() -> Path:
     return folder
 
 
+def _checked(
+    finished: subprocess.CompletedProcess[str], code: int | None
+) -> subprocess.CompletedProcess[str]:
+    assert 'Traceback' not in finished.stderr, finished.stderr
+    if code is not None:
+        assert finished.returncode == code, finished.stderr + finished.stdout
+    return finished
+
+
 @pytest.fixture(scope='session')
-def cli() -> Cli:
+def program() -> Cli:
+    """Return the command line as a process of its own."""
+
     def run(
         *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
     ) -> subprocess.CompletedProcess[str]:
@@ -81,9 +107,101 @@ def cli() -> Cli:
             timeout=300,
             check=False,
         )
-        assert 'Traceback' not in finished.stderr, finished.stderr
-        if code is not None:
-            assert finished.returncode == code, finished.stderr + finished.stdout
-        return finished
+        return _checked(finished, code)
 
     return run
+
+
+@contextmanager
+def _caught(name: str, descriptor: int) -> Iterator[Callable[[], str]]:
+    """Lead a standard stream into a file, and with it what libraries in C write there."""
+    before = getattr(sys, name)
+    before.flush()
+    kept = os.dup(descriptor)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), descriptor)
+        stream = open(descriptor, 'w', encoding='utf-8', closefd=False)  # noqa: SIM115
+        setattr(sys, name, stream)
+
+        def said() -> str:
+            stream.flush()
+            file.seek(0)
+            return file.read().decode()
+
+        try:
+            yield said
+        finally:
+            setattr(sys, name, before)
+            stream.close()
+            os.dup2(kept, descriptor)
+            os.close(kept)
+
+
+@contextmanager
+def _as_a_process(cwd: Path | None) -> Iterator[None]:
+    """Give a command what a process begins with, and take back what it does to this one."""
+    folder, environment = Path.cwd(), dict(os.environ)
+    log = logging.getLogger()
+    handlers, log.handlers = log.handlers, []  # pytest's keep from stderr what is logged
+    os.chdir(cwd or folder)
+    os.environ['COLUMNS'] = '80'
+    try:
+        with warnings.catch_warnings():
+            for hidden in (DeprecationWarning, PendingDeprecationWarning, ImportWarning):
+                warnings.simplefilter('ignore', hidden)
+            warnings.simplefilter('ignore', ResourceWarning)
+            warnings.showwarning = lambda *words, **_: print(
+                warnings.formatwarning(*words[:4]), file=sys.stderr
+            )
+            yield
+    finally:
+        log.handlers = handlers
+        os.chdir(folder)
+        os.environ.clear()
+        os.environ.update(environment)
+
+
+@pytest.fixture(scope='session')
+def cli(program: Cli) -> Cli:
+    """Return the command line in this process; with variables, in a process that finds them."""
+    from thermo_comp.cli.app import run as run_command
+
+    def run(
+        *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
+    ) -> subprocess.CompletedProcess[str]:
+        if env:
+            return program(*args, code=code, cwd=cwd, **env)
+        arguments = [str(argument) for argument in args]
+        with _as_a_process(cwd), _caught('stdout', 1) as output, _caught('stderr', 2) as errors:
+            returned = run_command(arguments)
+            finished = subprocess.CompletedProcess(arguments, returned, output(), errors())
+        return _checked(finished, code)
+
+    return run
+
+
+class Once(Protocol):
+    """Make a folder once in a run of the tests, whichever worker asks for it first."""
+
+    def __call__(self, name: str, make: Callable[[Path], object]) -> Path: ...
+
+
+@pytest.fixture(scope='session')
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if 'PYTEST_XDIST_WORKER' in os.environ else base) / 'once'
+    shared.mkdir(exist_ok=True)
+
+    def get(name: str, make: Callable[[Path], object]) -> Path:
+        folder, partial = shared / name, shared / f'.{name}'
+        with (shared / f'.{name}.lock').open('w') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not folder.exists():
+                # What a maker that failed has left is no beginning for the next.
+                shutil.rmtree(partial, ignore_errors=True)
+                partial.mkdir()
+                make(partial)
+                partial.rename(folder)
+        return folder
+
+    return get

@@ -8,6 +8,7 @@ import itertools
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,8 +16,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT, Cli
+from conftest import ROOT, Cli, Once
 
+#: What is made when an example asks for it; all else an example itself writes, or it lies ready.
+MADE = (
+    *('unit.yaml', 'unit42.yaml', 'unit01.yaml', 'unit02.yaml', 'unit03.yaml', 'map.yaml'),
+    *('autopilot.params', 'chamber.mcap', 'unit42_p01', 'freezer.mcap', 'bags/fleet', 'log.csv'),
+    *('flight.ulg', 'flight.bin'),
+)
 NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
@@ -30,11 +37,14 @@ class Desk:
         Where the files are made.
     cli : Cli
         The command line.
+    once : Once
+        Where files are that every desk needs.
 
     """
 
-    def __init__(self, folder: Path, cli: Cli) -> None:
+    def __init__(self, folder: Path, cli: Cli, once: Once) -> None:
         self._cli = cli
+        self._once = once
         self._ready = folder / 'ready'
         self._folder = folder
         self._n = 0
@@ -46,30 +56,35 @@ class Desk:
             (self._ready / name).symlink_to(ROOT / 'bags' / 'held_out.mcap')
         (self._ready / 'config').symlink_to(ROOT / 'config')
 
-    def _make(self, name: str) -> None:
-        """Make one file, when the first example asks for it."""
-        path = self._ready / name
-        if path.exists():
-            return
-        if name in ('unit42.yaml', 'unit.yaml'):
+    def _make(self, name: str) -> Path:
+        """Make one file, when the first desk asks for it; return where it lies here."""
+        made = self._ready / name
+        if not made.exists():
+            file = Path(name).name
+            made.symlink_to(self._once(file, lambda folder: self._write(folder / file)) / file)
+        return made
+
+    def _write(self, path: Path) -> None:
+        name = path.name
+        if name == 'unit42.yaml':
             fit = ('fit', *sorted((ROOT / 'bags' / 'fit').iterdir()), '--gravity', '9.80665')
             self._cli(*fit, '-o', path, '-q')
+        elif name == 'unit.yaml':
+            shutil.copy(self._make('unit42.yaml'), path)
         elif name in ('unit01.yaml', 'unit02.yaml', 'unit03.yaml'):
-            self._make('unit42.yaml')
-            text = (self._ready / 'unit42.yaml').read_text()
+            text = self._make('unit42.yaml').read_text()
             path.write_text(
                 re.sub(r'serial: .*?([,}\n])', rf'serial: {path.stem}\1', text, count=1)
             )
         elif name == 'autopilot.params':
-            self._make('unit42.yaml')
-            self._cli('export', self._ready / 'unit42.yaml', '--to', 'px4', '-o', path, '-q')
+            self._cli('export', self._make('unit42.yaml'), '--to', 'px4', '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
             # Short: some examples play it as slowly as it was recorded.
             self._cli('simulate', '--profile', '20 4s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
             self._cli('simulate', *program, '-o', path, '-q')
-        elif name == 'bags/fleet':
+        elif name == 'fleet':
             pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
             from fleet_helpers import write_unit
 
@@ -100,7 +115,7 @@ class Desk:
 
             write_new(path, np.random.default_rng(5))
 
-    def run(self, command: str) -> subprocess.CompletedProcess[str]:
+    def run(self, command: str, cli: Cli | None = None) -> subprocess.CompletedProcess[str]:
         """
         Run one example in a fresh folder, as it is written but for a wait; it must succeed.
 
@@ -108,6 +123,8 @@ class Desk:
         ----------
         command : str
             A line that starts with ``thermo_comp``; wildcards are expanded as a shell does.
+        cli : Cli or None, optional
+            The command line; the desk's own by default.
 
         Returns
         -------
@@ -122,10 +139,8 @@ class Desk:
         here = self._folder / f'run{self._n}'
         (here / 'bags').mkdir(parents=True)
         for word in words:
-            if '/' not in word and word not in outputs:
+            if word in MADE and word not in outputs:
                 self._make(word)
-        if 'bags/fleet' in words:
-            self._make('bags/fleet')
         for path in [*self._ready.iterdir(), *(self._ready / 'bags').iterdir()]:
             name = path.relative_to(self._ready)
             if path.name != 'bags' and str(name) not in outputs:
@@ -145,7 +160,7 @@ class Desk:
             arguments[1:1] = ['--wait', '0.5']
         if arguments[0] == 'view':
             return self._view(arguments, here)
-        return self._cli(*arguments, cwd=here)
+        return (cli or self._cli)(*arguments, cwd=here)
 
     def _view(self, arguments: list[str], here: Path) -> subprocess.CompletedProcess[str]:
         """Start a command that serves until Ctrl-C, and press Ctrl-C once it says where."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import Cli
+from conftest import Cli, Once
 from desk_helpers import Desk
 from typer.main import get_command
 
@@ -34,6 +34,12 @@ EXAMPLES = [
     if name != 'demo'
     for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
 ]
+# One of each command runs as a process of its own, as a user starts it; all others in this one.
+OF_ITS_OWN = {
+    next(one for one in EXAMPLES if one.startswith(f'thermo_comp {name} '))
+    for name in COMMANDS
+    if name != 'demo'
+}
 # What prints figures: all that only serves a page or plays a bag does not.
 WITH_JSON = [one for one in EXAMPLES if one.split()[1] not in ('view', 'play')]
 
@@ -41,8 +47,8 @@ QUICK = [one for one in EXAMPLES if one.split()[1] in ('info', 'convert', 'expor
 
 
 @pytest.fixture(scope='module')
-def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Desk:
-    return Desk(tmp_path_factory.mktemp('desk'), cli)
+def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli, once: Once) -> Desk:
+    return Desk(tmp_path_factory.mktemp('desk'), cli, once)
 
 
 def test_every_command_has_an_example() -> None:
@@ -58,8 +64,8 @@ def test_every_command_has_an_example() -> None:
 
 
 @pytest.mark.parametrize('example', EXAMPLES)
-def test_the_example_runs_and_fits_a_pipe(example: str, desk: Desk) -> None:
-    finished = desk.run(example)
+def test_the_example_runs_and_fits_a_pipe(example: str, desk: Desk, program: Cli) -> None:
+    finished = desk.run(example, program if example in OF_ITS_OWN else None)
     assert '\x1b' not in finished.stdout + finished.stderr
     long = [line for line in finished.stdout.splitlines() if len(line) > 80]
     # Prose is wrapped by the terminal; a table must not be.

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import ROOT, Cli
+from conftest import ROOT, Cli, Once
 from desk_helpers import Desk, same_words
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
@@ -46,8 +46,8 @@ COMMANDS = commands()
 
 
 @pytest.fixture(scope='module')
-def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Desk:
-    return Desk(tmp_path_factory.mktemp('desk'), cli)
+def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli, once: Once) -> Desk:
+    return Desk(tmp_path_factory.mktemp('desk'), cli, once)
 
 
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
