@@ -23,6 +23,7 @@ INSTALL = [
     'zstandard>=0.22',
     'lz4>=4.0',
     'matplotlib>=3.6',
+    'Jinja2>=3.1',
 ]
 EXTRAS = {
     'ros': ['ros-jazzy-rclpy[fastrtps]>=7.1,<8', 'ros-jazzy-common-interfaces>=5.3,<6'],

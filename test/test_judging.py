@@ -15,7 +15,7 @@ from builders import GRAVITY, axis_set, calibration, regime_set
 
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.judging import Judgement, Verdict, Windows, evaluate, judge
-from thermo_comp.judging.table import COLUMNS, csv_of
+from thermo_comp.judging.windows import COLUMNS, csv_of
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter, Topics, open_recording

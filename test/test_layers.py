@@ -51,6 +51,7 @@ HOMES = {
     'zstandard': {'recording'},
     'lz4': {'recording'},
     'matplotlib': {'report'},
+    'jinja2': {'report'},
     'pyulog': {'convert'},
     'pymavlink': {'convert'},
     'pyarrow': {'convert', 'fleet', 'recording'},

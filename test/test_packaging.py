@@ -37,6 +37,7 @@ KNOWN_KEYS = {
     'python3-scipy',
     'python3-yaml',
     'python3-matplotlib',
+    'python3-jinja2',
     'python3-rich',
     'python3-rosbags-pip',
     'python3-hypothesis',

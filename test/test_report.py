@@ -266,7 +266,9 @@ def test_figures_as_png(tmp_path):
     assert all(content.startswith(b'\x89PNG') for content in files.values())
     folder = tmp_path / 'new' / 'figures'
     write_report(bare(), tmp_path / 'page.html', figures=folder)
-    assert [path.name for path in sorted(folder.iterdir())] == ['1_functions.png', '2_step.png']
+    assert [path.name for path in sorted(folder.iterdir())] == [
+        *('1_functions.png', '2_step.png', '3_hysteresis.png')
+    ]
 
 
 def test_page_is_written_atomically(tmp_path):

@@ -17,7 +17,6 @@ from matplotlib.patches import StepPatch
 from report_helpers import evidence, run
 
 from thermo_comp.fitting.reduction import Readings
-from thermo_comp.report.decimate import thin
 from thermo_comp.report.figures_residual import draw_gravity, draw_histograms, draw_residuals
 from thermo_comp.report.figures_thermal import draw_dynamics, draw_temperatures
 from thermo_comp.report.figures_unit import (
@@ -28,9 +27,9 @@ from thermo_comp.report.figures_unit import (
     equal_area,
     step_answer,
 )
-from thermo_comp.report.inertial import position_error, schuler_peak
+from thermo_comp.report.page import position_error, schuler_peak
 from thermo_comp.report.plates import PLATES
-from thermo_comp.report.style import NARROW, WIDE, drawing, svg
+from thermo_comp.report.style import NARROW, WIDE, drawing, svg, thin
 from thermo_comp.report.text import label_text, number
 from thermo_comp.report.trace import thermal_trace
 from thermo_comp.thermal.regime import Regime
@@ -60,15 +59,13 @@ def test_thinning_loses_no_extreme(values, n_bins):
     assert thin_value.min() == value.min()
 
 
-def test_thinning_keeps_gaps_and_refuses_no_bins():
+def test_thinning_keeps_gaps():
     time = np.arange(1000.0)
     value = np.where((time > 300) & (time < 600), np.nan, time)
     thin_time, thin_value = thin(time, value, 20)
     (gap,) = np.flatnonzero(np.isnan(thin_value))
     assert thin_time[gap - 1] == 300
     assert thin_time[gap + 1] == 600
-    with pytest.raises(ValueError, match='`n_bins` must be at least 1'):
-        thin(time, value, 0)
 
 
 def test_bias_and_scale_curves_by_hand():

@@ -58,7 +58,7 @@ def evaluate(
     """
     from ..files import CSV, check_output, write_atomically
     from ..judging import evaluate as run
-    from ..judging.table import csv_of
+    from ..judging.windows import csv_of
     from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)

@@ -188,7 +188,12 @@ def build_calibration(
             ),
             residuals=tuple(
                 ResidualSummary(
-                    row.section, row.fitted.n, row.raw.rms, row.fitted.rms, row.fitted.peak
+                    section=row.section,
+                    n_windows=row.fitted.n,
+                    raw_rms_m_s2=row.raw.rms,
+                    rms_m_s2=row.fitted.rms,
+                    max_m_s2=row.fitted.peak,
+                    left_out_rms_m_s2=row.left_out.rms if row.left_out.n else None,
                 )
                 for row in residuals
                 if row.fitted.n

@@ -13,9 +13,9 @@ from urllib.parse import quote
 import numpy as np
 
 from .. import __version__
-from ..report.figures_fleet import draw_distances, draw_plate, draw_shares
+from ..report.figures_fleet import draw_distances, draw_shares
 from ..report.html import document, figure, table
-from ..report.plates import DrawnPlate
+from ..report.plates import Draw, DrawnPlate, draw_plates
 from ..report.text import number
 from .summary import Summary
 from .table import Cell, Row, is_fitted, is_valid
@@ -154,9 +154,8 @@ def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnPlate]:
         section: np.array([v for row in fitted if isinstance(v := row[f'{section}_ug'], float)])
         for section in ('raw', 'static', 'dynamic')
     }
-    drawn = [
-        draw_plate(
-            1,
+    drawn: list[tuple[str, str, str, Draw]] = [
+        (
             'residuals',
             'What is left of |g|, unit by unit?',
             'Share of the units whose residual at rest is below the value: raw (constants at the '
@@ -169,16 +168,16 @@ def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnPlate]:
         labels, z, names = zip(
             *((one.quantity.label, one.z, one.names) for one in summary.spreads), strict=True
         )
-        plate = draw_plate(
-            2,
+        distances: Draw = partial(draw_distances, labels, z, names, summary.limit)
+        plate = (
             'distances',
             'Which units stand out, and in what?',
             'Each stroke is a unit: its distance from the fleet’s median in robust standard '
             'deviations. Diamonds beyond the dashed lines are the units listed above.',
-            partial(draw_distances, labels, z, names, summary.limit),
+            distances,
         )
         drawn.append(plate)
-    return drawn
+    return draw_plates(drawn)
 
 
 def _spreads(summary: Summary) -> str:

@@ -10,7 +10,7 @@ the calibration has changed, reads it once.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import RecordingError
@@ -33,17 +33,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class OpenedBag:
-    """
-    A bag that was read once.
-
-    Parameters
-    ----------
-    info : RecordingInfo
-        What it holds.
-    reduced : ReducedBag
-        Its sums at rest and its temperature readings.
-
-    """
+    """A bag that was read once: what it holds, its sums at rest and its temperature readings."""
 
     info: RecordingInfo
     reduced: ReducedBag
@@ -52,17 +42,9 @@ class OpenedBag:
 @dataclass(frozen=True)
 class Evaluation:
     """
-    What recordings tell of one or more calibrations.
+    What recordings tell of one or more calibrations, by their names in the order given.
 
-    Parameters
-    ----------
-    bags : tuple of OpenedBag
-        The recordings.
-    judgements : dict of {str: Judgement}
-        By the calibrations' names, in the order given.
-    notes : tuple of str
-        What of the recordings was not judged.
-
+    The notes say what of the recordings was not judged.
     """
 
     bags: tuple[OpenedBag, ...]
@@ -152,27 +134,16 @@ def judge_bags(
     config: CompensatorConfig | None = None,
 ) -> Judgement | None:
     """
-    Judge a calibration on bags that have been reduced, by whomever.
+    Judge a calibration on bags that have been reduced, as `evaluate` does.
 
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        Bags of its unit.
-    calibration : Calibration
-        The calibration.
-    gravity, window_s, tolerance, config
-        As for `evaluate`.
-
-    Returns
-    -------
-    Judgement or None
-        None where no window rests with a temperature.
-
+    None where no window rests with a temperature.
     """
     windows = corrected_windows(
         bags, calibration, gravity=gravity, window_s=window_s, config=config
     )
-    return judge(windows, calibration, tolerance) if len(windows) else None
+    known = {source.sha256 for source in calibration.provenance.sources if source.sha256}
+    is_seen = all(bag.source.sha256 in known for bag in bags)
+    return judge(windows, calibration, tolerance, is_seen=is_seen) if len(windows) else None
 
 
 def evaluate(
@@ -233,7 +204,9 @@ def evaluate(
         raise ValueError('`paths` and `calibrations` must hold at least one each')
     _, first = calibrations[0]
     gravity = first.gravity_m_s2 if gravity is None else gravity
-    tell = progress or _silent
+    tell = progress or (lambda _part: None)
+    # A bag with as many samples as one of the fit may be that one: its hash is worth reading.
+    seen = {one.n_samples for _, by in calibrations for one in by.provenance.sources if one.sha256}
     bags = []
     for number, path in enumerate(paths):
         bag = open_bag(
@@ -249,6 +222,9 @@ def evaluate(
         )
         for _, calibration in calibrations:
             check_unit(calibration, bag.info, serial)
+        if bag.reduced.n_samples in seen:
+            source = replace(bag.reduced.source, sha256=digest(Path(path)))
+            bag = replace(bag, reduced=replace(bag.reduced, source=source))
         bags.append(bag)
     reduced = [bag.reduced for bag in bags]
     judgements = {}
@@ -267,11 +243,11 @@ def evaluate(
                 path=', '.join(map(str, paths)),
             )
         judgements[name] = judgement
-    seen = set(next(iter(judgements.values())).windows.bag.tolist())
+    judged = set(next(iter(judgements.values())).windows.bag.tolist())
     notes = tuple(
         f'{path}: no window of {window_s:g} s at rest was corrected: not judged'
         for number, path in enumerate(paths)
-        if number not in seen
+        if number not in judged
     )
     return Evaluation(tuple(bags), judgements, notes)
 
@@ -287,7 +263,3 @@ def _told(blocks: Iterator[Block], total: int, progress: Progress | None) -> Ite
 
 def _part_of(tell: Progress, before: int, total: int) -> Progress:
     return lambda part: tell((before + part) / total)
-
-
-def _silent(_part: float) -> None:
-    return

@@ -52,19 +52,10 @@ class Verdict(Enum):
 @dataclass(frozen=True)
 class Section:
     """
-    ``|f| - g`` of one section.
+    ``|f| - g`` of the `n` windows of one section [m/s^2].
 
-    Parameters
-    ----------
-    n : int
-        Windows.
-    raw_rms, raw_peak : float
-        RMS and largest magnitude by the constants at the reference temperature [m/s^2].
-    rms, mean, peak : float
-        RMS, mean and largest magnitude by the calibration.
-    claimed_rms : float
-        RMS of what is claimed for the same windows; NaN where nothing is claimed.
-
+    Raw is by the constants at the reference temperature, the others by the calibration;
+    `claimed_rms` is the RMS of what is claimed for the same windows, NaN where nothing is.
     """
 
     n: int
@@ -94,6 +85,8 @@ class Judgement:
         One sentence of numbers.
     sections : dict of {str: Section}
         ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside`` them.
+    left_out_rms : float
+        Of windows that the fit has seen: what it left on positions left out [m/s^2], else NaN.
     tolerance : float or None
         The user's acceptance limit [m/s^2].
     shifts : tuple of AxisShift
@@ -112,6 +105,7 @@ class Judgement:
     kind: Verdict
     reason: str
     sections: dict[str, Section]
+    left_out_rms: float
     tolerance: float | None
     shifts: tuple[AxisShift, ...]
     moved: tuple[str, ...]
@@ -128,6 +122,11 @@ class Judgement:
     def exit_code(self) -> int:
         """0 for a calibration that was shown to hold, else 1."""
         return 0 if self.is_valid else 1
+
+    @property
+    def headline_rms(self) -> float:
+        """RMS of what a new attitude will see: left out of the fit, or of bags it has not seen."""
+        return _headline(self.left_out_rms, self.sections['all'])
 
     @property
     def verdict(self) -> str:
@@ -149,6 +148,7 @@ class Judgement:
             'gravity_m_s2': self.windows.gravity,
             'window_s': self.windows.window_s,
             'tolerance_m_s2': self.tolerance,
+            'left_out_rms_m_s2': self.left_out_rms,
             'sections_m_s2': {
                 name: {**asdict(one), 'ratio': one.ratio} for name, one in self.sections.items()
             },
@@ -159,7 +159,13 @@ class Judgement:
         }
 
 
-def judge(windows: Windows, calibration: Calibration, tolerance: float | None = None) -> Judgement:
+def judge(
+    windows: Windows,
+    calibration: Calibration,
+    tolerance: float | None = None,
+    *,
+    is_seen: bool = False,
+) -> Judgement:
     """
     Judge a calibration by its windows.
 
@@ -171,11 +177,9 @@ def judge(windows: Windows, calibration: Calibration, tolerance: float | None = 
         The calibration.
     tolerance : float or None, optional
         The largest RMS that the user accepts in either regime [m/s^2]; it decides where given.
-
-    Returns
-    -------
-    Judgement
-        Verdict, numbers and evidence.
+    is_seen : bool, optional
+        Whether the calibration was fitted on such windows: then what its fit left on positions
+        left out stands for them.
 
     Raises
     ------
@@ -195,13 +199,15 @@ def judge(windows: Windows, calibration: Calibration, tolerance: float | None = 
             SECTIONS, (inside & ~dynamic, inside & dynamic, inside, ~inside), strict=True
         )
     }
+    left_out = calibration.provenance.left_out_rms if is_seen else np.nan
     shifts = axis_shifts(windows.select(inside), calibration.misalignment_sd)
     moved = what_moved(shifts) if claims else ()
-    kind, reason = _verdict(windows, sections, tolerance, moved, claims)
+    kind, reason = _verdict(windows, sections, left_out, tolerance, moved, claims)
     return Judgement(
         kind=kind,
         reason=reason,
         sections=sections,
+        left_out_rms=left_out,
         tolerance=tolerance,
         shifts=shifts,
         moved=moved,
@@ -223,6 +229,7 @@ def _section(windows: Windows, rows: Bools, claims: bool) -> Section:
 def _verdict(
     windows: Windows,
     sections: dict[str, Section],
+    left_out: float,
     tolerance: float | None,
     moved: tuple[str, ...],
     claims: bool,
@@ -234,13 +241,14 @@ def _verdict(
         )
         return Verdict.OUTSIDE, reason
     judged = [s for s in (sections['static'], sections['dynamic']) if s.n >= _FEWEST] or [one]
-    worst = max((*judged, one), key=lambda s: s.rms)
+    headline = _headline(left_out, one)
+    worst = max(*(s.rms for s in judged), headline)
     ratio = max(s.ratio for s in (*judged, one))
     # A NaN of no claim compares false.
     is_wide = one.claimed_rms > (tolerance or min(_WIDE_PART * one.raw_rms, _WIDE_CLAIM))
-    if one.rms >= one.raw_rms:
+    if max(one.rms, headline) >= one.raw_rms:
         kind = Verdict.NO_BETTER
-    elif tolerance is not None and worst.rms > tolerance:
+    elif tolerance is not None and worst > tolerance:
         kind = Verdict.RECALIBRATE
     elif tolerance is None and not claims:
         kind = Verdict.NO_CLAIM
@@ -249,8 +257,11 @@ def _verdict(
     else:
         kind = Verdict.WIDE if is_wide else Verdict.VALID
     said = [f'{_numbers(one)} over {_windows(one.n, windows)}']
+    if np.isfinite(left_out):
+        said = [f'{spoken(left_out)} RMS of |f| - g on positions left out; in sample {said[0]}']
     if tolerance is not None:
-        said.append(f'{spoken(worst.rms)} in the worse regime, {spoken(tolerance)} tolerated')
+        where = 'on positions left out' if worst == left_out else 'in the worse regime'
+        said.append(f'{spoken(worst)} {where}, {spoken(tolerance)} tolerated')
     elif claims:
         said.append(f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}')
     else:
@@ -263,6 +274,10 @@ def _verdict(
             f'{spoken(outside.rms)}'
         )
     return kind, '; '.join(said)
+
+
+def _headline(left_out: float, section: Section) -> float:
+    return left_out if np.isfinite(left_out) else section.rms
 
 
 def _numbers(section: Section) -> str:

@@ -33,15 +33,9 @@ _ALIKE = 6.0
 @dataclass(frozen=True)
 class AxisShift:
     """
-    What one axis differs by from the calibration.
+    What one axis differs by from the calibration: bias [m/s^2] and relative scale.
 
-    Parameters
-    ----------
-    bias, bias_sd : float
-        Shift of the bias [m/s^2] and its standard deviation, what the calibration claims included.
-    scale, scale_sd : float
-        Relative shift of the scale, and its standard deviation.
-
+    The standard deviations include what the calibration claims.
     """
 
     bias: float
@@ -65,18 +59,8 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     """
     Fit nine constants to the positions' means of the corrected force.
 
-    Parameters
-    ----------
-    windows : Windows
-        The windows.
-    misalignment_sd : tuple of float
-        How well the calibration knows the three elements of M.
-
-    Returns
-    -------
-    tuple of AxisShift
-        Per axis; empty with fewer than six distinct positions.
-
+    `misalignment_sd` is how well the calibration knows the three elements of M. Empty with fewer
+    than six distinct positions.
     """
     from scipy.optimize import least_squares
 
@@ -133,11 +117,8 @@ def wander(windows: Windows) -> Floats:
     """
     Tell what moves each axis at rest, to a constant, whatever the number of positions.
 
-    Returns
-    -------
-    ndarray, shape (2, 3)
-        RMS of each axis about its mean in a position [m/s^2], static and dynamic; NaN without.
-
+    RMS of each axis about its mean in a position [m/s^2], shape (2, 3): static and dynamic, NaN
+    without windows.
     """
     _, place = np.unique(windows.position, return_inverse=True)
     about = windows.force - _means(windows, windows.force)[place]

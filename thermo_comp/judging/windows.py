@@ -10,6 +10,8 @@ node's; what is kept of a bag of any length is a row per window.
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -23,8 +25,16 @@ from ..online.snapshot import take_snapshot
 from ..online.status import CompensatorConfig
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.calibration import Calibration
+from ..unit.gravity import MICRO_G
 from ..unit.metrics import norm_residual
 
+#: Headings of `csv_of`.
+COLUMNS = (
+    *('bag', 'position', 'start_ns', 'time_s', 'window_s', 'samples'),
+    *('board_c', 'board_rate_k_min', 'regime', 'is_inside'),
+    *('force_x_m_s2', 'force_y_m_s2', 'force_z_m_s2'),
+    *('raw_residual_ug', 'residual_ug', 'claimed_sd_ug'),
+)
 #: Length of a window unless the user says otherwise [s].
 WINDOW_S = 60.0
 # The sums that windows are made of are no longer than this [s]: the thermal state moves little.
@@ -111,17 +121,7 @@ class Windows:
 
 def sum_length(window_s: float) -> float:
     """
-    Choose the length of the sums that windows are put together from.
-
-    Parameters
-    ----------
-    window_s : float
-        Length of a window [s].
-
-    Returns
-    -------
-    float
-        The longest part of it up to ten seconds, for `fitting.reduction`.
+    Choose the longest part of a window up to ten seconds, for the sums of `fitting.reduction`.
 
     Raises
     ------
@@ -136,18 +136,8 @@ def sum_length(window_s: float) -> float:
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
     """
-    Choose the length of the windows of bags that were not read for a length in particular [s].
-
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        At least one.
-
-    Returns
-    -------
-    float
-        60 s, or what is next to it where the bags' sums do not fill that.
-
+    Choose the length of the windows of bags that were not read for a length in particular [s]:
+    60 s, or what is next to it where the bags' sums do not fill that.
     """
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
@@ -220,25 +210,8 @@ def raw_windows(bags: Sequence[ReducedBag], gravity: float, window_s: float) -> 
     """
     Take the windows of bags as they are: static all of them, inside any range, without a claim.
 
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        Bags with a board temperature.
-    gravity : float
-        Local gravity; NaN where nobody knows it.
-    window_s : float
-        Length of a window [s].
-
-    Returns
-    -------
-    Windows
-        Its forces are the means of the samples.
-
-    Raises
-    ------
-    RecordingError
-        If the samples of a bag are too slow for such windows.
-
+    Their forces are the means of the samples; gravity is NaN where nobody knows it. Raises a
+    RecordingError as `corrected_windows` does.
     """
 
     def keep(bag: ReducedBag, sums: Floats) -> None:
@@ -252,6 +225,31 @@ def raw_windows(bags: Sequence[ReducedBag], gravity: float, window_s: float) -> 
     return _windows(
         bags, table, window_s, gravity, table[:, _MEAN], claimed_sd=nothing, noise_sd=nothing
     )
+
+
+def csv_of(windows: Windows, bags: Sequence[str]) -> str:
+    """Write windows as CSV with all digits: a line of headings, then one per window."""
+    columns = (
+        [bags[number] for number in windows.bag.tolist()],
+        (windows.position + 1).tolist(),
+        windows.start_ns.tolist(),
+        windows.time.tolist(),
+        [windows.window_s] * len(windows),
+        windows.count.astype(int).tolist(),
+        windows.board.tolist(),
+        (windows.rate * 60.0).tolist(),
+        ['dynamic' if dynamic else 'static' for dynamic in windows.is_dynamic.tolist()],
+        windows.is_inside.astype(int).tolist(),
+        *windows.force.T.tolist(),
+        (windows.raw_residual / MICRO_G).tolist(),
+        (windows.residual / MICRO_G).tolist(),
+        (windows.claimed_sd / MICRO_G).tolist(),
+    )
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(COLUMNS)
+    writer.writerows(zip(*columns, strict=True))
+    return text.getvalue()
 
 
 # Columns of a sum and of a window. Averaged over a window's sums are all from the time on.

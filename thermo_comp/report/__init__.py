@@ -5,12 +5,20 @@ Owns the report: a unit's certificate as one HTML page, its figures, and its liv
 
 - `evidence_of_bags` gathers what bags tell, with or without a calibration,
   `evidence_of_fit` takes what a fit has to show; `write_report` writes the page.
-- The only place with matplotlib.
+- The only place with matplotlib and Jinja2.
 """
 
+from .certificate import CertificateInfo, load_certificate_info
 from .evidence import Evidence
-from .fitted import evidence_of_fit
-from .gather import evidence_of_bags
-from .write import render_report, write_report
+from .gather import evidence_of_bags, evidence_of_fit
+from .page import render_report, write_report
 
-__all__ = ['Evidence', 'evidence_of_bags', 'evidence_of_fit', 'render_report', 'write_report']
+__all__ = [
+    'CertificateInfo',
+    'Evidence',
+    'evidence_of_bags',
+    'evidence_of_fit',
+    'load_certificate_info',
+    'render_report',
+    'write_report',
+]

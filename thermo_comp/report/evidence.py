@@ -22,7 +22,7 @@ from ..fitting.reduction import Readings
 from ..judging import Judgement, Verdict, Windows
 from ..simulation import Cyclogram
 from ..typing import Floats
-from ..unit.calibration import Calibration
+from ..unit.calibration import Calibration, Source
 from ..unit.metrics import norm_residual
 from .trace import ThermalTrace
 
@@ -35,64 +35,28 @@ LEFT_OUT = 'left out'
 
 @dataclass(frozen=True)
 class BagFacts:
-    """
-    One bag in the certificate's table.
-
-    Parameters
-    ----------
-    name, sha256 : str
-        Name and hash; an unknown hash is empty.
-    start_ns : int
-        Stamp of the first sample.
-    duration_s : float
-        Length [s].
-    n_samples : int
-        Samples read.
-    rate_hz : float
-        Samples per second; NaN when unknown.
-    board_span : (float, float) or None
-        Lowest and highest board reading [degC].
-    remarks : tuple of str
-        What a reader should know: cut off, saturated, moved.
-
-    """
+    """One bag in the certificate's table; `remarks` say what of it was lost or is odd."""
 
     name: str
-    sha256: str
+    sha256: str  # empty where nobody took it
     start_ns: int
     duration_s: float
     n_samples: int
-    rate_hz: float
-    board_span: tuple[float, float] | None
+    rate_hz: float  # NaN when unknown
+    board_span: tuple[float, float] | None  # lowest and highest reading [degC]
     remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class ShownBag:
-    """
-    The bag that the time figures show.
-
-    Parameters
-    ----------
-    index : int
-        Its place in `Evidence.bags`.
-    start_ns : int
-        Stamp that times count from.
-    board, case : Readings
-        Its readings.
-    trace : ThermalTrace
-        Derivatives and regime.
-    cyclogram : Cyclogram or None
-        The chamber's program, when somebody knows it; its start is the bag's.
-
-    """
+    """The bag that the time figures show: `index` of `Evidence.bags`, times from `start_ns`."""
 
     index: int
     start_ns: int
     board: Readings
     case: Readings
     trace: ThermalTrace
-    cyclogram: Cyclogram | None
+    cyclogram: Cyclogram | None  # the chamber's program, when somebody knows it
 
 
 @dataclass(frozen=True)
@@ -100,19 +64,8 @@ class Position:
     """
     One still position.
 
-    Parameters
-    ----------
-    number : int
-        Counted from 1.
-    bag : int
-        Its bag.
-    duration_s : float
-        How long its windows last together.
-    up : tuple of float
-        Direction of the specific force in the output frame.
-    residual_rms : dict of {str: float}
-        Per rung, RMS of ``|f| - g`` [m/s^2]; `LEFT_OUT` where the fit could do without it.
-
+    `up` is the direction of the specific force in the output frame, `residual_rms` by rung the
+    RMS of ``|f| - g`` [m/s^2], `LEFT_OUT` where the fit could do without the position.
     """
 
     number: int
@@ -150,12 +103,12 @@ class Evidence:
     left_out : dict of {int: float}
         By `Windows.position`: RMS of ``|f| - g`` with what the other positions alone say of the
         unit [m/s^2].
-    findings : tuple of str
-        What speaks against calibration or bags.
-    checks : tuple of str
-        What the fit looked at and found good.
+    findings, checks : tuple of str
+        What speaks against calibration or bags; what the fit looked at and found good.
     is_fit : bool
         Whether the calibration was fitted on these very bags.
+    is_simulated : bool
+        Whether a bag comes from our own simulator.
 
     """
 
@@ -172,12 +125,17 @@ class Evidence:
     findings: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     is_fit: bool = False
+    is_simulated: bool = False
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """The bags that the calibration was fitted on."""
+        return () if self.calibration is None else self.calibration.provenance.sources
 
     @property
     def is_seen(self) -> bool:
         """Whether the calibration was fitted on one of these bags."""
-        sources = () if self.calibration is None else self.calibration.provenance.sources
-        known = {source.sha256 for source in sources if source.sha256}
+        known = {source.sha256 for source in self.sources if source.sha256}
         return self.is_fit or any(bag.sha256 in known for bag in self.bags)
 
     @property
@@ -249,16 +207,10 @@ class Evidence:
 
     def axis_residuals(self) -> dict[str, Floats]:
         """
-        Residual of each axis over the windows, per rung [m/s^2].
+        Residual of each axis over the windows, per rung, shape (n, 3) [m/s^2].
 
         The attitude of a position is not known, so the mean direction that the judged rung sees
-        there stands for it, with the length of gravity.
-
-        Returns
-        -------
-        dict of {str: ndarray, shape (n, 3)}
-            Empty without gravity.
-
+        there stands for it, with the length of gravity. Empty without gravity.
         """
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:

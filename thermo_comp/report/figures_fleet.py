@@ -4,33 +4,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from ..typing import Floats
-from .plates import DrawnPlate
 from .style import (
     BLACK,
     DYNAMIC_LINE,
     GREY,
-    NARROW,
     RED,
     RUNG_LINES,
     STATIC_LINE,
-    WIDE,
     Line,
     Sheet,
-    drawing,
     legend_above,
     log_axis,
     new_figure,
-    svg,
 )
 from .text import label_text
-
-Draw = Callable[[Sheet], Figure]
 
 # More names than these would lie over each other.
 _MOST_NAMES = 12
@@ -41,48 +34,8 @@ _SECTION_LINES: dict[str, Line] = {
 }
 
 
-def draw_plate(number: int, name: str, question: str, reading: str, draw: Draw) -> DrawnPlate:
-    """
-    Draw one figure for the page.
-
-    Parameters
-    ----------
-    number : int
-        Counted from 1.
-    name, question, reading : str
-        As in `plates.Plate`.
-    draw : callable
-        Draws it on a sheet.
-
-    Returns
-    -------
-    DrawnPlate
-        Ready for the page.
-
-    """
-    with drawing():
-        return DrawnPlate(
-            number=number,
-            name=name,
-            question=question,
-            reading=reading,
-            wide=svg(draw(WIDE), f'f{number}w', question),
-            narrow=svg(draw(NARROW), f'f{number}n', question),
-        )
-
-
 def draw_shares(curves: Mapping[str, Floats], sheet: Sheet) -> Figure:
-    """
-    Draw the share of units below each residual, by section.
-
-    Parameters
-    ----------
-    curves : mapping of str to ndarray
-        Residuals [micro-g] of ``raw``, ``static``, ``dynamic``.
-    sheet : Sheet
-        The paper.
-
-    """
+    """Draw the share of units below each residual [micro-g], by section."""
     figure = new_figure(sheet, 2.6)
     axes = figure.subplots()
     drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}
@@ -108,21 +61,9 @@ def draw_distances(
     sheet: Sheet,
 ) -> Figure:
     """
-    Draw every unit's distance from the fleet's middle, quantity by quantity.
+    Draw every unit's distance from the fleet's middle in standard deviations, by quantity.
 
-    Parameters
-    ----------
-    labels : sequence of str
-        The quantities.
-    distances : sequence of ndarray
-        In standard deviations.
-    names : sequence of sequence of str
-        The units, as in `distances`.
-    limit : float
-        Beyond it a unit is named.
-    sheet : Sheet
-        The paper.
-
+    `names` are the units, as in `distances`; beyond `limit` they are written beside it.
     """
     figure = new_figure(sheet, 0.6 + 0.19 * len(labels))
     axes = figure.subplots()

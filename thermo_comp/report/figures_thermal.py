@@ -34,15 +34,7 @@ _SHADE = '#E9E9E9'
 
 
 def shown_bag(evidence: Evidence) -> tuple[ShownBag, BagFacts]:
-    """
-    Return the bag of the time figures and its facts.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-
-    """
+    """Return the bag of the time figures and its facts."""
     if evidence.shown is None:
         raise ValueError('`evidence` has no bag to show')
     return evidence.shown, evidence.bags[evidence.shown.index]
@@ -140,20 +132,8 @@ def _draw_drift(
 
 def reading_drift(evidence: Evidence) -> tuple[Floats, str]:
     """
-    Change of the raw readings within each position since it began.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        With windows.
-
-    Returns
-    -------
-    drift : ndarray, shape (n, 3)
-        In micro-g where the scale factor is known, otherwise in raw units.
-    unit : str
-        Its unit.
-
+    Give the change of the raw readings within each position since it began, shape (n, 3), and its
+    unit: micro-g where the scale factor is known, otherwise raw units.
     """
     windows = evidence.windows
     if windows is None:

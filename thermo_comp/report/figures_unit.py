@@ -11,8 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ..thermal.state import Layout as StateLayout
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
+from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
 from .evidence import LEFT_OUT, RAW, Evidence, Position
@@ -35,8 +37,16 @@ BAND_SDS = 1.96
 _N_CURVE = 61
 #: From a few readings to where the longest lag of the bank has forgotten.
 _STEP_MINUTES = (0.2, 500.0)
+# Diameter of the ring of the position that the others tell the least of [pt].
+_RING = 22.0
 # Number labels of a dot plot beyond this would overlap.
 _MOST_LABELS = 24
+
+
+def _calibration(evidence: Evidence) -> Calibration:
+    if evidence.calibration is None:
+        raise ValueError('`evidence` has no calibration')
+    return evidence.calibration
 
 
 def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
@@ -82,19 +92,8 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
 @dataclass(frozen=True)
 class Curve:
     """
-    Bias and scale over temperature in one thermal state, against a soak at the reference.
-
-    Parameters
-    ----------
-    name, line, hatch, marker : str, Line, str, str
-        How it is drawn.
-    temperature : ndarray, shape (n,)
-        Board temperature.
-    bias, sd_bias : ndarray, shape (n, 3)
-        Micro-g.
-    scale, sd_scale : ndarray, shape (n, 3)
-        Parts per million.
-
+    Bias [micro-g] and scale [ppm] over the board temperature in one thermal state, against a soak
+    at the reference, shapes (n, 3); line, hatch and marker are how it is drawn.
     """
 
     name: str
@@ -112,16 +111,7 @@ def curves(calibration: Calibration) -> list[Curve]:
     """
     Evaluate a calibration in a soak, and in ramps through its range at half of the fastest rate.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-
-    Returns
-    -------
-    list of Curve
-        The soak alone where ramps make no difference.
-
+    The soak alone where ramps make no difference.
     """
     static, dynamic = calibration.regime_sets()
     looks = [('soak', static, 0.0, STATIC_LINE, '////', 'o')]
@@ -161,12 +151,6 @@ def curves(calibration: Calibration) -> list[Curve]:
     return found
 
 
-def _calibration(evidence: Evidence) -> Calibration:
-    if evidence.calibration is None:
-        raise ValueError('`evidence` has no calibration')
-    return evidence.calibration
-
-
 def _draw_band(axes: Axes, curve: Curve, value: Floats, half: Floats) -> None:
     axes.fill_between(
         curve.temperature,
@@ -202,20 +186,8 @@ def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     """
     Evaluate what a step of board and case by 1 K, up to the reference, leaves to come.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-
-    Returns
-    -------
-    minutes : ndarray, shape (n,)
-        Time since the step.
-    bias : ndarray, shape (n, 3)
-        Bias less that of the soak at the end [micro-g].
-    scale : ndarray, shape (n, 3)
-        The same of the scale [ppm].
-
+    Returns the minutes since the step, and bias [micro-g] and scale [ppm] less those of the soak
+    at the end, shapes (n, 3).
     """
     minutes = np.geomspace(*_STEP_MINUTES, _N_CURVE)
     since_s = np.append(minutes * 60.0, np.inf)
@@ -224,11 +196,54 @@ def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     return minutes, (bias[:-1] - bias[-1]) / MICRO_G, (scale[:-1] / scale[-1] - 1.0) * 1e6
 
 
+def draw_hysteresis(evidence: Evidence, sheet: Sheet) -> Figure:
+    """Draw the loop of each axis' bias in a slow run through the range and back."""
+    temperature, heating, cooling = hysteresis_loop(_calibration(evidence))
+    figure = new_figure(sheet, 5.6 if sheet.is_narrow else 2.5)
+    panels = figure.subplots(*((3, 1) if sheet.is_narrow else (1, 3)), sharex=True, sharey=True)
+    for i, axes in enumerate(panels):
+        middle = (heating[:, i] + cooling[:, i]) / 2.0
+        for name, bias, line, marker in (
+            ('heating', heating, DYNAMIC_LINE, '^'),
+            ('cooling', cooling, AXIS_LINES[2], 'v'),
+        ):
+            loop = bias[:, i] - middle
+            axes.plot(
+                temperature, loop, label=name, marker=marker, markevery=12, markersize=3.5, **line
+            )
+        axes.set_title(f'bias {AXES[i]}')
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        if sheet.is_narrow or not i:
+            axes.set_ylabel('loop, µg')
+        if i == 2 or not sheet.is_narrow:
+            axes.set_xlabel('T board, °C')
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper left', ncols=2)
+    return figure
+
+
+def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
+    """
+    Evaluate the bias in a run through the static range and back that is too slow for any lag.
+
+    Returns the temperatures, and the bias on the way up and down [micro-g], shapes (n, 3). Each
+    play begins at the end that the way before has pushed it to.
+    """
+    lower, upper = calibration.static.temperature_range_c
+    temperature = np.linspace(lower, upper, _N_CURVE)
+    plays = StateLayout(Correction(calibration).memory).plays
+    ways = []
+    for sign, travelled in ((1.0, temperature - lower), (-1.0, upper - temperature)):
+        states = ramp_states(calibration, temperature, 0.0, 0.0)
+        for (_, width), place in plays.items():
+            states[:, place] = sign * np.maximum(width - travelled, -width)
+        ways.append(bias_and_scale(calibration, states)[0] / MICRO_G)
+    return temperature, ways[0], ways[1]
+
+
 def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw where the positions point on the sphere, and what is left on each of them."""
     positions = evidence.positions
-    if not positions:
-        raise ValueError('`evidence` has no positions')
     if sheet.is_narrow:
         figure = new_figure(sheet, 4.6 + 0.5)
         grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.5])
@@ -251,20 +266,8 @@ def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:
 
 def equal_area(up: tuple[float, float, float], side: int) -> tuple[float, float]:
     """
-    Map a direction of one hemisphere into the unit disc, equal areas to equal areas.
-
-    Parameters
-    ----------
-    up : tuple of float
-        Unit vector.
-    side : int
-        +1 for the hemisphere of +z, -1 for that of -z.
-
-    Returns
-    -------
-    x, y : float
-        In the disc; the pole is its centre, the equator its rim.
-
+    Map a direction of one hemisphere (side +1 of +z, -1 of -z) into the unit disc, equal areas to
+    equal areas: the pole is its centre, the equator its rim.
     """
     x, y, z = up
     factor = 1.0 / np.sqrt(1.0 + max(side * z, 0.0))
@@ -281,10 +284,14 @@ def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int) -> 
     axes.plot([0, 0], [-1, 1], color='#BBBBBB', linewidth=0.6)
     for label, x, y in (('+x', 1.2, 0), ('−x', -1.2, 0), ('+y', 0, 1.2), ('−y', 0, -1.2)):
         axes.text(x, y, label, ha='center', va='center', color='#555555', fontsize=7.5)
+    largest = max((p.residual_rms.get(LEFT_OUT, 0.0) for p in positions), default=0.0)
     for position in positions:
-        if side * position.up[2] >= 0.0 if side > 0 else position.up[2] < 0.0:
+        if (position.up[2] >= 0.0) == (side > 0):
             x, y = equal_area(position.up, side)
             axes.plot(x, y, 'o', markersize=4.5, color='black')
+            if LEFT_OUT in position.residual_rms and largest > 0.0:
+                size = _RING * np.sqrt(position.residual_rms[LEFT_OUT] / largest)
+                axes.plot(x, y, 'o', markersize=size, mfc='none', mec=RED, mew=1.1)
             axes.annotate(
                 str(position.number),
                 (x, y),

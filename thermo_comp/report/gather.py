@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way from bags, with or without a calibration, to a report's evidence.
+Owns the way to a report's evidence: from bags, with or without a calibration, or from a fit.
 
 Reading and judging are apart, so that a viewer reads a bag once and judges it anew whenever the
 calibration changes.
@@ -10,14 +10,18 @@ calibration changes.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from ..fitting import FitResult
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector
+from ..fitting.verdict import Finding
 from ..judging import WINDOW_S, OpenedBag, judge_bags
-from ..judging.windows import raw_windows
+from ..judging.windows import raw_windows, usual_window
+from ..recording import inspect_recording
 from ..replay import check_unit
 from ..simulation import CYCLOGRAM_NAMES, Cyclogram, cyclogram_preset, parse_cyclogram
 from ..unit.calibration import Calibration
@@ -28,15 +32,8 @@ from .trace import thermal_trace
 _LONGEST_PROGRAM = 4096
 # A ramp slower than this says nothing of its direction.
 _SLOWEST_RAMP_K_MIN = 0.05
-
-
-def span_of(bag: ReducedBag) -> tuple[int, int]:
-    """
-    Give the first and the last stamp of a bag: of its samples, or of its readings without them.
-    """
-    if bag.n_samples:
-        return bag.start_ns, bag.end_ns
-    return int(bag.board.stamp_ns[0]), int(bag.board.stamp_ns[-1])
+#: The key of a bag's metadata under which our simulator tells what it simulated.
+_SIMULATED = 'truth'
 
 
 def evidence_of_bags(
@@ -69,11 +66,6 @@ def evidence_of_bags(
         The chamber's program, as `simulation.parse_cyclogram` reads it; by default what a
         simulated bag says of itself.
 
-    Returns
-    -------
-    Evidence
-        For `write_report`.
-
     Raises
     ------
     CalibrationError
@@ -85,6 +77,7 @@ def evidence_of_bags(
 
     """
     reduced = [bag.reduced for bag in bags]
+    metadata = [bag.info.metadata for bag in bags]
     judgement = None
     unit = 'counts'
     if calibration is not None:
@@ -100,90 +93,105 @@ def evidence_of_bags(
         if any(bag.info.input == 'imu' for bag in bags):
             unit = 'm/s^2'
         windows = raw_windows(reduced, np.nan if gravity is None else gravity, window_s)
+    if calibration is not None:
+        serial = calibration.unit.serial
+    said = sorted({one['serial'] for one in metadata if one.get('serial')})
     return Evidence(
-        serial=_serial(bags, calibration, serial),
+        serial=serial or ', '.join(said) or 'unknown',
         unit=unit,
         gravity=gravity,
         calibration=calibration,
-        bags=tuple(bag_facts(bag.reduced, bag.info.truncated) for bag in bags),
-        shown=shown_of(reduced, calibration, program, [bag.info.metadata for bag in bags]),
+        bags=tuple(_facts(bag.reduced, bag.info.truncated) for bag in bags),
+        shown=_shown(reduced, calibration, program, metadata),
         windows=windows,
         judgement=judgement,
-        findings=() if calibration is None else of_calibration(calibration),
+        findings=() if calibration is None else _against(calibration),
+        is_simulated=any(_SIMULATED in one for one in metadata),
     )
 
 
-def shown_of(
-    bags: Sequence[ReducedBag],
-    calibration: Calibration | None,
-    program: str | None,
-    metadata: Sequence[object] = (),
-) -> ShownBag | None:
+def evidence_of_fit(
+    result: FitResult,
+    *,
+    paths: Sequence[str | Path] = (),
+    program: str | None = None,
+    is_brief: bool = False,
+) -> Evidence:
     """
-    Prepare the bag that the time figures show.
+    Gather what a fit has to show, on the bags that it was made of.
 
     Parameters
     ----------
-    bags : sequence of ReducedBag
-        The bags.
-    calibration : Calibration or None
-        Gives the detector; without one it is learnt from the bags.
-    program : str or None
+    result : FitResult
+        The fit.
+    paths : sequence of str or Path, optional
+        The bags it was made of, in its order, to look up what simulated ones say of themselves.
+    program : str or None, optional
         The chamber's program, as `simulation.parse_cyclogram` reads it.
-    metadata : sequence of mapping, optional
-        Of each bag; what simulated ones say of their program is used without `program`.
-
-    Returns
-    -------
-    ShownBag or None
-        None without bags.
+    is_brief : bool, optional
+        Leave out what only figures show.
 
     Raises
     ------
+    RecordingError
+        If one of `paths` cannot be opened.
     ValueError
         If `program` cannot be read.
 
     """
-    cyclogram = None if program is None else parse_cyclogram(program)
-    if not bags:
-        return None
-    detector = learn_detector(bags) if calibration is None else calibration.detector
-    index = best_bag(bags)
-    bag = bags[index]
-    span_ns = span_of(bag)
-    if cyclogram is None and index < len(metadata):
-        cyclogram = recorded_program(metadata[index])
-    return ShownBag(
-        index=index,
-        start_ns=span_ns[0],
-        board=bag.board,
-        case=bag.case,
-        trace=thermal_trace(bag.board, bag.case, span_ns, detector),
-        cyclogram=cyclogram,
+    calibration = result.calibration
+    judgement = judge_bags(result.bags, calibration, window_s=usual_window(result.bags))
+    metadata = [] if is_brief else [inspect_recording(path).metadata for path in paths]
+    rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
+    left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
+    against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
+    return Evidence(
+        serial=calibration.unit.serial,
+        unit=calibration.unit.input,
+        gravity=calibration.gravity_m_s2,
+        calibration=calibration,
+        bags=tuple(_facts(one) for one in result.bags),
+        shown=None if is_brief else _shown(result.bags, calibration, program, metadata),
+        windows=None if judgement is None else judgement.windows,
+        judgement=judgement,
+        steps=result.residuals,
+        left_out={k: left_out[rest] for k, rest in enumerate(rests) if rest in left_out},
+        findings=tuple(dict.fromkeys((*_against(calibration), *against))),
+        checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
+        is_fit=True,
+        is_simulated=any(_SIMULATED in one for one in metadata),
     )
 
 
-def bag_facts(bag: ReducedBag, truncated: str | None = None) -> BagFacts:
-    """
-    Describe a bag for the certificate's table.
+def _is_reservation(finding: Finding) -> bool:
+    # More positions than enough would be better still: no reservation.
+    return finding.level == 'advice' and finding.name != 'positions'
 
-    Parameters
-    ----------
-    bag : ReducedBag
-        The bag.
-    truncated : str or None, optional
-        What is missing of it.
 
-    Returns
-    -------
-    BagFacts
-        Its line.
+def _against(calibration: Calibration) -> tuple[str, ...]:
+    """Give what speaks against a calibration by itself, but for its wish for more positions."""
+    lower, upper = calibration.dynamic.rate_range_k_min
+    found = [
+        f'the dynamic set never saw {name}: its ramps are a guess there'
+        for name, rate in (('heating', upper), ('cooling', -lower))
+        if rate < _SLOWEST_RAMP_K_MIN
+    ]
+    if not calibration.has_uncertainty:
+        found.append('the calibration says nothing of its uncertainty')
+    found += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
+    return tuple(dict.fromkeys(found))
 
-    """
-    start_ns, end_ns = span_of(bag)
-    remarks = []
-    if truncated:
-        remarks.append(truncated)
+
+def _span_ns(bag: ReducedBag) -> tuple[int, int]:
+    """Give a bag's first and last stamp: of its samples, or of its readings without them."""
+    if bag.n_samples:
+        return bag.start_ns, bag.end_ns
+    return int(bag.board.stamp_ns[0]), int(bag.board.stamp_ns[-1])
+
+
+def _facts(bag: ReducedBag, truncated: str | None = None) -> BagFacts:
+    start_ns, end_ns = _span_ns(bag)
+    remarks = [truncated] if truncated else []
     if bag.n_saturated:
         remarks.append(f'{bag.n_saturated} samples saturated, left out')
     if bag.n_dropped:
@@ -209,77 +217,41 @@ def bag_facts(bag: ReducedBag, truncated: str | None = None) -> BagFacts:
     )
 
 
-def best_bag(bags: Sequence[ReducedBag]) -> int:
-    """
-    Choose the bag that the time figures show: the widest in temperature, then the longest.
-
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        At least one.
-
-    Returns
-    -------
-    int
-        Its place; the first of equals, and spans within 5 % are equal.
-
-    """
+def _shown(
+    bags: Sequence[ReducedBag],
+    calibration: Calibration | None,
+    program: str | None,
+    metadata: Sequence[Mapping[str, str]],
+) -> ShownBag | None:
+    """Prepare the bag of the time figures: the widest in temperature, then the longest."""
+    cyclogram = None if program is None else parse_cyclogram(program)
+    if not bags:
+        return None
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
+    # Spans within 5 % are equal, and so are lengths within a minute; the first of equals.
     wide = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
-    return max(wide, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
+    index = max(wide, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
+    bag = bags[index]
+    span_ns = _span_ns(bag)
+    if cyclogram is None and index < len(metadata):
+        cyclogram = _recorded_program(metadata[index])
+    detector = learn_detector(bags) if calibration is None else calibration.detector
+    trace = thermal_trace(bag.board, bag.case, span_ns, detector)
+    return ShownBag(index, span_ns[0], bag.board, bag.case, trace, cyclogram)
 
 
-def recorded_program(metadata: object) -> Cyclogram | None:
-    """
-    Find the chamber's program in a simulated bag's metadata.
-
-    Parameters
-    ----------
-    metadata : mapping of str to str
-        The bag's metadata; written by others, so nothing in it is believed.
-
-    Returns
-    -------
-    Cyclogram or None
-        The program; None where there is none that can be read.
-
-    """
-    text = metadata.get('truth', '') if isinstance(metadata, dict) else ''
-    if not isinstance(text, str) or len(text) > 16 * _LONGEST_PROGRAM:
+def _recorded_program(metadata: Mapping[str, str]) -> Cyclogram | None:
+    """Find the chamber's program in a simulated bag's metadata, in which nothing is believed."""
+    text = metadata.get(_SIMULATED, '')
+    if len(text) > 16 * _LONGEST_PROGRAM:
         return None
     try:
         truth = json.loads(text)
-    except ValueError:
-        return None
-    profile = truth.get('profile') if isinstance(truth, dict) else None
-    if not isinstance(profile, str) or len(profile) > _LONGEST_PROGRAM:
-        return None
-    try:
+        profile = truth.get('profile') if isinstance(truth, dict) else None
+        if not isinstance(profile, str) or len(profile) > _LONGEST_PROGRAM:
+            return None
         if profile in CYCLOGRAM_NAMES:
             return cyclogram_preset(profile)
         return parse_cyclogram(profile)
     except ValueError:
         return None
-
-
-def of_calibration(calibration: Calibration) -> tuple[str, ...]:
-    """Give what speaks against a calibration by itself, but for its wish for more positions."""
-    lower, upper = calibration.dynamic.rate_range_k_min
-    found = [
-        f'the dynamic set never saw {name}: its ramps are a guess there'
-        for name, rate in (('heating', upper), ('cooling', -lower))
-        if rate < _SLOWEST_RAMP_K_MIN
-    ]
-    if not calibration.has_uncertainty:
-        found.append('the calibration says nothing of its uncertainty')
-    found += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
-    return tuple(dict.fromkeys(found))
-
-
-def _serial(bags: Sequence[OpenedBag], calibration: Calibration | None, serial: str | None) -> str:
-    if calibration is not None:
-        return calibration.unit.serial
-    found = sorted(
-        {bag.info.metadata['serial'] for bag in bags if bag.info.metadata.get('serial')}
-    )
-    return serial or ', '.join(found) or 'unknown'

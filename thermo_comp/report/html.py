@@ -1,63 +1,61 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the parts of a page that needs nothing else: the document, its tables, its figures.
+Owns the way into HTML: the templates, in which every text is escaped, and the page's policy.
 
-What comes from a bag or a calibration is text that somebody else wrote: it passes through
-`html.escape` on its way into the page, and the page's own policy forbids it to run or load
-anything.
+What comes from a bag or a calibration is text that somebody else wrote; the page's own policy
+forbids it to run or load anything.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
+from functools import cache
 from pathlib import Path
+from typing import Any
 
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from ..unit.gravity import MICRO_G
 from .plates import DrawnPlate
+from .text import label_text, minus, number
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
-# A table of at most so many rows is not torn apart in print.
-_SHORT = 16
-_STYLE = Path(__file__).with_name('page.css')
+# What stands in the margin of a printed page has no more letters.
+_LONGEST_MARGIN = 90
 
 
-def document(title: str, parts: Sequence[str], *, script: str = '', nonce: str = '') -> str:
+def render(template: str, *, script: str = '', nonce: str = '', **context: Any) -> str:
     """
-    Put a page together.
+    Fill a template that extends ``page.html``.
 
     Parameters
     ----------
-    title : str
-        Its title; escaped here.
-    parts : sequence of str
-        HTML, in order; empty ones are left out.
-    script : str, optional
-        Script of the viewer that serves the page; a page in a file has none.
-    nonce : str, optional
-        Makes the page's policy let this one script run, and talk to its server.
-
-    Returns
-    -------
-    str
-        The HTML document.
+    template : str
+        Its file's name.
+    script, nonce : str, optional
+        Script of the viewer that serves the page, and what makes the page's policy let this one
+        script run and talk to its server; a page in a file has none.
+    **context
+        What the template names; at least `title`.
 
     """
     policy = _POLICY
     if script:
         policy += f"; script-src 'nonce-{nonce}'; connect-src 'self'"
-    lines = [
-        '<!DOCTYPE html>',
-        '<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{escape(title)}</title>',
-        f'<style>{_STYLE.read_text(encoding="utf-8")}</style></head><body>',
-        *parts,
-        f'<script nonce="{nonce}">{script}</script>' if script else '',
-        '</body></html>\n',
-    ]
-    return '\n'.join(line for line in lines if line)
+    found = _templates().get_template(template)
+    return found.render(
+        {'margin': '', 'footer': '', 'is_simulated': False}
+        | context
+        | {'policy': Markup(policy), 'script': Markup(script), 'nonce': nonce}  # noqa: S704 - our own
+    )
+
+
+def document(title: str, parts: Sequence[str]) -> str:
+    """Put a page together of parts that are HTML, in order."""
+    body = Markup('\n'.join(part for part in parts if part))  # noqa: S704 - escaped by its makers
+    return render('page.html', title=title, body=body)
 
 
 def table(
@@ -72,55 +70,42 @@ def table(
     """
     Write a table whose first `texts` columns are text and whose others are numbers.
 
-    Parameters
-    ----------
-    headings : sequence of str
-        The columns.
-    rows : sequence of sequence of str
-        The cells.
-    texts : int, optional
-        Columns of text.
-    caption : str, optional
-        A note above it.
-    chosen : sequence of bool, optional
-        Rows in bold.
-    links : sequence of str, optional
-        Where the first cell of each row leads; empty for nowhere.
-
-    Returns
-    -------
-    str
-        The element; everything in it is escaped.
-
+    Rows that are `chosen` are bold; the first cell of a row leads to its link, if any.
     """
-
-    def cells(row: Sequence[str], tag: str, link: str = '') -> str:
-        said = [escape(cell) for cell in row]
-        if link:
-            said[0] = f'<a href="{escape(link)}">{said[0]}</a>'
-        return ''.join(
-            f'<{tag}{"" if i < texts else " class=number"}>{cell}</{tag}>'
-            for i, cell in enumerate(said)
-        )
-
-    body = ''.join(
-        f'<tr{" class=chosen" if i < len(chosen) and chosen[i] else ""}>'
-        f'{cells(row, "td", links[i] if i < len(links) else "")}</tr>'
-        for i, row in enumerate(rows)
-    )
-    kind = 'scroll short' if len(rows) <= _SHORT else 'scroll'
-    note = f'<p class="note">{escape(caption)}</p>' if caption else ''
-    return (
-        f'{note}<div class="{kind}"><table><thead><tr>{cells(headings, "th")}</tr></thead>'
-        f'<tbody>{body}</tbody></table></div>'
-    )
+    return str(_parts().table(headings, rows, texts, caption, list(chosen), list(links)))
 
 
 def figure(plate: DrawnPlate) -> str:
     """Write a figure with its caption, for paper and for a phone."""
-    return (
-        f'<figure id="figure-{plate.number}"><div class="wide">{plate.wide}</div>'
-        f'<div class="narrow">{plate.narrow}</div>'
-        f'<figcaption><strong>{plate.number}. {escape(plate.question)}</strong> '
-        f'{escape(plate.reading)}</figcaption></figure>'
+    return str(_parts().figure(plate))
+
+
+@cache
+def _templates() -> Environment:
+    made = Environment(
+        loader=FileSystemLoader(Path(__file__).with_name('templates')),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
+    made.filters |= {'number': number, 'minus': minus, 'ug': _micro_g, 'css': _css_text}
+    return made
+
+
+@cache
+def _parts() -> Any:
+    return _templates().get_template('parts.html').module
+
+
+def _micro_g(acceleration: float, digits: int = 3) -> str:
+    return number(acceleration / MICRO_G, digits)
+
+
+def _css_text(value: str) -> Markup:
+    """Write a text as a string of a style sheet: all but letters and digits by their numbers."""
+    said = ''.join(
+        c if c.isalnum() and c.isascii() else f'\\{ord(c):06x}'
+        for c in label_text(value, _LONGEST_MARGIN)
+    )
+    return Markup(f'"{said}"')  # noqa: S704 - nothing of it is markup any more

@@ -62,26 +62,8 @@ class LiveOptions:
     program: str | None = None
 
 
-@dataclass(frozen=True)
-class _Made:
-    evidence: Evidence
-    plates: list[DrawnPlate]
-
-
 class LiveReport:
-    """
-    The page of a calibration and bags, always as the files are.
-
-    Parameters
-    ----------
-    calibration : Path
-        The calibration file.
-    bags : sequence of Path, optional
-        Bags to judge it on; each is read again only when it has changed.
-    options : LiveOptions, optional
-        How they are read.
-
-    """
+    """The page of a calibration and bags, as the files are; a bag is read when it changes."""
 
     def __init__(
         self, calibration: Path, bags: Sequence[Path] = (), options: LiveOptions | None = None
@@ -92,7 +74,7 @@ class LiveReport:
         self._lock = threading.Lock()
         self._opened: dict[Path, tuple[str, OpenedBag]] = {}
         self._version = ''
-        self._made: _Made | None = None
+        self._made: tuple[Evidence, list[DrawnPlate]] | None = None
         self._notice = ''
 
     def version(self) -> str:
@@ -100,27 +82,15 @@ class LiveReport:
         return _signature([self._calibration, *self._bags])
 
     def page(self) -> str:
-        """
-        Make the page, if the files have changed, and return it.
-
-        Returns
-        -------
-        str
-            The HTML document.
-
-        """
+        """Make the page, if the files have changed, and return it."""
         with self._lock:
             version = self.version()
             if version != self._version:
                 self._make(version)
-            made = self._made
-            if made is None:
-                # Nothing good was seen yet: a page with the reason, which goes on asking.
-                evidence = Evidence(serial=self._calibration.name, unit='counts')
-                made = _Made(evidence, [])
+            # While nothing good was seen yet: a page with the reason, which goes on asking.
+            evidence = Evidence(serial=self._calibration.name, unit='counts')
             return render_page(
-                made.evidence,
-                made.plates,
+                *(self._made or (evidence, [])),
                 script=_SCRIPT % (version, _POLL_MS),
                 nonce=secrets.token_urlsafe(16),
                 notice=self._notice,
@@ -130,7 +100,7 @@ class LiveReport:
         self._version = version
         try:
             evidence = self._evidence()
-            self._made = _Made(evidence, drawn_plates(evidence))
+            self._made = (evidence, drawn_plates(evidence))
             self._notice = ''
         except (ThermoCompError, OSError, ValueError) as error:
             older = '' if self._made is None else '\nThe page below is older.'
@@ -165,14 +135,7 @@ class LiveReport:
 
 class LiveServer(ThreadingHTTPServer):
     """
-    Serves one live report on the loopback interface.
-
-    Parameters
-    ----------
-    report : LiveReport
-        The report.
-    port : int, optional
-        Port; 0 takes any that is free.
+    Serves one live report on the loopback interface; port 0 takes any that is free.
 
     Raises
     ------
@@ -219,29 +182,25 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Answer with the page or with its version."""
         name, _, port = self.headers.get('Host', '').partition(':')
+        status, kind, text = HTTPStatus.NOT_FOUND, 'plain', 'nothing here\n'
         if name not in _NAMES or port != str(self.server.server_port):
-            self._answer(HTTPStatus.FORBIDDEN, 'text/plain', 'another host\n')
+            status, text = HTTPStatus.FORBIDDEN, 'another host\n'
         elif self.path == '/':
-            self._answer(HTTPStatus.OK, 'text/html', self.server.report.page())
+            status, kind, text = HTTPStatus.OK, 'html', self.server.report.page()
         elif self.path == '/version':
-            self._answer(HTTPStatus.OK, 'text/plain', self.server.report.version())
-        else:
-            self._answer(HTTPStatus.NOT_FOUND, 'text/plain', 'nothing here\n')
-
-    def _answer(self, status: HTTPStatus, kind: str, text: str) -> None:
+            status, text = HTTPStatus.OK, self.server.report.version()
         content = text.encode()
         self.send_response(status)
-        self.send_header('Content-Type', f'{kind}; charset=utf-8')
-        self.send_header('Content-Length', str(len(content)))
-        self.send_header('Cache-Control', 'no-store')
-        self.send_header('X-Content-Type-Options', 'nosniff')
-        self.send_header('X-Frame-Options', 'DENY')
+        for header, value in (
+            ('Content-Type', f'text/{kind}; charset=utf-8'),
+            ('Content-Length', str(len(content))),
+            ('Cache-Control', 'no-store'),
+            ('X-Content-Type-Options', 'nosniff'),
+            ('X-Frame-Options', 'DENY'),
+        ):
+            self.send_header(header, value)
         self.end_headers()
-        try:
-            self.wfile.write(content)
-        except (BrokenPipeError, ConnectionResetError):
-            # The reader has closed the page meanwhile.
-            self.close_connection = True
+        self.wfile.write(content)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base's name
         """Say nothing: a request a second is no news."""

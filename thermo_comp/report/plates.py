@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from matplotlib.figure import Figure
@@ -12,32 +12,17 @@ from matplotlib.figure import Figure
 from .evidence import Evidence
 from .figures_residual import draw_gravity, draw_histograms, draw_residuals
 from .figures_thermal import draw_dynamics, draw_temperatures
-from .figures_unit import draw_functions, draw_positions, draw_step
+from .figures_unit import draw_functions, draw_hysteresis, draw_positions, draw_step
 from .style import NARROW, WIDE, Sheet, drawing, png, svg
 from .text import label_text
 
+Draw = Callable[[Sheet], Figure]
 _GREY = 'Grey: the time in which the flag says dynamic.'
 
 
 @dataclass(frozen=True)
 class Plate:
-    """
-    One figure of the report.
-
-    Parameters
-    ----------
-    name : str
-        Its file's name.
-    question : str
-        What it answers.
-    reading : callable
-        How the answer is read, as a text, from the evidence.
-    draw : callable
-        Draws it on a sheet.
-    is_possible : callable
-        Whether the evidence suffices.
-
-    """
+    """One figure of the report; `reading` says how its answer is read."""
 
     name: str
     question: str
@@ -48,19 +33,7 @@ class Plate:
 
 @dataclass(frozen=True)
 class DrawnPlate:
-    """
-    A figure ready for the page.
-
-    Parameters
-    ----------
-    number : int
-        Counted from 1.
-    name, question, reading : str
-        As in `Plate`.
-    wide, narrow : str
-        SVG elements, for paper and desk, and for a phone.
-
-    """
+    """A figure ready for the page: as SVG for paper and desk, and narrow for a phone."""
 
     number: int
     name: str
@@ -70,62 +43,48 @@ class DrawnPlate:
     narrow: str
 
 
-def possible_plates(evidence: Evidence) -> list[Plate]:
-    """List the figures that the evidence allows, in order."""
-    return [plate for plate in PLATES if plate.is_possible(evidence)]
+def draw_plates(plates: Sequence[tuple[str, str, str, Draw]]) -> list[DrawnPlate]:
+    """Draw figures, given by name, question, reading and way to draw, and number them."""
+    with drawing():
+        return [
+            DrawnPlate(
+                number,
+                name,
+                question,
+                reading,
+                wide=svg(draw(WIDE), f'f{number}w', question),
+                narrow=svg(draw(NARROW), f'f{number}n', question),
+            )
+            for number, (name, question, reading, draw) in enumerate(plates, 1)
+        ]
 
 
 def drawn_plates(evidence: Evidence) -> list[DrawnPlate]:
-    """
-    Draw all figures for the page.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        What they show.
-
-    Returns
-    -------
-    list of DrawnPlate
-        In order.
-
-    """
-    result = []
-    with drawing():
-        for number, plate in enumerate(possible_plates(evidence), 1):
-            result.append(
-                DrawnPlate(
-                    number=number,
-                    name=plate.name,
-                    question=plate.question,
-                    reading=plate.reading(evidence),
-                    wide=svg(plate.draw(evidence, WIDE), f'f{number}w', plate.question),
-                    narrow=svg(plate.draw(evidence, NARROW), f'f{number}n', plate.question),
-                )
-            )
-    return result
+    """Draw all figures that the evidence allows, in order."""
+    return draw_plates(
+        [
+            (one.name, one.question, one.reading(evidence), _drawer(one, evidence))
+            for one in possible_plates(evidence)
+        ]
+    )
 
 
 def png_files(evidence: Evidence) -> dict[str, bytes]:
-    """
-    Draw all figures as PNG files.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        What they show.
-
-    Returns
-    -------
-    dict of {str: bytes}
-        Content by file name, e.g. ``1_temperatures.png``.
-
-    """
+    """Draw all figures as PNG: their content by file name, like ``1_temperatures.png``."""
     with drawing():
         return {
             f'{number}_{plate.name}.png': png(plate.draw(evidence, WIDE))
             for number, plate in enumerate(possible_plates(evidence), 1)
         }
+
+
+def possible_plates(evidence: Evidence) -> list[Plate]:
+    """List the figures that the evidence allows, in order."""
+    return [plate for plate in PLATES if plate.is_possible(evidence)]
+
+
+def _drawer(plate: Plate, evidence: Evidence) -> Draw:
+    return lambda sheet: plate.draw(evidence, sheet)
 
 
 def _bag(evidence: Evidence) -> str:
@@ -149,11 +108,10 @@ def _dynamics(evidence: Evidence) -> str:
     window_s = 0.0 if evidence.windows is None else evidence.windows.window_s
     return (
         f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
-        'rates of the '
-        f'temperatures and, below, the second derivative of the {sensor} temperature, whose '
-        'pulses open and close the dynamic state; (c) the state that follows, with its '
-        f'direction; before the detector has seen enough it is unknown. {_GREY} '
-        f'{_bag(evidence)} After Fig. 4 of the paper.'
+        f'rates of the temperatures and, below, the second derivative of the {sensor} '
+        'temperature, whose pulses open and close the dynamic state; (c) the state that follows, '
+        'with its direction; before the detector has seen enough it is unknown. '
+        f'{_GREY} {_bag(evidence)} After Fig. 4 of the paper.'
     )
 
 
@@ -185,36 +143,26 @@ def _functions(evidence: Evidence) -> str:
     )
 
 
-def _step(_evidence: Evidence) -> str:
-    return (
-        'What is still to come of the change of bias and scale when board and case have jumped '
-        'by 1 K together: what a line leaves, the curve over temperature does not know. Where '
-        'it meets zero, the unit has settled.'
+def _positions(evidence: Evidence) -> str:
+    rings = (
+        ' Rings and diamonds: what the other positions alone leave on it, which is what a new '
+        'attitude will see; the area of a ring is in proportion.'
+        if evidence.left_out
+        else ''
     )
-
-
-def _histograms(_evidence: Evidence) -> str:
-    return (
-        '|g| − g over all windows of all positions. Bars: by regime, with the normal '
-        'distribution of the same mean and spread; where they follow the line, what is left '
-        'is noise. Steps: the size of the residual without and with the correction, on a '
-        'logarithmic axis; the further left, the better.'
-    )
-
-
-def _positions(_evidence: Evidence) -> str:
     return (
         'Direction of the specific force in the unit’s frame, position by position, in an '
         'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° of '
         'elevation. Beside it, where gravity is known, what is left in each position: one that '
-        'stands out was moved, or is not of this unit. Diamonds: what the other positions alone '
-        'leave on it.'
+        f'stands out was moved, or is not of this unit.{rings}'
     )
 
 
-def _has_windows_of_shown(evidence: Evidence) -> bool:
+def _has_residuals_of_shown(evidence: Evidence) -> bool:
     shown, windows = evidence.shown, evidence.windows
-    return shown is not None and windows is not None and bool((windows.bag == shown.index).any())
+    if shown is None or windows is None or not evidence.residuals:
+        return False
+    return bool((windows.bag == shown.index).any())
 
 
 PLATES = (
@@ -237,14 +185,14 @@ PLATES = (
         'What does the correction leave on each axis?',
         _residuals,
         draw_residuals,
-        lambda evidence: _has_windows_of_shown(evidence) and bool(evidence.residuals),
+        _has_residuals_of_shown,
     ),
     Plate(
         'gravity',
         'Does |g| stay constant over the whole program?',
         _gravity,
         draw_gravity,
-        lambda evidence: _has_windows_of_shown(evidence) and bool(evidence.residuals),
+        _has_residuals_of_shown,
     ),
     Plate(
         'functions',
@@ -256,7 +204,11 @@ PLATES = (
     Plate(
         'step',
         'For how long does the unit remember a change of temperature?',
-        _step,
+        lambda _: (
+            'What is still to come of the change of bias and scale when board and case have '
+            'jumped by 1 K together: what a line leaves, the curve over temperature does not '
+            'know. Where it meets zero, the unit has settled.'
+        ),
         draw_step,
         lambda evidence: (
             evidence.calibration is not None
@@ -264,11 +216,29 @@ PLATES = (
         ),
     ),
     Plate(
+        'hysteresis',
+        'Does the bias come back on another way than it went?',
+        lambda _: (
+            'Slow run through the whole range and back: bias of each axis less the middle of both '
+            'ways. The width of the loop is what no curve over temperature can correct.'
+        ),
+        draw_hysteresis,
+        lambda evidence: (
+            evidence.calibration is not None
+            and any(term.kind == 'play' for term in evidence.calibration.response)
+        ),
+    ),
+    Plate(
         'histograms',
         'Is what is left noise, or is there something to model?',
-        _histograms,
+        lambda _: (
+            '|g| − g over all windows of all positions. Bars: by regime, with the normal '
+            'distribution of the same mean and spread; where they follow the line, what is left '
+            'is noise. Steps: the size of the residual without and with the correction, on a '
+            'logarithmic axis; the further left, the better.'
+        ),
         draw_histograms,
-        lambda evidence: bool(evidence.residuals) and _has_windows_of_shown(evidence),
+        _has_residuals_of_shown,
     ),
     Plate(
         'positions',

@@ -15,6 +15,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import matplotlib as mpl
@@ -24,7 +25,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ..typing import Floats, Ints
-from .decimate import thin
 from .evidence import CHOSEN, RAW
 
 Line = dict[str, Any]
@@ -85,23 +85,11 @@ _PNG_DPI = 160
 
 @dataclass(frozen=True)
 class Sheet:
-    """
-    The paper that a figure is drawn on.
-
-    Parameters
-    ----------
-    width : float
-        Inches.
-    n_bins : int
-        Pixels that a line may use across.
-    is_narrow : bool
-        A phone's screen: panels stand below each other.
-
-    """
+    """The paper of a figure: its width in inches, and how many pixels a line may use across."""
 
     width: float
     n_bins: int
-    is_narrow: bool
+    is_narrow: bool  # a phone's screen: panels stand below each other
 
 
 WIDE = Sheet(7.1, 420, False)
@@ -125,22 +113,10 @@ def new_figure(sheet: Sheet, height: float) -> Figure:
 
 def svg(figure: Figure, name: str, label: str) -> str:
     """
-    Write a figure as an SVG element for a page.
+    Write a figure as an SVG element for a page, without a header.
 
-    Parameters
-    ----------
-    figure : Figure
-        The figure.
-    name : str
-        Makes the ids in the element unique in the page; letters and digits.
-    label : str
-        What the figure shows, for readers who do not see it.
-
-    Returns
-    -------
-    str
-        The element, without a header; the page's style sheet gives its lines round joints.
-
+    The letters and digits of `name` make its ids unique in the page; `label` says what it shows
+    to readers who do not see it. The page's style sheet gives its lines round joints.
     """
     buffer = io.StringIO()
     nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}
@@ -160,7 +136,7 @@ def svg(figure: Figure, name: str, label: str) -> str:
     head, rest = text.split('>', 1)
     head = re.sub(r' (width|height|version|xmlns:xlink)="[^"]*"', '', head)
     rest = rest.replace('xlink:href', 'href')
-    return f'{head} role="img" aria-label="{_attribute(label)}">{rest}'.strip()
+    return f'{head} role="img" aria-label="{escape(label)}">{rest}'.strip()
 
 
 def png(figure: Figure) -> bytes:
@@ -170,29 +146,41 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def _attribute(value: str) -> str:
-    for sign, entity in (('&', '&amp;'), ('<', '&lt;'), ('>', '&gt;'), ('"', '&quot;')):
-        value = value.replace(sign, entity)
-    return value
-
-
 def time_unit(duration_s: float) -> tuple[float, str]:
-    """
-    Choose the unit of a time axis.
-
-    Returns
-    -------
-    seconds : float
-        Seconds in one of it.
-    name : str
-        What the axis is called.
-
-    """
+    """Choose the unit of a time axis: the seconds in one of it, and what the axis is called."""
     if duration_s >= 2.5 * 3600.0:
         return 3600.0, 'time, h'
     if duration_s >= 300.0:
         return 60.0, 'time, min'
     return 1.0, 'time, s'
+
+
+def thin(time: Floats, value: Floats, n_bins: int) -> tuple[Floats, Floats]:
+    """
+    Keep, of each of `n_bins` equal stretches of time, the lowest and the highest point.
+
+    So a line through the result covers the same pixels as a line through all points, and no
+    spike is lost. Where values are missing a NaN stays, so that the line breaks there.
+    """
+    use = np.isfinite(value)
+    if len(time) <= 2 * n_bins or not use.any():
+        return time, np.where(use, value, np.nan)
+    width = (float(time[-1]) - float(time[0])) / n_bins
+    bins = np.minimum(((time - time[0]) / width).astype(np.int64), n_bins - 1)
+    kept, at, found = bins[use], time[use], value[use]
+    order = np.lexsort((found, kept))
+    first = np.flatnonzero(np.concatenate(([True], np.diff(kept[order]) > 0)))
+    last = np.concatenate((first[1:], [len(order)])) - 1
+    rows = np.unique(np.concatenate((order[first], order[last])))
+    times, values = at[rows], found[rows]
+    # A missing stretch: not thinned away, because a line must not cross it.
+    broken = np.flatnonzero(~use & np.concatenate(([True], use[:-1])))
+    if len(broken):
+        times = np.concatenate((times, time[broken]))
+        values = np.concatenate((values, np.full(len(broken), np.nan)))
+        by_time = np.argsort(times, kind='stable')
+        times, values = times[by_time], values[by_time]
+    return times, values
 
 
 def plot_thinned(axes: Axes, time: Floats, value: Floats, sheet: Sheet, **line: Any) -> None:
@@ -201,22 +189,7 @@ def plot_thinned(axes: Axes, time: Floats, value: Floats, sheet: Sheet, **line: 
 
 
 def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]:
-    """
-    Put a gap into a series of windows wherever it changes position or pauses.
-
-    Parameters
-    ----------
-    time, value : ndarray, shape (n,)
-        The series.
-    position : ndarray of int64, shape (n,)
-        Which position each window belongs to.
-
-    Returns
-    -------
-    time, value : ndarray, shape (m,)
-        With a NaN before each new stretch.
-
-    """
+    """Put a NaN into a series of windows wherever it changes position or pauses."""
     if len(time) < 2:
         return time, value
     steps = np.diff(time)
@@ -229,17 +202,7 @@ def legend_above(axes: Axes, sheet: Sheet, *, share: float = 1.0, **keys: Any) -
     """
     Put the legend above the axes, where it hides nothing, in as many columns as fit.
 
-    Parameters
-    ----------
-    axes : Axes
-        The axes.
-    sheet : Sheet
-        The paper.
-    share : float, optional
-        Part of its width that the axes have.
-    **keys
-        For the legend.
-
+    The axes have a `share` of the sheet's width.
     """
     labels = axes.get_legend_handles_labels()[1]
     # An entry takes its label and a handle as wide as some eight letters.

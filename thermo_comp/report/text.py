@@ -17,8 +17,27 @@ def number(value: float, digits: int = 3) -> str:
     if size > 8:
         return f'{value:.{digits - 1}e}'
     decimals = digits - 1 - size
-    text = f'{round(value, decimals):.{min(max(decimals, 0), digits)}f}'
+    return minus(f'{round(value, decimals):.{min(max(decimals, 0), digits)}f}')
+
+
+def minus(text: str) -> str:
+    """Put the sign of a printed number for the hyphen."""
     return text.replace('-', '−')
+
+
+def rounded(value: float, expanded: float) -> tuple[str, str]:
+    """
+    Round an expanded uncertainty to two significant digits, and its value to the same place.
+
+    An unknown uncertainty is a dash, and its value has six digits.
+    """
+    if not 0.0 < expanded < math.inf:
+        return number(value, 6), '–'
+    place = 1 - math.floor(math.log10(expanded))
+    if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 is 0.10
+        place -= 1
+    said = (f'{round(one, place):.{max(place, 0)}f}' for one in (value, expanded))
+    return minus(next(said)), next(said)
 
 
 def label_text(value: str, limit: int = 40) -> str:

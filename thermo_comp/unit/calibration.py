@@ -179,6 +179,9 @@ class ResidualSummary:
     raw_rms_m_s2: NotNegative
     rms_m_s2: NotNegative
     max_m_s2: NotNegative
+    left_out_rms_m_s2: Annotated[
+        NotNegative | None, 'On each position by what the others say of the unit; null if unknown.'
+    ] = None
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,12 @@ class Provenance:
     sources: tuple[Source, ...] = ()
     residuals: tuple[ResidualSummary, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @property
+    def left_out_rms(self) -> float:
+        """RMS of ``|f| - g`` on positions left out of the fit [m/s^2]; NaN where unknown."""
+        found = [one.left_out_rms_m_s2 for one in self.residuals if one.section == 'all']
+        return math.nan if not found or found[0] is None else found[0]
 
 
 @dataclass(frozen=True)
