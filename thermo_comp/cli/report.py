@@ -26,6 +26,9 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help='Folder for the figures as PNG files.', metavar='DIR')
     ] = None,
+    certificate_info: Annotated[
+        Path | None, typer.Option(help='What the laboratory states: number, customer, ... (YAML).')
+    ] = None,
     gravity: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
@@ -57,7 +60,7 @@ def report(
     from ..files import PAGE, check_output
     from ..judging import open_bag
     from ..replay import input_for
-    from ..report import evidence_of_bags, write_report
+    from ..report import evidence_of_bags, load_certificate_info, write_report
     from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
@@ -71,12 +74,16 @@ def report(
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
     paths = bags or []
     loaded = None if calibration is None else load_calibration(calibration)
+    info = None
+    if certificate_info is not None:
+        info = load_certificate_info(
+            certificate_info, None if loaded is None else loaded.unit.serial
+        )
     kind = input_.value if loaded is None else input_for(loaded, input_.value)
     full_scale = None if loaded is None else loaded.unit.full_scale
     opened = []
     with out.progress('reading', total=max(len(paths), 1)) as done:
         for number, path in enumerate(paths):
-            tell = partial(_tell, done, number)
             opened.append(
                 open_bag(
                     path,
@@ -85,7 +92,7 @@ def report(
                     number=number,
                     window_s=window,
                     full_scale=full_scale,
-                    progress=tell,
+                    progress=partial(_tell, done, number),
                 )
             )
     try:
@@ -101,7 +108,7 @@ def report(
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
     is_torn = out.torn(bag.info for bag in opened)
-    write_report(evidence, output, figures=figures, overwrite=force)
+    write_report(evidence, output, info=info, figures=figures, overwrite=force)
     for finding in evidence.findings:
         out.line(f'- {finding}')
     judgement = evidence.judgement

@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Holds the certificate of a laboratory: its statements, its uncertainties, its rounding."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from report_helpers import evidence, fitted, write_bag
+
+from thermo_comp.errors import ThermoCompError
+from thermo_comp.judging import open_bag
+from thermo_comp.report import CertificateInfo, evidence_of_bags, load_certificate_info
+from thermo_comp.report.certificate import budget, combined, conformity_rule, results
+from thermo_comp.report.page import render_page
+from thermo_comp.report.text import rounded
+from thermo_comp.unit.calibration_file import save_calibration
+from thermo_comp.unit.gravity import MICRO_G
+
+LAB = """
+number: 2026-017
+laboratory: {name: Inertial Lab, address: 1 Street, accreditation: L-1}
+customer: {name: A Customer}
+operator: A. Person
+unit: {maker: ACME, model: TRI-3, serial: thermostatted-0001}
+instruments:
+  - {name: chamber, model: CX, serial: '4711', traceability: certificate 3 of 2025}
+gravity: {standard_uncertainty_m_s2: 2.0e-5, source: absolute gravimeter}
+thermometers: {standard_uncertainty_k: 0.05}
+dates: {test: 2026-03-01, issue: 2026-03-31, due: 2027-03-31}
+conditions: (23 ± 1) °C
+signatory: B. Person
+"""
+
+
+def lab(folder: Path, text: str = LAB) -> Path:
+    path = folder / 'lab.yaml'
+    path.write_text(text, encoding='utf-8')
+    return path
+
+
+@pytest.mark.parametrize(
+    ('value', 'expanded', 'said'),
+    [
+        (302.95873, 0.01319, ('302.959', '0.013')),
+        (1954.9, 21.7, ('1955', '22')),
+        (-356.26, 199.6, ('−360', '200')),
+        (0.0123, 0.0996, ('0.01', '0.10')),
+        (12345.6, 9960.0, ('12000', '10000')),
+        (1.23456789, math.nan, ('1.23457', '–')),
+        (1.5, 0.0, ('1.50000', '–')),
+    ],
+)
+def test_uncertainties_have_two_digits_and_values_their_place(value, expanded, said):
+    assert rounded(value, expanded) == said
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e5))
+def test_rounding_moves_neither_by_more_than_half_a_digit(value, expanded):
+    text, of_it = rounded(value, expanded)
+    assert float(of_it) == pytest.approx(expanded, rel=0.0501)
+    assert len(of_it.replace('.', '').strip('0')) <= 2
+    # Half of the second digit of an uncertainty is at most a twentieth of it.
+    assert abs(float(text.replace('−', '-')) - value) <= 0.0501 * expanded + 1e-9 * abs(value)
+
+
+def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
+    info = load_certificate_info(lab(tmp_path), 'thermostatted-0001')
+    page = render_page(evidence(), [], info=info)
+    for text in (
+        *('2026-017', 'Inertial Lab', '1 Street', 'L-1', 'A Customer', 'A. Person', 'ACME'),
+        *('TRI-3', 'certificate 3 of 2025', '2e-05 m/s²', 'absolute gravimeter', '2026-03-01'),
+        *('2026-03-31', '2027-03-31', '(23 ± 1) °C', 'B. Person', 'thermostatted-0001'),
+    ):
+        assert text in page, text
+    # The address of the customer, and the place of the signature.
+    assert page.count('class="blank"') == 2
+    # In the margin of each printed page: the certificate and the unit, whatever they are called.
+    margin = (
+        'certificate\\0000202026\\00002d017\\00002c\\000020unit\\000020thermostatted\\00002d0001'
+    )
+    assert margin in page
+    order = [
+        *(
+            'Certificate number',
+            'Laboratory',
+            'Customer',
+            'Unit, maker',
+            'Date of test',
+            'Conditions',
+        ),
+        *('>Instruments', 'Local gravity', '>Method', '>Results', '>Uncertainty budget'),
+        *('>Statement of conformity', '>Range of validity', 'Authorised by'),
+    ]
+    places = [page.index(text) for text in order]
+    assert places == sorted(places)
+    assert render_page(evidence(), []).count('class="blank"') == 18
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('numbr: 1', 'numbr: unknown key'),
+        ('number: 17', 'number: must be a valid text, got 17'),
+        ('laboratory: Inertial Lab', 'laboratory: must be a mapping of keys'),
+        ('gravity: {standard_uncertainty_m_s2: small}', 'gravity.standard_uncertainty_m_s2: must'),
+        ('gravity: {standard_uncertainty_m_s2: -1.0}', 'must be at least 0'),
+        ('instruments: [{model: CX}]', 'instruments[0].name: this key is missing'),
+        ('dates: {due: tomorrow}', 'dates.due: must be a date like 2026-03-31'),
+        (
+            'unit: {serial: other}',
+            'unit.serial: must be that of the calibration, unit-1, got other',
+        ),
+        ('- number', 'must be a mapping of keys'),
+        ('a: *b', 'YAML aliases are not accepted'),
+        ('operator: ' + 'x' * 70_000, 'bytes, at most'),
+    ],
+)
+def test_a_mistake_in_the_statements_is_one_sentence(tmp_path, text, said):
+    path = lab(tmp_path, text)
+    with pytest.raises(ThermoCompError) as caught:
+        load_certificate_info(path, 'unit-1')
+    message = str(caught.value)
+    assert message.startswith(f'{path}: ')
+    assert said in message
+    assert '\n' not in message
+
+
+def test_statements_that_are_no_text_file_are_refused(tmp_path):
+    with pytest.raises(ThermoCompError, match='cannot be read: No such file'):
+        load_certificate_info(tmp_path / 'none.yaml')
+    (tmp_path / 'binary.yaml').write_bytes(b'number: \xff')
+    with pytest.raises(ThermoCompError, match='not UTF-8 text'):
+        load_certificate_info(tmp_path / 'binary.yaml')
+    (tmp_path / 'empty.yaml').write_text('')
+    assert load_certificate_info(tmp_path / 'empty.yaml') == CertificateInfo()
+
+
+def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
+    found = {one.name: one.standard for one in budget(evidence(), CertificateInfo())}
+    assert found['gravity'] is None
+    assert found['thermometers'] is None
+    # Noise, attitude and model are the claim, taken apart; the residual is within it.
+    windows = evidence().judgement.windows
+    claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
+    parts = [found[name] for name in ('noise', 'attitude', 'model')]
+    assert float(np.linalg.norm(parts)) == pytest.approx(claim)
+    assert found['repeatability'] == 0.0
+    # Gravity in doubt by 1 ug, and the thermometers by what a kelvin is worth.
+    info = load_certificate_info(lab(tmp_path))
+    stated = budget(evidence(), info)
+    by_name = {one.name: one.standard for one in stated}
+    assert by_name['gravity'] == 2e-5
+    expected = math.hypot(claim, 2e-5, by_name['thermometers'])
+    assert combined(stated) == pytest.approx(expected)
+
+
+def test_residual_beyond_the_claim_is_repeatability():
+    judgement = evidence().judgement
+    doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=1e-3))
+    found = {one.name: one.standard for one in budget(doubtful, CertificateInfo())}
+    whole = combined(budget(doubtful, CertificateInfo()))
+    assert 0.9e-3 < found['repeatability'] < 1e-3
+    assert whole == pytest.approx(1e-3)
+
+
+def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
+    info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
+    rows = {one.quantity: one for one in results(evidence(), info, ())}
+    scale = fitted().calibration.axes.x.scale_factor
+    # A thousandth of gravity, twice: much more than what the fit leaves open.
+    assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
+    assert (
+        rows['bias x']
+        == {one.quantity: one for one in results(evidence(), CertificateInfo(), ())}['bias x']
+    )
+
+
+def test_rule_of_conformity_names_the_limit():
+    judgement = replace(evidence().judgement, tolerance=100.0 * MICRO_G)
+    assert 'limit of 100 µg' in conformity_rule(replace(evidence(), judgement=judgement))
+    assert 'No limit was specified' in conformity_rule(evidence())
+    assert 'no statement' in conformity_rule(replace(evidence(), judgement=None))
+
+
+def test_simulated_bags_mark_every_page(tmp_path):
+    calibration = fitted().calibration
+    simulated = evidence_of_bags([open_bag(write_bag(tmp_path / 'sim.mcap'))], calibration)
+    assert 'class="simulated"' in render_page(simulated, [])
+    assert 'class="simulated"' not in render_page(evidence_of_bags([], calibration), [])
+
+
+def test_command_takes_the_statements(cli, tmp_path):
+    save_calibration(fitted().calibration, tmp_path / 'unit.yaml')
+    given = ('-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'page.html', '--certificate-info')
+    cli('report', *given, lab(tmp_path))
+    assert 'Inertial Lab' in (tmp_path / 'page.html').read_text(encoding='utf-8')
+    refused = cli('report', *given, lab(tmp_path, 'number: 17'), '--force', code=1)
+    assert 'lab.yaml: number: must be a valid text, got 17' in refused.stderr
