@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import ThermoCompError
 from ..files import read_bounded
+from ..judging import Verdict
 from ..plain_yaml import load_plain_yaml
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
@@ -267,6 +268,11 @@ def conformity_rule(evidence: Evidence) -> str:
             f'Simple acceptance: the RMS of |f| − g of each regime within the calibrated ranges '
             f'is at most the limit of {limit} µg and below that without the correction; the '
             'uncertainty is not subtracted from the limit (guard band 0).'
+        )
+    if judgement.kind is Verdict.NO_CLAIM:
+        return (
+            'No limit was specified and the calibration states no uncertainty: no statement of '
+            'conformity is made.'
         )
     return (
         'No limit was specified. The calibration conforms to its own statement: in each regime '
