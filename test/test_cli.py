@@ -131,6 +131,27 @@ class TestOutput:
         assert 'replaying' not in finished.stdout + finished.stderr
 
 
+def test_a_command_computes_in_one_thread() -> None:
+    # WHY: on two cores that are busy a fit took 16 times as long, waiting for its own threads.
+    # WHAT: numpy is not there yet when its library is told so; what a user has set holds.
+    code = (
+        'import os, sys; from thermo_comp.cli import app; '
+        "app.run = lambda _: print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS']); "
+        'app.main([])'
+    )
+    for wanted, said in (({}, '1'), ({'OPENBLAS_NUM_THREADS': '3'}, '3')):
+        environment = {k: v for k, v in os.environ.items() if k != 'OPENBLAS_NUM_THREADS'}
+        finished = subprocess.run(
+            [sys.executable, '-c', code],
+            cwd=ROOT,
+            env={**environment, **wanted},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert finished.stdout.split() == ['False', said]
+
+
 def on_a_terminal(*arguments: str, no_color: bool = False) -> str:
     """Run the command line on a pseudo-terminal and return what it showed."""
     leader, follower = pty.openpty()
