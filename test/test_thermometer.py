@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from thermal_signals import LAG_S, SECOND_NS, lagged, read
 
-from thermo_comp.thermal.modes import blend, correct, predict
+from thermo_comp.thermal.kalman import correct, mix, predict
 from thermo_comp.thermal.settings import ThermometerSettings
 from thermo_comp.thermal.thermometer import Thermometer
 
@@ -229,7 +229,8 @@ def test_a_blend_has_the_moments_of_the_mixture():
         mean = rng.normal(size=3)
         states.append((*mean, *(root @ root.T)[upper]))
         samples.append(rng.multivariate_normal(mean, root @ root.T, n))
-    out = blend(*states, 0.25)
+    out, back = mix(*states, 0.25, 0.75)
+    np.testing.assert_allclose(back, out, rtol=1e-12)
     mixed = np.concatenate(samples)
     # 400 000 samples of sds of a few: 1 % of the covariances
     np.testing.assert_allclose(out[:3], mixed.mean(axis=0), atol=0.02)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from array import array
 
 import numpy as np
+import numpy.typing as npt
 
 from ..thermal.reading_queue import refused_readings
 from ..typing import Bools, Floats, Ints, Stamps
@@ -139,43 +140,30 @@ def _run_thermal_side(
     n_samples = len(stamps)
     # A reading takes effect at the first sample that is not before it and that comes after it.
     pending = compensator.take_pending()
-    reading_ns = [np.array([entry[0] for entry in pending], dtype=np.int64)]
-    kinds = [np.array([entry[1] for entry in pending], dtype=np.int64)]
-    orders = [np.array([entry[2] for entry in pending], dtype=np.int64)]
-    values = [np.array([entry[3] for entry in pending])]
-    after = [np.zeros(len(pending), dtype=np.int64)]
+    columns = [list(column) for column in zip(*pending, strict=True)] or [[], [], [], []]
+    parts: list[tuple[npt.ArrayLike, ...]] = [(*columns, [0] * len(pending))]
     for kind, name in enumerate(compensator.thermal.inputs):
-        if name not in block.temperatures:
-            continue
-        s, v, a = block.temperatures[name]
-        reading_ns.append(np.asarray(s, dtype=np.int64))
-        kinds.append(np.full(len(s), kind))
-        # Behind whatever was pushed before: only the order within one sensor and stamp counts.
-        orders.append(np.arange(len(s)) + (1 << 60))
-        values.append(np.asarray(v, dtype=np.float64))
-        place = np.asarray(a, dtype=np.int64)
-        after.append(place if kept_before is None else kept_before[place])
-    reading_stamps = np.concatenate(reading_ns)
-    kind_column = np.concatenate(kinds)
-    value_column = np.concatenate(values)
-    arrival = np.concatenate(after)
-    effect = np.maximum(np.searchsorted(stamps, reading_stamps, side='left'), arrival)
-    order = np.lexsort((np.concatenate(orders), kind_column, reading_stamps, effect))
-    refused = refused_readings(reading_stamps, kind_column, arrival, effect)
+        if name in block.temperatures:
+            own_ns, celsius, place = block.temperatures[name]
+            # Behind whatever was pushed before: only the order within one sensor and stamp counts.
+            later = np.arange(len(own_ns)) + (1 << 60)
+            place = np.asarray(place) if kept_before is None else kept_before[np.asarray(place)]
+            parts.append((own_ns, np.full(len(own_ns), kind), later, celsius, place))
+    reading_ns, kinds, orders, arrival = (
+        np.concatenate([np.asarray(part[k], np.int64) for part in parts]) for k in (0, 1, 2, 4)
+    )
+    values = np.concatenate([np.asarray(part[3], dtype=np.float64) for part in parts])
+    effect = np.maximum(np.searchsorted(stamps, reading_ns, side='left'), arrival)
+    order = np.lexsort((orders, kinds, reading_ns, effect))
+    refused = refused_readings(reading_ns, kinds, arrival, effect)
     if refused is not None:
-        for kind, n_refused in enumerate(np.bincount(kind_column[refused]).tolist()):
+        for kind, n_refused in enumerate(np.bincount(kinds[refused]).tolist()):
             compensator.thermal.count_rejected(kind, n_refused)
         order = order[~refused[order]]
-    effect = effect[order]
     events = zip(
-        effect.tolist(),
-        reading_stamps[order].tolist(),
-        kind_column[order].tolist(),
-        value_column[order].tolist(),
-        strict=True,
+        *(column[order].tolist() for column in (effect, reading_ns, kinds, values)), strict=True
     )
     thermal = compensator.thermal
-    apply_reading = thermal.apply
     position = 0
     for at, stamp_ns, kind, celsius in events:
         if at > position:
@@ -185,7 +173,7 @@ def _run_thermal_side(
         if at >= n_samples:
             compensator.push(thermal.inputs[kind], stamp_ns, celsius)
         else:
-            apply_reading(stamp_ns, kind, celsius)
+            thermal.apply(stamp_ns, kind, celsius)
     if position < n_samples:
         _add_segments(compensator, segments, stamps, position, n_samples, n_seen)
     return segments
@@ -246,10 +234,10 @@ def _apply(
         [(slow[k], slow[k + 1], slow[k + 2]) for k in (0, 3, 6)],
         np.array(segments.noise_excess),
     )
-    first = np.array(segments.first)
-    counts = np.array(segments.after) - first
-    source = _covered(first, counts, len(stamps))
-    if source is not None:
+    counts = np.array(segments.after) - np.array(segments.first)
+    if int(counts.sum()) < len(stamps):
+        covered = zip(segments.first, segments.after, strict=True)
+        source = np.concatenate([np.arange(first, after) for first, after in covered])
         index, stamps, samples = index[source], stamps[source], samples[source]
     lines = Lines(np.array(segments.start_ns, dtype=np.int64), columns, counts)
     force, covariance, lowest, highest = correct(lines, correction.misalignment, stamps, samples)
@@ -268,13 +256,6 @@ def _apply(
         force, covariance = force[keep], covariance[keep]
     compensator.counters.n_out += len(index)
     return CompensatedBlock(index, stamps, force, covariance)
-
-
-def _covered(first: Ints, counts: Ints, n_samples: int) -> Ints | None:
-    """Find the samples that lie in a segment; None when all do."""
-    if int(counts.sum()) == n_samples:
-        return None
-    return np.concatenate([np.arange(f, f + c) for f, c in zip(first, counts, strict=True)])
 
 
 def _judge(

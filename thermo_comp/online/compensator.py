@@ -15,7 +15,7 @@ per sample, and a batch comes to the same verdicts.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, cast
 
 from ..unit.calibration import Calibration
 from .health import GravityMonitor
@@ -172,12 +172,7 @@ class Compensator:
         end = thermal.tracker.sample(start_ns + SEGMENT_NS)
         slow = thermal.slow_at(start_ns, end)
         numbers = lay_lines(thermal.correction, start, end, slow, thermal.noise_excess)
-        bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = numbers[:12]
-        ax, lx, qx, ay, ly, qy, az, lz, qz = numbers[12:]
-        return (
-            (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1),
-            (ax, lx, qx, ay, ly, qy, az, lz, qz),
-        )
+        return cast(_Twelve, tuple(numbers[:12])), cast(_Nine, tuple(numbers[12:]))
 
     def _admit(self, stamp_ns: int) -> bool:
         if stamp_ns > self.last_ns:

@@ -28,20 +28,7 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     ahead_s = 0.0 if stamp_ns is None else compensator.pending_ahead(stamp_ns)
     board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
     if stamp_ns is None or board_ns is None:
-        return CompensatorStatus(
-            counters,
-            stamp_ns,
-            None,
-            math.inf,
-            math.inf,
-            True,
-            True,
-            True,
-            0.0,
-            0.0,
-            0.0,
-            pending_ahead_s=ahead_s,
-        )
+        return CompensatorStatus(counters, stamp_ns, pending_ahead_s=ahead_s)
     board_age = (stamp_ns - board_ns) * 1e-9
     # Half the time-out at the latest, so that a warning always comes before the error.
     stale_after = compensator.config.temperature_timeout_s / 2.0

@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
+from operator import attrgetter
 
 from ..thermal.plausibility import Fault
 from ..thermal.settings import ThermalConfig, refuse_outside
@@ -13,39 +15,22 @@ from ..thermal.state import ThermalState
 
 @dataclass(frozen=True)
 class CompensatorConfig:
-    """
-    What the user sets beside the calibration.
+    """What the user sets beside the calibration; ValueError if a value is out of its range."""
 
-    Parameters
-    ----------
-    transition_time_s : float
-        Time over which the sets cross over after a switch [s], stretched where they differ much
-        (`Correction.gentle_transition`); 0 = the paper's hard switch.
-    temperature_timeout_s : float
-        Age of the board temperature at which nothing is published any more [s].
-    case_timeout_s : float
-        Age of the case temperature at which the regime falls back to the board sensor [s].
-    stuck_timeout_s : float
-        Time after which samples that are equal to the bit are not believed [s], and three exact
-        zeros never are; 0 = any sample is believed.
-    local_gravity_m_s2 : float
-        Gravity where the platform stands [m/s^2]; 0 = that of the calibration.
-    gravity_tolerance_m_s2 : float
-        Standing shows the calibration to be another unit's, or an axis to be reversed, where
-        |f| misses gravity by more than this: nothing is published then [m/s^2]; 0 = never.
-
-    Raises
-    ------
-    ValueError
-        If a value is out of its range.
-
-    """
-
+    #: Time over which the sets cross over after a switch [s], stretched where they differ much
+    #: (`Correction.gentle_transition`); 0 = the paper's hard switch.
     transition_time_s: float = 30.0
+    #: Age of the board temperature at which nothing is published any more [s].
     temperature_timeout_s: float = 60.0
+    #: Age of the case temperature at which the board decides the regime [s].
     case_timeout_s: float = 30.0
+    #: Time after which samples that are equal to the bit are not believed [s], and three exact
+    #: zeros never are; 0 = any sample is believed.
     stuck_timeout_s: float = 2.0
+    #: Gravity where the platform stands [m/s^2]; 0 = that of the calibration.
     local_gravity_m_s2: float = 0.0
+    #: What |f| at rest may miss gravity by [m/s^2]; beyond it the calibration is another unit's,
+    #: or an axis is reversed, and nothing is published; 0 = anything.
     gravity_tolerance_m_s2: float = 0.5
 
     def __post_init__(self) -> None:
@@ -69,6 +54,7 @@ DROPPED = (
     'n_too_fast',
     'n_refuted',
 )
+_dropped = attrgetter(*DROPPED)
 
 
 @dataclass(slots=True)
@@ -93,16 +79,7 @@ class Counters:
     @property
     def n_dropped(self) -> int:
         """Samples that came in and did not go out."""
-        return (
-            self.n_not_finite
-            + self.n_saturated
-            + self.n_out_of_order
-            + self.n_no_temperature
-            + self.n_stale
-            + self.n_stuck
-            + self.n_too_fast
-            + self.n_refuted
-        )
+        return sum(_dropped(self))
 
     @property
     def n_in(self) -> int:
@@ -136,18 +113,18 @@ class CompensatorStatus:
     counters: Counters
     stamp_ns: int | None
     #: None until there is a board temperature.
-    state: ThermalState | None
+    state: ThermalState | None = None
     #: Ages of the last used readings at the last sample [s]; infinite when there was none.
-    board_age_s: float
-    case_age_s: float
-    is_board_stale: bool
-    is_board_lost: bool
-    is_case_lost: bool
+    board_age_s: float = inf
+    case_age_s: float = inf
+    is_board_stale: bool = True
+    is_board_lost: bool = True
+    is_case_lost: bool = True
     #: How far outside the calibrated ranges, in half ranges; 0 inside.
-    relative_excess: float
+    relative_excess: float = 0.0
     #: Board temperature beyond the calibrated range [K], signed; rate beyond [K/min].
-    temperature_excess_k: float
-    rate_excess_k_min: float
+    temperature_excess_k: float = 0.0
+    rate_excess_k_min: float = 0.0
     #: T_case - T_board beyond the calibrated range [K], signed.
     gradient_excess_k: float = 0.0
     #: What is wrong with the sensors' readings, and the size of a step that is not believed [K].

@@ -25,7 +25,7 @@ from __future__ import annotations
 from math import erf, exp, inf, nan, sqrt
 from typing import Final
 
-from .modes import NOWHERE, State, blend, correct, merge, mix, predict
+from .kalman import NOWHERE, State, correct, merge, mix, predict
 from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovations beyond this limit count less ...
@@ -235,14 +235,14 @@ class Thermometer:
     @property
     def acceleration(self) -> float:
         """Estimate of the second derivative [K/s^2]."""
-        return blend(self._quiet, self._bent, self.bending)[2]
+        return mix(self._quiet, self._bent, self.bending, 0.0)[0][2]
 
     @property
     def var_acceleration(self) -> float:
         """Variance of the second derivative [K^2/s^4]."""
         if self.stamp_ns is None:
             return inf
-        return blend(self._quiet, self._bent, self.bending)[8]
+        return mix(self._quiet, self._bent, self.bending, 0.0)[0][8]
 
     @property
     def noise_factor(self) -> float:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the arithmetic of one mode of the thermometer: predict, correct and blend its state.
+Owns the Kalman filters of the thermometer, one for each of its two modes: predict, correct, mix.
 
 Plain floats, written out: a matrix library costs more per call than all of this together.
 """
@@ -19,8 +19,8 @@ NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)
 
 def mix(quiet: State, bent: State, to_quiet: float, to_bent: float) -> tuple[State, State]:
     """
-    Blend each of two states with the other one: what they differ by is worked out once. Gives
-    ``blend(quiet, bent, to_quiet)`` and ``blend(bent, quiet, to_bent)``, to the bit.
+    Blend each of two states with the other one by its share of it: mean and covariance of the
+    mixture, which contains the distance of the two.
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = quiet
     u, w, b, r00, r01, r02, r11, r12, r22 = bent
@@ -114,7 +114,7 @@ def correct(state: State, measured: float, variance: float) -> tuple[State, floa
 
 def merge(one: State, other: State, share: float) -> tuple[float, float, float, float, float]:
     """
-    Mix two states as `blend` does, but for the acceleration, which is asked for rarely:
+    Mix two states as `mix` does, but for the acceleration, which is asked for rarely:
     temperature, rate; then P00, P01, P11.
     """
     t, v, _, p00, p01, _, p11, _, _ = one
@@ -128,27 +128,4 @@ def merge(one: State, other: State, share: float) -> tuple[float, float, float, 
         p00 + share * (r00 - p00) + apart * u * u,
         p01 + share * (r01 - p01) + apart * u * w,
         p11 + share * (r11 - p11) + apart * w * w,
-    )
-
-
-def blend(one: State, other: State, share: float) -> State:
-    """
-    Mix two states by the share of the other one: the covariance contains the distance of the two.
-    """
-    t, v, a, p00, p01, p02, p11, p12, p22 = one
-    u, w, b, r00, r01, r02, r11, r12, r22 = other
-    u -= t
-    w -= v
-    b -= a
-    apart = share * (1.0 - share)
-    return (
-        t + share * u,
-        v + share * w,
-        a + share * b,
-        p00 + share * (r00 - p00) + apart * u * u,
-        p01 + share * (r01 - p01) + apart * u * w,
-        p02 + share * (r02 - p02) + apart * u * b,
-        p11 + share * (r11 - p11) + apart * w * w,
-        p12 + share * (r12 - p12) + apart * w * b,
-        p22 + share * (r22 - p22) + apart * b * b,
     )
