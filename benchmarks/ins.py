@@ -1,0 +1,242 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what the drift of an accelerometer does to an inertial navigator, and what is left of it.
+
+A platform stands in the chamber of the held-out bag: whatever its navigator says of motion is
+error. It levels itself for five minutes, then navigates freely for half an hour; or it is told
+every minute that it stands (ZUPT), and then coasts for five minutes. Every minute of the run
+begins such a flight, with the raw accelerometer, with one set of coefficients, and compensated.
+
+The gyroscopes are ideal and the Earth does not turn, so nothing but the accelerometer is judged;
+the vertical channel, which no navigator has without a barometer, is held. The filter has four
+errors per level axis, position p, velocity v, tilt a and accelerometer b, as of [1]_ chapter 12::
+
+    p' = v      v' = b - g a      a' = v / R      b' = -b / tau + noise
+
+Run ``python benchmarks/ins.py --figure docs/images/ins.png``.
+
+References
+----------
+.. [1] D. Titterton, J. Weston, "Strapdown Inertial Navigation Technology", 2nd edition, 2004.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+import thermo_comp as tc
+from thermo_comp.recording import inspect_recording
+from thermo_comp.typing import Floats
+from thermo_comp.unit.correction import Correction
+
+BAGS = Path(__file__).resolve().parent.parent / 'bags'
+#: Mean radius of the Earth [m]: IUGG, R_1.
+EARTH_RADIUS = 6.371009e6
+ALIGN_S, FREE_S, COAST_S, STANDING_S = 300.0, 1800.0, 300.0, 1500.0
+#: Between two zero-velocity updates, how well they are known [m/s], and from flight to flight.
+ZUPT_S, ZUPT_SD, EVERY_S = 60.0, 1e-3, 60.0
+#: How long the accelerometer's error lasts, for the filter: some lags of a board.
+BIAS_S = 1800.0
+COLOURS = {'raw': '#b2182b', 'one set': '#e08214', 'compensated': '#2166ac'}
+
+
+def turned(angles: Floats) -> Floats:
+    """Give the matrix of a small rotation, (..., 3) to (..., 3, 3)."""
+    x, y, z = np.moveaxis(angles, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*x.shape, 3, 3)
+    return np.eye(3) + cross + 0.5 * cross @ cross
+
+
+def levelled(force: Floats) -> Floats:
+    """Give the attitude, body to east-north-up, that makes a mean force (..., 3) vertical."""
+    up = force / np.linalg.norm(force, axis=-1, keepdims=True)
+    east = np.array([1.0, 0.0, 0.0]) - up[..., :1] * up
+    east /= np.linalg.norm(east, axis=-1, keepdims=True)
+    return np.stack([east, np.cross(up, east), up], axis=-2)
+
+
+@dataclass
+class Navigator:
+    """A strapdown navigator, or many that start together: attitude, velocity, position."""
+
+    attitude: Floats
+    gravity: float
+    velocity: Floats = field(init=False)
+    position: Floats = field(init=False)
+    bias: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        zeros = np.zeros(self.attitude.shape[:-1])
+        self.velocity, self.position, self.bias = zeros, zeros.copy(), zeros.copy()
+
+    def step(self, dt: float, force: Floats, rate: Floats | float = 0.0) -> None:
+        """Integrate the specific force [m/s^2] and the body's rate [rad/s] over a time [s]."""
+        v = self.velocity
+        transport = np.stack([-v[..., 1], v[..., 0], 0.0 * v[..., 0]], -1) / EARTH_RADIUS
+        self.attitude = turned(-transport * dt) @ self.attitude @ turned(rate * dt + 0.0 * v)
+        acceleration = (self.attitude @ force[..., None])[..., 0] - self.bias
+        acceleration[..., 2] -= self.gravity
+        self.velocity = v + acceleration * dt
+        self.velocity[..., 2] = 0.0
+        self.position = self.position + self.velocity * dt
+
+    def correct(self, gain: Floats, innovation: Floats) -> None:
+        """Take the errors p, v, a, b of both level axes off, as a measurement tells them."""
+        level = innovation[..., :2, None] * gain
+        up = np.zeros((*level.shape[:-2], 1))
+        position, velocity, tilt, bias = (
+            np.concatenate([level[..., k], up], axis=-1) for k in range(4)
+        )
+        self.position = self.position - position
+        self.velocity = self.velocity - velocity
+        self.bias = self.bias + bias
+        about = np.stack([-tilt[..., 1], tilt[..., 0], up[..., 0]], -1)
+        self.attitude = turned(about) @ self.attitude
+
+
+@dataclass(frozen=True)
+class Model:
+    """One way to correct the bag: specific force (n, 3) [m/s^2], and what it claims."""
+
+    force: Floats
+    noise_density: float
+    bias_sd: float
+
+
+@dataclass(frozen=True)
+class Flights:
+    """Errors of all flights over time, shape (steps, flights), and the filter's own sigma."""
+
+    time_s: Floats
+    position: Floats
+    velocity: Floats
+    tilt: Floats
+    sigma: Floats
+
+
+def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> Flights:
+    """Level, stand with zero-velocity updates for a while, navigate freely; from every minute."""
+    n_align = round(ALIGN_S / dt)
+    n = round((zupts_s + (COAST_S if zupts_s else FREE_S)) / dt)
+    starts = np.arange(0, len(model.force) - n_align - n, round(EVERY_S / dt))
+    means = np.stack([model.force[s : s + n_align].mean(axis=0) for s in starts])
+    navigator = Navigator(levelled(means), gravity)
+    A = np.zeros((4, 4))
+    A[0, 1], A[1, 2], A[1, 3], A[2, 1], A[3, 3] = (
+        1.0, -gravity, 1.0, 1.0 / EARTH_RADIUS, -1.0 / BIAS_S,
+    )  # fmt: skip
+    F = np.eye(4) + A * dt + 0.5 * A @ A * dt * dt
+    Q = np.diag([0.0, model.noise_density**2, 0.0, 2.0 * model.bias_sd**2 / BIAS_S]) * dt
+    # Levelling turns the accelerometer's error into a tilt that hides it.
+    tilt = np.array([0.0, 0.0, 1.0 / gravity, 1.0])
+    P = np.outer(tilt, tilt) * model.bias_sd**2
+    P[2, 2] += model.noise_density**2 / ALIGN_S / gravity**2
+    rows = []
+    for k in range(n):
+        navigator.step(dt, model.force[starts + n_align + k])
+        navigator.bias *= 1.0 - dt / BIAS_S
+        P = F @ P @ F.T + Q
+        if (k + 1) % round(ZUPT_S / dt) == 0 and (k + 1) * dt <= zupts_s:
+            gain = P[:, 1] / (P[1, 1] + ZUPT_SD**2)
+            P = P - np.outer(gain, P[1])
+            navigator.correct(gain, navigator.velocity)
+        true_up = navigator.attitude @ up
+        level = [np.hypot(*v.T[:2]) for v in (navigator.position, navigator.velocity, true_up)]
+        rows.append([*level, np.full(len(starts), np.sqrt(2.0 * P[0, 0]))])
+    table = np.array(rows)
+    return Flights(np.arange(1, n + 1) * dt, *table.transpose(1, 0, 2))
+
+
+def models() -> tuple[dict[str, Model], float, Floats, float]:
+    """Fit the sample bags, correct the held-out one; also its step [s], true up and gravity."""
+    bags, held_out = sorted((BAGS / 'fit').glob('*.mcap')), BAGS / 'held_out.mcap'
+    full = tc.fit(bags, gravity=9.80665)
+    one = tc.fit(bags, gravity=9.80665, groups=('curve',), static_curve='cubic',
+                 dynamic_curve='cubic')  # fmt: skip
+    recording = tc.read(held_out)
+    found = {}
+    for name, unit in (('one set', one), ('compensated', full)):
+        out = unit.correct(recording.time_s, recording.counts, **recording.temperatures)
+        noise = np.array(Correction(unit).noise)
+        claimed = np.nanmean(np.diagonal(out.covariance, axis1=1, axis2=2), axis=0) - noise
+        density = float(np.mean(unit.noise_density_m_s2_sqrt_hz))
+        found[name] = Model(out.specific_force, density, float(np.sqrt(claimed[:2].mean())))
+    axes = [getattr(full.axes, axis) for axis in 'xyz']
+    bias = np.array([axis.bias for axis in axes])
+    scale = np.array([axis.scale_factor for axis in axes])
+    raw = (recording.counts - bias) / scale @ np.array(full.misalignment).T
+    # It claims nothing, so the filter is told what it is told of the compensated one.
+    ours = found['compensated']
+    truth = json.loads(inspect_recording(held_out).metadata['truth'])
+    return (
+        {'raw': Model(raw, ours.noise_density, ours.bias_sd), **found},
+        float(np.median(np.diff(recording.time_s))),
+        np.array(truth['up']),
+        full.gravity_m_s2,
+    )
+
+
+def draw(path: Path, results: dict[str, dict[str, Flights]]) -> None:
+    """Draw the position error of both programs over time."""
+    mpl.use('Agg')
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(9.6, 3.8), sharey=True, layout='constrained')
+    for panel, (program, flights) in zip(panels, results.items(), strict=True):
+        for name, one in flights.items():
+            minutes, colour = one.time_s / 60.0, COLOURS[name]
+            low, high = np.quantile(one.position, (0.05, 0.95), axis=1)
+            if name != 'one set':
+                panel.fill_between(minutes, low, high, color=colour, alpha=0.15, linewidth=0)
+            panel.plot(minutes, np.sqrt(np.mean(one.position**2, 1)), color=colour, label=name)
+        panel.plot(minutes, one.sigma[:, 0], color=colour, dashes=(4, 3), label="filter's sigma")
+        panel.set(yscale='log', xlabel='minutes after levelling', title=program, ylim=(1e-3, None))
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel('horizontal position error, m')
+    panels[0].legend(loc='lower right')
+    figure.savefig(path, dpi=110)
+
+
+def main() -> int:
+    """Print the table, and draw."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--figure', type=Path, help='PNG to draw')
+    options = parser.parse_args()
+    of_model, dt, up, gravity = models()
+    results = {
+        program: {name: fly(model, dt, up, gravity, zupts_s) for name, model in of_model.items()}
+        for program, zupts_s in (
+            ('free for 30 min', 0.0), ('25 min of ZUPT, 5 min coast', STANDING_S),
+        )
+    }  # fmt: skip
+    print('| program | accelerometer | position, m RMS | max | velocity, m/s RMS | tilt, urad RMS '
+          '| sigma of position, m | error / sigma |')  # fmt: skip
+    print('|---|---|---|---|---|---|---|---|')
+    for program, flights in results.items():
+        for name, one in flights.items():
+            position, velocity, tilt = (
+                float(np.sqrt(np.mean(error[-1] ** 2)))
+                for error in (one.position, one.velocity, one.tilt)
+            )
+            sigma = float(one.sigma[-1, 0])
+            print(f'| {program} | {name} | {position:.3g} | {one.position[-1].max():.3g} '
+                  f'| {velocity:.2g} | {1e6 * tilt:.3g} | {sigma:.3g} '
+                  f'| {position / sigma:.2f} |')  # fmt: skip
+    if options.figure:
+        draw(options.figure, results)
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
