@@ -11,7 +11,7 @@ VERSION = re.search(
     r"^__version__ = '([^']+)'$", (ROOT / NAME / '__init__.py').read_text(), re.MULTILINE
 ).group(1)
 
-# On Ubuntu 24.04 apt satisfies every floor but those of typer, rosbags and mcap.
+# Of the commands; the node needs numpy and yaml alone, and package.xml names those.
 INSTALL = [
     'numpy>=1.26',
     'PyYAML>=6.0',
@@ -76,7 +76,7 @@ setup(
     extras_require=EXTRAS,
     entry_points={
         'console_scripts': [
-            'thermo_comp = thermo_comp.cli.app:main',
+            'thermo_comp = thermo_comp.__main__:main',
             'thermo_comp_node = thermo_comp.ros.node:main',
         ]
     },

@@ -55,6 +55,7 @@ stamps are carried through; the node never stamps with its own clock and needs n
 | in | `temperature/board`, `temperature/case` | sensor_msgs/Temperature, degC | best effort, keep last 50 |
 | out | `imu/data_raw` | sensor_msgs/Imu, specific force in m/s^2 | reliable |
 | out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every case temperature; nothing while unknown | reliable, transient local |
+| out | `regime/stamped` | diagnostic_msgs/DiagnosticArray: the same flag with the stamp of the reading that decides; `status[0].message` is `dynamic` or `static` | reliable, transient local |
 | out | `/diagnostics` | diagnostic_msgs/DiagnosticArray, 1 Hz, hardware_id = serial | reliable |
 
 Each QoS policy can be overridden at start with the usual `qos_overrides./topic.subscription.reliability`

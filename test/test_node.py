@@ -174,6 +174,7 @@ def test_flag_is_latched_and_not_there_while_unknown(
     with node_in_thread(*saved(calibration()), *lossless()) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         flags = peer.listen(Bool, 'regime/dynamic')
+        stamped_flags = peer.listen(DiagnosticArray, 'regime/stamped')
         wait = diagnosis(peer)
         driver = drive(peer, node)
         driver.temperatures(START_NS, 20.0, 20.0)
@@ -194,6 +195,16 @@ def test_flag_is_latched_and_not_there_while_unknown(
         late = peer.listen(Bool, 'regime/dynamic', LATCHED)
         peer.wait_for(lambda: late, 'the latched flag')
         assert not late[0].data
+        # The same with the stamp of the reading that decides, latched, too.
+        latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
+        peer.wait_for(lambda: latched and len(stamped_flags) == len(flags), 'the stamped flag')
+        for array in (*stamped_flags, latched[0]):
+            (status,) = array.status
+            assert (status.message, status.hardware_id) == ('static', 'T-1')
+            assert (stamp_of(array) - START_NS) % SECOND_NS == 0
+        stamps = [stamp_of(array) for array in stamped_flags]
+        assert stamps == sorted(set(stamps))
+        assert stamp_of(latched[0]) == stamps[-1] <= START_NS + n * SECOND_NS
 
 
 def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[str]]) -> None:

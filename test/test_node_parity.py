@@ -16,6 +16,7 @@ from builders import rich_calibration
 from rosbags.highlevel import AnyReader
 
 from thermo_comp.errors import ThermoCompError
+from thermo_comp.online.stamped_flag import STAMPED_TOPIC
 from thermo_comp.recording import BagWriter, Block, ImuColumns, Topics, read_recording
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, replay
 from thermo_comp.ros.round_trip import round_trip
@@ -63,20 +64,23 @@ def thermal_test(path: Path, imu: bool = False) -> int:
     return n
 
 
-def output_of(path: Path) -> tuple[Block, list[bool]]:
-    """Read a corrected bag; the flags through a library that is not ours."""
+def output_of(path: Path) -> tuple[Block, list[bool], list[bytes]]:
+    """Read a corrected bag; the flags, and the stamped ones as bytes, by a library not ours."""
     with AnyReader([path]) as reader:
         wanted = [c for c in reader.connections if c.topic.endswith(REGIME_TOPIC)]
         flags = [
             bool(reader.deserialize(data, connection.msgtype).data)
             for connection, _, data in reader.messages(wanted)
         ]
+        wanted = [c for c in reader.connections if c.topic.endswith(STAMPED_TOPIC)]
+        stamped = [bytes(data) for _, _, data in reader.messages(wanted)]
     topics = Topics(imu=OUTPUT_TOPIC)
-    return read_recording(path, topics, 'imu', require=('accel',)).columns, flags
+    return read_recording(path, topics, 'imu', require=('accel',)).columns, flags, stamped
 
 
 def assert_same(live: Path, offline: Path) -> None:
-    (found, flags), (expected, expected_flags) = output_of(live), output_of(offline)
+    found, flags, stamped = output_of(live)
+    expected, expected_flags, expected_stamped = output_of(offline)
     assert found.frame_id == expected.frame_id
     assert found.accel_stamp_ns.tolist() == expected.accel_stamp_ns.tolist()
     different = np.flatnonzero((found.accel != expected.accel).any(axis=1))
@@ -89,6 +93,7 @@ def assert_same(live: Path, offline: Path) -> None:
     assert (len(flags), flags) == (len(expected_flags), expected_flags)
     assert False in flags
     assert True in flags
+    assert (len(stamped), stamped) == (len(flags), expected_stamped)
 
 
 def run(calibration: Calibration, bag: Path, folder: Path, *node_args: str, **keys: str) -> int:

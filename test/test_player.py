@@ -17,6 +17,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -265,6 +266,7 @@ def test_recorder_keeps_every_message_under_its_stamp(peer: Peer, tmp_path: Path
     with Recorder(tmp_path / 'out') as recorder:
         imu = peer.publisher(Imu, 'imu/data_raw')
         flag = peer.publisher(Bool, 'regime/dynamic')
+        stamped = peer.publisher(DiagnosticArray, 'regime/stamped')
         assert recorder.wait_for_publishers(TIMEOUT)
         sent = []
         for k in range(500):
@@ -277,15 +279,18 @@ def test_recorder_keeps_every_message_under_its_stamp(peer: Peer, tmp_path: Path
         flag.publish(Bool(data=True))
         assert recorder.wait_until(lambda counts: counts['regime/dynamic'] == 1, TIMEOUT)
         assert recorder.newest('regime/dynamic').data
-        assert recorder.counts == {'imu/data_raw': 500, 'regime/dynamic': 1}
+        stamped.publish(DiagnosticArray())
+        assert recorder.wait_until(lambda counts: counts['regime/stamped'] == 1, TIMEOUT)
+        assert recorder.counts == {'imu/data_raw': 500, 'regime/dynamic': 1, 'regime/stamped': 1}
     with AnyReader([tmp_path / 'out']) as reader:
         rows = [(c.topic, log_ns, bytes(data)) for c, log_ns, data in reader.messages()]
     imus = [row for row in rows if row[0].endswith('imu/data_raw')]
     assert [log_ns for _, log_ns, _ in imus] == [7 * 10**9 + k for k in range(500)]
     assert [deserialize_message(data, Imu) for _, _, data in imus] == sent
-    # A flag has no stamp: it stands at the newest one before it.
-    (flagged,) = (row for row in rows if row not in imus)
-    assert flagged[1] == 7 * 10**9 + 499
+    # What has no Imu's stamp stands at the newest one before it.
+    flagged, unstamped = (row for row in rows if row not in imus)
+    assert flagged[1] == unstamped[1] == 7 * 10**9 + 499
+    assert deserialize_message(unstamped[2], DiagnosticArray) == DiagnosticArray()
     assert deserialize_message(flagged[2], Bool).data
     block = read_recording(tmp_path / 'out', Topics(imu='imu/data_raw'), 'imu', require=('accel',))
     assert len(block.columns) == 500

@@ -10,6 +10,7 @@ import csv
 import dataclasses
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -106,11 +107,22 @@ def one_by_one(
 
 def output_of(path: Path) -> tuple[Block, list[tuple[int, bool]]]:
     """Read a corrected bag through a library that is not ours."""
-    flags = []
+    flags, stamped = [], []
     with AnyReader([path]) as reader:
         wanted = [c for c in reader.connections if c.topic == '/' + REGIME_TOPIC]
         for connection, log_ns, data in reader.messages(wanted) if wanted else ():
             flags.append((log_ns, bool(reader.deserialize(data, connection.msgtype).data)))
+        wanted = [c for c in reader.connections if c.topic == '/regime/stamped']
+        for connection, log_ns, data in reader.messages(wanted) if wanted else ():
+            array: Any = reader.deserialize(data, connection.msgtype)
+            (status,) = array.status
+            assert (array.header.frame_id, status.name, status.level) == ('', 'regime', 0)
+            assert (status.hardware_id, status.values) == ('T-1', [])
+            assert status.message in ('dynamic', 'static')
+            stamp = array.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == log_ns
+            stamped.append((log_ns, status.message == 'dynamic'))
+    assert stamped == flags
     topics = Topics(imu=OUTPUT_TOPIC)
     return read_recording(path, topics, 'imu', require=('accel',)).columns, flags
 

@@ -1,8 +1,18 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``python -m thermo_comp``: the same door as the console script."""
+"""Owns the door of the commands: the console script and ``python -m thermo_comp``."""
 
-from .cli.app import main
+import sys
+
+
+def main() -> None:
+    """Run a command; say what is missing where there is no more than the node needs."""
+    try:
+        from .cli.app import main as run
+    except ModuleNotFoundError as error:
+        sys.exit(f'thermo_comp: error: the commands need {error.name}: pip install thermo_comp')
+    run()
+
 
 if __name__ == '__main__':
     main()

@@ -12,9 +12,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .text import one_line
+
 
 class ThermoCompError(Exception):
     """Any failure that a user can cause and mend; its text is one complete line."""
+
+    def __init__(self, *parts: str | None) -> None:
+        # A file, a bag or the network may have chosen some of it.
+        super().__init__(one_line(': '.join(part for part in parts if part)))
 
 
 class CalibrationError(ThermoCompError):
@@ -36,7 +42,7 @@ class CalibrationError(ThermoCompError):
         self.path = None if path is None else str(path)
         self.key = key
         self.rule = rule
-        super().__init__(': '.join(part for part in (self.path, key, message) if part))
+        super().__init__(self.path, key, message)
 
 
 class RecordingError(ThermoCompError):
@@ -48,7 +54,7 @@ class RecordingError(ThermoCompError):
         self.message = message
         self.path = None if path is None else str(path)
         self.topic = topic
-        super().__init__(': '.join(part for part in (self.path, topic, message) if part))
+        super().__init__(self.path, topic, message)
 
 
 class OutputError(ThermoCompError):
@@ -57,7 +63,7 @@ class OutputError(ThermoCompError):
     def __init__(self, message: str, path: str | Path) -> None:
         self.message = message
         self.path = str(path)
-        super().__init__(f'{path}: {message}')
+        super().__init__(self.path, message)
 
 
 class FleetError(ThermoCompError):

@@ -26,6 +26,7 @@ from .files import shown_name
 from .online.batch import process_block
 from .online.blocks import CompensatedBlock
 from .online.compensator import Compensator
+from .online.stamped_flag import STAMPED_TOPIC, STAMPED_TYPE, stamped_flag
 from .online.status import CompensatorConfig, Counters
 from .recording import (
     BagWriter,
@@ -242,7 +243,8 @@ def replay(
             sink = _rows_of(table_writer(output, metadata, overwrite=overwrite))
         else:
             bag = BagWriter(output, metadata=metadata, overwrite=overwrite)
-            sink = _messages_of(bag, reader, frame_id, _others(reader) if all_topics else ())
+            others = _others(reader) if all_topics else ()
+            sink = _messages_of(bag, reader, metadata['serial'], frame_id, others)
         with sink as write:
             blocks = reader.blocks(raw=is_raw, n_messages=BLOCK_MESSAGES)
             for item in corrected_blocks(compensator, blocks):
@@ -270,7 +272,11 @@ def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
 
 @contextmanager
 def _messages_of(
-    bag: BagWriter, reader: RecordingReader, frame_id: str, others: Iterable[RawMessages]
+    bag: BagWriter,
+    reader: RecordingReader,
+    serial: str,
+    frame_id: str,
+    others: Iterable[RawMessages],
 ) -> Iterator[WriteBlock]:
     """Write blocks as the node's messages, and beside them what was recorded until then."""
     following = iter(others)
@@ -296,7 +302,10 @@ def _messages_of(
             )
         if item.flags:
             stamps, values = zip(*item.flags, strict=True)
-            writer.write_bool(REGIME_TOPIC, np.array(stamps, dtype=np.int64), np.array(values))
+            times = np.array(stamps, dtype=np.int64)
+            writer.write_bool(REGIME_TOPIC, times, np.array(values))
+            stamped = [stamped_flag(*flag, serial) for flag in item.flags]
+            writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
         _write_inputs(writer, block, reader)
         if len(block):
             copy(block.log_ns['accel'][-1])
@@ -337,7 +346,8 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 def _others(reader: RecordingReader) -> Iterator[RawMessages]:
     """Read the topics that are neither inputs nor outputs."""
-    taken = {OUTPUT_TOPIC, REGIME_TOPIC, *(topic.strip('/') for topic in reader.topics.values())}
+    taken = {OUTPUT_TOPIC, REGIME_TOPIC, STAMPED_TOPIC}
+    taken |= {topic.strip('/') for topic in reader.topics.values()}
     return reader.raw({topic for topic in reader.info.topics if topic.strip('/') not in taken})
 
 

@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import os
+import sys
+
 #: A serial stands in file names, parameter files and tables.
 LONGEST_SERIAL = 64
 
@@ -18,6 +21,20 @@ def one_line(text: str) -> str:
     if text.isprintable():
         return text
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def hold_standard_streams() -> None:
+    """
+    Open what of stdin, stdout and stderr is closed: no other file may get their numbers, which
+    libraries write to.
+    """
+    for number, name in enumerate(('stdin', 'stdout', 'stderr')):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            os.dup2(descriptor, number)
+            if descriptor > 2:
+                os.close(descriptor)
+            setattr(sys, name, os.fdopen(number, 'r' if number == 0 else 'w'))
 
 
 def valid_serial(serial: str) -> str:

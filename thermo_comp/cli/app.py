@@ -16,6 +16,7 @@ import typer
 
 from .. import __version__
 from ..errors import ThermoCompError
+from ..text import hold_standard_streams
 from . import (
     convert,
     demo,
@@ -90,6 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
     0: done. 1: the data or the result is bad. 2: the command line is wrong. 70: a mistake of this
     program's; its traceback goes into a file. Whatever it is, it is one line on stderr.
     """
+    hold_standard_streams()
     # Threads over small matrices wait for each other: 16 times as long where the cores are busy.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
@@ -110,6 +112,9 @@ def run(arguments: list[str]) -> int:
         return 1
     except ThermoCompError as failure:
         output.error(str(failure))
+        return 1
+    except ModuleNotFoundError as failure:
+        output.error(f'this command needs {failure.name}: pip install thermo_comp')
         return 1
     except BrokenPipeError:
         # The reader of a pipe has seen enough (`... | head`); the interpreter must not complain

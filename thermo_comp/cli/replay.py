@@ -54,9 +54,10 @@ def replay(
     """
     Correct a whole bag offline, with the values of the live node.
 
-    Writes imu/data_raw (sensor_msgs/Imu) and regime/dynamic
-    (std_msgs/Bool); the log time of each message is its stamp. Or a table
-    of the corrected samples, which leaves the other topics out.
+    Writes imu/data_raw (sensor_msgs/Imu), regime/dynamic (std_msgs/Bool)
+    and regime/stamped (the same with its stamp); the log time of each
+    message is its stamp. Or a table of the corrected samples, which leaves
+    the other topics out.
 
     Example:
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap

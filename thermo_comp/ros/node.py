@@ -10,8 +10,10 @@ are checked when they are set and change what runs between two wake-ups.
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import time
+from contextlib import suppress
 from copy import copy
 from functools import partial
 from typing import Any
@@ -21,6 +23,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.context import Context
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -34,6 +37,8 @@ from std_msgs.msg import Bool
 from ..errors import ThermoCompError
 from ..online.compensator import Compensator
 from ..online.snapshot import take_snapshot
+from ..online.stamped_flag import STAMPED_TOPIC
+from ..text import hold_standard_streams, one_line
 from . import parameters
 from .conversions import SampleConverter
 from .diagnostics import Input, Snapshot, Traffic, build
@@ -80,6 +85,11 @@ parameters:
 
 #: What the launch file calls a parameter whose argument was not given.
 NOT_GIVEN = 'not_given.'
+
+#: What files, values, the environment and the middleware do: RuntimeError is its own, too.
+_NOT_OURS = (ThermoCompError, OSError, RuntimeError, ParameterException)
+#: What a name or a quality of service of the user's does.
+_UNOPENED = (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError)
 
 _INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
 
@@ -131,7 +141,7 @@ class CompensationNode:
         for name in undeclared_overrides(self.node):
             # The input that is not open may be opened later, with these.
             if not name.startswith((*inputs, NOT_GIVEN)):
-                self._log.warning(f'there is no parameter `{name}`, it has no effect')
+                self._log.warning(f'there is no parameter `{one_line(name)}`, it has no effect')
 
     def run(self) -> None:
         """Serve until shutdown or a signal."""
@@ -161,20 +171,21 @@ class CompensationNode:
             for name in self._thermometers
         ]
         try:
-            imu, flag, self._diagnostics = (
+            imu, flag, stamped, self._diagnostics = (
                 self.node.create_publisher(
                     message_type, topic, copy(qos), qos_overriding_options=overridable
                 )
                 for message_type, topic, qos in (
                     (Imu, 'imu/data_raw', OUTPUT_QOS),
                     (Bool, 'regime/dynamic', FLAG_QOS),
+                    (DiagnosticArray, STAMPED_TOPIC, FLAG_QOS),
                     (DiagnosticArray, '/diagnostics', DIAGNOSTICS_QOS),
                 )
             )
-        except (RuntimeError, InvalidQosOverridesError) as error:
+        except _UNOPENED as error:
             raise ParameterError(f'a topic cannot be opened: {error}') from error
         converter = self._new_converter(self._config)
-        return Relay(self.node, compensator, converter, samples, temperatures, imu, flag)
+        return Relay(self.node, compensator, converter, samples, temperatures, imu, flag, stamped)
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
         return self._subscribe(*_INPUTS[config.input], SAMPLE_QOS)
@@ -184,7 +195,7 @@ class CompensationNode:
     ) -> RawSubscription:
         try:
             return self._loop.subscribe(kind, topic, qos, is_hot=is_hot)
-        except (RuntimeError, InvalidQosOverridesError) as error:
+        except _UNOPENED as error:
             raise ParameterError(f'a topic cannot be opened: {error}') from error
 
     def _new_converter(self, config: NodeConfig) -> SampleConverter:
@@ -323,16 +334,21 @@ def main(args: list[str] | None = None) -> int:
     wrong usage.
     """
     args = sys.argv if args is None else args
+    hold_standard_streams()
     try:
         extra = remove_ros_args(args)[1:]
     except RuntimeError as error:
-        print(f'thermo_comp_node: {error}', file=sys.stderr)
-        return 2
+        return _fail(error, 2)
     if extra:
         is_help = extra[0] in {'-h', '--help'}
         problem = '' if is_help else f'thermo_comp_node: unknown argument {extra[0]!r}\n'
         text = problem + USAGE + parameters.parameters_help()
-        print(text, file=sys.stdout if is_help else sys.stderr)
+        try:
+            print(text, file=sys.stdout if is_help else sys.stderr, flush=True)
+        except OSError as error:
+            # The interpreter would try again at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0 if isinstance(error, BrokenPipeError) else _fail(error, 1)
         return 0 if is_help else 2
     with SignalWatch() as signals:
         try:
@@ -341,12 +357,18 @@ def main(args: list[str] | None = None) -> int:
             _serve(signals)
         except ExternalShutdownException:
             pass
-        except ThermoCompError as error:
-            print(f'thermo_comp_node: {error}', file=sys.stderr)
-            return 1
+        except _NOT_OURS as error:
+            return _fail(error, 1)
         finally:
             rclpy.try_shutdown()
     return 0
+
+
+def _fail(error: Exception, code: int) -> int:
+    """Print the one line that a failed start leaves behind; return its exit code."""
+    with suppress(OSError):
+        print(f'thermo_comp_node: {one_line(str(error))}', file=sys.stderr, flush=True)
+    return code
 
 
 def _serve(signals: SignalWatch) -> None:

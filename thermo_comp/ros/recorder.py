@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -27,13 +28,18 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
 from ..errors import ThermoCompError
+from ..online.stamped_flag import STAMPED_TOPIC
 from ..recording import BagWriter
 from .waitloop import WaitLoop
 
 NODE_NAME = 'thermo_comp_recorder'
 
 #: The node's outputs.
-OUTPUTS: Mapping[str, Any] = {'imu/data_raw': Imu, 'regime/dynamic': Bool}
+OUTPUTS: Mapping[str, Any] = {
+    'imu/data_raw': Imu,
+    'regime/dynamic': Bool,
+    STAMPED_TOPIC: DiagnosticArray,
+}
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 _STAMP = Struct('<iI')
 

@@ -22,6 +22,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
 
 from ..online.compensator import Compensator
+from ..online.stamped_flag import stamped_flag
 from .conversions import SampleConverter, read_temperature
 from .raw import RawPublisher, RawSubscription
 from .waitloop import RCLError
@@ -55,6 +56,7 @@ class Relay:
         temperatures: Sequence[tuple[RawSubscription, Push]],
         imu: Publisher,
         flag: Publisher,
+        stamped: Publisher,
     ) -> None:
         self._node = node
         self._compensator = compensator
@@ -64,13 +66,14 @@ class Relay:
         self._temperatures: list[tuple[RawSubscription, Push]] = list(temperatures)
         self._publish = RawPublisher(imu).publish
         self._publish_flag = RawPublisher(flag).publish
+        self._publish_stamped = RawPublisher(stamped).publish
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
         #: Readings that were none.
         self.n_malformed = 0
         #: Messages that the middleware did not take.
         self.n_unpublished = 0
-        #: Changes of the flag.
+        #: Flags, one for each reading that decides.
         self.n_flags = 0
         #: Messages not used because their input had more than one publisher.
         self.n_contested = 0
@@ -168,9 +171,11 @@ class Relay:
         self._publish_flags()
 
     def _publish_flags(self) -> None:
-        for _, is_dynamic in self._compensator.take_flags():
+        for stamp_ns, is_dynamic in self._compensator.take_flags():
+            serial = self._compensator.calibration.unit.serial
             try:
                 self._publish_flag(_FLAGS[is_dynamic])
+                self._publish_stamped(stamped_flag(stamp_ns, is_dynamic, serial))
             except RCLError:
                 self._count_unpublished()
             self.n_flags += 1

@@ -28,6 +28,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from ..errors import ThermoCompError
+from ..online.stamped_flag import STAMPED_TOPIC
 from ..recording import Input, Role, Topics
 from .node import NODE_NAME
 from .player import PlayReport, play
@@ -121,6 +122,7 @@ def lossless(namespace: str = '') -> list[str]:
         *(f'{topic}.subscription.history:=keep_all' for topic in _INPUTS),
         'imu/data_raw.publisher.history:=keep_all',
         'regime/dynamic.publisher.depth:=1000',
+        f'{STAMPED_TOPIC}.publisher.depth:=1000',
     ]
     return [
         argument
@@ -164,7 +166,7 @@ def round_trip(
                 lambda _: recorder.newest('diagnostics') is not None, DISCOVERY_S
             )
         ):
-            raise ThermoCompError(node.said or 'the node was not found')
+            raise ThermoCompError(' '.join(node.said.split()) or 'the node was not found')
         played = play(
             bag,
             rate=rate,
@@ -178,7 +180,7 @@ def round_trip(
         )
         account = _wait_for_all(recorder, max(played.n_messages.values()))
         if not node.is_alive:
-            raise ThermoCompError(f'the node ended: {node.said}')
+            raise ThermoCompError(f'the node ended: {" ".join(node.said.split())}')
         return RoundTrip(played, recorder.counts, account)
 
 
@@ -218,8 +220,9 @@ def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
 
     def is_complete(counts: Mapping[str, int]) -> bool:
         account.update(_account(recorder))
-        expected = [account.get(key, '') for key in ('samples in', 'samples out', 'flags')]
-        found = [n_sent, counts['imu/data_raw'], counts['regime/dynamic']]
+        keys = ('samples in', 'samples out', 'flags', 'flags')
+        expected = [account.get(key, '') for key in keys]
+        found = [n_sent, *(counts[topic] for topic in OUTPUTS)]
         return expected == [str(count) for count in found] or time.monotonic() > deadline
 
     recorder.wait_until(is_complete, COMPLETION_S)
