@@ -3,7 +3,7 @@
 """
 Runs the fuzz targets, guided by coverage, for a time or a number of inputs.
 
-    python fuzz/run.py [calibration|mcap|cdr|db3|zstd|csv|parquet|all] [--seconds 60]
+    python fuzz/run.py [calibration|mcap|cdr|parameters|db3|zstd|csv|parquet|all] [--seconds 60]
 
 Needs the extra `fuzz` (atheris). A target fails on an exception, on an input that takes 10 s, and
 beyond 1 GiB of memory; the input is then left as `crash-*` in the working folder. What was found
@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 CORPUS = Path(__file__).resolve().parent / 'corpus'
-NAMES = ('calibration', 'mcap', 'cdr', 'db3', 'zstd', 'csv', 'parquet')
+NAMES = ('calibration', 'mcap', 'cdr', 'parameters', 'db3', 'zstd', 'csv', 'parquet')
 
 
 def main() -> int:

@@ -83,6 +83,27 @@ TOLD = [
         f'{_DEFENCE}::test_any_request_is_answered_and_samples_go_on',
     ),
     Told(
+        'a question of 100 000 names',
+        'to each service that tells of parameters',
+        'answered as one of unknown names; samples go on',
+        '',
+        f'{_DEFENCE}::test_questions_of_any_length_are_answered',
+    ),
+    Told(
+        'an environment that ROS cannot use',
+        'ROS_DOMAIN_ID is no number, the log folder cannot be made, a parameter of another type',
+        'exit code 1',
+        'one line: what ROS says of it',
+        'test_node_startup.py::test_an_environment_that_ros_cannot_use',
+    ),
+    Told(
+        'the node is started with closed streams',
+        'no stdin, stdout, stderr',
+        'runs, and ends by a signal with exit code 0',
+        '',
+        'test_node_startup.py::test_closed_streams_are_no_signal',
+    ),
+    Told(
         'a callback fails',
         'an exception in a timer, a service, the relay itself',
         'samples go on',

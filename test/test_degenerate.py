@@ -28,6 +28,7 @@ import degenerate
         ('reversed stamps', ('info', 'fit')),
         ('stamps of the limits', ('info',)),
         ('one sample', ('fit',)),
+        ('all zeros', ('fit',)),
         ('readings of one stamp', ('info',)),
         ('all values 1e308', ('report',)),
         ('name not UTF-8', ('replay',)),

@@ -38,6 +38,12 @@ def test_seeds_and_what_is_near_them(name: str, rng: np.random.Generator) -> Non
             target.check(bytes(changed))
 
 
+def test_the_runner_lists_every_target() -> None:
+    import run
+
+    assert set(run.NAMES) == set(TARGETS)
+
+
 def test_seeds_are_behind_the_first_checks() -> None:
     assert parse_calibration(TARGETS['calibration'].seeds[0]).unit.serial == 'T'
     for seed in TARGETS['mcap'].seeds:

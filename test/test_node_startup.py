@@ -15,7 +15,8 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
-from ros_helpers import TIMEOUT, Peer
+from ros_helpers import TIMEOUT, Driver, Peer, standing
+from sensor_msgs.msg import Imu
 
 from thermo_comp.ros.node import main
 from thermo_comp.ros.round_trip import NodeProcess
@@ -53,6 +54,11 @@ def unit(tmp_path: Path) -> Path:
             ],
             'a topic cannot be opened: ',
         ),
+        (
+            ['calibration_file:={unit}', 'qos_overrides./accel/counts.subscription.depth:=deep'],
+            "a topic cannot be opened: Trying to set parameter 'qos_overrides./accel/counts",
+        ),
+        (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
     ],
 )
 def test_bad_start(
@@ -83,6 +89,106 @@ def test_bad_start_as_a_process_is_one_line_too(tmp_path: Path) -> None:
     assert finished.stderr == (
         'thermo_comp_node: none: cannot be read: No such file or directory\n'
     )
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'text'),
+    [
+        ('ROS_DOMAIN_ID', 'abc', 'ROS_DOMAIN_ID is not an integral number'),
+        ('ROS_LOG_DIR', '/proc/none', "Failed to create log directory '/proc/none'"),
+    ],
+)
+def test_an_environment_that_ros_cannot_use(
+    name: str,
+    value: str,
+    text: str,
+    unit: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv(name, value)
+    assert main(arguments(f'calibration_file:={unit}')) == 1
+    said = capfd.readouterr().err.splitlines()[-1]
+    assert said.startswith('thermo_comp_node: failed to initialize')
+    assert text in said
+
+
+def test_closed_streams_are_no_signal(unit: Path) -> None:
+    # WHY: the pipe of the signals took the number of stderr, and the log's first letter was one.
+    peer = Peer()
+    shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
+    words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]
+    with subprocess.Popen(words, cwd=Path(__file__).parents[1]) as node:
+        assert peer.describe('serial')[0].description
+        node.terminate()
+        assert node.wait(TIMEOUT) == 0
+    peer.close()
+
+
+@pytest.mark.parametrize(('sink', 'code'), [('> /dev/full', 1), ('| true', 0)])
+def test_help_that_cannot_be_written(sink: str, code: int) -> None:
+    words = f'set -o pipefail; "{sys.executable}" -m thermo_comp.ros.node --help {sink}'
+    root = Path(__file__).parents[1]
+    finished = subprocess.run(
+        ['bash', '-c', words], cwd=root, capture_output=True, text=True, check=False
+    )
+    assert finished.returncode == code
+    assert 'Traceback' not in finished.stderr
+
+
+#: What the tools need and apt lacks, or the robot has no use for.
+ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
+
+
+def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
+    unit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The interpreter of the node and those that it starts import this before anything else.
+    (tmp_path / 'sitecustomize.py').write_text(
+        'import sys\n'
+        'class Absent:\n'
+        '    def find_spec(self, name, *_):\n'
+        f'        if name.partition(".")[0] in {ABSENT!r}:\n'
+        '            raise ModuleNotFoundError(name, name=name)\n'
+        'sys.meta_path.insert(0, Absent())\n'
+    )
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+    for name in ABSENT:
+        finished = subprocess.run(
+            [sys.executable, '-c', f'import {name}'], capture_output=True, text=True, check=False
+        )
+        assert f'ModuleNotFoundError: {name}' in finished.stderr
+    peer = Peer()
+    heard = peer.listen(Imu, 'imu/data_raw')
+    with NodeProcess('-p', f'calibration_file:={unit}') as node:
+        driver = Driver(peer)
+        peer.poll(lambda: peer.node.count_publishers('imu/data_raw'), 'the output')
+
+        def is_heard() -> bool:
+            stamp_ns = time.monotonic_ns()
+            driver.temperatures(stamp_ns, 20.0, 20.0)
+            driver.counts(stamp_ns, *standing(stamp_ns))
+            return bool(heard)
+
+        peer.poll(is_heard, 'a sample')
+        # Another process reads the file.
+        (result,) = peer.set_parameters(calibration_file=str(unit))
+        assert result.successful, result.reason
+        del heard[:]
+        peer.poll(is_heard, 'a sample after the reload')
+        assert node.stop() == 0
+        assert 'rror' not in node.said.replace('[ERROR]', '')
+    peer.close()
+    finished = subprocess.run(
+        [sys.executable, '-m', 'thermo_comp', 'info', unit],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert finished.returncode == 1
+    said = 'thermo_comp: error: the commands need typer: pip install thermo_comp\n'
+    assert (finished.stdout, finished.stderr) == ('', said)
 
 
 def test_usage(capfd: pytest.CaptureFixture[str]) -> None:

@@ -24,7 +24,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermo_comp.cli.app import run
-from thermo_comp.errors import FitError
+from thermo_comp.errors import (
+    CalibrationError,
+    FitError,
+    OutputError,
+    RecordingError,
+    ThermoCompError,
+)
 from thermo_comp.fitting import FitOptions, FitSource
 from thermo_comp.fitting.fit import check_serial
 from thermo_comp.recording import BagWriter
@@ -45,6 +51,18 @@ def test_one_line_is_one_harmless_line(text: str) -> None:
     shown.encode()
     if not re.search(r'[^ -~]', text):
         assert shown == text
+
+
+def test_an_error_is_one_harmless_line() -> None:
+    # WHY: of what the node prints and logs, other hands wrote paths, keys and topics.
+    for error in (
+        ThermoCompError(FORGED),
+        CalibrationError('cannot be read', FORGED, FORGED),
+        RecordingError('no such', Path('bag'), FORGED),
+        OutputError(FORGED, FORGED),
+    ):
+        assert str(error) == one_line(str(error))
+        assert one_line(FORGED) in str(error)
 
 
 @pytest.mark.parametrize('serial', BAD_SERIALS)

@@ -12,11 +12,9 @@ already one micro-g.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
 
@@ -25,10 +23,6 @@ from ..typing import Bools, Floats, Ints
 _VARIANCE_RATIO = 4.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
-# A drift takes steps like those before and after it: of so many on both sides the median is its.
-_DRIFT_STEPS = 3
-# What drifts faster is turned: relative to gravity, per second (1 mrad in a minute).
-_FASTEST_DRIFT = 2e-5
 _QUANTUM_SAMPLES = 20000
 #: How many windows a cell lasts where the samples are slow.
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)
@@ -267,9 +261,8 @@ def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
     full = cells.count >= max(2.0, 0.5 * float(np.median(cells.count)))
     if not full.any():
         return []
-    drift, bend = _drift(cells)
-    quiet = full & _is_quiet(cells, full, drift)
-    broken = ~_is_joined(cells, quiet, drift, bend)
+    quiet = full & _is_quiet(cells, full)
+    broken = ~_is_joined(cells, quiet)
     # A cell beside a moving one, or on either side of a step, holds the edge of the motion.
     moved = ~quiet
     near = moved.copy()
@@ -284,49 +277,19 @@ def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
     ]
 
 
-def _drift(cells: Cells) -> tuple[Floats, Floats]:
-    """
-    Tell the usual step about each step between cells, and how it changes there, shape (n - 1, 3).
-
-    None where it is too fast for a drift.
-    """
-    step = np.diff(cells.mean, axis=0)
-    padded = np.pad(
-        np.where(np.diff(cells.index)[:, None] == 1, step, np.nan),
-        ((_DRIFT_STEPS, _DRIFT_STEPS), (0, 0)),
-        constant_values=np.nan,
-    )
-    if not len(step):
-        return step, step
-    around = sliding_window_view(padded, 2 * _DRIFT_STEPS + 1, axis=0)
-    with warnings.catch_warnings():
-        # Between two gaps there is none.
-        warnings.simplefilter('ignore', RuntimeWarning)
-        usual = np.nan_to_num(np.nanmedian(around, axis=2))
-        before = np.nanmedian(around[:, :, :_DRIFT_STEPS], axis=2)
-        after = np.nanmedian(around[:, :, _DRIFT_STEPS + 1 :], axis=2)
-    slow = _FASTEST_DRIFT * cells.cell_s * np.linalg.norm(cells.mean[1:], axis=1)[:, None]
-    usual *= (np.abs(usual) <= slow).all(axis=1)[:, None]
-    return usual, np.minimum(np.abs(np.nan_to_num(after - before)), slow)
-
-
-def _is_quiet(cells: Cells, full: Bools, drift: Floats) -> Bools:
-    """Compare each cell's variance about its drift with the quietest tenth of the bag."""
-    slope = np.zeros_like(cells.mean)
-    slope[1:] += 0.5 * drift
-    slope[:-1] += 0.5 * drift
-    variance = cells.variance - slope**2 / 12.0
+def _is_quiet(cells: Cells, full: Bools) -> Bools:
+    """Compare each cell's variance with the quietest tenth of the bag."""
     # A sensor that reads the same number for long is no measure of its noise: toggling between two
     # neighbours has a variance of a quarter step squared.
     floor = 0.25 * cells.quantum**2
-    level = np.quantile(variance[full], 0.1, axis=0)
+    level = np.quantile(cells.variance[full], 0.1, axis=0)
     # A tenth-percentile of a chi-square variance lies a little below its mean; 1.3 covers it
     # for cells of 32 samples.
     limit = _VARIANCE_RATIO * np.maximum(1.3 * level, floor)
-    return np.asarray((variance <= limit).all(axis=1))
+    return np.asarray((cells.variance <= limit).all(axis=1))
 
 
-def _is_joined(cells: Cells, quiet: Bools, drift: Floats, bend: Floats) -> Bools:
+def _is_joined(cells: Cells, quiet: Bools) -> Bools:
     """Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step in the mean."""
     step = np.diff(cells.mean, axis=0)
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
@@ -339,5 +302,5 @@ def _is_joined(cells: Cells, quiet: Bools, drift: Floats, bend: Floats) -> Bools
     limit = np.maximum(
         _STEP_SDS * np.maximum(spread, noise), np.where(is_stuck, 1.1 * cells.quantum, 0.0)
     )
-    joined: Bools = both & (np.abs(step - drift) <= limit + bend).all(axis=1)
+    joined: Bools = both & (np.abs(step) <= limit).all(axis=1)
     return joined

@@ -16,6 +16,7 @@ from dataclasses import dataclass, fields, replace
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from ..online.status import CompensatorStatus, Counters
+from ..text import one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from .reader import LoadedCalibration
@@ -91,9 +92,11 @@ def build(
     return DiagnosticStatus(
         level=bytes([findings[0][0] if findings else 0]),
         name=f'{name}: compensation',
-        message='; '.join(text for _, text in findings) or _all_well(now),
+        message=one_line('; '.join(text for _, text in findings) or _all_well(now)),
         hardware_id=loaded.calibration.unit.serial,
-        values=[KeyValue(key=key, value=value) for key, value in _values(loaded, now, before)],
+        values=[
+            KeyValue(key=key, value=one_line(value)) for key, value in _values(loaded, now, before)
+        ],
     )
 
 

@@ -19,16 +19,29 @@ from typing import Any
 
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    GetParameterTypes,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.service import Service
 
 from ..errors import ThermoCompError
+from ..text import one_line
 from .waitloop import WaitLoop
 
 #: More requests than this that wait, or parameters in one of them, are refused.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
+#: Of a reason, which may repeat what came in.
+_LONGEST_REASON = 1000
+
+_QUESTIONS = (DescribeParameters, GetParameters, GetParameterTypes, ListParameters)
 
 #: Runs beside the samples: what takes time about a change.
 Prepare = Callable[[list[Parameter]], Any]
@@ -59,6 +72,8 @@ class ParameterRequests:
                 loop.serve(service, self._set_each)
             elif service.srv_type is SetParametersAtomically:
                 loop.serve(service, self._set_together)
+            elif service.srv_type in _QUESTIONS:
+                loop.serve(service, partial(_reply, service))
 
     def close(self) -> None:
         """Finish what is being prepared; nothing is applied any more."""
@@ -90,7 +105,8 @@ class ParameterRequests:
             self._waiting.put_nowait(partial(self._work, groups, respond))
         except (RequestError, queue.Full) as error:
             reason = str(error) or 'too many requests wait already, try again'
-            respond([_refusal(reason) for _ in groups])
+            # Not one for each: to write so many would take as long as to read them.
+            respond([_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT))
 
     def _run(self) -> None:
         """Prepare one request after the other, in the thread."""
@@ -120,9 +136,8 @@ class ParameterRequests:
             if isinstance(prepared, Exception):
                 raise prepared
             news = [one for one in changes if not self._is_in_force(one)]
-            results.append(
-                self._apply(news, prepared) if news else SetParametersResult(successful=True)
-            )
+            result = self._apply(news, prepared) if news else SetParametersResult(successful=True)
+            results.append(result if result.successful else _refusal(result.reason))
         except (ThermoCompError, ParameterNotDeclaredException) as error:
             results.append(_refusal(str(error)))
         except Exception as error:
@@ -143,6 +158,13 @@ class ParameterRequests:
         )
 
 
+def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> None:
+    """Let rclpy answer a question; one of too many names as if it knew none of them."""
+    names = request.prefixes if service.srv_type is ListParameters else request.names
+    response = service.srv_type.Response()
+    answer(response if len(names) > PARAMETERS_LIMIT else service.callback(request, response))
+
+
 def read_parameter(message: ParameterMessage) -> Parameter:
     """Read a parameter off the network; RequestError if it has no name, or a value of no type."""
     if not message.name:
@@ -158,4 +180,4 @@ def read_parameter(message: ParameterMessage) -> Parameter:
 
 
 def _refusal(reason: str) -> SetParametersResult:
-    return SetParametersResult(successful=False, reason=reason)
+    return SetParametersResult(successful=False, reason=one_line(reason[:_LONGEST_REASON]))

@@ -43,6 +43,7 @@ from rclpy.service import Service
 from rclpy.signals import SignalHandlerGuardCondition
 from rclpy.subscription import Subscription
 
+from ..text import one_line
 from .raw import RawSubscription
 
 #: While samples flow, services and timers are looked after this often [ns].
@@ -345,8 +346,9 @@ class WaitLoop:
         now = time.monotonic_ns()
         if now - self._logged_ns >= _LOG_PERIOD_NS:
             self._logged_ns = now
-            lines = ''.join(traceback.format_exception(error))
-            self._node.get_logger().error(f'a callback failed, samples go on:\n{lines}')
+            lines = ''.join(traceback.format_exception(error)).splitlines()
+            text = '\n'.join(['a callback failed, samples go on:', *map(one_line, lines)])
+            self._node.get_logger().error(text)
 
 
 def _take_request(service: Service, callback: Serve) -> None:
@@ -371,4 +373,5 @@ def _never_called(message: bytes) -> None:
 
 def undeclared_overrides(node: Node) -> list[str]:
     """Name the parameters that the user gave and the node does not have: misspelt, most likely."""
-    return sorted(name for name in node._parameter_overrides if not node.has_parameter(name))  # noqa: SLF001
+    overrides = node._parameter_overrides  # noqa: SLF001
+    return sorted(name for name in overrides if not node.has_parameter(name))
