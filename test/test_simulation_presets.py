@@ -100,7 +100,7 @@ class _Campaign:
             run = simulate(unit, program, up, rate_hz=RATE_HZ, seed=100 * seed + k)
             n = len(run.counts) // int(RATE_HZ * MINUTE)
             counts.append(_means(run.counts, int(RATE_HZ * MINUTE), n))
-            force.append(np.tile(run.truth.specific_force[0], (n, 1)))
+            force.append(np.tile(run.truth.specific_force, (n, 1)))
             self.columns.append({'board': run.board, 'case': run.case, 'n': np.array(n)})
         self.accel = (np.concatenate(counts) - unit.bias_at_reference) / unit.scale_factor
         self.force = np.concatenate(force)

@@ -16,7 +16,7 @@ Nothing here is built from a compensator's regressors, reads a file or a clock.
 """
 
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
-from .attitude import Handling, positions
+from .attitude import positions
 from .campaign import PLAN_NAMES, Position, Record, arrays, plan
 from .converter import Converter
 from .cyclogram import (
@@ -62,7 +62,6 @@ __all__ = [
     'DriftModel',
     'Effect',
     'FlowEffect',
-    'Handling',
     'LeakageEffect',
     'Link',
     'PartEffect',

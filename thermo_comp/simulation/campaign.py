@@ -9,7 +9,7 @@ Owns a whole test in memory: which positions go through which programs, and what
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,9 +28,7 @@ PLAN_NAMES = ('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """
-    One position of a test: a name, the chamber's program, the direction of the specific force.
-    """
+    """One position of a test: the chamber's program, and the direction of the specific force."""
 
     name: str
     program: Cyclogram
@@ -44,12 +42,10 @@ class Record:
 
     Parameters
     ----------
-    name : str
-        Position.
     time_s : ndarray, shape (n,)
-        Ends of the cycles (of the windows, where means were asked for) from the start, s.
+        Ends of the cycles from the start, s.
     counts : ndarray, shape (n, 3)
-        Output per cycle (its means), counts.
+        Output per cycle, counts.
     board_time_s, board, case_time_s, case : ndarray, shape (m,)
         Readings of the thermometers: instants [s] and values [degC].
     specific_force : ndarray, shape (3,)
@@ -91,21 +87,12 @@ class Record:
 
 def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
-    Return the positions of a test.
+    Return the positions of a test in the order of their recording.
 
-    Parameters
-    ----------
-    name : str
-        'chamber-18' (18 positions of 9.5 h), 'chamber-9' (9 of 3 h), 'tumble' (18 of 20 min at
-        room temperature), 'tumble-3', 'tumble-1' (the same and 3 or 1 of 3 h in the chamber) or
-        'held-out' (3 positions with other ramps and attitudes, for judging).
-    seed : int, optional
-        Seed of the attitudes and of the room's temperature.
-
-    Returns
-    -------
-    tuple of Position
-        The positions in the order of their recording.
+    'chamber-18' (18 positions of 9.5 h), 'chamber-9' (9 of 3 h), 'tumble' (18 of 20 min at room
+    temperature), 'tumble-3', 'tumble-1' (the same and 3 or 1 of 3 h in the chamber) or 'held-out'
+    (3 positions with other ramps and attitudes, for judging). `seed` is that of the attitudes and
+    of the room's temperature.
 
     Raises
     ------
@@ -146,34 +133,9 @@ def arrays(
     seed: int = 0,
     *,
     rate_hz: float = 4.0,
-    window_s: float | None = None,
     gravity: float = STANDARD_GRAVITY,
 ) -> list[Record]:
-    """
-    Run a unit through a test in memory.
-
-    Parameters
-    ----------
-    unit : UnitModel
-        The unit.
-    stations : iterable of Position
-        The test, e.g. from `plan`.
-    seed : int, optional
-        Seed of the noise; each position has its own.
-    rate_hz : float, optional
-        Conversion cycles per second.
-    window_s : float or None, optional
-        Windows whose means are wanted instead of the cycles, whole seconds: the same statistics,
-        rounding included, a hundred times sooner.
-    gravity : float, optional
-        Local gravity, m/s^2.
-
-    Returns
-    -------
-    list of Record
-        One for each position.
-
-    """
+    """Run a unit through a test in memory; each position has a seed of its own."""
     solved: dict[Cyclogram, ThermalTruth] = {}
     records = []
     for number, station in enumerate(stations):
@@ -183,16 +145,12 @@ def arrays(
         thermal = None if unit.loads else solved.get(station.program)
         chamber = Chamber(unit, station.program, station.up, options, thermal)
         solved[station.program] = chamber.thermal
-        if window_s is None:
-            (run,) = chamber.blocks(chamber.n_cycles)
-            time_s, counts = _seconds(run.accel_stamp_ns), run.counts.astype(np.float64)
-        else:
-            time_s, counts = _window_means(unit, chamber, station.up, options, window_s)
+        (run,) = chamber.blocks(chamber.n_cycles)
         records.append(
             Record(
                 station.name,
-                time_s,
-                counts,
+                _seconds(run.accel_stamp_ns),
+                run.counts.astype(np.float64),
                 _seconds(chamber.board[0]),
                 chamber.board[1],
                 _seconds(chamber.case[0]),
@@ -207,28 +165,3 @@ def arrays(
 
 def _seconds(stamp_ns: Ints) -> Floats:
     return stamp_ns.astype(np.float64) * 1e-9
-
-
-def _window_means(
-    unit: UnitModel, chamber: Chamber, up: Floats, options: RunOptions, window_s: float
-) -> tuple[Floats, Floats]:
-    """
-    Return ends and means of whole windows: a window is one long cycle of a converter to match.
-    """
-    per_s, cycles = round(window_s), round(window_s * options.rate_hz)
-    n = (len(chamber.bias) - 1) // per_s
-    bias, scale = (
-        x[: n * per_s].reshape(n, per_s, 3).mean(axis=1)
-        for x in (chamber.bias, chamber.thermal.scale)
-    )
-    force = options.gravity * np.linalg.solve(unit.M, up)
-    # Cycles that are rounded each by itself make white noise of it.
-    rounding = 0.0 if unit.converter.carries_remainder else cycles / 12.0
-    density = np.array(unit.noise_density) * unit.counts_per_micro_g
-    noise_sd = np.sqrt(cycles**2 * density**2 / window_s + rounding)
-    noise = [generator(options.seed, Stream.ACCEL_NOISE, i).standard_normal(n) for i in range(3)]
-    charge = cycles * (bias + np.array(unit.scale_factor) * scale * force)
-    charge += noise_sd * np.stack(noise, axis=1)
-    converter = replace(unit.converter, bits=31)
-    counts, _ = converter.convert(charge, converter.start(options.seed))
-    return window_s * np.arange(1.0, n + 1.0), counts / cycles

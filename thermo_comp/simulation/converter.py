@@ -26,14 +26,9 @@ _ROWS = 1 << 20  # rows summed at once: 2^20 fractions below 2^40 stay far below
 @dataclass(frozen=True)
 class Converter:
     """
-    Signed integer converter of a current into counts per cycle.
+    Signed integer converter, `bits` wide in two's complement, of a current into counts per cycle.
 
-    Parameters
-    ----------
-    bits : int, optional
-        Width of the output word, two's complement.
-    carries_remainder : bool, optional
-        True balances charge; False rounds every cycle by itself, as a sampling converter does.
+    It balances charge, or rounds every cycle by itself, as a sampling converter does.
 
     Raises
     ------
@@ -60,20 +55,7 @@ class Converter:
         return (1 << (self.bits - 1)) - 1
 
     def start(self, seed: int) -> Ints:
-        """
-        Return the charge on the integrators at power-on.
-
-        Parameters
-        ----------
-        seed : int
-            Seed of the run.
-
-        Returns
-        -------
-        ndarray of int64, shape (3,)
-            Remainder per axis in units of 2^-40 count, within one count.
-
-        """
+        """Return the charge on the integrators at power-on, shape (3,), in 2^-40 count."""
         return np.array(
             [generator(seed, Stream.CONVERTER_PHASE, axis).integers(_ONE) for axis in range(3)],
             dtype=np.int64,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,28 +17,20 @@ from numpy.typing import ArrayLike
 from ..typing import Floats
 
 _MINUTE = 60.0
-_HOUR = 3600.0
 _STEP = re.compile(
     r'^(?P<target>[+-]?\d+(?:\.\d*)?|[+-]?\.\d+)'
     r'(?:\s*@\s*(?P<rate>\d+(?:\.\d*)?|\.\d+))?'
     r'(?:\s+(?P<soak>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>h|min|s))?$'
 )
-_SECONDS = {'h': _HOUR, 'min': _MINUTE, 's': 1.0}
+_SECONDS = {'h': 3600.0, 'min': _MINUTE, 's': 1.0}
 
 
 @dataclass(frozen=True)
 class Cyclogram:
     """
-    Air temperature in the chamber over time: straight lines between points.
+    Air temperature [degC] in the chamber over time [s]: straight lines between points.
 
     Before the first point the air rests at the first temperature, after the last one at the last.
-
-    Parameters
-    ----------
-    time_s : sequence of float, shape (n,)
-        Times of the points from the start of the program, the first 0, strictly increasing, s.
-    temperature_c : sequence of float, shape (n,)
-        Air temperature at the points, degC.
 
     Raises
     ------
@@ -77,42 +69,13 @@ class Cyclogram:
         return rates
 
     def at(self, time: ArrayLike) -> Floats:
-        """
-        Return the programmed air temperature.
-
-        Parameters
-        ----------
-        time : array_like, shape (m,)
-            Seconds from the start of the program.
-
-        Returns
-        -------
-        ndarray, shape (m,)
-            Air temperature, degC.
-
-        """
+        """Return the programmed air temperature [degC] at times [s] from the start, shape (m,)."""
         air: Floats = np.interp(np.asarray(time, dtype=float), self.time_s, self.temperature_c)
         return air
 
     def cut(self, duration: float) -> Cyclogram:
         """
         Return the program up to a time, or drawn out to it by resting at its last temperature.
-
-        Parameters
-        ----------
-        duration : float
-            New length, s.
-
-        Returns
-        -------
-        Cyclogram
-            The program of that length.
-
-        Raises
-        ------
-        ValueError
-            If `duration` is not positive.
-
         """
         if not duration > 0.0:
             raise ValueError(f'`duration` must be positive, got {duration}')
@@ -124,21 +87,12 @@ class Cyclogram:
 
 def ramps_and_soaks(start: float, soak: float, steps: Sequence[Sequence[float]]) -> Cyclogram:
     """
-    Build a program from ramps, each followed by a soak.
-
-    Parameters
-    ----------
-    start : float
-        First temperature, degC.
-    soak : float
-        Rest at the first temperature, minutes; 0 starts with the first ramp.
-    steps : sequence of (target, rate, soak)
-        Target temperature [degC], rate [K/min, its sign is ignored], soak there [minutes].
+    Build a program from a first soak [min] and steps: target [degC], rate [K/min], soak [min].
 
     Raises
     ------
     ValueError
-        If a rate is not positive or a soak is negative.
+        If a rate is 0 or a soak is negative.
 
     """
     time, temperature = [0.0], [float(start)]
@@ -163,17 +117,12 @@ def ramps_and_soaks(start: float, soak: float, steps: Sequence[Sequence[float]])
 
 def parse_cyclogram(text: str) -> Cyclogram:
     """
-    Read a program that a user typed.
+    Read a program that a user typed, or the name of a ready-made one.
 
-    Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target
-    in degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is
-    the starting temperature and takes no rate; a later one without a rate keeps the last rate
-    (1 K/min if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
-
-    Parameters
-    ----------
-    text : str
-        The steps, or the name of a preset.
+    Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target in
+    degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the
+    starting temperature and takes no rate; a later one without a rate keeps the last rate (1 K/min
+    if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
 
     Raises
     ------
@@ -181,7 +130,7 @@ def parse_cyclogram(text: str) -> Cyclogram:
         If a step cannot be read, with its number and text, or the program has no duration.
 
     """
-    if text.strip() in _PRESETS:
+    if text.strip() in _PROGRAMS:
         return cyclogram_preset(text.strip())
     steps: list[tuple[float, float, float]] = []
     rate = 1.0
@@ -204,96 +153,48 @@ def _is_rate_wrong(number: int, rate: str | None) -> bool:
     return rate is not None and (number == 1 or float(rate) == 0.0)
 
 
+# First temperature, first soak [min], then target, rate [K/min] and soak [min] of each step.
+_Steps = tuple[float, float, list[tuple[float, float, float]]]
+_PROGRAMS: dict[str, _Steps] = {
+    # The range and the style of the paper's Fig. 3: up, down and back, with long soaks.
+    'paper': (
+        20, 60, [(35, 0.5, 90), (20, 0.5, 60), (5, 0.5, 90), (20, 0.5, 60), (35, 0.5, 60)]
+    ),
+    # Four hours, one bag of a calibration: the whole range, both directions, two ramp rates.
+    'chamber': (20, 20, [(35, 0.75, 35), (5, 0.6, 45), (20, 0.75, 35), (8, 1, 23)]),
+    # The shortest that shows the whole range, both directions and some rest.
+    'three-hours': (20, 10, [(35, 0.8, 30), (5, 1.2, 40), (22, 0.5, 22.25)]),
+    # Nine hours and a half: slow and quick ramps both ways, so that no other is beyond them.
+    'long': (20, 30, [(35, 0.5, 60), (5, 1, 60), (25, 0.3, 40), (10, 0.7, 45), (33, 0.9, 40),
+                      (15, 0.35, 40), (20, 0.5, 20)]),
+    # Other rates, other soak temperatures and another order: what a fit never saw.
+    'held-out': (
+        12, 40, [(31, 0.35, 45), (17, 0.9, 30), (26, 0.6, 50), (7, 0.7, 60), (22, 0.25, 40)]
+    ),
+    'staircase': (
+        5, 60, [*((c, 1, 60) for c in range(10, 36, 5)), *((c, 1, 60) for c in range(30, 4, -5))]
+    ),
+    'triangle': (20, 10, [(35, 0.4, 0), (5, 0.4, 0), (35, 0.4, 0), (5, 0.4, 0)]),
+    'slow': (20, 60, [(35, 0.1, 60), (5, 0.2, 60), (20, 0.15, 60)]),
+    'fast': (20, 45, [(35, 3, 75), (5, 2, 90), (25, 1.5, 75), (10, 3, 60)]),
+    # Ninety minutes: short enough for a bag that ships, with both regimes and both directions.
+    'demo': (15, 12, [(30, 1, 22), (8, 1.1, 21)]),
+    'soak': (20, 240, []),
+}  # fmt: skip
+CYCLOGRAM_NAMES = tuple(_PROGRAMS)
+
+
 def cyclogram_preset(name: str) -> Cyclogram:
     """
-    Return a ready-made program.
-
-    Parameters
-    ----------
-    name : str
-        One of `CYCLOGRAM_NAMES`.
+    Return one of the ready-made programs, `CYCLOGRAM_NAMES`.
 
     Raises
     ------
     ValueError
-        If there is no such preset.
+        If there is no such program.
 
     """
-    if name not in _PRESETS:
+    if name not in _PROGRAMS:
         raise ValueError(f'`name` must be one of {", ".join(CYCLOGRAM_NAMES)}, got {name!r}')
-    return _PRESETS[name]()
-
-
-def _paper() -> Cyclogram:
-    # The range and the style of the paper's Fig. 3: up, down and back, with long soaks.
-    return ramps_and_soaks(
-        20.0, 60.0, [(35, 0.5, 90), (20, 0.5, 60), (5, 0.5, 90), (20, 0.5, 60), (35, 0.5, 60)]
-    )
-
-
-def _chamber() -> Cyclogram:
-    # Four hours, one bag of a calibration: the whole range, both directions, two ramp rates.
-    return ramps_and_soaks(20.0, 20.0, [(35, 0.75, 35), (5, 0.6, 45), (20, 0.75, 35), (8, 1, 23)])
-
-
-def _three_hours() -> Cyclogram:
-    # The shortest that shows the whole range, both directions and some rest.
-    return ramps_and_soaks(20.0, 10.0, [(35, 0.8, 30), (5, 1.2, 40), (22, 0.5, 22.25)])
-
-
-def _long() -> Cyclogram:
-    # Nine hours and a half: slow and quick ramps both ways, so that no other is beyond them.
-    return ramps_and_soaks(
-        20.0, 30.0, [(35, 0.5, 60), (5, 1, 60), (25, 0.3, 40), (10, 0.7, 45), (33, 0.9, 40),
-                     (15, 0.35, 40), (20, 0.5, 20)],
-    ).cut(9.5 * _HOUR)  # fmt: skip
-
-
-def _held_out() -> Cyclogram:
-    # Other rates, other soak temperatures and another order than 'paper': what a fit never saw.
-    return ramps_and_soaks(
-        12.0, 40.0, [(31, 0.35, 45), (17, 0.9, 30), (26, 0.6, 50), (7, 0.7, 60), (22, 0.25, 40)]
-    )
-
-
-def _staircase() -> Cyclogram:
-    up = [(c, 1.0, 60.0) for c in range(10, 36, 5)]
-    down = [(c, 1.0, 60.0) for c in range(30, 4, -5)]
-    return ramps_and_soaks(5.0, 60.0, up + down)
-
-
-def _triangle() -> Cyclogram:
-    return ramps_and_soaks(20.0, 10.0, [(35, 0.4, 0), (5, 0.4, 0), (35, 0.4, 0), (5, 0.4, 0)])
-
-
-def _slow() -> Cyclogram:
-    return ramps_and_soaks(20.0, 60.0, [(35, 0.1, 60), (5, 0.2, 60), (20, 0.15, 60)])
-
-
-def _fast() -> Cyclogram:
-    return ramps_and_soaks(20.0, 45.0, [(35, 3, 75), (5, 2, 90), (25, 1.5, 75), (10, 3, 60)])
-
-
-def _demo() -> Cyclogram:
-    # Ninety minutes: short enough for a bag that ships, with both regimes and both directions.
-    return ramps_and_soaks(15.0, 12.0, [(30, 1.0, 22), (8, 1.1, 21)])
-
-
-def _soak() -> Cyclogram:
-    return Cyclogram((0.0, 4 * _HOUR), (20.0, 20.0))
-
-
-_PRESETS: dict[str, Callable[[], Cyclogram]] = {
-    'paper': _paper,
-    'chamber': _chamber,
-    'three-hours': _three_hours,
-    'long': _long,
-    'held-out': _held_out,
-    'staircase': _staircase,
-    'triangle': _triangle,
-    'slow': _slow,
-    'fast': _fast,
-    'demo': _demo,
-    'soak': _soak,
-}
-CYCLOGRAM_NAMES = tuple(_PRESETS)
+    program = ramps_and_soaks(*_PROGRAMS[name])
+    return program.cut(9.5 * 3600.0) if name == 'long' else program

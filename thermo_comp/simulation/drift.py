@@ -26,19 +26,10 @@ ZERO: Triple = (0.0, 0.0, 0.0)
 @dataclass(frozen=True, eq=False)
 class PartHistory:
     """
-    What the parts went through, on an even grid.
+    What the parts went through, on an even grid of `step` seconds.
 
-    Parameters
-    ----------
-    nodes : tuple of str
-        Parts, the columns of the arrays.
-    deviation : ndarray, shape (m, n_parts)
-        Temperatures from the reference's still state, K.
-    origin : ndarray, shape (n_parts,)
-        Temperatures in that state, degC.
-    step : float
-        Step of the grid, s.
-
+    `deviation`, shape (m, n_parts), are the temperatures from the reference's still state, K, and
+    `origin`, shape (n_parts,), those in that state, degC; columns in the order of `nodes`.
     """
 
     nodes: tuple[str, ...]
@@ -66,13 +57,7 @@ class Effect:
     """
     One cause of errors; per axis ``bias * first + bias_curvature * second``, the scale likewise.
 
-    Parameters
-    ----------
-    scale, scale_curvature : tuple of float, optional
-        Relative scale change per unit of the first and the second signal, ppm.
-    bias, bias_curvature : tuple of float, optional
-        Bias change per unit of the first and the second signal, ug.
-
+    Bias changes in ug and scale changes in ppm per unit of the first and the second signal.
     """
 
     scale: Triple = ZERO
@@ -125,23 +110,10 @@ class FlowEffect(Effect):
     What a heat flow does whichever way it goes, less what it does at rest.
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent``: a gas that rises in
-    a gap (1.25), the load of a heat pump (1), its losses (2). Where the supply of the pump limits
-    it, the signal levels off at 1, ``x^e / (1 + x^e)``: then it is a matter of on and off. The
-    second signal is the first times the deviation of `cold`.
-
-    Parameters
-    ----------
-    hot, cold : str
-        The parts.
-    exponent : float, optional
-        Growth with the difference.
-    knee : float, optional
-        Difference at which the signal is 1, or half of where it levels off, K.
-    is_limited : bool, optional
-        Whether it levels off.
-    power : int, optional
-        How the first signal changes with the deviation of `cold`.
-
+    a gap (1.25), the load of a heat pump (1), its losses (2); times the deviation of `cold` to the
+    `power`. Where the supply of the pump limits it, the signal levels off at 1, ``x^e / (1 +
+    x^e)``: then it is a matter of on and off. The second signal is the first times the deviation
+    of `cold`.
     """
 
     hot: str

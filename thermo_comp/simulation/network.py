@@ -23,17 +23,10 @@ AIR = 'air'
 @dataclass(frozen=True)
 class Link:
     """
-    Heat path between two parts, or between a part and the air.
+    Heat path between two parts, or between a part and the chamber's air, `AIR`.
 
-    Parameters
-    ----------
-    a, b : str
-        The parts; `AIR` stands for the chamber's air.
-    conductance : float
-        Conductance of the path, W/K (at 1 K, with convection).
-    exponent : float, optional
-        The heat flows as this power of the difference: 1 by conduction, 1.25 by free convection.
-
+    The conductance is in W/K (at 1 K, with convection); the heat flows as the power `exponent` of
+    the difference: 1 by conduction, 1.25 by free convection.
     """
 
     a: str
@@ -45,23 +38,10 @@ class Link:
 @dataclass(frozen=True)
 class Thermostat:
     """
-    Proportional-integral heater with a soft start.
+    Proportional-integral heater of one part, which holds `set_point` [degC].
 
-    Parameters
-    ----------
-    node : str
-        Part that is heated and measured.
-    set_point : float
-        Temperature to hold, degC.
-    proportional : float
-        Proportional gain, W/K.
-    integral : float
-        Integral gain, W/(K s).
-    soft_start : float
-        Time constant with which the set point is approached after power-on, s.
-    max_power : float
-        Most that the heater can give, W; the least is 0.
-
+    Gains in W/K and W/(K s); `soft_start` is the time constant with which the set point is
+    approached after power-on, s; the heater gives 0 to `max_power` W.
     """
 
     node: str
@@ -75,18 +55,9 @@ class Thermostat:
 @dataclass(frozen=True)
 class ThermalNetwork:
     """
-    Parts with heat capacities, the paths between them, and the power they dissipate.
+    Parts with heat capacities [J/K], the paths between them, and the power [W] they dissipate.
 
-    Parameters
-    ----------
-    capacity : mapping of str to float
-        Heat capacity of each part, J/K; its keys name the parts and fix their order.
-    links : tuple of Link
-        Heat paths; at least one leads to the air.
-    power : mapping of str to float, optional
-        Constant dissipation of parts while the unit is on, W.
-    thermostat : Thermostat or None, optional
-        Heater of one part.
+    The keys of `capacity` name the parts and fix their order.
 
     Raises
     ------
@@ -138,15 +109,8 @@ class ThermalNetwork:
         """
         Return the matrices of ``dx/dt = A x + b u + p``, convection left out.
 
-        Returns
-        -------
-        A : ndarray, shape (k, k)
-            State matrix, 1/s; the parts first, then the thermostat's integral and set point.
-        b : ndarray, shape (k,)
-            What the air temperature drives, 1/s.
-        p : ndarray, shape (k,)
-            Constant drive, K/s.
-
+        Shapes (k, k), (k,) and (k,): the parts first, then the thermostat's integral and set
+        point.
         """
         n = len(self.nodes)
         size = n + (0 if self.thermostat is None else 2)
@@ -215,42 +179,14 @@ class ThermalNetwork:
         return state
 
     def equilibrium(self, air: float) -> Floats:
-        """
-        Return the temperatures after an endless soak.
-
-        Parameters
-        ----------
-        air : float
-            Air temperature, degC.
-
-        Returns
-        -------
-        ndarray, shape (n_parts,)
-            Temperatures of the parts, degC.
-
-        """
+        """Return the temperatures [degC] of the parts after an endless soak, shape (n_parts,)."""
         A, b, p = self.system()
         if self.is_convective:
             return self.settled(air, p)[: len(self.nodes)]
         return np.asarray(np.linalg.solve(A, -b * air - p)[: len(self.nodes)], dtype=np.float64)
 
     def air_for(self, node: str, temperature: float) -> float:
-        """
-        Return the air temperature whose endless soak brings a part to a temperature.
-
-        Parameters
-        ----------
-        node : str
-            Part.
-        temperature : float
-            Its temperature, degC.
-
-        Returns
-        -------
-        float
-            Air temperature, degC.
-
-        """
+        """Return the air temperature whose endless soak brings a part to a temperature."""
         i, air = self.nodes.index(node), 0.0
         for _ in range(20 if self.is_convective else 1):
             cold, hot = self.equilibrium(air)[i], self.equilibrium(air + 1.0)[i]
@@ -258,20 +194,7 @@ class ThermalNetwork:
         return air
 
     def heater_power(self, air: float) -> float:
-        """
-        Return what the thermostat spends in an endless soak, 0 W without one.
-
-        Parameters
-        ----------
-        air : float
-            Air temperature, degC.
-
-        Returns
-        -------
-        float
-            Heater power, W.
-
-        """
+        """Return what the thermostat spends in an endless soak, W; 0 without one."""
         if self.thermostat is None:
             return 0.0
         A, b, p = self.system()

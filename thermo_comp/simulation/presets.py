@@ -69,6 +69,9 @@ class _Specimen:
         a, b, c = self.normal(sd)
         return (1.0, 0.0, 0.0), (a, 1.0, 0.0), (b, c, 1.0)
 
+    def heat(self, **capacity: float) -> dict[str, float]:
+        return {part: self.near(value) for part, value in capacity.items()}
+
     def links(self, *paths: tuple[str, str, float]) -> tuple[Link, ...]:
         return tuple(Link(a, b, self.near(conductance)) for a, b, conductance in paths)
 
@@ -110,29 +113,18 @@ class _Specimen:
 def _thermostatted(seed: int) -> UnitModel:
     draw = _Specimen('thermostatted', seed)
     network = ThermalNetwork(
-        capacity={
-            'case': draw.near(1500.0),
-            'board': draw.near(110.0),
-            'cover': draw.near(65.0),
-            'reference': draw.near(12.0),
-            'integrator': draw.near(25.0),
-            'oven': draw.near(200.0),
-            'head': draw.near(400.0),
-        },
+        capacity=draw.heat(
+            case=1500, board=110, cover=65, reference=12, integrator=25, oven=200, head=400
+        ),
         links=draw.links(
-            (AIR, 'case', 5.0),
-            ('case', 'board', 0.40),
-            ('board', 'cover', 0.16),
-            ('cover', 'reference', 0.04),
-            ('board', 'reference', 0.03),
-            ('board', 'integrator', 0.03),
-            ('case', 'oven', 0.15),
-            ('board', 'oven', 0.02),
+            (AIR, 'case', 5.0), ('case', 'board', 0.40), ('board', 'cover', 0.16),
+            ('cover', 'reference', 0.04), ('board', 'reference', 0.03),
+            ('board', 'integrator', 0.03), ('case', 'oven', 0.15), ('board', 'oven', 0.02),
             ('oven', 'head', 1.5),
         ),
         power={'board': 0.8, 'reference': 0.02, 'head': 0.3},
         thermostat=Thermostat('oven', 55.0, 20.0, 0.08, 1800.0, 25.0),
-    )
+    )  # fmt: skip
     drift = DriftModel(
         effects=(
             # The reference current sets the scale of all axes; its curvature is a bandgap's.
@@ -155,31 +147,17 @@ def _thermostatted(seed: int) -> UnitModel:
 def _bare_quartz(seed: int) -> UnitModel:
     draw = _Specimen('bare-quartz', seed)
     network = ThermalNetwork(
-        capacity={
-            'case': draw.near(900.0),
-            'board': draw.near(150.0),
-            'cover': draw.near(45.0),
-            'reference': draw.near(10.0),
-            'head': draw.near(120.0),
-            'magnet': draw.near(25.0),
-            'mount': draw.near(50.0),
-            'pendulum': draw.near(3.0),
-        },
+        capacity=draw.heat(
+            case=900, board=150, cover=45, reference=10, head=120, magnet=25, mount=50, pendulum=3
+        ),
         links=draw.links(
-            (AIR, 'case', 4.0),
-            ('case', 'board', 0.50),
-            ('board', 'cover', 0.12),
-            ('cover', 'reference', 0.04),
-            ('board', 'reference', 0.02),
-            ('board', 'head', 4.0),
-            ('head', 'magnet', 0.80),
-            ('head', 'mount', 0.05),
-            ('case', 'mount', 0.01),
-            ('head', 'pendulum', 0.01),
-            ('magnet', 'pendulum', 0.01),
+            (AIR, 'case', 4.0), ('case', 'board', 0.50), ('board', 'cover', 0.12),
+            ('cover', 'reference', 0.04), ('board', 'reference', 0.02), ('board', 'head', 4.0),
+            ('head', 'magnet', 0.80), ('head', 'mount', 0.05), ('case', 'mount', 0.01),
+            ('head', 'pendulum', 0.01), ('magnet', 'pendulum', 0.01),
         ),
         power={'board': 0.6, 'magnet': 0.02},
-    )
+    )  # fmt: skip
     drift = DriftModel(
         effects=(
             PartEffect(
@@ -203,20 +181,13 @@ def _bare_quartz(seed: int) -> UnitModel:
 def _mems(seed: int) -> UnitModel:
     draw = _Specimen('mems', seed)
     network = ThermalNetwork(
-        capacity={
-            'case': draw.near(60.0),
-            'board': draw.near(12.0),
-            'package': draw.near(0.6),
-            'die': draw.near(0.05),
-        },
+        capacity=draw.heat(case=60, board=12, package=0.6, die=0.05),
         links=draw.links(
-            (AIR, 'case', 0.5),
-            ('case', 'board', 0.08),
-            ('board', 'package', 0.02),
+            (AIR, 'case', 0.5), ('case', 'board', 0.08), ('board', 'package', 0.02),
             ('package', 'die', 0.01),
         ),
         power={'board': 0.15, 'die': 0.004},
-    )
+    )  # fmt: skip
     drift = DriftModel(
         effects=(
             PartEffect(
@@ -380,18 +351,9 @@ _EXTRA: dict[str, Callable[[_Specimen], list[Effect]]] = {
 # With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
 _TRIAD_DENSITY = 3.0
 TRIAD_NAMES = (
-    'own-lags',
-    'between',
-    'products',
-    'hysteresis',
-    'even',
-    'convection',
-    'switched-load',
-    'paper',
-    'slow-noise',
-    'plain',
-    'demo',
-)
+    'own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load',
+    'paper', 'slow-noise', 'plain', 'demo',
+)  # fmt: skip
 _PRESETS: dict[str, Callable[[int], UnitModel]] = {
     'thermostatted': _thermostatted,
     'bare-quartz': _bare_quartz,
@@ -403,27 +365,21 @@ UNIT_NAMES = tuple(_PRESETS)
 
 def unit_preset(name: str, seed: int = 0) -> UnitModel:
     """
-    Return one specimen of a kind of unit.
+    Return one specimen of a kind of unit; another one for every seed, which is not negative.
 
-    Parameters
-    ----------
-    name : str
-        One of `UNIT_NAMES`. 'thermostatted' (quartz triad in an oven, the converter's board
-        outside: the board's drift dominates), 'bare-quartz' (no oven: the magnet's scale tempco
-        dominates), 'mems', or a triad with one kind of physics beside tempcos that lag:
-        'own-lags' (a time constant for each head), 'between' (heads between case and board),
-        'products' (expansion coefficients that change with temperature), 'hysteresis' (joints
-        that slip), 'even' (errors even in the heat flow), 'convection' (heat that flows through
-        gas, and a leakage), 'switched-load' (electronics that heat by turns), 'paper' (a load
-        while the ambient changes), 'slow-noise' (a bias that walks), 'plain' (no thermal error
-        at all), 'demo' (the sample unit: paper and lags).
-    seed : int, optional
-        Another specimen for every seed, not negative.
+    'thermostatted' (quartz triad in an oven, the converter's board outside: the board's drift
+    dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates), 'mems', or a triad
+    with one kind of physics beside tempcos that lag: 'own-lags' (a time constant for each head),
+    'between' (heads between case and board), 'products' (expansion coefficients that change with
+    temperature), 'hysteresis' (joints that slip), 'even' (errors even in the heat flow),
+    'convection' (heat that flows through gas, and a leakage), 'switched-load' (electronics that
+    heat by turns), 'paper' (a load while the ambient changes), 'slow-noise' (a bias that walks),
+    'plain' (no thermal error at all), 'demo' (the sample unit: paper and lags).
 
     Raises
     ------
     ValueError
-        If there is no such preset.
+        If there is no such kind.
 
     """
     if name not in _PRESETS:

@@ -32,10 +32,8 @@ class ThermalResponse:
     ----------
     network : ThermalNetwork
         The parts.
-    knot_time : array_like, shape (m,)
-        Times of the air temperature's knots, increasing, s.
-    knot_air : array_like, shape (m,)
-        Air temperature at the knots, degC; straight between them.
+    knot_time, knot_air : array_like, shape (m,)
+        Times [s] and air temperatures [degC] of knots; straight between them.
     power : array_like, shape (m - 1, n_parts), optional
         What the parts dissipate between the knots beside the network's constant powers, W.
     is_warm : bool, optional
@@ -125,18 +123,7 @@ class ThermalResponse:
 
     def states(self, time: ArrayLike) -> Floats:
         """
-        Return the whole state.
-
-        Parameters
-        ----------
-        time : array_like, shape (m,)
-            Instants within the program, s.
-
-        Returns
-        -------
-        ndarray, shape (m, k)
-            Parts, then the thermostat's integral [W] and set point.
-
+        Return the parts' temperatures, the thermostat's integral [W] and set point, shape (m, k).
         """
         return self._evaluate(time)[0]
 
@@ -166,37 +153,11 @@ class ThermalResponse:
         return states, rates
 
     def temperatures(self, time: ArrayLike) -> Floats:
-        """
-        Return the temperatures of the parts.
-
-        Parameters
-        ----------
-        time : array_like, shape (m,)
-            Instants within the program, s.
-
-        Returns
-        -------
-        ndarray, shape (m, n_parts)
-            Temperatures in the order of ``network.nodes``, degC.
-
-        """
+        """Return the temperatures [degC] in the order of ``network.nodes``, shape (m, n_parts)."""
         return self.states(time)[:, : len(self.network.nodes)]
 
     def heater_power(self, time: ArrayLike) -> Floats:
-        """
-        Return what the thermostat spends, 0 W without one.
-
-        Parameters
-        ----------
-        time : array_like, shape (m,)
-            Instants within the program, s.
-
-        Returns
-        -------
-        ndarray, shape (m,)
-            Heater power, W.
-
-        """
+        """Return what the thermostat spends at instants [s], W; 0 without one."""
         states = self.states(time)
         heat = self.network.thermostat
         if heat is None:

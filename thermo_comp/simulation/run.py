@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from ..typing import Floats, Ints
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
-from .attitude import Attitude, Handling
 from .cyclogram import Cyclogram
 from .drift import PartHistory
 from .response import ThermalResponse
@@ -24,21 +23,15 @@ from .unit import UnitModel
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
+_GRID_S = 1.0  # step of the thermal grid; bias and scale are straight between its points
 
 
 @dataclass(frozen=True)
 class ChamberRipple:
     """
-    What the chamber's own regulation leaves on the air temperature.
+    What the chamber's own regulation leaves on the air temperature: a sine that wanders.
 
-    Parameters
-    ----------
-    amplitude : float, optional
-        Half of peak to peak, K.
-    period : float, optional
-        Mean period of the regulation, s.
-    wander : float, optional
-        Random walk of the phase, rad per square root of a period.
+    Half of peak to peak [K], mean period [s], random walk of the phase [rad per root of a period].
 
     Raises
     ------
@@ -80,17 +73,11 @@ class RunOptions:
         True starts in thermal equilibrium; False switches the unit on at the start.
     ripple : ChamberRipple or None, optional
         Regulation of the chamber; None is a perfect one.
-    switch_s : sequence of float or None, optional
-        Starts of the handling between positions, s from the start; None shares the run evenly.
-    handling : Handling, optional
-        How the block is handled.
-    grid_step : float, optional
-        Step of the thermal grid, s; bias and scale are straight between its points.
 
     Raises
     ------
     ValueError
-        If a rate or step is not positive.
+        If rate or gravity is not positive.
 
     """
 
@@ -101,42 +88,25 @@ class RunOptions:
     gravity: float = STANDARD_GRAVITY
     warm: bool = True
     ripple: ChamberRipple | None = None
-    switch_s: Sequence[float] | None = None
-    handling: Handling = field(default_factory=Handling)
-    grid_step: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ('rate_hz', 'grid_step'):
+        for name in ('rate_hz', 'gravity'):
             if not (getattr(self, name) > 0.0 and math.isfinite(getattr(self, name))):
                 raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
 
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
     """
-    Run a unit through a program.
+    Run a unit through a program, with `RunOptions` as keywords.
 
-    Parameters
-    ----------
-    unit : UnitModel
-        The unit, e.g. from `unit_preset`.
-    cyclogram : Cyclogram
-        The chamber's program; its length is the run's.
-    up : array_like, shape (3,) or (p, 3)
-        Direction of the specific force at rest in the orthogonal frame of the accelerometer; for
-        several rows the block is handled from one to the next within the run.
-    **options
-        As in `RunOptions`.
-
-    Returns
-    -------
-    SimulatedRun
-        Columns and truth.
+    `up`, shape (3,), is the direction of the specific force in the orthogonal frame of the
+    accelerometer.
 
     Raises
     ------
     ValueError
-        If the program is shorter than a cycle, or the options, `up`, `switch_s`, `gravity` or the
-        thermostat's power do not fit (see `RunOptions`, `Attitude` and `ThermalResponse`).
+        If the program is shorter than a cycle, or the options, `up` or the thermostat's power do
+        not fit (see `RunOptions` and `ThermalResponse`).
 
     """
     chamber = Chamber(unit, cyclogram, up, RunOptions(**options))
@@ -154,19 +124,9 @@ def simulate_blocks(
     """
     Run a unit through a program in bounded memory: the bits of `simulate`, block by block.
 
-    Parameters
-    ----------
-    unit, cyclogram, up, **options
-        As in `simulate`.
-    block_size : int, optional
-        Cycles per block; the result does not depend on it.
-
-    Returns
-    -------
-    iterator of SimulatedRun
-        Consecutive stretches of the run. A reading of a thermometer is in the block whose cycles
-        it falls among: after the last stamp of the block before, up to the last of its own; those
-        after the very last cycle are in the last block. Each truth holds the whole thermal grid.
+    A reading of a thermometer is in the block whose cycles it falls among: after the last stamp of
+    the block before, up to the last of its own; those after the very last cycle are in the last
+    block. Each truth holds the whole thermal grid.
 
     Raises
     ------
@@ -190,15 +150,15 @@ class ThermalTruth:
         self.response = ThermalResponse(
             unit.network, knots, air, power=power, is_warm=options.warm
         )
-        n_grid = math.ceil(cyclogram.duration_s / options.grid_step) + 1
-        self.grid: Floats = np.arange(n_grid, dtype=float) * options.grid_step
+        n_grid = math.ceil(cyclogram.duration_s / _GRID_S) + 1
+        self.grid: Floats = np.arange(n_grid, dtype=float) * _GRID_S
         self.air = np.interp(self.grid, knots, air)
         n_nodes = len(unit.network.nodes)
         self.temperatures = self.response.states(self.grid)[:, :n_nodes]
         self.rates = self.response.rates(self.grid)[:, :n_nodes]
         origin = unit.origin
         bias_ug, scale = unit.drift.evaluate(
-            PartHistory(unit.network.nodes, self.temperatures - origin, origin, options.grid_step)
+            PartHistory(unit.network.nodes, self.temperatures - origin, origin, _GRID_S)
         )
         self.bias = np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g
         self.scale = 1.0 + scale
@@ -222,23 +182,19 @@ class Chamber:
         if self.n_cycles < 1:
             raise ValueError(f'the program of {duration} s is shorter than one cycle')
         self._unit, self._options = unit, options
-        n_positions = 1 if np.ndim(up) == 1 else len(np.asarray(up))
-        switch_s = options.switch_s
-        if switch_s is None:
-            switch_s = [duration * k / n_positions for k in range(1, n_positions)]
-        self._attitude = Attitude(up, switch_s, options.gravity, options.handling)
+        direction = np.asarray(up, dtype=float)
+        length = np.linalg.norm(direction, axis=-1)
+        if direction.shape != (3,) or not length > 0.0:
+            raise ValueError(f'`up` must be a vector other than zero, shape (3,), got {up!r}')
+        self._force: Floats = options.gravity * (direction / length)
         self.thermal = thermal or ThermalTruth(unit, cyclogram, options)
         self.bias = self.thermal.bias + _wander(unit, self.thermal.grid, options.seed)
 
         if options.temperature_rate_hz is not None:
             unit = unit.with_thermometers(rate_hz=options.temperature_rate_hz)
         response = self.thermal.response
-        self.board = unit.board.read(
-            response, duration, options.seed, Stream.BOARD_NOISE, Stream.BOARD_OUTLIERS
-        )
-        self.case = unit.case.read(
-            response, duration, options.seed, Stream.CASE_NOISE, Stream.CASE_OUTLIERS
-        )
+        self.board = unit.board.read(response, duration, options.seed, Stream.BOARD_NOISE)
+        self.case = unit.case.read(response, duration, options.seed, Stream.CASE_NOISE)
 
     def blocks(self, block_size: int) -> Iterator[SimulatedRun]:
         """Return the run in stretches of so many cycles."""
@@ -246,19 +202,17 @@ class Chamber:
         seed, rate = options.seed, options.rate_hz
         K = np.array(unit.scale_factor)
         to_axes = np.linalg.inv(unit.M)
+        s = sum(self._force[j] * to_axes[:, j] for j in range(3))
         # A mean over one cycle of white noise: density times the root of the cycle rate.
         noise_sd = np.array(unit.noise_density) * MICRO_G * K * math.sqrt(rate)
         noise = [generator(seed, Stream.ACCEL_NOISE, i) for i in range(3)]
-        vibration = [generator(seed, Stream.HANDLING, i) for i in range(3)]
         remainder = unit.converter.start(seed)
         passed = -1
         for first in range(0, self.n_cycles, block_size):
             last = min(first + block_size, self.n_cycles)
             cycle = np.arange(first, last)
             stamp_ns = np.rint((cycle + 1.0) * (_NS / rate)).astype(np.int64)
-            truth = self._truth((cycle + 0.5).astype(np.float64) / rate, vibration)
-            # Column by column: the sums of a matrix product may depend on the number of rows.
-            s = sum(truth.specific_force[:, [j]] * to_axes[:, j] for j in range(3))
+            truth = self._truth((cycle + 0.5).astype(np.float64) / rate)
             # Eq. (2), (8) and (9)
             charge = truth.bias + K * truth.scale * s
             for i in range(3):
@@ -279,7 +233,7 @@ class Chamber:
                 truth=truth,
             )
 
-    def _truth(self, cycle_s: Floats, vibration: list[np.random.Generator]) -> Truth:
+    def _truth(self, cycle_s: Floats) -> Truth:
         thermal = self.thermal
         return Truth(
             unit=self._unit,
@@ -292,8 +246,7 @@ class Chamber:
             bias_grid=self.bias,
             scale_grid=thermal.scale,
             cycle_s=cycle_s,
-            position=self._attitude.position(cycle_s),
-            specific_force=self._attitude.specific_force(cycle_s, vibration),
+            specific_force=self._force,
         )
 
 
@@ -334,7 +287,7 @@ def _switched(
 
 def _wander(unit: UnitModel, grid: Floats, seed: int) -> Floats:
     """
-    Return what the bias does of itself, counts/cycle: another one in each mounting, and a walk.
+    Return what the bias does of itself, counts/cycle: a walk.
     """
     result = np.zeros((len(grid), 3))
     step_h = grid[1] / 3600.0
@@ -342,8 +295,6 @@ def _wander(unit: UnitModel, grid: Floats, seed: int) -> Floats:
         if density:
             steps = generator(seed, Stream.BIAS_WALK, i).standard_normal(len(grid) - 1)
             result[1:, i] += density * math.sqrt(step_h) * np.cumsum(steps)
-    for i, sd in enumerate(unit.remounting):
-        result[:, i] += sd * generator(seed, Stream.REMOUNTING, i).standard_normal()
     return result * unit.counts_per_micro_g
 
 

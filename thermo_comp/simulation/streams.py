@@ -14,42 +14,23 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """Error sources; the numbers are part of what a seed means and never change."""
+    """Error sources; the numbers are part of what a seed means: never changed, nor used again."""
 
     ACCEL_NOISE = 0
     CONVERTER_PHASE = 1
     BOARD_NOISE = 2
     CASE_NOISE = 3
-    BOARD_OUTLIERS = 4
-    CASE_OUTLIERS = 5
     CHAMBER_RIPPLE = 6
-    HANDLING = 7
     UNIT = 8
     POSITIONS = 9
     CYCLOGRAM = 10
     BIAS_WALK = 11
-    REMOUNTING = 12
     LOAD = 13
     SIBLING = 14
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
     """
-    Return the generator of one source.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the run, not negative.
-    stream : Stream
-        Error source.
-    axis : int, optional
-        Axis, or another running number within the source.
-
-    Returns
-    -------
-    numpy.random.Generator
-        A fresh generator at the start of its stream.
-
+    Return the generator of one source, at the start of its stream, for an axis or other number.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))

@@ -21,31 +21,13 @@ class ThermometerModel:
     """
     One thermometer on one part: ``reading = quantum * round((T + offset + noise) / quantum)``.
 
-    Parameters
-    ----------
-    node : str
-        Part whose temperature it reads.
-    rate_hz : float, optional
-        Readings per second.
-    noise_sd : float, optional
-        White noise of a reading, K.
-    quantum : float, optional
-        Step of the readings, K; 0 is continuous.
-    offset : float, optional
-        Constant error, K.
-    phase : float, optional
-        Instant of the first reading within its period, 0..1.
-    outlier_probability : float, optional
-        Chance that a reading is hit by an outlier.
-    outlier_size : float, optional
-        Largest outlier, either sign, K.
-    gaps_s : tuple of (float, float), optional
-        Spans from the start of the run in which readings are lost, start included, end not, s.
+    White noise, quantum (0 is continuous) and offset in K; `phase` is the instant of the first
+    reading within its period, 0..1.
 
     Raises
     ------
     ValueError
-        If the rate is not positive, or noise, quantum, phase or probability is out of range.
+        If the rate is not positive, or noise, quantum or phase is out of range.
 
     """
 
@@ -55,9 +37,6 @@ class ThermometerModel:
     quantum: float = 0.0
     offset: float = 0.0
     phase: float = 0.0
-    outlier_probability: float = 0.0
-    outlier_size: float = 5.0
-    gaps_s: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         if not (self.rate_hz > 0.0 and math.isfinite(self.rate_hz)):
@@ -67,57 +46,17 @@ class ThermometerModel:
                 raise ValueError(f'`{name}` must not be negative, got {getattr(self, name)}')
         if not 0.0 <= self.phase < 1.0:
             raise ValueError(f'`phase` must lie in [0, 1), got {self.phase}')
-        if not 0.0 <= self.outlier_probability <= 1.0:
-            raise ValueError(
-                f'`outlier_probability` must lie in [0, 1], got {self.outlier_probability}'
-            )
 
     def read(
-        self,
-        response: ThermalResponse,
-        duration: float,
-        seed: int,
-        noise: Stream,
-        outliers: Stream,
+        self, response: ThermalResponse, duration: float, seed: int, noise: Stream
     ) -> tuple[Ints, Floats]:
-        """
-        Take the readings of a run.
-
-        Parameters
-        ----------
-        response : ThermalResponse
-            True temperatures.
-        duration : float
-            Length of the run, s.
-        seed : int
-            Seed of the run.
-        noise, outliers : Stream
-            Streams of this thermometer.
-
-        Returns
-        -------
-        stamp_ns : ndarray of int64, shape (m,)
-            Instants from the start of the run, ns.
-        reading : ndarray, shape (m,)
-            Readings, degC.
-
-        """
+        """Take the readings [degC] of a run, with their stamps [ns] from its start."""
         n = math.floor(duration * self.rate_hz * (1.0 + 1e-12) - self.phase) + 1
         stamp_ns = np.rint((np.arange(max(n, 0)) + self.phase) * (_NS / self.rate_hz))
         time = stamp_ns / _NS
         true = response.temperatures(time)[:, response.network.nodes.index(self.node)]
         white = generator(seed, noise).standard_normal(len(time))
         reading = true + self.offset + self.noise_sd * white
-        rng = generator(seed, outliers)
-        chance = rng.random((len(time), 2))
-        reading += np.where(
-            chance[:, 0] < self.outlier_probability,
-            self.outlier_size * (2.0 * chance[:, 1] - 1.0),
-            0.0,
-        )
         if self.quantum > 0.0:
             reading = self.quantum * np.rint(reading / self.quantum)
-        is_kept = np.ones(len(time), dtype=bool)
-        for first, last in self.gaps_s:
-            is_kept &= (time < first) | (time >= last)
-        return stamp_ns[is_kept].astype(np.int64), reading[is_kept]
+        return stamp_ns.astype(np.int64), reading

@@ -29,20 +29,16 @@ class Truth:
         Local gravity, m/s^2.
     nodes : tuple of str
         Parts, the columns of the temperatures.
-    grid_s : ndarray, shape (m,)
-        Instants of the thermal grid from the start of the run, s.
-    air : ndarray, shape (m,)
-        Air temperature, degC.
+    grid_s, air : ndarray, shape (m,)
+        Instants of the thermal grid from the start of the run, s, and air temperature, degC.
     temperatures, rates : ndarray, shape (m, n_parts)
         Temperatures of the parts, degC, and their derivatives, K/s.
     bias_grid, scale_grid : ndarray, shape (m, 3)
         Bias [counts/cycle] and relative scale on the grid.
     cycle_s : ndarray, shape (n,)
         Middles of the accelerometer's cycles from the start of the run, s.
-    position : ndarray of int64, shape (n,)
-        Position at rest of each cycle, -1 while handled.
-    specific_force : ndarray, shape (n, 3)
-        Mean specific force over each cycle in the orthogonal frame, m/s^2.
+    specific_force : ndarray, shape (3,)
+        In the orthogonal frame, m/s^2.
 
     """
 
@@ -56,7 +52,6 @@ class Truth:
     bias_grid: Floats
     scale_grid: Floats
     cycle_s: Floats
-    position: Ints
     specific_force: Floats
 
     @property
@@ -71,18 +66,7 @@ class Truth:
 
     def temperature(self, node: str) -> Floats:
         """
-        Return the temperature of one part on the thermal grid.
-
-        Parameters
-        ----------
-        node : str
-            Part, or 'air'.
-
-        Returns
-        -------
-        ndarray, shape (m,)
-            Temperature, degC.
-
+        Return the temperature [degC] of one part, or the air, on the thermal grid, shape (m,).
         """
         return self.air if node == AIR else self.temperatures[:, self.nodes.index(node)]
 
@@ -92,19 +76,8 @@ class SimulatedRun:
     """
     What a recorder would have stored, and the truth.
 
-    Parameters
-    ----------
-    accel_stamp_ns : ndarray of int64, shape (n,)
-        End of each conversion cycle.
-    counts : ndarray of int32, shape (n, 3)
-        Output of each cycle, counts.
-    board_stamp_ns, case_stamp_ns : ndarray of int64, shape (m,)
-        Instants of the thermometers' readings.
-    board, case : ndarray, shape (m,)
-        Readings, degC.
-    truth : Truth
-        What really happened.
-
+    Ends of the conversion cycles [ns], shape (n,), and their counts, shape (n, 3); instants and
+    values [degC] of the thermometers' readings, shape (m,).
     """
 
     accel_stamp_ns: Ints
@@ -115,31 +88,9 @@ class SimulatedRun:
     case: Floats
     truth: Truth
 
-    @property
-    def is_saturated(self) -> Bools:
-        """Cycles with an axis at its rail, shape (n,)."""
-        converter = self.truth.unit.converter
-        at_rail = (self.counts <= converter.low) | (self.counts >= converter.high)
-        return np.asarray(np.any(at_rail, axis=1))
-
 
 def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
-    """
-    Tell where the board really takes up or gives off heat.
-
-    Parameters
-    ----------
-    run : SimulatedRun
-        The run.
-    threshold_k_min : float, optional
-        True rate of the board's temperature above which the state is dynamic, K/min.
-
-    Returns
-    -------
-    ndarray of bool, shape (m,)
-        On the thermal grid of the run.
-
-    """
+    """Tell where, on the thermal grid, the board really takes up or gives off heat."""
     truth = run.truth
     rate = truth.rates[:, truth.nodes.index(truth.unit.board.node)]
     result: Bools = np.abs(rate) * 60.0 > threshold_k_min

@@ -19,19 +19,7 @@ from .thermometers import ThermometerModel
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """
-    Electronics that are switched on and off for random spells, off at first.
-
-    Parameters
-    ----------
-    part : str
-        Part that is heated.
-    power : float
-        What it dissipates while on, W.
-    spell : tuple of (float, float), optional
-        Shortest and longest spell, s.
-
-    """
+    """Electronics that heat a part with `power` [W] for random spells [s], off at first."""
 
     part: str
     power: float
@@ -43,21 +31,11 @@ class UnitModel:
     """
     One physical unit with all its constants: the truth that a calibration looks for.
 
-    Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where
-    ``s = inverse(M) @ f`` is the specific force along the sensitivity axes.
+    Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where ``s =
+    inverse(M) @ f`` is the specific force along the sensitivity axes.
 
     Parameters
     ----------
-    name : str
-        Preset or other kind of unit.
-    serial : str
-        Serial number.
-    network : ThermalNetwork
-        Its parts and heat paths.
-    drift : DriftModel
-        Its temperature effects.
-    board, case : ThermometerModel
-        Its thermometers.
     scale_factor : tuple of float
         K per axis at the reference temperature, counts/cycle per m/s^2.
     bias_at_reference : tuple of float
@@ -67,14 +45,10 @@ class UnitModel:
     noise_density : tuple of float
         White noise of the acceleration per axis, ug/sqrt(Hz): the mean over `T` seconds has the
         standard deviation ``noise_density / sqrt(T)``.
-    converter : Converter
-        The converter.
     reference_temperature : float, optional
         Reading of the board's part at which K and bias hold in still air, degC.
     bias_walk : tuple of float, optional
         Random walk of the bias per axis within a run, ug per square root of an hour.
-    remounting : tuple of float, optional
-        Standard deviation of the bias per axis from one run to the next, ug.
     loads : tuple of SwitchedLoad, optional
         Loads beside the constant powers.
 
@@ -93,7 +67,6 @@ class UnitModel:
     converter: Converter
     reference_temperature: float = 20.0
     bias_walk: Triple = ZERO
-    remounting: Triple = ZERO
     loads: tuple[SwitchedLoad, ...] = ()
 
     @property
@@ -109,7 +82,7 @@ class UnitModel:
     @property
     def origin(self) -> Floats:
         """
-        Temperatures of the parts in the still state of the reference, shape (n_parts,), degC.
+        Temperatures [degC] of the parts in the still state of the reference, shape (n_parts,).
         """
         air = self.network.air_for(self.board.node, self.reference_temperature)
         return self.network.equilibrium(air)
@@ -121,24 +94,7 @@ class UnitModel:
         quantum: float | None = None,
         rate_hz: float | None = None,
     ) -> UnitModel:
-        """
-        Return the unit with other thermometers, the same kind on board and case.
-
-        Parameters
-        ----------
-        noise_sd : float or None, optional
-            White noise of a reading, K; None keeps.
-        quantum : float or None, optional
-            Step of the readings, K; None keeps.
-        rate_hz : float or None, optional
-            Readings per second; None keeps.
-
-        Returns
-        -------
-        UnitModel
-            The changed unit.
-
-        """
+        """Return the unit with other thermometers on board and case; None keeps what they have."""
 
         def changed(model: ThermometerModel) -> ThermometerModel:
             return replace(
@@ -154,18 +110,8 @@ class UnitModel:
         """
         Return another unit of the same type: every coefficient and time constant a bit different.
 
-        Parameters
-        ----------
-        seed : int
-            Another sibling for every seed.
-        spread : float, optional
-            Largest relative difference of a coefficient, a width or a heat capacity.
-
-        Returns
-        -------
-        UnitModel
-            The sibling, with constants and misalignment of its own.
-
+        `spread` is the largest relative difference of a coefficient, a width or a heat capacity;
+        constants and misalignment are its own.
         """
         rng = generator(seed, Stream.SIBLING)
 
