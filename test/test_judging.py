@@ -14,12 +14,13 @@ import pytest
 from builders import GRAVITY, axis_set, calibration, regime_set
 
 from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.fitting.fit_sources import digest
 from thermo_comp.judging import Judgement, Verdict, Windows, evaluate, judge
 from thermo_comp.judging.windows import COLUMNS, csv_of
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter, Topics, open_recording
-from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.calibration import Calibration, Provenance, ResidualSummary, Source
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
 
 TOPICS = Topics()
@@ -252,6 +253,34 @@ class TestVerdict:
         found = judge(made(residual, raw, claimed), CLAIMING, 100.0 * MICRO_G)
         assert found.verdict == verdict
         assert '100 ug tolerated' in found.reason
+
+    def test_headline_of_seen_windows_is_what_was_left_out(self) -> None:
+        # WHY: in sample 59 ug, held out of the same positions 61, in a new attitude 1091.
+        fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
+        one = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
+        windows = made(50.0, 1000.0, 60.0)
+        unseen, seen = (judge(windows, one, is_seen=is_seen) for is_seen in (False, True))
+        assert unseen.headline_rms / MICRO_G == pytest.approx(50.0)
+        assert unseen.reason.startswith('50 ug RMS of |f| - g, 1 mg raw')
+        assert seen.headline_rms / MICRO_G == pytest.approx(300.0)
+        assert seen.reason.startswith(
+            '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
+        )
+        # Against the claim like stands beside like; the limit holds for a new attitude.
+        assert seen.verdict == unseen.verdict == 'valid'
+        limited = judge(windows, one, 100.0 * MICRO_G, is_seen=True)
+        assert limited.verdict == 'recalibrate'
+        assert '300 ug on positions left out, 100 ug tolerated' in limited.reason
+        assert judge(windows, one, 100.0 * MICRO_G).verdict == 'valid'
+
+    def test_a_bag_of_the_fit_is_known_by_its_hash(self, tmp_path: Path) -> None:
+        bag = resting(tmp_path / 'bag', 25.0)
+        fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=3e-4)
+        for sha256, expected in ((digest(bag), 3e-4), ('0' * 64, np.nan)):
+            sources = (Source('bag', sha256, 6000),)
+            provenance = Provenance(sources=sources, residuals=(fitted,))
+            found = judged(bag, dataclasses.replace(CLAIMING, provenance=provenance))
+            assert found.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_no_uncertainty_makes_no_claim(self) -> None:
         # WHY: an import that says nothing of itself was held to the noise and called wrong.

@@ -246,7 +246,7 @@ def _verdict(
     ratio = max(s.ratio for s in (*judged, one))
     # A NaN of no claim compares false.
     is_wide = one.claimed_rms > (tolerance or min(_WIDE_PART * one.raw_rms, _WIDE_CLAIM))
-    if max(one.rms, headline) >= one.raw_rms:
+    if one.rms >= one.raw_rms:
         kind = Verdict.NO_BETTER
     elif tolerance is not None and worst > tolerance:
         kind = Verdict.RECALIBRATE

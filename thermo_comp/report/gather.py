@@ -25,6 +25,7 @@ from ..recording import inspect_recording
 from ..replay import check_unit
 from ..simulation import CYCLOGRAM_NAMES, Cyclogram, cyclogram_preset, parse_cyclogram
 from ..unit.calibration import Calibration
+from ..unit.gravity import spoken
 from .evidence import BagFacts, Evidence, ShownBag
 from .trace import thermal_trace
 
@@ -176,6 +177,13 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
         for name, rate in (('heating', upper), ('cooling', -lower))
         if rate < _SLOWEST_RAMP_K_MIN
     ]
+    for one in calibration.provenance.residuals:
+        left_out = one.left_out_rms_m_s2
+        if one.section == 'all' and left_out is not None and left_out >= one.raw_rms_m_s2:
+            found.append(
+                f'on positions left out {spoken(left_out)} are no better than '
+                f'{spoken(one.raw_rms_m_s2)} raw: the positions do not tell a new attitude'
+            )
     if not calibration.has_uncertainty:
         found.append('the calibration says nothing of its uncertainty')
     found += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
