@@ -9,7 +9,6 @@ forbids it to run or load anything.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from ..unit.gravity import MICRO_G
-from .plates import DrawnPlate
 from .text import label_text, minus, number
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
@@ -52,34 +50,6 @@ def render(template: str, *, script: str = '', nonce: str = '', **context: Any) 
     )
 
 
-def document(title: str, parts: Sequence[str]) -> str:
-    """Put a page together of parts that are HTML, in order."""
-    body = Markup('\n'.join(part for part in parts if part))  # noqa: S704 - escaped by its makers
-    return render('page.html', title=title, body=body)
-
-
-def table(
-    headings: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    *,
-    texts: int = 1,
-    caption: str = '',
-    chosen: Sequence[bool] = (),
-    links: Sequence[str] = (),
-) -> str:
-    """
-    Write a table whose first `texts` columns are text and whose others are numbers.
-
-    Rows that are `chosen` are bold; the first cell of a row leads to its link, if any.
-    """
-    return str(_parts().table(headings, rows, texts, caption, list(chosen), list(links)))
-
-
-def figure(plate: DrawnPlate) -> str:
-    """Write a figure with its caption, for paper and for a phone."""
-    return str(_parts().figure(plate))
-
-
 @cache
 def _templates() -> Environment:
     made = Environment(
@@ -91,11 +61,6 @@ def _templates() -> Environment:
     )
     made.filters |= {'number': number, 'minus': minus, 'ug': _micro_g, 'css': _css_text}
     return made
-
-
-@cache
-def _parts() -> Any:
-    return _templates().get_template('parts.html').module
 
 
 def _micro_g(acceleration: float, digits: int = 3) -> str:
