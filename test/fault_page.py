@@ -67,7 +67,8 @@ TAIL = """
 - Hours at full rate: [the soak](benchmarks.md#the-soak).
 - A calibration that has aged shows while the platform stands: |f| against gravity, with its
   uncertainty, in the diagnostics (`gravity residual`, `gravity residual sd`); WARN beyond five
-  standard deviations, and beyond `gravity_tolerance` nothing is published (`test_health.py`).
+  standard deviations, and beyond `gravity_tolerance` nothing is published
+  (`test_gravity_check.py`).
 - A driver that sends the magnitude of its own wrong calibration, a platform that accelerates
   steadily while the temperature rests, and a thermometer that drifts by less than its noise in
   a lag cannot be known from the messages: no row can show them.

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from builders import SECOND_NS
 
-from thermo_comp.thermal.memory import LagBank, MemorySpec, ThermalMemory, start_covariance
-from thermo_comp.thermal.plays import Plays
+from thermo_comp.thermal.memory import LagBank, MemorySpec, Plays, ThermalMemory, start_covariance
 
 TAUS = (60.0, 900.0, 7680.0)
 

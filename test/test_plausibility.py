@@ -52,11 +52,11 @@ def test_a_step_of_40_degrees_is_no_temperature():
     now = soak(tracker)
     for second in range(now, now + 30):
         assert not tracker.read('board', second * SECOND_NS, 60.0 + 0.01 * second)
-        assert tracker.guards['board'].fault == Fault.STEP
-        assert tracker.guards['board'].step == pytest.approx(40.0, abs=1.0)
+        assert tracker.checks['board'].fault == Fault.STEP
+        assert tracker.checks['board'].step == pytest.approx(40.0, abs=1.0)
     assert tracker.board.temperature == pytest.approx(20.0, abs=0.01)
     assert tracker.read('board', (now + 30) * SECOND_NS, 20.01)
-    assert tracker.guards['board'].fault == Fault.NONE
+    assert tracker.checks['board'].fault == Fault.NONE
 
 
 def test_a_step_that_stays_is_a_new_beginning_after_the_time_out():
@@ -122,11 +122,11 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
         last = values
         tracker.read('board', second * SECOND_NS, values['board'])
         tracker.read('case', second * SECOND_NS, values['case'])
-        guard = tracker.guards[frozen]
+        guard = tracker.checks[frozen]
         if guard.fault == Fault.FROZEN:
             break
         assert second < 1200
-    other = tracker.guards['case'] if frozen == 'board' else tracker.guards['board']
+    other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
     # Until then the sensor was off by what the other told: some quanta and a kelvin; a case is
@@ -151,7 +151,7 @@ def test_two_sensors_that_stand_still_count_with_growing_doubt():
     for second in range(600):
         assert tracker.read('board', second * SECOND_NS, 20.0)
         assert tracker.read('case', second * SECOND_NS, 20.0)
-    assert tracker.guards['board'].fault == tracker.guards['case'].fault == Fault.STILL
+    assert tracker.checks['board'].fault == tracker.checks['case'].fault == Fault.STILL
     # The fastest ramp it is made for, 3 K/min, for ten minutes.
     sd = math.sqrt(tracker.sample(600 * SECOND_NS)[VAR_BOARD])
     assert sd == pytest.approx(30.0, rel=1e-3)
@@ -168,7 +168,7 @@ def test_a_ramp_does_not_end_because_a_sensor_stands_still():
         ramp = min(second, 1900) - 1500
         tracker.read('board', second * SECOND_NS, 20.0 + ramp / 90.0 + flicker * (ramp < 400))
         tracker.read('case', second * SECOND_NS, 20.0 + ramp / 60.0 + flicker * (ramp < 400))
-    assert tracker.guards['case'].fault == Fault.STILL
+    assert tracker.checks['case'].fault == Fault.STILL
     assert tracker.detector.regime == Regime.DYNAMIC
 
 
@@ -177,7 +177,7 @@ def test_a_standstill_within_the_quantum_is_no_fault():
     for second in range(3600):
         tracker.read('board', second * SECOND_NS, 20.0)
         tracker.read('case', second * SECOND_NS, 20.0)
-    assert tracker.guards['board'].fault == tracker.guards['case'].fault == Fault.NONE
+    assert tracker.checks['board'].fault == tracker.checks['case'].fault == Fault.NONE
 
 
 def test_readings_that_chance_may_repeat():
@@ -213,8 +213,8 @@ def test_a_unit_in_its_chamber_is_never_doubted_and_swapped_topics_are(preset, s
         tracker.read(names[kind], stamp_ns, celsius)
         was_reversed = was_reversed or tracker.lead.is_reversed
         if not is_swapped:
-            assert tracker.guards['board'].fault == Fault.NONE
-            assert tracker.guards['case'].fault == Fault.NONE
+            assert tracker.checks['board'].fault == Fault.NONE
+            assert tracker.checks['case'].fault == Fault.NONE
     if not is_swapped:
         assert not was_reversed
     elif (preset, sensor) != ('bare-quartz', 'degrees') and preset != 'mems':

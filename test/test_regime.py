@@ -23,7 +23,7 @@ from thermal_signals import (
     switches,
 )
 
-from thermo_comp.thermal.onset import OnsetTest
+from thermo_comp.thermal.change_detector import ChangeDetector
 from thermo_comp.thermal.regime import Regime, RegimeDetector
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.thermal.thermometer import Thermometer
@@ -170,7 +170,7 @@ def test_false_alarms_keep_to_the_setting():
     # crossings, and those of one filter come in bunches and with those of the other, so the
     # formula is a bound: 100 h give at most 2000 departures, not in bunches; and it is not idle.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
-    test = OnsetTest(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
+    test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
     n = 100 * 3600
     sensor = Thermometer(settings)
@@ -192,7 +192,7 @@ def test_threshold_is_that_of_the_filters_noise(dt):
     # Second route: the filter's steady gain from its Riccati equation, its noise and the
     # correlation of neighbours from its impulse response, Rice's formula with those. The closed
     # forms are first order in the pace, which is at most 0.3 here: within 4 %.
-    test = OnsetTest(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
+    test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
         forward = np.array([[1.0, dt], [0.0, 1.0]])

@@ -18,8 +18,8 @@ import math
 from typing import Final, cast
 
 from ..unit.calibration import Calibration
-from .health import GravityMonitor
-from .sample_guard import StuckWatch
+from .gravity_check import GravityCheck
+from .sample_checks import StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, ThermalSide, lay_lines
 from .status import CompensatorConfig, Counters
 
@@ -40,7 +40,7 @@ class Compensator:
     def __init__(self, calibration: Calibration, config: CompensatorConfig | None = None) -> None:
         self.config = config or CompensatorConfig()
         self.counters = Counters()
-        self.stuck = StuckWatch(self.config.stuck_timeout_s)
+        self.stuck = StuckCheck(self.config.stuck_timeout_s)
         self.thermal = ThermalSide(calibration, self.config, self.counters)
         self._use(calibration)
         self.last_ns = self._event_ns = EVER_NS
@@ -48,10 +48,10 @@ class Compensator:
     def _use(self, calibration: Calibration) -> None:
         self.calibration = calibration
         self._full_scale = self._limit = calibration.unit.full_scale
-        self.gravity = self._gravity_monitor()
+        self.gravity = self._gravity_check()
 
-    def _gravity_monitor(self) -> GravityMonitor:
-        return GravityMonitor(
+    def _gravity_check(self) -> GravityCheck:
+        return GravityCheck(
             self.config.local_gravity_m_s2 or self.calibration.gravity_m_s2,
             self.config.gravity_tolerance_m_s2,
         )
@@ -191,7 +191,7 @@ class Compensator:
         # What comes is another recording.
         self.thermal.reset()
         self.stuck.reset()
-        self.gravity = self._gravity_monitor()
+        self.gravity = self._gravity_check()
 
     def take_flags(self) -> list[tuple[int, bool]]:
         """Take the regime flags that became due: (stamp of the leading sensor's reading, S)."""
@@ -233,9 +233,9 @@ class Compensator:
     def reconfigure(self, config: CompensatorConfig) -> None:
         """Take over other settings between two samples."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
-            self.stuck = StuckWatch(config.stuck_timeout_s)
+            self.stuck = StuckCheck(config.stuck_timeout_s)
         self.config = config
-        self.gravity = self._gravity_monitor()
+        self.gravity = self._gravity_check()
         self.thermal.reconfigure(config, self.now_ns)
         self._event_ns = EVER_NS
 

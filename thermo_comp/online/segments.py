@@ -26,7 +26,7 @@ from ..unit.calibration import Calibration
 from ..unit.correction import Correction, Variance
 from ..unit.functions import Number
 from ..unit.uncertainty import SlowUncertainty
-from .sample_guard import RateWatch
+from .sample_checks import RateCheck
 from .status import CompensatorConfig, Counters
 
 #: Longest time over which bias and scale are taken as linear in time.
@@ -62,7 +62,7 @@ class ThermalSide:
         self.correction = Correction(calibration)
         self._uncertainty = SlowUncertainty(calibration, self.correction)
         self.inputs = (BOARD_INPUT, *calibration.sensors)
-        self.rate = RateWatch(calibration.unit.cycle_time_s)
+        self.rate = RateCheck(calibration.unit.cycle_time_s)
         self._counts_cycles = calibration.unit.input == 'counts'
         self._forget_segment()
 

@@ -37,7 +37,7 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         stale_after = max(usual, SHORTEST_STALE_S)
     state = tracker.sample(stamp_ns)
     correction = thermal.correction
-    board, case = (tracker.guards[name] for name in thermal.inputs[:2])
+    board, case = (tracker.checks[name] for name in thermal.inputs[:2])
     is_dynamic = tracker.detector.regime == Regime.DYNAMIC
     excess = (correction.dynamic if is_dynamic else correction.static).excess(state)
     return CompensatorStatus(

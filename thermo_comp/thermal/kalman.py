@@ -65,7 +65,7 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
     half = 0.5 * dt * dt
     decay = 1.0 / (1.0 + dt / lag)
     grown = power * dt
-    wander = grown * half
+    driven = grown * half
     # the transition times the covariance, above its diagonal
     c01 = p01 + dt * p11 + half * p12
     c02 = p02 + dt * p12 + half * p22
@@ -74,10 +74,10 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
         t + dt * v + half * a,
         v + dt * a,
         decay * a,
-        p00 + dt * (p01 + c01) + half * (p02 + c02 + 0.2 * wander),
-        c01 + dt * (c02 + 0.25 * wander),
-        decay * c02 + wander / 3.0,
-        p11 + dt * (p12 + c12) + wander / 1.5,
+        p00 + dt * (p01 + c01) + half * (p02 + c02 + 0.2 * driven),
+        c01 + dt * (c02 + 0.25 * driven),
+        decay * c02 + driven / 3.0,
+        p11 + dt * (p12 + c12) + driven / 1.5,
         decay * c12 + 0.5 * dt * grown,
         decay * decay * p22 + grown,
     )

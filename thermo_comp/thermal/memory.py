@@ -18,7 +18,6 @@ from typing import Final
 import numpy as np
 
 from ..typing import Floats
-from .plays import Plays
 
 #: The input of a lag or play that is the board's own temperature.
 BOARD_INPUT: Final = 'board'
@@ -202,6 +201,42 @@ class LagBank:
         start_ns = self.start_ns
         age = 0.0 if start_ns is None else max(stamp_ns - start_ns, 0) * 1e-9
         return [math.exp(-age / tau) for tau in self.taus]
+
+
+class Plays:
+    """
+    Play operators, the parts of rate-independent hysteresis, of some half-widths r [K] on an input
+    v, which they follow only where it pushes them: ``P = min(max(P, v - r), v + r)``.
+    """
+
+    def __init__(self, widths: tuple[float, ...]) -> None:
+        self.widths = widths
+        self._held: list[float] = []
+
+    def forget(self) -> None:
+        """Begin anew with the next input, in the middle of every play."""
+        self._held = []
+
+    def step(self, v: float) -> None:
+        """Take the next value of the input."""
+        held = self._held
+        if not held:
+            self._held = [v] * len(self.widths)
+            return
+        self._held = [
+            v - r if p < v - r else v + r if p > v + r else p
+            for p, r in zip(held, self.widths, strict=True)
+        ]
+
+    def at(self, v: float) -> list[float]:
+        """Give each play less its input, for a value that is not remembered."""
+        if not self._held:
+            return [0.0] * len(self.widths)
+        result = []
+        for held, r in zip(self._held, self.widths, strict=True):
+            beside = held - v
+            result.append(-r if beside < -r else r if beside > r else beside)
+        return result
 
 
 class ThermalMemory:

@@ -66,7 +66,7 @@ class Fault(Enum):
 _NO_FAULT = Fault.NONE
 
 
-class SensorGuard:
+class SensorCheck:
     """
     Judges one sensor's readings by its past and by the other sensor, which it follows by `lag_s`;
     0 for the one that leads. `is_revived`: the reading just admitted ends a standstill.
@@ -218,7 +218,7 @@ def still_readings(settings: ThermometerSettings) -> int:
     return max(STILL_READINGS, round(log(STILL_PROBABILITY) / log(same)))
 
 
-class LeadWatch:
+class LeadCheck:
     """
     Finds out which of two sensors leads in a ramp.
 

@@ -4,10 +4,10 @@
 Owns the causal static/dynamic decision with its memory; it has no clock of its own.
 
 The dynamic state *opens* when the rate of the leading sensor has left the baseline of the soak
-(`onset`: the integral of the second derivative against ripple and noise), or when any rate is
-obviously that of a ramp. It is *held* as long as any sensor's rate, now or half a lag ahead, may
-exceed the relaxed rate: through the ramp, where the second derivative is nil, and after it, until
-the lag of the board has died. The derivation is in docs/regime.md.
+(`change_detector`: the integral of the second derivative against ripple and noise), or when any
+rate is obviously that of a ramp. It is *held* as long as any sensor's rate, now or half a lag
+ahead, may exceed the relaxed rate: through the ramp, where the second derivative is nil, and after
+it, until the lag of the board has died. The derivation is in docs/regime.md.
 
 References
 ----------
@@ -21,7 +21,7 @@ from enum import IntEnum
 from math import sqrt
 from typing import Final
 
-from .onset import OnsetTest
+from .change_detector import ChangeDetector
 from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
@@ -58,8 +58,8 @@ class RegimeDetector:
             settings.ripple_c,
             settings.false_alarms_per_hour / 3600.0,
         )
-        self._case_onset = OnsetTest(settings.case, *test)
-        self._board_onset = OnsetTest(settings.board, *test)
+        self._case_change = ChangeDetector(settings.case, *test)
+        self._board_change = ChangeDetector(settings.board, *test)
         self._case_calm = _CalmTest(settings, settings.case)
         self._board_calm = _CalmTest(settings, settings.board)
         self.reset()
@@ -74,8 +74,8 @@ class RegimeDetector:
         self._held_until_ns: int | None = None
         self._turning_ns: int | None = None
         self._is_grown = False
-        self._case_onset.reset()
-        self._board_onset.reset()
+        self._case_change.reset()
+        self._board_change.reset()
         self._case_calm.reset()
         self._board_calm.reset()
 
@@ -85,9 +85,9 @@ class RegimeDetector:
         for a sensor that is lost.
         """
         if case is not None:
-            lead, onset = case, self._case_onset
+            lead, change = case, self._case_change
         elif board is not None:
-            lead, onset = board, self._board_onset
+            lead, change = board, self._board_change
         else:
             return self.regime
         if self._stamp_ns is not None and stamp_ns - self._stamp_ns > self._forget_ns:
@@ -95,19 +95,19 @@ class RegimeDetector:
         self._stamp_ns = stamp_ns
         regime = self.regime
         is_dynamic = regime is Regime.DYNAMIC
-        departure = onset.update(
+        departure = change.update(
             stamp_ns, lead, 1.0 if not is_dynamic else (0.0 if self._is_grown else 0.25)
         )
         if not lead.is_ready:
             return regime
 
-        is_calm = self._case_calm.update(stamp_ns, case, self._case_onset, onset.swing)
-        if not self._board_calm.update(stamp_ns, board, self._board_onset, onset.swing):
+        is_calm = self._case_calm.update(stamp_ns, case, self._case_change, change.swing)
+        if not self._board_calm.update(stamp_ns, board, self._board_change, change.swing):
             is_calm = False
         if is_dynamic and not self._is_grown:
             # An onset is seen before the rate is large: until then only its own end ends it.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
-            is_calm = is_calm and onset.is_back()
+            is_calm = is_calm and change.is_back()
         if not is_calm:
             self._calm_ns = None
         elif self._calm_ns is None:
@@ -128,17 +128,17 @@ class RegimeDetector:
                 if direction:
                     self._open(stamp_ns, direction, lead)
         else:
-            self._turn(stamp_ns, _obvious(lead, onset.swing))
+            self._turn(stamp_ns, _obvious(lead, change.swing))
         if (
             self._calm_ns is not None
             and self.regime is not Regime.STATIC
             and stamp_ns - self._calm_ns
-            >= self._dwell_ns * (1.0 + 2.0 * onset.swing / self._relaxed_rate)
+            >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
             # a soak that nobody saw begin may swing as nobody has learnt yet
             is_first = self.regime == Regime.UNKNOWN
-            onset.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
+            change.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
             self.regime = Regime.STATIC
             self.direction = 0
             self.switched_ns = stamp_ns
@@ -194,7 +194,7 @@ class _CalmTest:
         self._mean = 0.0
 
     def update(
-        self, stamp_ns: int, sensor: Thermometer | None, onset: OnsetTest, lead_swing: float
+        self, stamp_ns: int, sensor: Thermometer | None, change: ChangeDetector, lead_swing: float
     ) -> bool:
         """Follow the rate of the sensor; a lost or stale one has no say."""
         seen_ns = None if sensor is None else sensor.stamp_ns
@@ -203,8 +203,8 @@ class _CalmTest:
         if not sensor.is_ready:
             self._stamp_ns = None
             return False
-        # The onset test's filters do not overshoot a ripple; the third-order thermometer does.
-        rate = onset.rate if onset.is_following(stamp_ns) else sensor.rate
+        # The detector's filters do not overshoot a ripple; the third-order thermometer does.
+        rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         doubt = sqrt(sensor.var_rate)
         relaxed = self._relaxed
         stamp = self._stamp_ns
@@ -217,7 +217,7 @@ class _CalmTest:
         changed = sensor.changed_ns
         if self._still_ns and changed is not None and stamp_ns - changed > self._still_ns:
             return True
-        swing = onset.swing
+        swing = change.swing
         room = relaxed + (swing if swing < 0.25 * relaxed else 0.25 * relaxed)
         room -= SURE_SIGMAS * doubt
         if not -room < rate < room:

@@ -4,8 +4,8 @@
 Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stamped readings.
 
 Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, in which the
-acceleration hardly moves (a soak, the middle of a ramp), and *bending*, in which it wanders as
-ramps through a thermal lag make it wander [2]_ (an onset, an end). The estimate is their mixture,
+acceleration hardly moves (a soak, the middle of a ramp), and *bending*, in which it moves as ramps
+through a thermal lag make it move [2]_ (an onset, an end). The estimate is their mixture,
 and its variance contains their disagreement. A sensor whose quantum exceeds its noise is read
 through its cells: a change of the reading measures the edge between two cells sharply, an
 unchanged one only says that the temperature has not left its cell.
@@ -32,7 +32,7 @@ OUTLIER_SIGMAS: Final = 6.0  # innovations beyond this limit count less ...
 OUTLIER_LIMITS: Final = 5.0  # ... and beyond this many limits not at all ...
 RESTART_READINGS: Final = 4  # ... unless that many in a row lie on one side
 SOAK_S: Final = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
-QUIET_SHARE: Final = 5e-3  # quiet acceleration wander / bending one, of a sensor without cells
+QUIET_SHARE: Final = 5e-3  # acceleration, quiet / bending, of a sensor without cells
 CELL_SHARE: Final = 0.2  # the same where wide cells hide slow changes
 #: What is outside is no temperature of an instrument [degC]; nor is NaN.
 COLDEST: Final = -273.15
@@ -55,8 +55,6 @@ class Thermometer:
 
     def __init__(self, settings: ThermometerSettings) -> None:
         self.settings = settings
-        self.n_used = 0
-        self.n_rejected = 0
         self.n_restarts = 0
         noise, quantum = settings.noise_sd_c, settings.quantum_c
         self._noise = noise * noise
@@ -98,13 +96,11 @@ class Thermometer:
         last one, an outlier.
         """
         if not COLDEST <= reading_c <= HOTTEST:
-            self.n_rejected += 1
             return False
         if self.stamp_ns is None:
             self._start(stamp_ns, reading_c)
             return True
         if stamp_ns <= self.stamp_ns:
-            self.n_rejected += 1
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         lag = self._lag
@@ -156,7 +152,6 @@ class Thermometer:
                 self._start(stamp_ns, reading_c)
                 return True
             if abs(surprise) > OUTLIER_LIMITS * limit:
-                self.n_rejected += 1
                 return False
             noise = max(noise, surprise * surprise / OUTLIER_SIGMAS**2 - variance)
         else:
@@ -199,7 +194,6 @@ class Thermometer:
         self.interval_s = interval
         self._horizon_s = HORIZON_INTERVALS * interval
         self.is_ready = True
-        self.n_used += 1
         return True
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
@@ -261,7 +255,6 @@ class Thermometer:
             reading_c, 0.0, 0.0, noise, 0.0, 0.0, self.var_rate, 0.0, self._bend**2
         )  # fmt: skip
         self.n_in_row = 1
-        self.n_used += 1
 
     def _cell(
         self, reading: float, expected: float, variance: float, move: float, var_move: float

@@ -14,7 +14,7 @@ from math import sqrt
 from typing import Final
 
 from .memory import BOARD_INPUT, MemorySpec, ThermalMemory, start_covariance
-from .plausibility import Fault, LeadWatch, SensorGuard
+from .plausibility import Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
 from .state import BOARD, GRADIENT, RATE, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout, ThermalState
@@ -46,14 +46,14 @@ class ThermalTracker:
         self.sensors = [Thermometer(detector.case) for _ in self.spec.sensors]
         self.case = self.sensors[0]
         self.detector = RegimeDetector(detector)
-        self._board_guard = SensorGuard(self.board, self.case, self.config.board_lag_s)
-        self._guards = [SensorGuard(sensor, self.board, 0.0) for sensor in self.sensors]
+        self._board_check = SensorCheck(self.board, self.case, self.config.board_lag_s)
+        self._checks = [SensorCheck(sensor, self.board, 0.0) for sensor in self.sensors]
         #: What is wrong with each thermometer, by name.
-        self.guards = {
-            BOARD_INPUT: self._board_guard,
-            **dict(zip(self.spec.sensors, self._guards, strict=True)),
+        self.checks = {
+            BOARD_INPUT: self._board_check,
+            **dict(zip(self.spec.sensors, self._checks, strict=True)),
         }
-        self.lead = LeadWatch(self.case, self.board, detector.relaxed_rate_k_min)
+        self.lead = LeadCheck(self.case, self.board, detector.relaxed_rate_k_min)
         self.memory = ThermalMemory(self.spec)
         self._places = {name: k for k, name in enumerate(self.spec.sensors)}
         self._clear()
@@ -78,8 +78,8 @@ class ThermalTracker:
         self.board.reset()
         for sensor in self.sensors:
             sensor.reset()
-        for guard in self.guards.values():
-            guard.reset()
+        for check in self.checks.values():
+            check.reset()
         self.detector.reset()
         self.lead.reset()
         self.memory.forget()
@@ -91,7 +91,7 @@ class ThermalTracker:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self._configure(config)
-        self._board_guard.lag_s = config.board_lag_s
+        self._board_check.lag_s = config.board_lag_s
 
     def is_live(self, stamp_ns: int, place: int = 0) -> bool:
         """Whether a sensor, the leading one by default, is there and fresh enough at a stamp."""
@@ -109,15 +109,15 @@ class ThermalTracker:
         return self._read_sensor(self._places[name], stamp_ns, celsius)
 
     def _read_board(self, stamp_ns: int, celsius: float) -> bool:
-        board, guard = self.board, self._board_guard
+        board, check = self.board, self._board_check
         before_ns, before, n_restarts = board.stamp_ns, board.temperature, board.n_restarts
         is_anew = False
-        if not guard.admits(stamp_ns, celsius):
+        if not check.admits(stamp_ns, celsius):
             self._is_doubted = True
-            if not self._may_begin_anew(guard, stamp_ns, self.config.temperature_timeout_s):
+            if not self._may_begin_anew(check, stamp_ns, self.config.temperature_timeout_s):
                 return False
             is_anew = True
-        if is_anew or guard.is_revived:
+        if is_anew or check.is_revived:
             board.reset()
         if not board.update(stamp_ns, celsius):
             return False
@@ -127,14 +127,14 @@ class ThermalTracker:
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > self.settings.board.lag_s
             if is_anew or is_gap:
                 memory.forget()
-            if is_anew or guard.is_revived or (has_restarted and not is_gap):
+            if is_anew or check.is_revived or (has_restarted and not is_gap):
                 change = board.temperature - before
-                guard.note_jump(stamp_ns, change)
+                check.note_jump(stamp_ns, change)
                 memory.note_jump(change)
         if not memory.is_empty:
             memory.board_step(stamp_ns, board.temperature)
             self._guess_gradients(stamp_ns)
-        for other in self._guards:
+        for other in self._checks:
             other.watch_other()
         self._note(stamp_ns)
         if not self.is_live(stamp_ns):
@@ -149,15 +149,15 @@ class ThermalTracker:
                 bank.step(stamp_ns, gradient, sqrt(variance))
 
     def _read_sensor(self, place: int, stamp_ns: int, celsius: float) -> bool:
-        sensor, guard = self.sensors[place], self._guards[place]
+        sensor, check = self.sensors[place], self._checks[place]
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         is_anew = False
-        if not guard.admits(stamp_ns, celsius):
+        if not check.admits(stamp_ns, celsius):
             self._is_doubted = True
-            if not self._may_begin_anew(guard, stamp_ns, self.config.case_timeout_s):
+            if not self._may_begin_anew(check, stamp_ns, self.config.case_timeout_s):
                 return False
             is_anew = True
-        is_anew = is_anew or guard.is_revived
+        is_anew = is_anew or check.is_revived
         if is_anew:
             sensor.reset()
         if not sensor.update(stamp_ns, celsius):
@@ -167,41 +167,41 @@ class ThermalTracker:
             is_gap = (stamp_ns - before_ns) * 1e-9 > self.settings.case.lag_s
             if is_anew or not is_gap:
                 change = sensor.temperature - before
-                guard.note_jump(stamp_ns, change)
+                check.note_jump(stamp_ns, change)
                 bank.note_jump(change)
         if bank.taus and self.board.stamp_ns is not None:
             bank.step(stamp_ns, sensor.temperature - self.board.at(stamp_ns)[0])
         self._note(stamp_ns)
         if place == 0:
-            self._board_guard.watch_other()
+            self._board_check.watch_other()
             detector = self.detector
-            if guard.fault is not Fault.STILL or detector.regime is not Regime.DYNAMIC:
+            if check.fault is not Fault.STILL or detector.regime is not Regime.DYNAMIC:
                 # One that stands still does not tell that a ramp has ended.
                 self._decide(stamp_ns, sensor)
             self.lead.update(detector.regime is Regime.STATIC)
         return True
 
     @staticmethod
-    def _may_begin_anew(guard: SensorGuard, stamp_ns: int, patience_s: float) -> bool:
+    def _may_begin_anew(check: SensorCheck, stamp_ns: int, patience_s: float) -> bool:
         """
         Let a sensor begin again that has stayed where it cannot have come to for long enough.
         """
-        seen_ns = guard.own.stamp_ns
-        if guard.fault != Fault.STEP or seen_ns is None:
+        seen_ns = check.own.stamp_ns
+        if check.fault != Fault.STEP or seen_ns is None:
             return False
         if (stamp_ns - seen_ns) * 1e-9 <= patience_s:
             return False
-        guard.reset()
+        check.reset()
         return True
 
     def _note(self, stamp_ns: int) -> None:
         if self.updated_ns is None or stamp_ns > self.updated_ns:
             self.updated_ns = stamp_ns
         is_doubted = (
-            self._board_guard.is_doubtful or self.lead.is_reversed or self.lead.doubt > 0.0
+            self._board_check.is_doubtful or self.lead.is_reversed or self.lead.doubt > 0.0
         )
-        for guard in self._guards:
-            is_doubted = is_doubted or guard.is_doubtful
+        for check in self._checks:
+            is_doubted = is_doubted or check.is_doubtful
         self._is_doubted = is_doubted
 
     def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
@@ -268,9 +268,9 @@ class ThermalTracker:
         return tuple(state)
 
     def _add_doubt(self, stamp_ns: int, state: list[float]) -> None:
-        state[VAR_BOARD] += self._board_guard.doubt(stamp_ns)
-        for place, guard in enumerate(self._guards):
-            state[VAR_GRADIENT + 2 * place] += guard.doubt(stamp_ns)
+        state[VAR_BOARD] += self._board_check.doubt(stamp_ns)
+        for place, check in enumerate(self._checks):
+            state[VAR_GRADIENT + 2 * place] += check.doubt(stamp_ns)
         if self.lead.is_reversed:
             # What is called the case may be the board.
             state[VAR_BOARD] += state[GRADIENT] * state[GRADIENT]

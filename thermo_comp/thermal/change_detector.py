@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the test for an onset: has the rate of one sensor left the baseline of the soak?
+Owns the detection of a change: has the rate of one sensor left the baseline of the soak?
 
 Two linear filters of temperature and rate, of different memory, integrate the second derivative.
 A rate counts as departed when it is beyond the baseline by more than the soak is known to swing,
@@ -39,7 +39,7 @@ SWING_SIGMAS: Final = 3.0  # ... beyond what the noise makes of it
 SWING_MEMORY_LAGS: Final = 10.0  # and how slowly it is forgotten
 
 
-class OnsetTest:
+class ChangeDetector:
     """
     Baseline, swing and departure of the rate of one sensor.
 

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
-from thermo_comp.online.sample_guard import (
+from thermo_comp.online.sample_checks import (
     BURST_SAMPLES,
     LARGEST_RATE,
     STUCK_SAMPLES,
-    RateWatch,
-    StuckWatch,
+    RateCheck,
+    StuckCheck,
 )
 from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.online.status import DROPPED, Counters
@@ -103,7 +103,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
     values = np.repeat(np.arange(len(lengths)) % n_values, lengths)
     samples = np.stack([values * (k == values % 3) for k in range(3)], axis=1) + 1.0
     stamps = np.arange(len(values), dtype=np.int64) * 20_000_000
-    one, many = (StuckWatch(period / 50.0) for _ in range(2))
+    one, many = (StuckCheck(period / 50.0) for _ in range(2))
     expected = []
     for stamp_ns, sample in zip(stamps.tolist(), samples.tolist(), strict=True):
         if tuple(sample) == one.run[:3]:
@@ -227,7 +227,7 @@ def test_every_reason_is_counted_once():
 
 
 def test_a_long_excess_is_soon_forgiven():
-    watch = RateWatch(0.01)
+    watch = RateCheck(0.01)
     for second in range(100):
         watch.update(2000 * second, second * SECOND_NS)
     assert watch.is_too_fast

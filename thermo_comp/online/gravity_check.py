@@ -37,7 +37,7 @@ RESTORING_WINDOWS: Final = 2
 REFUTING_SIGMAS: Final = 5.0
 
 
-class GravityMonitor:
+class GravityCheck:
     """
     Compare |f| with gravity over still windows; `is_refuted` tells whether the last of them all
     missed it by more than the tolerance [m/s^2], 0 = anything. Raises ValueError if gravity is not

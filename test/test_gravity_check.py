@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from builders import GRAVITY
 
-from thermo_comp.online.health import GravityMonitor
+from thermo_comp.online.gravity_check import GravityCheck
 
 NOISE_SD = 2e-3
 BIAS_SD = 1e-4
@@ -19,7 +19,7 @@ COVARIANCE = (VARIANCE, 0.0, 0.0, VARIANCE, 0.0, VARIANCE)
 
 
 def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
-    monitor = monitor or GravityMonitor(GRAVITY)
+    monitor = monitor or GravityCheck(GRAVITY)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     n = seconds * rate_hz
     t = np.arange(n) / rate_hz
@@ -50,7 +50,7 @@ def test_motion_says_nothing(rng):
 
 
 def test_time_that_jumps_starts_a_new_window(rng):
-    monitor = GravityMonitor(GRAVITY)
+    monitor = GravityCheck(GRAVITY)
     watch(rng, seconds=10, monitor=monitor)
     result = watch(rng, seconds=10, monitor=monitor)
     assert result.n_windows == 19
@@ -58,4 +58,4 @@ def test_time_that_jumps_starts_a_new_window(rng):
 
 def test_gravity_must_be_positive():
     with pytest.raises(ValueError, match='`gravity` must be positive'):
-        GravityMonitor(0.0)
+        GravityCheck(0.0)

@@ -34,7 +34,7 @@ _WINDOW_S: Final = 1.0
 _NEVER_NS: Final = 1 << 62
 
 
-class StuckWatch:
+class StuckCheck:
     """
     Counts equal samples in a row, in stream and batch; beyond the time-out [s] they are not
     believed, with 0 they always are.
@@ -123,7 +123,7 @@ def _may_stand_still(samples: Floats) -> bool:
     return False
 
 
-class RateWatch:
+class RateCheck:
     """
     Compares the rate of the samples with the calibrated one, at the start of each segment.
 
