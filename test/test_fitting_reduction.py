@@ -275,7 +275,7 @@ def test_a_slow_ramp_is_not_to_be_missed(rng: np.random.Generator) -> None:
     celsius = celsius + 0.005 * rng.standard_normal(n)
     readings = Readings(stamps(n, 1.0), celsius, n)
     bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
-    slow = learn_detector([ReducedBag(**{**vars(bag), 'board': readings, 'case': readings})])
+    slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
     # The ramp is 0.15 K/min: seven tenths of it.
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5

@@ -53,15 +53,7 @@ class CorrectedBlock:
     """
     One block of a recording and what the compensator made of it.
 
-    Parameters
-    ----------
-    block : Block
-        The input.
-    corrected : CompensatedBlock
-        The samples to be published.
-    flags : list of (int, bool)
-        Stamp of a case reading and the regime at it (True = dynamic).
-
+    A flag is the stamp of a case reading and the regime at it (True = dynamic).
     """
 
     block: Block
@@ -72,21 +64,9 @@ class CorrectedBlock:
 @dataclass(frozen=True)
 class ReplayResult:
     """
-    The account of a replay.
+    The account of a replay: what came in, what went out, and why some did not.
 
-    Parameters
-    ----------
-    info : RecordingInfo
-        The input.
-    output : Path
-        The bag written.
-    counters : Counters
-        What came in, what went out, and why some did not.
-    n_flags : int
-        Regime flags written.
-    switches : list of (int, bool)
-        First flag, and each that differs from the one before.
-
+    `switches` are the first flag and each that differs from the one before.
     """
 
     info: RecordingInfo
@@ -103,20 +83,8 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
     """
     Refuse a calibration that is for another unit, or for another kind of input.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    info : RecordingInfo
-        The recording; its metadata may name the unit.
-    serial : str or None, optional
-        The unit as the user knows it; it wins over the metadata, and an empty text accepts any.
-
-    Raises
-    ------
-    CalibrationError
-        If the serials differ, or the recording is in another unit than the calibration.
-
+    The serial, as the user knows it, wins over the recording's; an empty one accepts any. Raises
+    CalibrationError.
     """
     expected = info.metadata.get('serial', '') if serial is None else serial
     if expected and expected != calibration.unit.serial:
@@ -134,22 +102,7 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
 
 
 def input_for(calibration: Calibration, asked: Input) -> Input:
-    """
-    Choose what is read from a recording for a calibration.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    asked : {'auto', 'counts', 'imu'}
-        The user's word.
-
-    Returns
-    -------
-    {'counts', 'imu'}
-        For ``auto``, counts for a calibration in counts and Imu for one in m/s^2.
-
-    """
+    """Choose what is read for a calibration: for ``auto``, counts if it is in counts, else Imu."""
     if asked != 'auto':
         return asked
     return 'counts' if calibration.unit.input == 'counts' else 'imu'
@@ -182,48 +135,14 @@ def replay(
     """
     Correct a recording and write what the node would publish.
 
-    Parameters
-    ----------
-    path : str or Path
-        The recording.
-    calibration : Calibration
-        The unit's calibration.
-    output : str or Path
-        A bag, ``*.mcap`` or a rosbag2 directory; or ``*.csv`` or ``*.parquet``, a table of the
-        corrected samples.
-    config : CompensatorConfig or None, optional
-        The node's settings.
-    topics : Topics or None, optional
-        Names of the inputs.
-    input : {'auto', 'counts', 'imu'}, optional
-        What is corrected; by default what the calibration is for.
-    serial : str or None, optional
-        See `check_unit`.
-    frame_id : str, optional
-        Frame of the output; empty keeps the input's.
-    keep_inputs : bool, optional
-        Copy the input messages beside the output, at their own stamps.
-    all_topics : bool, optional
-        Copy these and every other topic, at their log times; but none that bears an output's name.
-    overwrite : bool, optional
-        Replace an output that is there.
-    progress : callable or None, optional
-        Called with the fraction done.
+    The output is a bag, ``*.mcap`` or a rosbag2 directory; or ``*.csv`` or ``*.parquet``, a table
+    of the corrected samples. `input` is by default what the calibration is for, `serial` as in
+    `check_unit`; an empty `frame_id` keeps the input's. `keep_inputs` copies the input messages
+    beside the output, at their own stamps; `all_topics` these and every other topic, at their log
+    times, but none that bears an output's name. `progress` is called with the fraction done.
 
-    Returns
-    -------
-    ReplayResult
-        The account.
-
-    Raises
-    ------
-    RecordingError
-        If the recording cannot be read.
-    OutputError
-        If the output may not or cannot be written.
-    CalibrationError
-        If the calibration is for another unit.
-
+    Raises RecordingError if the recording cannot be read, OutputError if the output may not or
+    cannot be written, CalibrationError if the calibration is for another unit.
     """
     compensator = Compensator(calibration, config)
     wanted = input_for(calibration, input)

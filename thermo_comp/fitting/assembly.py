@@ -68,6 +68,8 @@ class UnitFacts:
         T_ref [degC].
     model : str
         Name of the model, for the provenance.
+    sensors : tuple of str
+        Thermometers beside the board; the first leads, the others stay where they are of use.
 
     """
 
@@ -76,6 +78,7 @@ class UnitFacts:
     board_lag: float
     reference_temperature: float
     model: str
+    sensors: tuple[str, ...] = ('case',)
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,11 @@ def build_calibration(
         slow_noise_m_s2_sqrt_h=_triple(walk),
         misalignment=(_triple(matrix[0]), _triple(matrix[1]), _triple(matrix[2])),
         misalignment_sd=_triple(np.sqrt(np.diag(covariance)[-3:])),
+        sensors=tuple(
+            name
+            for k, name in enumerate(facts.sensors)
+            if not k or any(name == column.sensor for column in terms)
+        ),
         response=terms,
         board_lag_s=facts.board_lag,
         detector=facts.detector,

@@ -218,11 +218,12 @@ def fit_bags(
     known = options.prior
     detector = options.detector or (known.detector if known else learn_detector(bags))
     tell('temperatures', 0.55)
+    sensors = known.sensors if known else sensors_of(bags)
     if known is not None:
         sets, columns = prior_sets(known), prior_columns(known)
     else:
         sets = sets_of(options, bags)
-        columns = () if options.model == 'golovach' else bank()
+        columns = () if options.model == 'golovach' else bank(sensors)
     windows = thermal_windows(
         bags,
         columns,
@@ -231,6 +232,7 @@ def fit_bags(
         ThermalConfig(transition_time_s=options.transition_time_s),
         options.reference_temperature,
         options.regression_window_s,
+        sensors,
     )
     start = first_guess(windows, options) if known is None else constants_of(known)
     up = start.force(position_means(windows.data))
@@ -287,6 +289,7 @@ def fit_bags(
         board_lag(windows),
         options.reference_temperature,
         options.model,
+        sensors,
     )
     try:
         calibration = build_calibration(
@@ -303,6 +306,14 @@ def fit_bags(
         windows=windows,
         bags=tuple(bags),
     )
+
+
+def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
+    """Name the thermometers beside the board that every bag has; the case leads, seen or not."""
+    common = set.intersection(
+        *({n for n, one in b.temperatures.items() if len(one.value)} for b in bags)
+    )
+    return 'case', *sorted(common - {'board', 'case'})
 
 
 def _check_temperatures(bags: Sequence[ReducedBag]) -> None:

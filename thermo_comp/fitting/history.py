@@ -4,11 +4,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..thermal.tracker import ThermalTracker
-from ..typing import Floats
-from .reduction import ReducedBag
+from ..typing import Floats, Ints
+from .reduction import NO_READINGS, ReducedBag
+
+
+def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> tuple[list[str], Ints, Floats]:
+    """Thermometer, stamp and value of each reading; of equal stamps in the order of `inputs`."""
+    found = [bag.temperatures.get(name, NO_READINGS) for name in inputs]
+    stamps = np.concatenate([one.stamp_ns for one in found])
+    order = np.argsort(stamps, kind='stable')
+    names = np.repeat(inputs, [len(one.value) for one in found])[order]
+    values = np.concatenate([one.value for one in found])[order]
+    return names.tolist(), stamps[order], values
 
 
 def thermal_states(
@@ -34,13 +46,7 @@ def thermal_states(
         `ThermalTracker.sample` at each grid point.
 
     """
-    stamps = np.concatenate((bag.board.stamp_ns, bag.case.stamp_ns))
-    values = np.concatenate((bag.board.value, bag.case.value))
-    is_case = np.concatenate(
-        (np.zeros(len(bag.board.value), bool), np.ones(len(bag.case.value), bool))
-    )
-    order = np.argsort(stamps, kind='stable')
-    stamps, values, is_case = stamps[order], values[order], is_case[order]
+    names, stamps, values = readings_in_order(bag, ('board', *tracker.spec.sensors))
     step_ns = round(step_s * 1e9)
     begin = max(int(bag.board.stamp_ns[0]), bag.start_ns)
     grid = np.arange(begin, max(bag.end_ns, begin) + step_ns, step_ns)
@@ -48,11 +54,10 @@ def thermal_states(
     due = np.searchsorted(stamps, grid, side='right')
     rows = []
     reading = 0
-    stamp_list, value_list, case_list = stamps.tolist(), values.tolist(), is_case.tolist()
+    stamp_list, value_list = stamps.tolist(), values.tolist()
     for stamp, stop in zip(grid.tolist(), due.tolist(), strict=True):
         while reading < stop:
-            name = 'case' if case_list[reading] else 'board'
-            tracker.read(name, stamp_list[reading], value_list[reading])
+            tracker.read(names[reading], stamp_list[reading], value_list[reading])
             reading += 1
         rows.append(tracker.sample(stamp))
     return (begin - bag.start_ns) * 1e-9, np.array(rows)

@@ -12,6 +12,7 @@ because a charge-balancing converter makes means better than the scatter of its 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,9 @@ class Readings:
     stamp_ns: Ints
     value: Floats
     n_read: int
+
+
+NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0), 0)
 
 
 @dataclass(frozen=True)
@@ -99,8 +103,8 @@ class ReducedBag:
         First and last stamp of the samples used.
     intervals : tuple of StillInterval
         Still intervals in order.
-    board, case : Readings
-        Temperature readings.
+    temperatures : mapping of str to Readings
+        By the name of the thermometer.
     n_samples, n_dropped, n_saturated : int
         Samples read; not finite or out of order; at the full scale.
     n_cells, n_still_cells : int
@@ -118,8 +122,7 @@ class ReducedBag:
     start_ns: int
     end_ns: int
     intervals: tuple[StillInterval, ...]
-    board: Readings
-    case: Readings
+    temperatures: Mapping[str, Readings]
     n_samples: int
     n_dropped: int
     n_saturated: int
@@ -128,6 +131,16 @@ class ReducedBag:
     window_s: float
     cycle_s: float
     is_integer: bool
+
+    @property
+    def board(self) -> Readings:
+        """Readings of the board's thermometer."""
+        return self.temperatures.get('board', NO_READINGS)
+
+    @property
+    def case(self) -> Readings:
+        """Readings of the case's thermometer."""
+        return self.temperatures.get('case', NO_READINGS)
 
 
 def reduce_source(
@@ -160,12 +173,12 @@ def reduce_source(
 
     """
     cells = CellAccumulator(cell_s, full_scale, window_s)
-    board, case = _ReadingCollector(), _ReadingCollector()
+    collectors: dict[str, _ReadingCollector] = {}
     n_samples = 0
     for block in source.blocks():
         cells.add(block.accel_stamp_ns, block.accel)
-        board.add(*block.temperatures['board'][:2])
-        case.add(*block.temperatures['case'][:2])
+        for name, (reading_ns, celsius, _) in block.temperatures.items():
+            collectors.setdefault(name, _ReadingCollector()).add(reading_ns, celsius)
         n_samples += len(block.accel_stamp_ns)
     found = cells.finish()
     ranges = still_intervals(found, min_still_s)
@@ -184,8 +197,7 @@ def reduce_source(
             )
             for lower, upper in ranges
         ),
-        board=board.finish(),
-        case=case.finish(),
+        temperatures={name: one.finish() for name, one in collectors.items()},
         n_samples=n_samples,
         n_dropped=found.n_dropped,
         n_saturated=found.n_saturated,

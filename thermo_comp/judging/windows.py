@@ -19,6 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import RecordingError
+from ..fitting.history import readings_in_order
 from ..fitting.reduction import ReducedBag, StillInterval
 from ..online.compensator import Compensator
 from ..online.snapshot import take_snapshot
@@ -342,17 +343,14 @@ def _windows(
 
 def _correct(compensator: Compensator, bag: ReducedBag, sums: Floats) -> None:
     """Run sums through the compensator, with the readings that came before each."""
-    stamps = np.concatenate((bag.board.stamp_ns, bag.case.stamp_ns))
-    order = np.argsort(stamps, kind='stable')
-    values = np.concatenate((bag.board.value, bag.case.value))[order].tolist()
-    is_case = (order >= len(bag.board.value)).tolist()
-    readings = zip(stamps[order].tolist(), values, is_case, strict=True)
+    names, stamps, values = readings_in_order(bag, compensator.thermal.inputs)
+    readings = zip(names, stamps.tolist(), values.tolist(), strict=True)
     reading = next(readings, None)
     for row in sums:
         stamp_ns = bag.start_ns + round(float(row[_TIME]) * 1e9)
-        while reading is not None and reading[0] <= stamp_ns:
-            compensator.push('case' if reading[2] else 'board', *reading[:2])
-            compensator.flush(reading[0])
+        while reading is not None and reading[1] <= stamp_ns:
+            compensator.push(*reading)
+            compensator.flush(reading[1])
             reading = next(readings, None)
         corrected = compensator.process(stamp_ns, *row[_MEAN].tolist())
         status = take_snapshot(compensator)

@@ -34,24 +34,10 @@ class RecordingInfo:
     """
     What a bag holds, known before its messages are read.
 
-    Attributes
-    ----------
-    path : Path
-        The bag as it was named by the caller.
-    storage : str
-        ``mcap``, ``sqlite3`` or ``ros1``.
-    topics : mapping of str to (str, int)
-        Message type and number of messages per topic; a topic of which two types were recorded
-        has them joined by `` | ``.
-    start_ns, end_ns : int
-        Log time of the first and of the last message; 0 and 0 where there is none.
-    truncated : str or None
-        What is missing, in words, where the bag was cut off; None where it is whole.
-    metadata : mapping of str to str
-        The key-value pairs that the bag's writer left in it.
-    input : {'counts', 'imu'} or None
-        Which accelerometer topic is read; None where the bag has neither.
-
+    `topics` have message type and number of messages; two types are joined by `` | ``. `start_ns`
+    and `end_ns` are the log times of the first and the last message, or 0. `truncated` says what
+    is missing; `metadata` are the pairs that the bag's writer left in it; `input` says which
+    accelerometer topic is read, if there is one.
     """
 
     path: Path
@@ -67,6 +53,17 @@ class RecordingInfo:
     def n_messages(self) -> int:
         """Count the messages of all topics."""
         return sum(count for _, count in self.topics.values())
+
+
+def count_topics(channels: Iterable[tuple[str, str, int]]) -> dict[str, tuple[str, int]]:
+    """Make `RecordingInfo.topics` of topic, type and number of messages of each channel."""
+    found: dict[str, tuple[str, int]] = {}
+    for topic, kind, count in channels:
+        known, n_before = found.get(topic, (kind, 0))
+        if kind not in known.split(' | '):
+            known = f'{known} | {kind}'
+        found[topic] = known, n_before + count
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,24 +119,12 @@ NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64)
 @dataclass(frozen=True, slots=True)
 class Block:
     """
-    A run of messages in reading order, as columns.
+    A run of messages in reading order, as columns, n samples.
 
-    Attributes
-    ----------
-    accel_stamp_ns : ndarray of int64, shape (n,)
-    accel : ndarray, shape (n, 3)
-        Counts per cycle, or m/s^2 where the input is sensor_msgs/Imu.
-    frame_id : str
-        Of the accelerometer messages; a block ends where it changes.
-    imu : ImuColumns or None
-        The rest of the message where the input is sensor_msgs/Imu.
-    temperatures : mapping of str to Readings
-        By the name of the thermometer; empty for those that the bag lacks.
-    log_ns : mapping of str to ndarray of int64
-        Log times of the messages by role.
-    raw : tuple of RawMessages
-        The very messages, where the caller asked for them; one for each topic.
-
+    `accel`, shape (n, 3), is in counts per cycle, or m/s^2 where the input is sensor_msgs/Imu;
+    `imu` is the rest of that message. A block ends where the samples' `frame_id` changes. The
+    temperatures are by the name of the thermometer, empty for those that the bag lacks; `log_ns`
+    by role; `raw`, where asked for, has one entry for each topic.
     """
 
     accel_stamp_ns: Ints

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..typing import Bools, Bytes, Floats, Ints
+from ..typing import Bytes, Floats, Ints
 from .wire import gather, scatter
 
 OPCODE_MESSAGE = 5
@@ -27,17 +27,7 @@ Piece = tuple[int, Floats]
 
 
 def layout(n_bytes: int, /, **fields: tuple[Any, int]) -> np.dtype[Any]:
-    """
-    Describe rows of bytes.
-
-    Parameters
-    ----------
-    n_bytes : int
-        Bytes of a row.
-    **fields : (type, int)
-        Type and offset of each field.
-
-    """
+    """Describe rows of bytes by the type and offset of each field."""
     content: Any = {
         'names': list(fields),
         'formats': [kind for kind, _ in fields.values()],
@@ -62,15 +52,8 @@ RECORD_HEAD = layout(
 
 class Records(Protocol):
     """
-    Messages of one channel that wait to be written.
-
-    Attributes
-    ----------
-    channel : int
-    log_ns : ndarray of int64, shape (n,)
-    size : ndarray of int64, shape (n,)
-        Bytes of each whole record; may be one number broadcast.
-
+    Messages of one channel that wait to be written, shape (n,); `size` is that of each whole
+    record [bytes].
     """
 
     channel: int
@@ -79,15 +62,8 @@ class Records(Protocol):
 
     def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
         """
-        Build the records of the chosen messages.
-
-        Yields
-        ------
-        which : ndarray of int64 or slice
-            Places among the chosen.
-        rows : ndarray of void
-            Their records, all of one size.
-
+        Build the records of the chosen messages: their places among the chosen, and rows of one
+        size.
         """
         ...
 
@@ -96,19 +72,7 @@ class StampedRecords:
     """
     Messages that are a header and float64 numbers.
 
-    Parameters
-    ----------
-    channel : int
-        Number of the channel.
-    stamp_ns, log_ns : ndarray of int64, shape (n,)
-        Header stamps and log times.
-    frame_id : str
-        Of all of them.
-    n_numbers : int
-        How many numbers follow the header.
-    pieces : sequence of (int, ndarray)
-        Values of these numbers; those without a piece are 0.
-
+    Each piece is the first column and the values of some of the numbers; those without are 0.
     """
 
     def __init__(
@@ -154,54 +118,8 @@ class StampedRecords:
         yield slice(None), _as_void(rows)
 
 
-class BoolRecords:
-    """
-    Messages of std_msgs/Bool.
-
-    Parameters
-    ----------
-    channel : int
-        Number of the channel.
-    log_ns : ndarray of int64, shape (n,)
-        Log times.
-    values : ndarray of bool, shape (n,)
-        What they say.
-
-    """
-
-    _LAYOUT = layout(36, head=(RECORD_HEAD, 0), order=('u1', 32), value=('u1', 35))
-
-    def __init__(self, channel: int, log_ns: Ints, values: Bools) -> None:
-        self.channel = channel
-        self.log_ns = log_ns
-        self.size = np.broadcast_to(np.int64(self._LAYOUT.itemsize), log_ns.shape)
-        self._values = values
-
-    def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
-        """Build the records of the chosen messages."""
-        rows: NDArray[Any] = np.zeros(len(chosen), self._LAYOUT)
-        _fill_head(rows, self.channel, self.log_ns[chosen])
-        rows['order'] = 1
-        rows['value'] = self._values[chosen]
-        yield slice(None), _as_void(rows)
-
-
 class RawRecords:
-    """
-    Messages that are serialized already.
-
-    Parameters
-    ----------
-    channel : int
-        Number of the channel.
-    log_ns : ndarray of int64, shape (n,)
-        Log times.
-    data : ndarray of uint8
-        The messages behind each other.
-    ends : ndarray of int64, shape (n,)
-        Where each ends.
-
-    """
+    """Messages that are serialized already, behind each other in `data`, each up to its `ends`."""
 
     def __init__(self, channel: int, log_ns: Ints, data: Bytes, ends: Ints) -> None:
         self.channel = channel
@@ -233,18 +151,7 @@ class RawRecords:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """
-    Message records behind each other.
-
-    Attributes
-    ----------
-    data : ndarray of uint8
-    channel : ndarray of uint16, shape (n,)
-    log_ns : ndarray of int64, shape (n,)
-    size : ndarray of int64, shape (n,)
-        Bytes of each record.
-
-    """
+    """Message records behind each other in `data`; `size` is that of each [bytes], shape (n,)."""
 
     data: Bytes
     channel: NDArray[np.uint16]
@@ -256,11 +163,7 @@ class Merged:
     """
     The messages of several channels in log-time order, cut into stretches on demand.
 
-    Parameters
-    ----------
-    batches : list of Records
-        For equal log times the earlier batch goes first.
-
+    For equal log times the earlier batch goes first.
     """
 
     def __init__(self, batches: list[Records]) -> None:
@@ -278,18 +181,7 @@ class Merged:
 
     def take(self, n_bytes: int) -> Stretch | None:
         """
-        Build the next records, until they have at least so many bytes.
-
-        Parameters
-        ----------
-        n_bytes : int
-            The size wanted; the last stretch has less.
-
-        Returns
-        -------
-        Stretch or None
-            None where nothing is left.
-
+        Build the next records, until they have at least so many bytes; None where nothing is left.
         """
         begin = self._at
         if begin == len(self._order):
@@ -312,24 +204,7 @@ class Merged:
 
 
 def stamped_payloads(stamp_ns: Ints, frame_id: str, numbers: Floats) -> Bytes:
-    """
-    Serialize messages that are a header and float64 numbers.
-
-    Parameters
-    ----------
-    stamp_ns : ndarray of int64, shape (n,)
-        Header stamps.
-    frame_id : str
-        Of all of them.
-    numbers : ndarray, shape (n, k)
-        What follows the header.
-
-    Returns
-    -------
-    ndarray of uint8, shape (n, size)
-        CDR, little-endian.
-
-    """
+    """Serialize (CDR, little-endian) a header and `numbers`, shape (n, k), as rows of uint8."""
     payload = _stamped_layout(frame_id, numbers.shape[1])
     rows: NDArray[Any] = np.zeros(len(stamp_ns), payload)
     _fill_frame(rows, frame_id)
@@ -394,24 +269,7 @@ def _as_void(rows: NDArray[Any]) -> NDArray[Any]:
 
 
 def as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
-    """
-    Check a column of nanoseconds.
-
-    Parameters
-    ----------
-    name : str
-        The argument's name, for the error.
-    values : array_like of int, shape (n,)
-        The column.
-    n : int, optional
-        The length it must have.
-
-    Raises
-    ------
-    ValueError
-        Not integers, not one row, or a negative time.
-
-    """
+    """Check a column of nanoseconds: `n` integers, none negative; ValueError for another."""
     times = np.atleast_1d(np.asarray(values))
     if times.size == 0:
         times = times.astype(np.int64)
@@ -426,24 +284,7 @@ def as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
 
 
 def as_numbers(name: str, values: ArrayLike, n: int, width: int) -> Floats:
-    """
-    Check a column of numbers.
-
-    Parameters
-    ----------
-    name : str
-        The argument's name, for the error.
-    values : array_like, shape (n, width), or (width,) for the same in each row
-        The column.
-    n, width : int
-        The shape it must have.
-
-    Raises
-    ------
-    ValueError
-        Another shape.
-
-    """
+    """Check a column of numbers, shape (n, width) or (width,) for the same in each row."""
     numbers = np.asarray(values, np.float64)
     if numbers.shape not in {(n, width), (width,)}:
         raise ValueError(f'`{name}` must have shape ({n}, {width}), got {numbers.shape}')

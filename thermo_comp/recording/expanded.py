@@ -46,12 +46,7 @@ class ExpandedSource:
         except BaseException:
             self._folder.cleanup()
             raise
-        self.storage = self._source.storage
-        self.topics = self._source.topics
-        self.definitions = self._source.definitions
-        self.start_ns, self.end_ns = self._source.start_ns, self._source.end_ns
-        self.truncated = self._source.truncated
-        self.metadata = self._source.metadata
+        self.info, self.definitions = self._source.info, self._source.definitions
 
     def blocks(
         self, selection: Mapping[Role, str], names: Collection[str], *, raw: bool

@@ -9,7 +9,6 @@ time. What it raises on a damaged bag is translated here.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 
 from ..errors import RecordingError
 from .chunks import Messages
-from .columns import Block, RawMessages, Role
+from .columns import Block, RawMessages, RecordingInfo, Role, count_topics
 from .decode import Decoder, Feed
 from .unpack import unpack_message
 from .wire import Encoding
@@ -50,14 +49,10 @@ class ForeignSource:
 
         suffix = files[0].suffix
         self._encoding: Encoding = 'ros1' if suffix == '.bag' else 'cdr'
-        self.storage: str = {'.bag': 'ros1', '.mcap': 'mcap'}.get(suffix, 'sqlite3')
-        self.metadata: Mapping[str, str] = dict(metadata or {})
-        self.truncated = note
         self._path = files[0]
         self._is_packed = is_packed
         self._readers: list[tuple[Path, Any]] = []
-        types: dict[str, list[str]] = {}
-        counts: Counter[str] = Counter()
+        channels: list[tuple[str, str, int]] = []
         definitions: dict[str, tuple[str, str]] = {}
         spans: list[tuple[int, int]] = []
         try:
@@ -72,10 +67,7 @@ class ForeignSource:
                     # A database holds whatever it was given, in any column.
                     if not all(isinstance(c, str) for c in (connection.topic, connection.msgtype)):
                         raise RecordingError('a topic has no name or no type', file)
-                    counts[connection.topic] += connection.msgcount
-                    known = types.setdefault(connection.topic, [])
-                    if connection.msgtype not in known:
-                        known.append(connection.msgtype)
+                    channels.append((connection.topic, connection.msgtype, connection.msgcount))
                     if connection.msgdef.data and suffix != '.bag':
                         definitions[connection.msgtype] = (
                             f'ros2{connection.msgdef.format.name.lower()}',
@@ -84,12 +76,16 @@ class ForeignSource:
         except BaseException:
             self.close()
             raise
-        self.topics: Mapping[str, tuple[str, int]] = {
-            topic: (' | '.join(known), counts[topic]) for topic, known in types.items()
-        }
         self.definitions: Mapping[str, tuple[str, str]] = definitions
-        self.start_ns = min((start for start, _ in spans), default=0)
-        self.end_ns = max((end for _, end in spans), default=0)
+        self.info = RecordingInfo(
+            files[0],
+            {'.bag': 'ros1', '.mcap': 'mcap'}.get(suffix, 'sqlite3'),
+            count_topics(channels),
+            min((start for start, _ in spans), default=0),
+            max((end for _, end in spans), default=0),
+            note,
+            dict(metadata or {}),
+        )
 
     def blocks(
         self, selection: Mapping[Role, str], names: Collection[str], *, raw: bool

@@ -165,6 +165,11 @@ class McapFile:
             return
         if not len(chunks) == len({c.chunk_start_offset for c in chunks}) == said[0].chunk_count:
             return
+        if any(
+            one.chunk_start_offset + one.chunk_length + one.message_index_length > self.handle.size
+            for one in chunks
+        ):
+            return
         self._channels = channels
         self._schemas = {one.id: one for one in found.get(Schema, [])}
         self.counts.update(counts)
@@ -184,7 +189,8 @@ class McapFile:
             if one.uncompressed_size
         ]
         for index in found.get(MetadataIndex, []):
-            if index.name == METADATA_NAME and PREFIX.size <= index.length <= _MAX_SMALL_RECORD:
+            is_small = PREFIX.size <= index.length <= _MAX_SMALL_RECORD
+            if index.name == METADATA_NAME and is_small and index.offset < self.handle.size:
                 pairs = self.handle.read_at(index.offset, index.length)[PREFIX.size :]
                 self._on_record(Opcode.METADATA, pairs)
 

@@ -34,14 +34,19 @@ from mcap.records import (
     MetadataIndex,
     Schema,
     Statistics,
-    SummaryOffset,
 )
 
 from .. import __version__
 from ..typing import Bytes
-from .definitions import Definition, offered_qos
 from .encode import Merged, Stretch
-from .rosbag2_metadata import FileSummary, TopicSummary, dump_yaml, information
+from .rosbag2_metadata import (
+    Definition,
+    FileSummary,
+    TopicSummary,
+    dump_yaml,
+    information,
+    offered_qos,
+)
 
 MAGIC = b'\x89MCAP0\r\n'
 #: Name of the metadata record that holds the writer's key-value pairs.
@@ -57,20 +62,10 @@ _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 class McapFile:
     """
-    One MCAP file from its first byte to its footer.
+    One new MCAP file from its first byte to its footer.
 
-    Parameters
-    ----------
-    path : Path
-        Created; it must not exist.
-    compression : {'none', 'lz4', 'zstd'}
-    level : int or None
-    chunk_bytes : int
-    metadata : mapping of str to str
-        Written at the front, so that even a torn file has it.
-    name : str
-        What the finished file will be called; the rosbag2 metadata in it say so.
-
+    `metadata` is written at the front, so that even a torn file has it; `name` is what the
+    finished file will be called.
     """
 
     def __init__(
@@ -106,33 +101,15 @@ class McapFile:
 
     def channel(self, topic: str, kind: str, definition: Definition) -> int | None:
         """
-        Give the number of a topic's channel, made where it is new.
-
-        Parameters
-        ----------
-        topic : str
-            Its full name.
-        kind : str
-            Message type.
-        definition : Definition
-            Of the message type.
-
-        Returns
-        -------
-        int or None
-            None where the topic has another type already.
-
+        Give the number of a topic's channel, made where it is new; None if its type is another.
         """
         if topic in self._channels:
             same = self._topics[topic][0] == kind
             return self._channels[topic].id if same else None
         if kind not in self._schemas:
-            schema = Schema(
-                id=len(self._schemas) + 1,
-                data=definition.text.encode(),
-                encoding=definition.encoding,
-                name=kind,
-            )
+            text = definition.text.encode()
+            number = len(self._schemas) + 1
+            schema = Schema(id=number, data=text, encoding=definition.encoding, name=kind)
             self._schemas[kind] = schema
             self._put_record(schema)
         channel = Channel(
@@ -166,12 +143,12 @@ class McapFile:
         """Have the waiting messages compressed, and write what was compressed meanwhile."""
         stretch, self._tail = _joined(self._tail), []
         self._packing.append((stretch, self._pool.submit(self._pack, stretch.data)))
-        while len(self._packing) > _MAX_PACKING:
-            self._put_packed()
+        self._put_packed(_MAX_PACKING)
 
-    def _put_packed(self) -> None:
-        stretch, future = self._packing.popleft()
-        self._put_chunk(stretch, *future.result())
+    def _put_packed(self, n_left: int) -> None:
+        while len(self._packing) > n_left:
+            stretch, future = self._packing.popleft()
+            self._put_chunk(stretch, *future.result())
 
     def _pack(self, data: Bytes) -> tuple[bytes | memoryview, int]:
         return self._compress(data), zlib.crc32(data.data)
@@ -180,17 +157,16 @@ class McapFile:
         """
         Write the last chunk, the summary and the footer; flush all to disk and close.
 
-        Parameters
-        ----------
-        custom : mapping of str to str
-            The key-value pairs for rosbag2's own metadata record.
-
+        `custom` goes into rosbag2's own metadata record.
         """
         if self._tail:
             self._close_chunk()
-        while self._packing:
-            self._put_packed()
-        summary = self._summary()
+        self._put_packed(0)
+        topics = (
+            TopicSummary(topic, *self._topics[topic], self._counts[channel.id])
+            for topic, channel in self._channels.items()
+        )
+        summary = FileSummary(self._name, self._start_ns or 0, self._end_ns, tuple(topics))
         text = dump_yaml(information(summary, custom)).strip()
         self._put_metadata('rosbag2', {'serialized_metadata': text})
         self._put_record(DataEnd(data_section_crc=0))
@@ -213,7 +189,7 @@ class McapFile:
     def _put_record(self, record: McapRecord) -> None:
         builder = _new_builder()
         record.write(builder)
-        self._put(_taken(builder))
+        self._put(builder.end())
 
     def _put_metadata(self, name: str, content: Mapping[str, str]) -> None:
         begin = self._at
@@ -227,20 +203,9 @@ class McapFile:
         self._end_ns = max(self._end_ns, end)
         name = self._compression.encode()
         begin = self._at
-        self._put(
-            struct.pack(
-                f'<BQQQQII{len(name)}sQ',
-                Opcode.CHUNK,
-                40 + len(name) + len(packed),
-                start,
-                end,
-                len(stretch.data),
-                checksum,
-                len(name),
-                name,
-                len(packed),
-            )
-        )
+        n_bytes = len(stretch.data)
+        head = (Opcode.CHUNK, 40 + len(name) + len(packed), start, end, n_bytes, checksum)
+        self._put(struct.pack(f'<BQQQQII{len(name)}sQ', *head, len(name), name, len(packed)))
         self._put(packed)
         chunk_length = self._at - begin
         offsets: dict[int, int] = {}
@@ -269,17 +234,6 @@ class McapFile:
             )
         )
 
-    def _summary(self) -> FileSummary:
-        return FileSummary(
-            name=self._name,
-            start_ns=self._start_ns or 0,
-            end_ns=self._end_ns,
-            topics=tuple(
-                TopicSummary(topic, *self._topics[topic], self._counts[channel.id])
-                for topic, channel in self._channels.items()
-            ),
-        )
-
     def _put_summary(self) -> None:
         summary_start = self._at
         statistics = Statistics(
@@ -293,39 +247,21 @@ class McapFile:
             metadata_count=len(self._metadata_index),
             schema_count=len(self._schemas),
         )
-        groups: list[tuple[Opcode, list[McapRecord]]] = [
-            (Opcode.SCHEMA, list(self._schemas.values())),
-            (Opcode.CHANNEL, list(self._channels.values())),
-            (Opcode.STATISTICS, [statistics]),
-            (Opcode.CHUNK_INDEX, list(self._chunks)),
-            (Opcode.METADATA_INDEX, list(self._metadata_index)),
-        ]
         builder = _new_builder()
-        offsets: list[SummaryOffset] = []
-        for opcode, records in groups:
-            group_start = builder.count
-            for record in records:
-                record.write(builder)
-            if records:
-                offsets.append(
-                    SummaryOffset(
-                        group_length=builder.count - group_start,
-                        group_opcode=opcode,
-                        group_start=summary_start + group_start,
-                    )
-                )
-        offset_start = summary_start + builder.count
-        for offset in offsets:
-            offset.write(builder)
-        body = _taken(builder)
-        footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 20, summary_start, offset_start)
+        for record in (
+            *self._schemas.values(),
+            *self._channels.values(),
+            statistics,
+            *self._chunks,
+            *self._metadata_index,
+        ):
+            record.write(builder)
+        body: bytes = builder.end()
         self._put(body)
+        footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 20, summary_start, 0)
+        checksum = zlib.crc32(footer_head, zlib.crc32(body))
         self._put_record(
-            Footer(
-                summary_start=summary_start,
-                summary_offset_start=offset_start,
-                summary_crc=zlib.crc32(footer_head, zlib.crc32(body)),
-            )
+            Footer(summary_start=summary_start, summary_offset_start=0, summary_crc=checksum)
         )
         self._put(MAGIC)
 
@@ -339,11 +275,6 @@ def _joined(stretches: list[Stretch]) -> Stretch:
         np.concatenate([stretch.log_ns for stretch in stretches]),
         np.concatenate([stretch.size for stretch in stretches]),
     )
-
-
-def _taken(builder: Any) -> bytes:
-    data: bytes = builder.end()
-    return data
 
 
 def _compressor(

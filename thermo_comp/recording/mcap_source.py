@@ -10,7 +10,7 @@ A file with messages outside chunks has no such spans: it is read in the order o
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import ChainMap, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
@@ -22,7 +22,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..typing import Ints
 from .chunks import Messages, Span, load, pack
-from .columns import Block, RawMessages, Role
+from .columns import Block, RawMessages, RecordingInfo, Role, count_topics
 from .decode import Decoder, Feed
 from .mcap_file import McapFile, translated
 from .random_access import LocalFile, OpenFile
@@ -49,8 +49,6 @@ class McapSource:
     Raises RecordingError for a file that is no MCAP file or damaged.
     """
 
-    storage = 'mcap'
-
     def __init__(
         self,
         files: Sequence[Path],
@@ -67,33 +65,28 @@ class McapSource:
         except BaseException:
             self.close()
             raise
-        counts: Counter[str] = Counter()
-        types: dict[str, list[str]] = {}
-        for file in self._files:
-            for number, topic in file.topics.items():
-                counts[topic.name] += file.counts[number]
-                known = types.setdefault(topic.name, [])
-                if topic.type not in known:
-                    known.append(topic.type)
-        self.topics: Mapping[str, tuple[str, int]] = {
-            topic: (' | '.join(known), counts[topic]) for topic, known in types.items()
-        }
         self.definitions: Mapping[str, tuple[str, str]] = {
             kind: text for file in self._files for kind, text in file.definitions.items()
-        }
-        self.start_ns = min((f.start_ns for f in self._files if f.start_ns is not None), default=0)
-        self.end_ns = max((f.end_ns for f in self._files if f.end_ns is not None), default=0)
-        self.metadata: Mapping[str, str] = {
-            key: value
-            for pairs in (metadata or {}, *(file.metadata for file in self._files))
-            for key, value in pairs.items()
         }
         notes = [note] if note else []
         for file in self._files:
             if file.truncated is not None:
                 name = f'{file.path.name}: ' if len(self._files) > 1 else ''
                 notes.append(name + file.truncated)
-        self.truncated: str | None = '; '.join(notes) or None
+        channels = (
+            (topic.name, topic.type, file.counts[number])
+            for file in self._files
+            for number, topic in file.topics.items()
+        )
+        self.info = RecordingInfo(
+            files[0],
+            'mcap',
+            count_topics(channels),
+            min((f.start_ns for f in self._files if f.start_ns is not None), default=0),
+            max((f.end_ns for f in self._files if f.end_ns is not None), default=0),
+            '; '.join(notes) or None,
+            dict(ChainMap(*(file.metadata for file in self._files[::-1]), dict(metadata or {}))),
+        )
 
     def blocks(
         self, selection: Mapping[Role, str], names: Collection[str], *, raw: bool

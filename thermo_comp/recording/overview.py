@@ -31,21 +31,9 @@ _GAP_INTERVALS = 5.0
 @dataclass(frozen=True)
 class ThermometerSurvey:
     """
-    One thermometer's readings in a few numbers.
+    One thermometer's readings in a few numbers: degC, and largest mean rates over two minutes.
 
-    Parameters
-    ----------
-    n : int
-        Readings.
-    rate_hz : float
-        Median rate.
-    lowest, highest : float
-        Extremes.
-    steepest_heating_k_min, steepest_cooling_k_min : float
-        Largest mean rates over two minutes [K/min].
-    quantum : float
-        Smallest step between neighbouring readings that differ.
-
+    `quantum` is the smallest step between neighbouring readings that differ.
     """
 
     n: int
@@ -67,29 +55,8 @@ class Survey:
     """
     What a recording holds, as far as a fit is concerned.
 
-    Parameters
-    ----------
-    info : RecordingInfo
-        Topics and storage.
-    n : int
-        Accelerometer samples.
-    rate_hz, duration_s : float
-        Median rate and length.
-    n_gaps : int
-        Pauses of more than five usual intervals.
-    longest_gap_s : float
-        The longest of them, 0 when there is none.
-    n_backwards : int
-        Samples whose stamp does not rise.
-    n_not_finite : int
-        Samples that are no numbers.
-    n_still : int
-        Still intervals of at least 3 s.
-    still_s : float
-        Their length together.
-    board, case : ThermometerSurvey or None
-        The thermometers.
-
+    Gaps are pauses of more than five usual intervals; `n_backwards` counts samples whose stamp
+    does not rise; still intervals last at least 3 s, `still_s` together.
     """
 
     info: RecordingInfo
@@ -158,25 +125,7 @@ def survey_recording(
     """
     Read a recording once, in bounded memory, and describe it.
 
-    Parameters
-    ----------
-    path : str or Path
-        The recording.
-    topics : Topics or None, optional
-        Names of the inputs.
-    progress : callable or None, optional
-        Called with the fraction read.
-
-    Returns
-    -------
-    Survey
-        The description.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be read.
-
+    `progress` is called with the fraction read. Raises RecordingError if it cannot be read.
     """
     with open_recording(path, topics, require=()) as reader:
         name = reader.topics.get('accel')

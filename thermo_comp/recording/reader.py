@@ -40,15 +40,10 @@ from .topics import Topics, select_topics, shown
 
 
 class Source(Protocol):
-    """One opened storage."""
+    """One opened storage; which topics of `info` are read is chosen above it."""
 
-    storage: str
-    topics: Mapping[str, tuple[str, int]]
+    info: RecordingInfo
     definitions: Mapping[str, tuple[str, str]]
-    start_ns: int
-    end_ns: int
-    truncated: str | None
-    metadata: Mapping[str, str]
 
     def blocks(
         self, selection: Mapping[Role, str], names: Collection[str], *, raw: bool
@@ -69,15 +64,9 @@ class RecordingReader:
     """
     An open bag; use it as a context manager.
 
-    Attributes
-    ----------
-    info : RecordingInfo
-        What the bag says of itself; once all blocks are read, `truncated` names what did not come.
-    topics : mapping of str to str
-        The bag's own name of each role's topic.
-    definitions : mapping of str to (str, str)
-        Encoding and text of each message type's definition, where the bag carries it.
-
+    `info` is what the bag says of itself; once all blocks are read, its `truncated` names what did
+    not come. `topics` are the bag's own names of each role's, `definitions` encoding and text of
+    each message type's, where the bag carries it.
     """
 
     def __init__(
@@ -88,38 +77,19 @@ class RecordingReader:
         input: Input,  # noqa: A002 - the parameter's public name
         require: Collection[Role],
     ) -> None:
-        selection = select_topics(path, source.topics, topics, input, require)
+        selection = select_topics(path, source.info.topics, topics, input, require)
         self._source = source
         self._names = selection.thermometers
         self.topics: Mapping[Role, str] = dict(selection.topics)
         self.definitions = source.definitions
-        self.info = RecordingInfo(
-            path=path,
-            storage=source.storage,
-            topics=dict(source.topics),
-            start_ns=source.start_ns,
-            end_ns=source.end_ns,
-            truncated=source.truncated,
-            metadata=dict(source.metadata),
-            input=selection.input,
-        )
+        self.info = replace(source.info, path=path, input=selection.input)
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         """
-        Read the bag from its beginning in bounded memory.
+        Read the bag from its beginning in bounded memory, RecordingError for damaged data.
 
-        Parameters
-        ----------
-        raw : bool, optional
-            Keep the serialized messages in `Block.raw`.
-        n_messages : int, optional
-            About how many messages make a block; 0 = as few as are read at good speed.
-
-        Raises
-        ------
-        RecordingError
-            Damaged data.
-
+        `raw` keeps the serialized messages in `Block.raw`; `n_messages` is about how many make a
+        block, 0 for as few as are read at good speed.
         """
         n_read = dict.fromkeys(self.topics, 0)
         source = self._source.blocks(self.topics, self._names, raw=raw)
@@ -181,25 +151,11 @@ def open_recording(
     require: Collection[Role] = ROLES,
 ) -> RecordingReader:
     """
-    Open a bag for reading block by block.
+    Open a bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
 
-    Parameters
-    ----------
-    path : str or Path
-        A rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
-    topics : Topics, optional
-        Names of the inputs.
-    input : {'auto', 'counts', 'imu'}, optional
-        Which accelerometer topic is read; ``auto`` prefers the counts.
-    require : collection of {'accel', 'board', 'case'}, optional
-        Roles whose absence is an error; the others' columns are just empty.
-
-    Raises
-    ------
-    RecordingError
-        Missing file, not a bag, empty bag, missing or ambiguous topic, wrong message type,
-        damaged file.
-
+    Of the accelerometer's topics ``auto`` prefers the counts. Roles that are required are an error
+    where they are absent; the others' columns are just empty. Raises RecordingError for what is no
+    bag, an empty or damaged one, a missing or ambiguous topic, a wrong message type.
     """
     path = Path(path)
     try:
@@ -298,10 +254,11 @@ def _open_files(description: Description, files: Sequence[Path], note: str | Non
     else:
         source = ForeignSource(files, description.custom, note, is_packed=is_packed)
     losses = (
-        _loss(topic, source.topics.get(topic, ('', 0))[1], n_promised)
+        _loss(topic, source.info.topics.get(topic, ('', 0))[1], n_promised)
         for topic, n_promised in description.counts.items()
     )
-    source.truncated = '; '.join(filter(None, (source.truncated, *losses))) or None
+    told = '; '.join(filter(None, (source.info.truncated, *losses))) or None
+    source.info = replace(source.info, truncated=told)
     return source
 
 

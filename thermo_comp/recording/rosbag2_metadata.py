@@ -1,11 +1,16 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns rosbag2's metadata.yaml: written as ROS 2 Jazzy does it (version 9), any version read."""
+"""
+Owns what a rosbag2 bag says beside its messages: metadata.yaml, type definitions, QoS profiles.
+
+Written as ROS 2 Jazzy does it (version 9); any version is read.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
@@ -14,7 +19,7 @@ import yaml
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
-from .definitions import offered_qos
+from .topics import BOOL
 
 _VERSION = 9
 _MAX_BYTES = 1 << 24
@@ -23,6 +28,61 @@ _COMPRESSIONS: dict[str, Literal['', 'file', 'message']] = {
     'file': 'file',
     'message': 'message',
 }
+
+
+_INFINITE = {'sec': 9223372036, 'nsec': 854775807}
+
+
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """
+    A message type's definition with all that it depends on.
+
+    `encoding` is ``ros2msg`` or ``ros2idl``; `type_hash` the REP 2016 hash (RIHS01), empty where
+    it is not known.
+    """
+
+    encoding: str
+    text: str
+    type_hash: str
+
+
+@lru_cache(maxsize=1)
+def _typestore() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@lru_cache(maxsize=64)
+def known_definition(kind: str) -> Definition:
+    """Look up a message type of ROS 2 Jazzy; RecordingError for one that it does not have."""
+    typestore = _typestore()
+    if kind not in typestore.fielddefs:
+        raise RecordingError(f'the definition of message type {kind} is not known')
+    text, _ = typestore.generate_msgdef(kind, ros_version=2)
+    return Definition('ros2msg', text, typestore.hash_rihs01(kind))
+
+
+def offered_qos(kind: str) -> dict[str, Any]:
+    """
+    Give the QoS profile that is recorded as offered, in the form of metadata version 9.
+
+    Reliable, so that any reader matches; flags (std_msgs/Bool) are transient local with depth 1: a
+    late reader gets the last one.
+    """
+    is_flag = kind == BOOL
+    return {
+        'history': 'keep_last',
+        'depth': 1 if is_flag else 10,
+        'reliability': 'reliable',
+        'durability': 'transient_local' if is_flag else 'volatile',
+        'deadline': dict(_INFINITE),
+        'lifespan': dict(_INFINITE),
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': dict(_INFINITE),
+        'avoid_ros_namespace_conventions': False,
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,18 +97,7 @@ class TopicSummary:
 
 @dataclass(frozen=True, slots=True)
 class FileSummary:
-    """
-    What stands in a finished MCAP file.
-
-    Attributes
-    ----------
-    name : str
-        The file's name without directories.
-    start_ns, end_ns : int
-        First and last log time; 0 and 0 without messages.
-    topics : tuple of TopicSummary
-
-    """
+    """What stands in a finished MCAP file; first and last log time are 0 without messages."""
 
     name: str
     start_ns: int
@@ -57,17 +106,7 @@ class FileSummary:
 
 
 def information(summary: FileSummary, custom: Mapping[str, str]) -> dict[str, Any]:
-    """
-    Build the content of metadata.yaml below its only key.
-
-    Parameters
-    ----------
-    summary : FileSummary
-        What the file holds.
-    custom : mapping of str to str
-        Kept as ``custom_data``.
-
-    """
+    """Build the content of metadata.yaml below its only key."""
     n_messages = sum(topic.n_messages for topic in summary.topics)
     start = {'nanoseconds_since_epoch': summary.start_ns}
     duration = {'nanoseconds': summary.end_ns - summary.start_ns}
@@ -122,18 +161,9 @@ class Description:
     """
     What the reader needs of a metadata.yaml.
 
-    Attributes
-    ----------
-    storage : str
-        E.g. ``mcap``.
-    files : tuple of Path
-        In their order, each directly in the bag's directory.
-    compression : {'', 'file', 'message'}
-        What rosbag2 itself has compressed one by one.
-    custom : dict of str to str
-    counts : dict of str to int
-        Messages per topic, as the recorder counted them.
-
+    `files` are in their order, each directly in the bag's directory; `compression` is what rosbag2
+    itself has compressed one by one; `counts` are messages per topic, as the recorder counted
+    them.
     """
 
     storage: str
@@ -145,18 +175,9 @@ class Description:
 
 def read_metadata(directory: Path) -> Description | None:
     """
-    Read the metadata.yaml of a bag.
+    Read the metadata.yaml of a bag; None where it is missing or empty: the recorder was killed.
 
-    Returns
-    -------
-    Description or None
-        None where the file is missing or empty: the recorder was killed.
-
-    Raises
-    ------
-    RecordingError
-        A file that is no metadata of a bag, or names files that are not there.
-
+    Raises RecordingError for what is no metadata of a bag, or names files that are not there.
     """
     path = directory / 'metadata.yaml'
     try:

@@ -37,31 +37,12 @@ _STUCK = 0.3
 @dataclass(frozen=True)
 class Cells:
     """
-    Sufficient statistics of short runs of samples.
+    Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
 
-    Parameters
-    ----------
-    start_ns : int
-        Stamp that cell times count from.
-    time : ndarray, shape (n,)
-        Mean time of the cell's samples since `start_ns` [s].
-    count : ndarray of int64, shape (n,)
-        Samples in the cell.
-    mean, variance : ndarray, shape (n, 3)
-        Mean and variance of the samples.
-    index : ndarray of int64, shape (n,)
-        Number of the cell on the bag's time grid; neighbours differ by 1.
-    cell_s : float
-        Length of a cell [s].
-    n_dropped : int
-        Samples left out because a component was not finite or the stamp did not rise.
-    n_saturated : int
-        Samples at the full scale.
-    is_integer : bool
-        Whether all samples are whole numbers (counts).
-    quantum : ndarray, shape (3,)
-        Step of the samples, 0 when they have none to speak of.
-
+    `time` is the mean since `start_ns` [s]; `index` the number of the cell on the bag's time grid,
+    so that neighbours differ by 1. Dropped are samples with a component that is not finite or a
+    stamp that does not rise. `is_integer` where all are whole numbers (counts); `quantum` is the
+    step of the samples, 0 when they have none to speak of.
     """
 
     start_ns: int
@@ -81,16 +62,10 @@ class CellAccumulator:
     """
     Reduces samples to cells while they stream by.
 
-    Parameters
-    ----------
-    cell_s : float
-        Shortest length of a cell [s]; cells are longer where it would hold fewer than 30 samples.
-    full_scale : float or None
-        Magnitude at which a sample is saturated.
-    window_s : float or None, optional
-        What a whole number of cells is to last [s]; where even one cell of that length would hold
-        too few samples, a cell lasts one of `STRETCHES` times as long.
-
+    Cells of `cell_s` are longer where one would hold fewer than 30 samples. `full_scale` is where
+    a sample is saturated. `window_s` is what a whole number of cells is to last [s]; where even
+    one cell of that length would hold too few samples, a cell lasts one of `STRETCHES` times as
+    long.
     """
 
     _MIN_SAMPLES = 30
@@ -115,17 +90,7 @@ class CellAccumulator:
         self._open_id = -1
 
     def add(self, stamp_ns: Ints, samples: Floats) -> None:
-        """
-        Take the next samples in file order.
-
-        Parameters
-        ----------
-        stamp_ns : ndarray of int64, shape (n,)
-            Stamps.
-        samples : ndarray, shape (n, 3)
-            Samples.
-
-        """
+        """Take the next samples, shape (n, 3), in file order."""
         stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
         samples = np.asarray(samples, dtype=np.float64)
         if not len(stamp_ns):
@@ -150,15 +115,7 @@ class CellAccumulator:
         self._accumulate(stamp_ns, samples)
 
     def finish(self) -> Cells:
-        """
-        Close the last cell and return all of them.
-
-        Returns
-        -------
-        Cells
-            The bag's cells.
-
-        """
+        """Close the last cell and return all of them."""
         if self._open_id >= 0:
             self._ids.append(np.array([self._open_id]))
             self._sums.append(self._open)
@@ -240,20 +197,7 @@ def _quantum_of(samples: Floats) -> Floats:
 
 def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
     """
-    Find the runs of cells in which nothing moved.
-
-    Parameters
-    ----------
-    cells : Cells
-        The bag's cells.
-    min_still_s : float
-        Shortest interval worth using [s].
-
-    Returns
-    -------
-    list of (int, int)
-        Half-open ranges of cell numbers, in order.
-
+    Find the runs of cells in which nothing moved: half-open ranges of cell numbers, in order.
     """
     n = len(cells.count)
     if not n:

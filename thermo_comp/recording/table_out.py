@@ -24,27 +24,11 @@ def table_writer(
     path: str | Path, metadata: Mapping[str, str], *, overwrite: bool = False
 ) -> Iterator[WriteRows]:
     """
-    Write a table; it takes its name when the block ends well.
+    Write a table, by its suffix one of `TABLES`; it takes its name when the block ends well.
 
-    Parameters
-    ----------
-    path : str or Path
-        Its suffix is one of `TABLES`.
-    metadata : mapping of str to str
-        Kept in a Parquet file; a CSV file has no place for it.
-    overwrite : bool, optional
-        Replace a table that is there.
-
-    Yields
-    ------
-    callable
-        Takes columns by name, shape (n,) each, the same ones every time.
-
-    Raises
-    ------
-    OutputError
-        If it may not or cannot be written, or pyarrow is missing.
-
+    Yields what takes columns by name, shape (n,) each, the same ones every time. A CSV file has no
+    place for the metadata. Raises OutputError if it may not or cannot be written, or pyarrow is
+    missing.
     """
     kind = TABLES[Path(path).suffix]
     with drafted(path, kind, overwrite=overwrite) as partial:

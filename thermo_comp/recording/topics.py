@@ -6,6 +6,7 @@ Owns the search for the inputs' topics in a bag, and the sentences said when one
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,8 @@ _OPTIONS = {key: f'--{key}-topic' for key in _TYPES}
 #: What the node gives out is no input of it.
 _OUTPUT = '/imu/data_raw'
 
+#: Names of further thermometers: those that a role has not.
+_NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
@@ -38,7 +41,8 @@ class Topics:
 
     A name matches with or without its leading slash and, where only one topic of the bag fits,
     with any namespace in front: ``accel/counts`` finds ``/imu0/accel/counts``. Where a usual name
-    is not there, the bag's only topic of the type is taken.
+    is not there, the bag's only topic of the type is taken. Further thermometers are found by
+    themselves: ``temperature/<name>``, in the namespace of the board's.
     """
 
     counts: str = 'accel/counts'
@@ -104,7 +108,25 @@ def select_topics(
             found[role] = name
         elif role in require:
             raise RecordingError('the topic has no messages', path, shown(name))
-    return Selection(found, ('board', 'case'), accel if 'accel' in found else None)
+    further = _further(present, found)
+    thermometers = ('board', 'case', *further)
+    return Selection({**found, **further}, thermometers, accel if 'accel' in found else None)
+
+
+def _further(present: Present, found: Mapping[Role, str]) -> dict[str, str]:
+    """Find the other thermometers: ``temperature/<name>`` beside the board's or the case's."""
+    beside = found.get('board') or found.get('case') or ''
+    namespace, is_usual, _ = beside.rpartition('temperature/')
+    front = f'{namespace}temperature/' if is_usual else '/temperature/'
+    return {
+        name.removeprefix(front): name
+        for name, (kind, count) in sorted(present.items())
+        if kind == TEMPERATURE
+        and count
+        and name not in found.values()
+        and name.startswith(front)
+        and _NAME.fullmatch(name.removeprefix(front))
+    }
 
 
 def _accel_key(

@@ -47,7 +47,7 @@ def expand(packed: Path, target: Path) -> str | None:
         limit = size * _MAX_GROWTH + _FREE_GROWTH_BYTES
         loss = None
         try:
-            for data in _zstd_pieces(source):
+            for data in _zstd_pieces(source, _STEP_BYTES):
                 if file.tell() + len(data) > limit:
                     raise DamagedError(f'{size} bytes hold more than {limit}')
                 file.write(data)
@@ -76,14 +76,17 @@ def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
 
     Raises DamagedError for an unknown compression, damaged bytes, a wrong size or checksum.
     """
-    if compression == '':
-        data = packed
-    elif compression == 'zstd':
-        data = _unpack_zstd(packed, size)
-    elif compression == 'lz4':
-        data = _unpack_lz4(packed, size)
-    else:
-        raise _unknown(compression)
+    data = packed if compression == '' else _whole(packed, size) if compression == 'zstd' else None
+    if data is None:
+        pieces = []
+        try:
+            for piece in _pieces(compression, packed, max(size, 1)):
+                pieces.append(piece)
+                if sum(map(len, pieces)) > size:
+                    raise DamagedError(f'more than the {size} bytes that it claims')
+        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+            raise DamagedError(f'{compression}: {error}') from error
+        data = np.frombuffer(b''.join(pieces), np.uint8)
     if len(data) != size:
         raise DamagedError(f'{len(data)} bytes after decompression, expected {size}')
     if checksum and zlib.crc32(data.data) != checksum:
@@ -91,73 +94,48 @@ def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
     return data
 
 
+def _whole(packed: Bytes, size: int) -> Bytes | None:
+    """Take one frame that says how long it is, as all usual writers make it, in one go."""
+    with suppress(zstandard.ZstdError):
+        if zstandard.frame_content_size(packed.data) == size:
+            return np.frombuffer(_zstd().decompress(packed.data, allow_extra_data=False), np.uint8)
+    return None
+
+
 def unpack_beginning(compression: str, packed: Bytes) -> Bytes:
     """Decompress a torn chunk as far as its bytes go."""
     if compression == '':
         return packed
-    if compression not in {'zstd', 'lz4'}:
-        raise _unknown(compression)
-    stream = _zstd_pieces(packed.data) if compression == 'zstd' else _lz4_pieces(packed)
     pieces: list[bytes] = []
-    n_bytes = 0
     with suppress(zstandard.ZstdError, RuntimeError, EOFError):
-        for piece in stream:
+        for piece in _pieces(compression, packed, _STEP_BYTES):
             pieces.append(piece)
-            n_bytes += len(piece)
-            if n_bytes > MAX_CHUNK_BYTES:
+            if len(pieces) * _STEP_BYTES > MAX_CHUNK_BYTES:
                 break
     return np.frombuffer(b''.join(pieces), np.uint8)
 
 
-def _unknown(compression: str) -> DamagedError:
-    return DamagedError(f'unknown compression {compression!r}, expected zstd, lz4 or none')
+def _pieces(compression: str, packed: Bytes, step: int) -> Iterator[bytes]:
+    """Decompress so many bytes at a time."""
+    if compression == 'zstd':
+        yield from _zstd_pieces(packed.data, step)
+        return
+    if compression != 'lz4':
+        raise DamagedError(f'unknown compression {compression!r}, expected zstd, lz4 or none')
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    piece = decompressor.decompress(packed.data, max_length=step)
+    while piece:
+        yield piece
+        if decompressor.eof or decompressor.needs_input:
+            return
+        piece = decompressor.decompress(b'', max_length=step)
 
 
 def _zstd() -> zstandard.ZstdDecompressor:
     return zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
 
 
-def _zstd_pieces(source: Any) -> Iterator[bytes]:
+def _zstd_pieces(source: Any, step: int) -> Iterator[bytes]:
     with _zstd().stream_reader(source, read_across_frames=True) as reader:
-        while piece := reader.read(_STEP_BYTES):
+        while piece := reader.read(step):
             yield piece
-
-
-def _lz4_pieces(packed: Bytes) -> Iterator[bytes]:
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    piece = decompressor.decompress(packed.data, max_length=_STEP_BYTES)
-    while piece:
-        yield piece
-        if decompressor.eof or decompressor.needs_input:
-            return
-        piece = decompressor.decompress(b'', max_length=_STEP_BYTES)
-
-
-def _unpack_zstd(packed: Bytes, size: int) -> Bytes:
-    with suppress(zstandard.ZstdError):
-        # One frame that says how long it is, as all usual writers make it, is taken in one go.
-        if zstandard.frame_content_size(packed.data) == size:
-            whole = _zstd().decompress(packed.data, allow_extra_data=False)
-            return np.frombuffer(whole, np.uint8)
-    data = np.empty(size, np.uint8)
-    view = data.data
-    try:
-        with _zstd().stream_reader(packed.data, read_across_frames=True) as reader:
-            while len(view) > 0 and (n_read := reader.readinto(view)):
-                view = view[n_read:]
-            if reader.read(1):
-                raise DamagedError(f'more than the {size} bytes that it claims')
-    except zstandard.ZstdError as error:
-        raise DamagedError(f'zstd: {error}') from error
-    return data[: size - len(view)]
-
-
-def _unpack_lz4(packed: Bytes, size: int) -> Bytes:
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    try:
-        data = decompressor.decompress(packed.data, max_length=size)
-        if not decompressor.eof and decompressor.decompress(b'', max_length=1):
-            raise DamagedError(f'more than the {size} bytes that it claims')
-    except (RuntimeError, EOFError) as error:
-        raise DamagedError(f'lz4: {error}') from error
-    return np.frombuffer(data, np.uint8)

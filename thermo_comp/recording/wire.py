@@ -44,17 +44,10 @@ _NS = 1_000_000_000
 @dataclass(frozen=True, slots=True)
 class Stamped:
     """
-    Decoded messages of one topic.
+    Decoded messages of one topic, shape (n,) and `numbers` (n, k).
 
-    Attributes
-    ----------
-    stamp_ns : ndarray of int64, shape (n,)
-    numbers : ndarray, shape (n, k)
-    frame_start, frame_size : ndarray of int64, shape (n,)
-        Where the characters of `frame_id` stand in the buffer.
-    rows : ndarray of void, shape (n,), or None
-        The messages, where they and their `frame_id` are equally long and short.
-
+    The characters of `frame_id` stand at `frame_start` of the buffer; `rows` are the messages,
+    where they and their `frame_id` are equally long and short.
     """
 
     stamp_ns: Ints
@@ -66,17 +59,7 @@ class Stamped:
 
 def gather(buffer: Bytes, at: Ints, n_bytes: int) -> NDArray[Any]:
     """
-    Copy `n_bytes` from each position of a buffer.
-
-    Parameters
-    ----------
-    buffer : ndarray of uint8, contiguous
-        Where from.
-    at : ndarray of int64, shape (n,)
-        Positions, each at least `n_bytes` before the buffer's end.
-    n_bytes : int
-        Bytes of a row.
-
+    Copy `n_bytes` from each position, at least so far before the buffer's end, as rows of void.
     """
     kind = np.dtype((np.void, n_bytes))
     if len(at) == 0:
@@ -88,19 +71,7 @@ def gather(buffer: Bytes, at: Ints, n_bytes: int) -> NDArray[Any]:
 
 
 def scatter(buffer: Bytes, at: Ints, rows: NDArray[Any]) -> None:
-    """
-    Copy rows to positions of a buffer, the inverse of `gather`.
-
-    Parameters
-    ----------
-    buffer : ndarray of uint8, contiguous
-        Where to.
-    at : ndarray of int64, shape (n,)
-        Positions, each at least a row before the buffer's end.
-    rows : ndarray of void, shape (n,)
-        What.
-
-    """
+    """Copy rows to positions of a buffer, the inverse of `gather`."""
     if len(at):
         everywhere: NDArray[Any] = np.ndarray(
             (buffer.size - rows.itemsize + 1,), rows.dtype, buffer.data, strides=(1,)
@@ -109,24 +80,7 @@ def scatter(buffer: Bytes, at: Ints, rows: NDArray[Any]) -> None:
 
 
 def field(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
-    """
-    Look at one number of each gathered row.
-
-    Parameters
-    ----------
-    rows : ndarray of void, shape (n,)
-        Contiguous.
-    offset : int
-        Where the number stands in the row [bytes].
-    kind : str
-        Its numpy type.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        A view.
-
-    """
+    """Look at one number of each gathered row, by its offset [bytes] and numpy type: a view."""
     if len(rows) == 0:
         return np.empty(0, kind)
     view: NDArray[Any] = np.ndarray(
@@ -144,26 +98,10 @@ def decode_stamped(
     n_wanted: int | None = None,
 ) -> Stamped:
     """
-    Decode messages that are a header and float64 numbers.
+    Decode messages that are a header and float64 numbers, each at `start` of the buffer.
 
-    Parameters
-    ----------
-    buffer : ndarray of uint8, contiguous
-        The bytes they are in.
-    start, size : ndarray of int64, shape (n,)
-        Where each serialized message stands; all within the buffer.
-    kind : str
-        A key of `N_NUMBERS`.
-    encoding : {'cdr', 'ros1'}
-        How they are serialized.
-    n_wanted : int, optional
-        Take only so many leading numbers.
-
-    Raises
-    ------
-    RecordingError
-        Bytes that are no message of that type.
-
+    `kind` is a key of `N_NUMBERS`; with `n_wanted` only so many leading numbers are taken. Raises
+    RecordingError for bytes that are no message of that type.
     """
     n_numbers = N_NUMBERS[kind]
     if len(start) and int(np.min(size)) < HEAD_BYTES + 8 * n_numbers:
@@ -174,27 +112,15 @@ def decode_stamped(
     orders = _byte_orders(head) if encoding == 'cdr' else ['<']
     if len(orders) == 1:
         return _decode(buffer, start, size, head, orders[0], n_numbers, encoding, n_wanted)
-    little = field(head, 1, 'u1') == 1
-    halves = [
-        (
-            rows,
-            _decode(
-                buffer, start[rows], size[rows], head[rows], order, n_numbers, encoding, n_wanted
-            ),
-        )
-        for rows, order in ((np.flatnonzero(little), '<'), (np.flatnonzero(~little), '>'))
-    ]
-    joined = Stamped(
-        np.empty(len(start), np.int64),
-        np.empty((len(start), halves[0][1].numbers.shape[1])),
-        np.empty(len(start), np.int64),
-        np.empty(len(start), np.int64),
-    )
-    for rows, half in halves:
-        joined.stamp_ns[rows] = half.stamp_ns
-        joined.numbers[rows] = half.numbers
-        joined.frame_start[rows] = half.frame_start
-        joined.frame_size[rows] = half.frame_size
+    n = len(start)
+    stamp_ns, frame_start, frame_size = np.empty((3, n), np.int64)
+    numbers = np.empty((n, n_wanted or n_numbers))
+    joined = Stamped(stamp_ns, numbers, frame_start, frame_size)
+    is_little = field(head, 1, 'u1') == 1
+    for own in (np.flatnonzero(is_little), np.flatnonzero(~is_little)):
+        part = decode_stamped(buffer, start[own], size[own], kind, encoding, n_wanted)
+        for name in ('stamp_ns', 'numbers', 'frame_start', 'frame_size'):
+            getattr(joined, name)[own] = getattr(part, name)
     return joined
 
 
@@ -268,22 +194,7 @@ def _misfit(kind: str) -> RecordingError:
 
 
 def frame_runs(buffer: Bytes, messages: Stamped) -> list[tuple[int, str]]:
-    """
-    Find where `frame_id` changes along the messages.
-
-    Parameters
-    ----------
-    buffer : ndarray of uint8
-        The bytes they are in.
-    messages : Stamped
-        Decoded.
-
-    Returns
-    -------
-    list of (int, str)
-        First row of each run and its `frame_id`; empty where there are no messages.
-
-    """
+    """Find the first row and the text of each run of equal `frame_id`."""
     start, size = messages.frame_start, messages.frame_size
     if not len(start):
         return []

@@ -23,19 +23,9 @@ from ..errors import OutputError, RecordingError
 from ..files import Draft, bag_kind
 from ..typing import Ints
 from .columns import ImuColumns, RawMessages
-from .definitions import Definition, known_definition
-from .encode import (
-    BoolRecords,
-    Merged,
-    Piece,
-    RawRecords,
-    Records,
-    StampedRecords,
-    as_numbers,
-    as_times,
-)
+from .encode import Merged, Piece, RawRecords, Records, StampedRecords, as_numbers, as_times
 from .mcap_out import McapFile
-from .rosbag2_metadata import dump_metadata
+from .rosbag2_metadata import Definition, dump_metadata, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
 from .wire import N_NUMBERS
 
@@ -50,35 +40,19 @@ class BagWriter:
     """
     Write a bag; use it as a context manager.
 
-    Parameters
-    ----------
-    path : str or Path
-        ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
-    compression : {'zstd', 'lz4', 'none'}, optional
-    level : int, optional
-        Of the compression; the default favours speed.
-    metadata : mapping of str to str, optional
-        Key-value pairs kept in the bag; `RecordingInfo.metadata` gives them back.
-    overwrite : bool, optional
-        Replace an output that is there already.
-    chunk_bytes : int, optional
-        Size of a chunk before compression.
+    ``*.mcap`` makes a bare file, anything else a rosbag2 directory. `level` is that of the
+    compression (``zstd``, ``lz4`` or ``none``), by default a fast one; `chunk_bytes` counts before
+    it. `RecordingInfo.metadata` gives the metadata back. Raises OutputError where the output
+    exists and is not to be overwritten, is no bag that may be replaced, or cannot be created.
 
-    Raises
-    ------
-    OutputError
-        The output exists, is no bag that may be replaced, or cannot be created.
-    ValueError
-        An unknown compression.
-
-    Notes
-    -----
     Messages are buffered until `flush`, which merges all topics in log-time order; 64 MiB of them
     are flushed unasked. So one group of calls whose time spans overlap and a `flush` make a file
     in log-time order, whatever order the calls had. Arrays are not copied: leave them as they are
     until the `flush`. A process that is killed loses what is buffered and up to four chunks; the
     rest stands in a hidden file beside the target and can be read as a torn bag.
 
+    The writing methods raise ValueError for shapes that do not fit and times that no ROS stamp can
+    hold, OutputError where the disk is full or the like. Log times are the stamps, if not given.
     """
 
     def __init__(
@@ -120,30 +94,7 @@ class BagWriter:
         frame_id: str = '',
         log_ns: ArrayLike | None = None,
     ) -> None:
-        """
-        Write geometry_msgs/Vector3Stamped.
-
-        Parameters
-        ----------
-        topic : str
-            With or without a leading slash.
-        stamp_ns : array_like of int, shape (n,)
-            Header stamps.
-        xyz : array_like, shape (n, 3)
-            Counts per cycle.
-        frame_id : str, optional
-            Of all of them.
-        log_ns : array_like of int, shape (n,), optional
-            Log times; the stamps by default.
-
-        Raises
-        ------
-        ValueError
-            Shapes that do not fit, times that no ROS stamp can hold.
-        OutputError
-            The disk is full or the like.
-
-        """
+        """Write geometry_msgs/Vector3Stamped: counts per cycle, shape (n, 3)."""
         stamps = _as_stamps(stamp_ns)
         numbers = as_numbers('xyz', xyz, len(stamps), 3)
         self._write_stamped(topic, VECTOR3_STAMPED, stamps, log_ns, frame_id, [(0, numbers)])
@@ -158,30 +109,7 @@ class BagWriter:
         variance: ArrayLike = 0.0,
     ) -> None:
         """
-        Write sensor_msgs/Temperature.
-
-        Parameters
-        ----------
-        topic : str
-            With or without a leading slash.
-        stamp_ns : array_like of int, shape (n,)
-            Header stamps.
-        celsius : array_like, shape (n,)
-            degC.
-        log_ns : array_like of int, shape (n,), optional
-            Log times; the stamps by default.
-        frame_id : str, optional
-            Of all of them.
-        variance : array_like, shape (n,) or scalar, optional
-            K^2; 0 means unknown.
-
-        Raises
-        ------
-        ValueError
-            As for `write_counts`.
-        OutputError
-            As for `write_counts`.
-
+        Write sensor_msgs/Temperature: degC, shape (n,), and its variance [K^2], 0 for unknown.
         """
         stamps = _as_stamps(stamp_ns)
         column = np.asarray(celsius, np.float64)
@@ -201,88 +129,42 @@ class BagWriter:
         log_ns: ArrayLike | None = None,
     ) -> None:
         """
-        Write sensor_msgs/Imu.
+        Write sensor_msgs/Imu: m/s^2, shape (n, 3), with the covariance (n, 9) or (9,).
 
-        Parameters
-        ----------
-        topic : str
-            With or without a leading slash.
-        stamp_ns : array_like of int, shape (n,)
-            Header stamps.
-        linear_acceleration : array_like, shape (n, 3)
-            m/s^2.
-        linear_acceleration_covariance : array_like, shape (n, 9) or (9,)
-            m^2/s^4.
-        frame_id : str, optional
-            Of all of them.
-        imu : ImuColumns, optional
-            Orientation and angular velocity with their covariances. Without it neither is
-            claimed: identity orientation, zero rate, and -1 as first element of each covariance.
-        log_ns : array_like of int, shape (n,), optional
-            Log times; the stamps by default.
-
-        Raises
-        ------
-        ValueError
-            As for `write_counts`.
-        OutputError
-            As for `write_counts`.
-
+        Without `imu` neither orientation nor angular velocity is claimed: identity, zero rate, and
+        -1 as first element of each covariance.
         """
         stamps = _as_stamps(stamp_ns)
         n = len(stamps)
-        pieces: list[Piece] = [
-            (25, as_numbers('linear_acceleration', linear_acceleration, n, 3)),
-            (
-                28,
-                as_numbers('linear_acceleration_covariance', linear_acceleration_covariance, n, 9),
-            ),
+        columns: list[tuple[int, str, ArrayLike, int]] = [
+            (25, 'linear_acceleration', linear_acceleration, 3),
+            (28, 'linear_acceleration_covariance', linear_acceleration_covariance, 9),
         ]
         if imu is None:
             nothing = np.zeros((1, 25))
             nothing[0, 3] = 1.0
             nothing[0, [4, 16]] = -1.0
-            pieces.append((0, np.broadcast_to(nothing, (n, 25))))
+            columns.append((0, '', nothing[0], 25))
         else:
-            pieces += [
-                (0, as_numbers('imu.orientation', imu.orientation, n, 4)),
-                (4, as_numbers('imu.orientation_covariance', imu.orientation_covariance, n, 9)),
-                (13, as_numbers('imu.angular_velocity', imu.angular_velocity, n, 3)),
-                (
-                    16,
-                    as_numbers(
-                        'imu.angular_velocity_covariance', imu.angular_velocity_covariance, n, 9
-                    ),
-                ),
+            columns += [
+                (0, 'imu.orientation', imu.orientation, 4),
+                (4, 'imu.orientation_covariance', imu.orientation_covariance, 9),
+                (13, 'imu.angular_velocity', imu.angular_velocity, 3),
+                (16, 'imu.angular_velocity_covariance', imu.angular_velocity_covariance, 9),
             ]
+        pieces = [(at, as_numbers(name, value, n, width)) for at, name, value, width in columns]
         self._write_stamped(topic, IMU, stamps, log_ns, frame_id, pieces)
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
-        """
-        Write std_msgs/Bool.
-
-        Parameters
-        ----------
-        topic : str
-            With or without a leading slash.
-        log_ns : array_like of int, shape (n,)
-            Log times.
-        values : array_like of bool, shape (n,)
-            What they say.
-
-        Raises
-        ------
-        ValueError
-            As for `write_counts`.
-        OutputError
-            As for `write_counts`.
-
-        """
+        """Write std_msgs/Bool."""
         times = as_times('log_ns', log_ns)
         flags = np.atleast_1d(np.asarray(values, np.bool_))
         if flags.shape != times.shape:
             raise ValueError(f'`values` must have {len(times)} values, got {flags.shape}')
-        self._add(BoolRecords(self._channel(topic, BOOL), times, flags))
+        payloads = np.zeros((len(times), 5), np.uint8)
+        payloads[:, 1], payloads[:, 4] = 1, flags
+        ends = 5 * np.arange(1, len(times) + 1)
+        self._add(RawRecords(self._channel(topic, BOOL), times, payloads.ravel(), ends))
 
     def write_raw(
         self,
@@ -295,29 +177,8 @@ class BagWriter:
         """
         Write messages that are serialized (CDR) already.
 
-        Parameters
-        ----------
-        topic : str
-            With or without a leading slash.
-        type : str
-            E.g. ``diagnostic_msgs/msg/DiagnosticArray``.
-        log_ns : array_like of int, shape (n,)
-            Log times.
-        messages : sequence of bytes, or RawMessages
-            The serialized messages.
-        definition : (str, str), optional
-            Encoding (``ros2msg``, ``ros2idl``) and text of the type's definition, as
-            `RecordingReader.definitions` gives it; by default that of ROS 2 Jazzy.
-
-        Raises
-        ------
-        ValueError
-            Lengths that do not fit.
-        RecordingError
-            A type whose definition is not known.
-        OutputError
-            As for `write_counts`.
-
+        `definition` is encoding and text of the type's, as `RecordingReader.definitions` gives it;
+        by default that of ROS 2 Jazzy, RecordingError where that has none.
         """
         if isinstance(messages, RawMessages):
             data, ends = messages.data, messages.ends
@@ -329,15 +190,7 @@ class BagWriter:
         self._add(RawRecords(channel, times, data, ends))
 
     def flush(self) -> None:
-        """
-        Merge what is buffered in log-time order and hand it to the file.
-
-        Raises
-        ------
-        OutputError
-            The disk is full or the like.
-
-        """
+        """Merge what is buffered in log-time order and hand it to the file."""
         if self._batches:
             batches, self._batches, self._n_buffered_bytes = self._batches, [], 0
             with self._translated():
@@ -347,12 +200,8 @@ class BagWriter:
         """
         Finish the bag and give it its name.
 
-        Raises
-        ------
-        OutputError
-            The disk is full or the like, or somebody else was first; nothing of this output is
-            left then.
-
+        Raises OutputError where that fails, or somebody else was first; nothing is left of it
+        then.
         """
         if self._file is None:
             return
