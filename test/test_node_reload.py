@@ -135,6 +135,10 @@ def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
         assert "unit.serial: must be 'T-1' (parameter `serial`), got 'T-2'" in result.reason
         (result,) = peer.set_parameters(input='imu')
         assert "unit.input: must be 'm/s^2'" in result.reason
+        # Another set of thermometers, for which this node has no subscriptions.
+        save_calibration(of_bias(5.0, sensors=('case', 'lid')), third)
+        (result,) = peer.set_parameters(calibration_file=str(third))
+        assert 'sensors: must be case, which this node listens to, got case, lid' in result.reason
         flow.more()
         flow.stop()
         assert node.is_alive, node.said

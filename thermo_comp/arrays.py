@@ -229,7 +229,7 @@ def fit(
     Parameters
     ----------
     recordings : str, Path or Columns, or sequence of them
-        The bags, or arrays with the temperatures ``'board'`` and ``'case'``.
+        The bags, or arrays with the temperatures ``'board'``, ``'case'`` and any more.
     gravity : float
         Local gravity [m/s^2].
     **options
@@ -272,14 +272,13 @@ def _source(columns: Columns) -> FitSource:
     if samples.shape != (len(stamps), 3):
         raise ValueError(f'`counts` must have the shape ({len(stamps)}, 3), got {samples.shape}')
     empty: tuple[list[float], list[float]] = ([], [])
-    board, case = (
-        _readings(name, columns.temperatures.get(name, empty), stamps, _is_date(columns.time_s))
-        for name in ('board', 'case')
-    )
     start = columns.start_ns
-    block = ArrayBlock(
-        stamps + start, samples, board[0] + start, board[1], case[0] + start, case[1]
-    )
+    given: dict[str, Temperature] = {'board': empty, 'case': empty, **columns.temperatures}
+    found = {}
+    for name, value in given.items():
+        own, celsius, _ = _readings(name, value, stamps, _is_date(columns.time_s))
+        found[name] = own + start, celsius
+    block = ArrayBlock(stamps + start, samples, *found.pop('board'), *found.pop('case'), found)
     return FitSource(columns.name, lambda: [block], serial=columns.serial)
 
 

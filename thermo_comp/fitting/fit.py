@@ -310,10 +310,8 @@ def fit_bags(
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
     """Name the thermometers beside the board that every bag has; the case leads, seen or not."""
-    common = set.intersection(
-        *({n for n, one in b.temperatures.items() if len(one.value)} for b in bags)
-    )
-    return 'case', *sorted(common - {'board', 'case'})
+    seen = ({name for name, one in bag.temperatures.items() if len(one.value)} for bag in bags)
+    return 'case', *sorted(set.intersection(*seen) - {'board', 'case'})
 
 
 def _check_temperatures(bags: Sequence[ReducedBag]) -> None:

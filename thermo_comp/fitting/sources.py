@@ -10,7 +10,7 @@ simulated runs provide it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from ..typing import Floats, Ints
@@ -47,6 +47,8 @@ class ArrayBlock:
         Stamps of the temperature readings.
     board, case : ndarray, shape (m,) and (k,)
         Temperatures.
+    others : mapping of str to (ndarray of int64, ndarray), optional
+        Stamps and temperatures of further thermometers.
 
     """
 
@@ -56,6 +58,7 @@ class ArrayBlock:
     board: Floats
     case_stamp_ns: Ints
     case: Floats
+    others: Mapping[str, tuple[Ints, Floats]] = field(default_factory=dict)
 
     @property
     def temperatures(self) -> Mapping[str, tuple[Ints, Floats, Any]]:
@@ -63,6 +66,7 @@ class ArrayBlock:
         return {
             'board': (self.board_stamp_ns, self.board, None),
             'case': (self.case_stamp_ns, self.case, None),
+            **{name: (stamps, value, None) for name, (stamps, value) in self.others.items()},
         }
 
 

@@ -34,7 +34,7 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
-from ..errors import ThermoCompError
+from ..errors import CalibrationError, ThermoCompError
 from ..online.compensator import Compensator
 from ..online.snapshot import take_snapshot
 from ..online.stamped_flag import STAMPED_TOPIC
@@ -293,12 +293,24 @@ class CompensationNode:
                 # Set by code of this process, not through a service.
                 loaded = read(config.calibration_file, config.calibration_directory)
             check(loaded, config)
+            self._check_thermometers(loaded)
             if config.input != self._config.input:
                 samples = self._open_samples(config)
         except ThermoCompError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self._prepared = (config, loaded, samples)
         return SetParametersResult(successful=True)
+
+    def _check_thermometers(self, loaded: LoadedCalibration) -> None:
+        """Refuse a calibration whose thermometers are not those that this node listens to."""
+        named, heard = loaded.calibration.sensors, self._compensator.thermal.inputs[1:]
+        if named != heard:
+            raise CalibrationError(
+                f'must be {", ".join(heard)}, which this node listens to, got {", ".join(named)}: '
+                'start the node anew with this file',
+                loaded.path,
+                'sensors',
+            )
 
     def _post_set(self, _changes: list[Parameter]) -> None:
         """Apply what `_on_set` checked."""

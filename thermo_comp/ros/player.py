@@ -17,6 +17,7 @@ histories, which transient-local durability keeps full.
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,7 +41,7 @@ from ..typing import Bytes
 NODE_NAME = 'thermo_comp_player'
 
 #: Messages of a topic under way at most; so many are kept to be sent again.
-WINDOW: dict[Role, int] = {'accel': 200, 'board': 50, 'case': 50}
+WINDOW: dict[Role, int] = defaultdict(lambda: 50, accel=200)
 #: Wall time between two messages on `/clock` [s].
 CLOCK_PERIOD = 0.01
 #: The longest nap, so that an interrupt is heeded [s].
@@ -52,7 +53,6 @@ SETTLING = 0.3
 #: How long a subscriber may leave a window unacknowledged [s].
 PATIENCE = 30.0
 
-_NAMES: dict[Role, str] = {'board': 'temperature/board', 'case': 'temperature/case'}
 _ACCEL = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
 
 
@@ -137,7 +137,7 @@ class _Player:
         self._publishers: dict[Role, Any] = {
             role: self._node.create_publisher(
                 accel_type if role == 'accel' else Temperature,
-                accel_name if role == 'accel' else _NAMES[role],
+                accel_name if role == 'accel' else f'temperature/{role}',
                 _qos(WINDOW[role]),
             )
             for role in reader.topics

@@ -29,7 +29,7 @@ from rclpy.node import Node
 
 from ..errors import ThermoCompError
 from ..online.stamped_flag import STAMPED_TOPIC
-from ..recording import Input, Role, Topics
+from ..recording import ROLES, Input, Role, Topics
 from .node import NODE_NAME
 from .player import PlayReport, play
 from .recorder import OUTPUTS, Recorder
@@ -48,12 +48,9 @@ DROPPED_S = 0.5
 IN_FLIGHT = 1000
 
 _TOPICS = {**OUTPUTS, 'diagnostics': DiagnosticArray}
+#: The node's own word for a role.
+_SPOKEN: dict[Role, str] = {'accel': 'sample'}
 _ACCOUNT = ('-p', 'diagnostics_period:=0.1')
-_PUBLISHERS: dict[Role, str] = {
-    'accel': 'sample publishers',
-    'board': 'board publishers',
-    'case': 'case publishers',
-}
 _INPUTS = ('accel/counts', 'imu/uncompensated', 'temperature/board', 'temperature/case')
 
 
@@ -194,7 +191,9 @@ def _account(recorder: Recorder) -> dict[str, str]:
 def _is_found(recorder: Recorder, player: Node, roles: Collection[Role]) -> bool:
     """Tell whether the node has found the player, by what it says itself, and hears it."""
     account = _account(recorder)
-    if any(account.get(_PUBLISHERS[role], '0') == '0' for role in roles):
+    heard = {role: account.get(f'{_SPOKEN.get(role, role)} publishers') for role in roles}
+    # A further thermometer is heard if the node's calibration names it.
+    if any(n == '0' or (n is None and role in ROLES) for role, n in heard.items()):
         return False
     # The first thing that one process ever sends to another can get lost on a busy machine, and
     # would come again behind the samples: so it is a question that is answered.

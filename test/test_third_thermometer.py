@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A third thermometer: found in the bags, fitted, applied by replay, and of use where it sees more.
+
+The unit's electronics under the lid are switched on and off at random. Neither the board nor the
+case feels that, so what the lid's temperature does to the axes is seen by its own sensor alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.fit_sources import fit_sources
+from thermo_comp.judging import evaluate
+from thermo_comp.recording import BagWriter, Topics, read_recording
+from thermo_comp.replay import replay
+from thermo_comp.simulation import (
+    STANDARD_GRAVITY,
+    SimulatedRun,
+    parse_cyclogram,
+    positions,
+    simulate,
+    unit_preset,
+)
+from thermo_comp.simulation.drift import DriftModel, PartEffect
+from thermo_comp.simulation.network import AIR, Link, ThermalNetwork
+from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
+from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+
+PROGRAM = parse_cyclogram('20 10min, 40@1 40min, 5@1 40min')
+MICRO_G = STANDARD_GRAVITY * 1e-6
+#: What a kelvin of the lid does to the axes [ug], and what the load adds to it [K].
+LID_UG_K = (12.0, -9.0, 15.0)
+LOAD_K = 5.0
+
+
+def unit_with_a_lid() -> UnitModel:
+    network = ThermalNetwork(
+        {'case': 800.0, 'board': 120.0, 'lid': 60.0},
+        (Link(AIR, 'case', 4.0), Link('case', 'board', 0.4), Link('case', 'lid', 0.1)),
+    )
+    drift = DriftModel(
+        (PartEffect('board', bias=(6.0, 4.0, -8.0)), PartEffect('lid', bias=LID_UG_K))
+    )
+    return replace(
+        unit_preset('bare-quartz', 1),
+        network=network,
+        drift=drift,
+        loads=(SwitchedLoad('lid', 0.1 * LOAD_K),),
+    )
+
+
+def record(path: Path, run: SimulatedRun, *, has_lid: bool) -> Path:
+    truth, rng = run.truth, np.random.default_rng(7)
+    with BagWriter(path, metadata={'serial': truth.unit.serial}) as bag:
+        bag.write_temperature('temperature/board', run.board_stamp_ns, run.board)
+        bag.write_temperature('temperature/case', run.case_stamp_ns, run.case)
+        if has_lid:
+            since = (run.case_stamp_ns - run.accel_stamp_ns[0]) * 1e-9 + truth.cycle_s[0]
+            lid = np.interp(since, truth.grid_s, truth.temperature('lid'))
+            lid += 0.01 * rng.standard_normal(len(lid))
+            bag.write_temperature('temperature/lid', run.case_stamp_ns, lid)
+        bag.write_counts('accel/counts', run.accel_stamp_ns, run.counts.astype(float))
+    return path
+
+
+def fitted(bags: list[Path]) -> Calibration:
+    sources, _ = fit_sources(bags)
+    return fit(sources, FitOptions(gravity=STANDARD_GRAVITY)).calibration
+
+
+@pytest.fixture(scope='module')
+def runs() -> list[SimulatedRun]:
+    unit = unit_with_a_lid()
+    return [
+        simulate(unit, PROGRAM, up, rate_hz=2.0, temperature_rate_hz=1.0, seed=number)
+        for number, up in enumerate(positions(7, 1))
+    ]
+
+
+def test_a_third_thermometer_explains_what_the_others_do_not_see(
+    runs: list[SimulatedRun], tmp_path: Path
+) -> None:
+    errors, spreads = {}, {}
+    for has_lid in (False, True):
+        folder = tmp_path / str(has_lid)
+        folder.mkdir()
+        *bags, held_out = (
+            record(folder / f'{k}.mcap', run, has_lid=has_lid) for k, run in enumerate(runs)
+        )
+        save_calibration(fitted(bags), folder / 'unit.yaml')
+        calibration = load_calibration(folder / 'unit.yaml')
+        assert calibration.sensors == (('case', 'lid') if has_lid else ('case',))
+        assert any(term.sensor == 'lid' for term in calibration.response) == has_lid
+
+        output = folder / 'corrected.mcap'
+        replay(held_out, calibration, output)
+        corrected = read_recording(
+            output, Topics(imu='imu/data_raw'), 'imu', require=('accel',)
+        ).columns
+        truth = runs[-1].truth
+        index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)
+        error = corrected.accel - truth.specific_force[index]
+        use = (truth.position[index] >= 0) & (truth.cycle_s[index] > 600.0)
+        # A minute's means, about their own: neither noise nor constants are what is asked for.
+        n = int(use.sum()) // 120 * 120
+        means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
+        errors[has_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G
+        judged = evaluate([held_out], [('unit', calibration)]).judgements['unit']
+        assert judged is not None
+        norms = np.linalg.norm(judged.windows.force, axis=1)
+        spreads[has_lid] = float(np.std(norms)) / MICRO_G
+    # The switched load alone is worth this much on the axes together, RMS.
+    switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0
+    assert errors[False] > 0.3 * switched
+    assert errors[True] < 0.05 * errors[False]
+    assert spreads[True] < 0.2 * spreads[False]
