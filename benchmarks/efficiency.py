@@ -17,8 +17,6 @@ from accuracy import WINDOW_S, fit_and_correct
 
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
-    DriftModel,
-    PartEffect,
     Position,
     UnitModel,
     arrays,
@@ -27,6 +25,7 @@ from thermo_comp.simulation import (
     simulate,
     unit_preset,
 )
+from thermo_comp.simulation.drift import DriftModel, PartEffect
 from thermo_comp.typing import Floats
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from report_helpers import PROGRAM, RATE_HZ, certificate, evidence, fitted, run, write_bag
+from simulation_helpers import ideal_regime
 
 from thermo_comp import __version__
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
@@ -25,7 +26,7 @@ from thermo_comp.report import Evidence, evidence_of_bags, evidence_of_fit, writ
 from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.page import render_page
 from thermo_comp.report.plates import PLATES, png_files
-from thermo_comp.simulation import STANDARD_GRAVITY, ideal_regime, parse_cyclogram
+from thermo_comp.simulation import STANDARD_GRAVITY, parse_cyclogram
 from thermo_comp.thermal.regime import Regime
 
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}

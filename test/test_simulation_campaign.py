@@ -16,11 +16,7 @@ from thermo_comp.simulation import (
     PLAN_NAMES,
     STANDARD_GRAVITY,
     TRIAD_NAMES,
-    FlowEffect,
-    PartHistory,
     Position,
-    SlipEffect,
-    SwitchedLoad,
     UnitModel,
     arrays,
     parse_cyclogram,
@@ -28,6 +24,8 @@ from thermo_comp.simulation import (
     simulate,
     unit_preset,
 )
+from thermo_comp.simulation.drift import FlowEffect, PartHistory, SlipEffect
+from thermo_comp.simulation.unit import SwitchedLoad
 from thermo_comp.typing import Floats
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')

@@ -9,7 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from thermo_comp.simulation import Converter
+from thermo_comp.simulation.converter import Converter
 
 
 def test_sum_of_counts_is_the_integral_within_one_count(rng: np.random.Generator) -> None:

@@ -19,13 +19,13 @@ from thermo_comp.simulation import (
     MICRO_G,
     UNIT_NAMES,
     Cyclogram,
-    PartHistory,
     UnitModel,
     cyclogram_preset,
     positions,
     simulate,
     unit_preset,
 )
+from thermo_comp.simulation.drift import PartHistory
 from thermo_comp.typing import Floats
 
 RATE_HZ = 10.0

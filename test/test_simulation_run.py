@@ -9,24 +9,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import welch
+from simulation_helpers import ideal_regime
 
 from thermo_comp.simulation import (
     MICRO_G,
     START_NS,
     ChamberRipple,
-    DriftModel,
-    PartEffect,
     SimulatedRun,
-    ThermometerModel,
     UnitModel,
     cyclogram_preset,
-    ideal_regime,
     positions,
     ramps_and_soaks,
     simulate,
     simulate_blocks,
     unit_preset,
 )
+from thermo_comp.simulation.drift import DriftModel, PartEffect
+from thermo_comp.simulation.thermometers import ThermometerModel
 from thermo_comp.typing import Floats
 
 UP = np.array([0.48, -0.6, 0.64])

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from ..errors import RecordingError
 from ..typing import Bools, Floats, Ints
-from .log import ForeignLog, Readings, origin, thin
+from .log import NO_READINGS, ForeignLog, Readings, origin, thin
 from .table import NO_STAMP
 from .units import find_stillness
 
@@ -70,7 +70,9 @@ def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = No
     baros = {number: _reported(readings) for number, readings in log.baros.items()}
     if baro is None:
         baros = {number: readings for number, readings in baros.items() if len(readings.celsius)}
-    case = _choose(baros, baro, 'barometer', log.path) if baros or baro is not None else None
+    case = NO_READINGS
+    if baros or baro is not None:
+        case = _choose(baros, baro, 'barometer', log.path)
     board = _reported(Readings(rows.stamp_ns, rows.celsius))
     return ForeignLog(
         path=log.path,
@@ -80,8 +82,8 @@ def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = No
         stamp_ns=rows.stamp_ns,
         accel=rows.accel,
         gyro=rows.gyro,
-        board=thin(board) if len(board.celsius) else None,
-        case=None if case is None or not len(case.celsius) else thin(case),
+        board=thin(board),
+        case=thin(case),
         line=np.arange(1, len(rows.stamp_ns) + 1),
         serial=rows.serial,
         n_short=rows.n_short,

@@ -147,6 +147,6 @@ def _most(path: Path, names: list[str], what: str, option: str) -> str | None:
     return names[0] if names else None
 
 
-def _readings(stamp_ns: Ints, celsius: Floats) -> Readings | None:
+def _readings(stamp_ns: Ints, celsius: Floats) -> Readings:
     use = np.isfinite(celsius)
-    return Readings(stamp_ns[use], celsius[use]) if use.any() else None
+    return Readings(stamp_ns[use], celsius[use])

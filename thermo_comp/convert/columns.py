@@ -20,7 +20,7 @@ from ..plain_yaml import load_plain_yaml
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
-from .log import ForeignLog, Readings, origin, thin
+from .log import NO_READINGS, ForeignLog, Readings, origin, thin
 from .table import NO_STAMP, Column, Table, read_parquet, read_text
 
 #: A map takes some kB.
@@ -252,9 +252,9 @@ def _stamps(table: Table, columns: ColumnMap) -> Ints:
     return np.asarray(start_ns + steps.astype(np.int64))
 
 
-def _readings(table: Table, stamp_ns: Ints, thermometer: Thermometer | None) -> Readings | None:
+def _readings(table: Table, stamp_ns: Ints, thermometer: Thermometer | None) -> Readings:
     if thermometer is None:
-        return None
+        return NO_READINGS
     slope, offset = thermometer.linear
     known = stamp_ns != NO_STAMP
     celsius = table.values[thermometer.column][known] * slope + offset

@@ -80,8 +80,8 @@ class ForeignLog:
     stamp_ns: Ints
     accel: Floats
     gyro: Floats | None
-    board: Readings | None
-    case: Readings | None
+    board: Readings
+    case: Readings
     line: Ints
     counts_per_g: float | None = None
     clip: tuple[float, float] | None = None
@@ -130,6 +130,9 @@ class ConversionReport:
     stillness: Stillness
     start_ns: int
     missing: str | None
+
+
+NO_READINGS = Readings(np.empty(0, dtype=np.int64), np.empty(0))
 
 
 def thin(readings: Readings) -> Readings:
@@ -207,8 +210,8 @@ def write_log(
         output=str(output),
         rows=len(log.stamp_ns) + log.n_short,
         accel_messages=len(stamp_ns),
-        board_messages=0 if log.board is None else len(log.board.stamp_ns),
-        case_messages=0 if log.case is None else len(log.case.stamp_ns),
+        board_messages=len(log.board.stamp_ns),
+        case_messages=len(log.case.stamp_ns),
         input=log.input,
         rate_hz=1e9 / float(np.median(steps)) if len(steps) else float('nan'),
         duration_s=float(newest[-1] - stamp_ns[0]) * 1e-9,
@@ -239,9 +242,7 @@ def _is_in_range(stamp_ns: Ints) -> Bools:
     return np.asarray((stamp_ns >= 0) & (stamp_ns < STAMP_END_NS))
 
 
-def _stampable(readings: Readings | None) -> Readings | None:
-    if readings is None:
-        return None
+def _stampable(readings: Readings) -> Readings:
     use = _is_in_range(readings.stamp_ns)
     return Readings(readings.stamp_ns[use], readings.celsius[use])
 
@@ -259,7 +260,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
         )
     low, high = _PLAUSIBLE_CELSIUS
     for name, readings in (('board', log.board), ('case', log.case)):
-        if readings is None or not len(readings.celsius):
+        if not len(readings.celsius):
             continue
         typical = float(np.nanmedian(readings.celsius))
         if not low <= typical <= high:
@@ -284,29 +285,26 @@ def _write(
     stamp_ns = log.stamp_ns[usable]
     values = log.accel[usable] * log.factor
     gyro = None if log.gyro is None else log.gyro[usable]
-    log_of = {'board': _log_times(log.board), 'case': _log_times(log.case)}
-    written = {'board': 0, 'case': 0}
+    waiting = [
+        (topic, readings, np.maximum.accumulate(readings.stamp_ns))
+        for topic, readings in ((topics.board, log.board), (topics.case, log.case))
+        if len(readings.celsius)
+    ]
     with BagWriter(output, metadata=log.metadata, overwrite=force) as writer:
+        since = np.iinfo(np.int64).min
         for first in range(0, len(stamp_ns), _RUN_ROWS):
             last = min(first + _RUN_ROWS, len(stamp_ns))
-            is_end = last == len(stamp_ns)
-            for name, readings in (('board', log.board), ('case', log.case)):
-                if readings is None:
-                    continue
-                until = (
-                    len(readings.stamp_ns)
-                    if is_end
-                    else int(np.searchsorted(log_of[name], newest[last - 1], side='right'))
-                )
-                run = slice(written[name], until)
-                written[name] = until
+            until = newest[last - 1] if last < len(stamp_ns) else np.iinfo(np.int64).max
+            for topic, readings, log_ns in waiting:
+                run = slice(*np.searchsorted(log_ns, (since, until), side='right'))
                 writer.write_temperature(
-                    getattr(topics, name),
+                    topic,
                     readings.stamp_ns[run],
                     readings.celsius[run],
-                    log_ns=log_of[name][run],
+                    log_ns=log_ns[run],
                     frame_id=log.frame_id,
                 )
+            since = until
             rows = slice(first, last)
             if log.input == 'counts':
                 writer.write_counts(
@@ -326,12 +324,6 @@ def _write(
             writer.flush()
             if progress is not None:
                 progress(last / len(stamp_ns))
-
-
-def _log_times(readings: Readings | None) -> Ints:
-    if readings is None:
-        return np.empty(0, dtype=np.int64)
-    return np.maximum.accumulate(readings.stamp_ns)
 
 
 def _imu_columns(n: int, gyro: Floats | None) -> ImuColumns:

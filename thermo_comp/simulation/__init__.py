@@ -18,7 +18,6 @@ Nothing here is built from a compensator's regressors, reads a file or a clock.
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .attitude import positions
 from .campaign import PLAN_NAMES, Position, Record, arrays, plan
-from .converter import Converter
 from .cyclogram import (
     CYCLOGRAM_NAMES,
     Cyclogram,
@@ -26,27 +25,12 @@ from .cyclogram import (
     parse_cyclogram,
     ramps_and_soaks,
 )
-from .drift import (
-    CreepEffect,
-    DifferenceEffect,
-    DriftModel,
-    Effect,
-    FlowEffect,
-    LeakageEffect,
-    PartEffect,
-    PartHistory,
-    SlipEffect,
-)
-from .network import AIR, Link, ThermalNetwork, Thermostat
 from .presets import TRIAD_NAMES, UNIT_NAMES, unit_preset
-from .response import ThermalResponse
-from .run import START_NS, ChamberRipple, RunOptions, simulate, simulate_blocks
-from .thermometers import ThermometerModel
-from .truth import SimulatedRun, Truth, ideal_regime
-from .unit import SwitchedLoad, UnitModel
+from .run import START_NS, ChamberRipple, simulate, simulate_blocks
+from .truth import SimulatedRun
+from .unit import UnitModel
 
 __all__ = [
-    'AIR',
     'CYCLOGRAM_NAMES',
     'MICRO_G',
     'PLAN_NAMES',
@@ -55,32 +39,13 @@ __all__ = [
     'TRIAD_NAMES',
     'UNIT_NAMES',
     'ChamberRipple',
-    'Converter',
-    'CreepEffect',
     'Cyclogram',
-    'DifferenceEffect',
-    'DriftModel',
-    'Effect',
-    'FlowEffect',
-    'LeakageEffect',
-    'Link',
-    'PartEffect',
-    'PartHistory',
     'Position',
     'Record',
-    'RunOptions',
     'SimulatedRun',
-    'SlipEffect',
-    'SwitchedLoad',
-    'ThermalNetwork',
-    'ThermalResponse',
-    'ThermometerModel',
-    'Thermostat',
-    'Truth',
     'UnitModel',
     'arrays',
     'cyclogram_preset',
-    'ideal_regime',
     'parse_cyclogram',
     'plan',
     'positions',

@@ -125,43 +125,22 @@ class ThermalResponse:
         """
         Return the parts' temperatures, the thermostat's integral [W] and set point, shape (m, k).
         """
-        return self._evaluate(time)[0]
-
-    def rates(self, time: ArrayLike) -> Floats:
-        """Return the derivative of the whole state, shape (m, k), per second."""
-        return self._evaluate(time)[1]
-
-    def _evaluate(self, time: ArrayLike) -> tuple[Floats, Floats]:
         time = np.atleast_1d(np.asarray(time, dtype=float))
         k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
-        size = len(self.network.system()[1])
-        states, rates = np.empty((2, len(time), size))
+        states = np.empty((len(time), len(self.network.system()[1])))
         if self._integrated:
-            # The derivative of what was integrated, over half a second either side.
             for interval in np.unique(k):
-                here, solution = k == interval, self._integrated[interval]
-                states[here] = solution(time[here]).T
-                rates[here] = (solution(time[here] + 0.5) - solution(time[here] - 0.5)).T
-            return states, rates
+                here = k == interval
+                states[here] = self._integrated[interval](time[here]).T
+            return states
         for first in range(0, len(time), _CHUNK):
             piece = slice(first, first + _CHUNK)
             at, since = k[piece], time[piece] - self._time[k[piece]]
             decaying = np.exp(since[:, None] * self._rate) * self._amplitude[at]
             straight = self._alpha[at] + self._beta[at] * since[:, None]
             states[piece] = straight + (decaying @ self._modes.T).real
-            rates[piece] = self._beta[at] + ((decaying * self._rate) @ self._modes.T).real
-        return states, rates
+        return states
 
     def temperatures(self, time: ArrayLike) -> Floats:
         """Return the temperatures [degC] in the order of ``network.nodes``, shape (m, n_parts)."""
         return self.states(time)[:, : len(self.network.nodes)]
-
-    def heater_power(self, time: ArrayLike) -> Floats:
-        """Return what the thermostat spends at instants [s], W; 0 without one."""
-        states = self.states(time)
-        heat = self.network.thermostat
-        if heat is None:
-            return np.zeros(len(states))
-        n = len(self.network.nodes)
-        error = states[:, n + 1] - states[:, self.network.nodes.index(heat.node)]
-        return heat.proportional * error + states[:, n]

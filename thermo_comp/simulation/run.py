@@ -153,9 +153,7 @@ class ThermalTruth:
         n_grid = math.ceil(cyclogram.duration_s / _GRID_S) + 1
         self.grid: Floats = np.arange(n_grid, dtype=float) * _GRID_S
         self.air = np.interp(self.grid, knots, air)
-        n_nodes = len(unit.network.nodes)
-        self.temperatures = self.response.states(self.grid)[:, :n_nodes]
-        self.rates = self.response.rates(self.grid)[:, :n_nodes]
+        self.temperatures = self.response.temperatures(self.grid)
         origin = unit.origin
         bias_ug, scale = unit.drift.evaluate(
             PartHistory(unit.network.nodes, self.temperatures - origin, origin, _GRID_S)
@@ -242,7 +240,6 @@ class Chamber:
             grid_s=thermal.grid,
             air=thermal.air,
             temperatures=thermal.temperatures,
-            rates=thermal.rates,
             bias_grid=self.bias,
             scale_grid=thermal.scale,
             cycle_s=cycle_s,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..typing import Bools, Floats, Ints
+from ..typing import Floats, Ints
 from .network import AIR
 from .unit import UnitModel
 
@@ -31,8 +31,8 @@ class Truth:
         Parts, the columns of the temperatures.
     grid_s, air : ndarray, shape (m,)
         Instants of the thermal grid from the start of the run, s, and air temperature, degC.
-    temperatures, rates : ndarray, shape (m, n_parts)
-        Temperatures of the parts, degC, and their derivatives, K/s.
+    temperatures : ndarray, shape (m, n_parts)
+        Of the parts, degC.
     bias_grid, scale_grid : ndarray, shape (m, 3)
         Bias [counts/cycle] and relative scale on the grid.
     cycle_s : ndarray, shape (n,)
@@ -48,7 +48,6 @@ class Truth:
     grid_s: Floats
     air: Floats
     temperatures: Floats
-    rates: Floats
     bias_grid: Floats
     scale_grid: Floats
     cycle_s: Floats
@@ -87,14 +86,6 @@ class SimulatedRun:
     case_stamp_ns: Ints
     case: Floats
     truth: Truth
-
-
-def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
-    """Tell where, on the thermal grid, the board really takes up or gives off heat."""
-    truth = run.truth
-    rate = truth.rates[:, truth.nodes.index(truth.unit.board.node)]
-    result: Bools = np.abs(rate) * 60.0 > threshold_k_min
-    return result
 
 
 def _on_cycles(grid: Floats, grid_s: Floats, cycle_s: Floats) -> Floats:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -87,24 +88,10 @@ class UnitModel:
         air = self.network.air_for(self.board.node, self.reference_temperature)
         return self.network.equilibrium(air)
 
-    def with_thermometers(
-        self,
-        *,
-        noise_sd: float | None = None,
-        quantum: float | None = None,
-        rate_hz: float | None = None,
-    ) -> UnitModel:
-        """Return the unit with other thermometers on board and case; None keeps what they have."""
-
-        def changed(model: ThermometerModel) -> ThermometerModel:
-            return replace(
-                model,
-                noise_sd=model.noise_sd if noise_sd is None else noise_sd,
-                quantum=model.quantum if quantum is None else quantum,
-                rate_hz=model.rate_hz if rate_hz is None else rate_hz,
-            )
-
-        return replace(self, board=changed(self.board), case=changed(self.case))
+    def with_thermometers(self, **changes: Any) -> UnitModel:
+        """Return the unit with other thermometers, the same changes on board and case."""
+        board, case = (replace(one, **changes) for one in (self.board, self.case))
+        return replace(self, board=board, case=case)
 
     def sibling(self, seed: int, spread: float = 0.15) -> UnitModel:
         """
