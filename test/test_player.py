@@ -33,7 +33,7 @@ from thermo_comp.errors import OutputError, RecordingError, ThermoCompError
 from thermo_comp.recording import BagWriter, ImuColumns, Topics, read_recording
 from thermo_comp.ros import player
 from thermo_comp.ros.player import play
-from thermo_comp.ros.recorder import Recorder, record
+from thermo_comp.ros.recorder import Recorder
 
 WINDOW = player.WINDOW['accel']
 
@@ -308,15 +308,15 @@ def test_record_ends_when_told_or_when_nothing_comes(peer: Peer, tmp_path: Path)
     thread.start()
     topics = {'imu/data_raw': Imu}
     path = tmp_path / 'out.mcap'
-    counts = record(path, lambda counts: counts['imu/data_raw'] >= 20, topics=topics)
+    with Recorder(path, topics=topics) as recorder:
+        assert recorder.wait_until(lambda counts: counts['imu/data_raw'] >= 20, TIMEOUT)
     stop.set()
     thread.join(TIMEOUT)
-    assert counts['imu/data_raw'] >= 20
-    silent = {'nobody/is/there': Imu}
-    quiet = record(tmp_path / 'no.mcap', lambda _: False, topics=silent, timeout_s=0.2)
-    assert quiet == {'nobody/is/there': 0}
-    with pytest.raises(OutputError, match=r'out.mcap'):
-        record(path, lambda _: True, topics=topics)
+    with Recorder(tmp_path / 'no.mcap', topics={'nobody/is/there': Imu}) as recorder:
+        assert not recorder.wait_until(lambda _: False, 0.2)
+        assert recorder.counts == {'nobody/is/there': 0}
+    with pytest.raises(OutputError, match=r'out.mcap'), Recorder(path, topics=topics):
+        pass
 
 
 def test_a_recorder_says_that_the_disk_is_full(

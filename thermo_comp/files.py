@@ -76,12 +76,7 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """
-    Tell by the suffix what a bag is to be: ``*.mcap`` a bare file, a name without a suffix a
-    rosbag2 directory; OutputError for any other.
-
-    `others` is what else may be written there, for the message.
-    """
+    """Tell by the suffix what a bag is to be; `others` is what else may be, for the message."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP
@@ -93,9 +88,7 @@ def bag_kind(path: str | Path, others: str = '') -> Kind:
 
 
 def shown_name(path: str | Path) -> str:
-    """
-    Give the last part of a path as text that can be written anywhere, even where it is no UTF-8.
-    """
+    """Give the last part of a path as text that can be written anywhere, UTF-8 or not."""
     return os.fsencode(Path(path).name).decode('utf-8', 'replace')
 
 
@@ -116,9 +109,7 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 
 def read_bounded(path: str | Path, limit: int) -> bytes:
-    """
-    Read a regular file, OSError if it is none; ValueError if it is larger than `limit` bytes.
-    """
+    """Read a regular file; ValueError if it is larger than `limit` bytes, OSError as above."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
@@ -177,9 +168,7 @@ class Draft:
                 self.partial.mkdir()
 
     def publish(self) -> None:
-        """
-        Give the finished output its name; OutputError if somebody else was first, whose stays.
-        """
+        """Give the finished output its name; OutputError if somebody else was first."""
         with _told(self._path):
             if self.partial.is_dir():
                 sync_directory(self.partial)

@@ -24,10 +24,7 @@ def one_line(text: str) -> str:
 
 
 def hold_standard_streams() -> None:
-    """
-    Open what of stdin, stdout and stderr is closed: no other file may get their numbers, which
-    libraries write to.
-    """
+    """Open what of the three is closed: no file may get a number that libraries write to."""
     for number, name in enumerate(('stdin', 'stdout', 'stderr')):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
@@ -38,10 +35,7 @@ def hold_standard_streams() -> None:
 
 
 def valid_serial(serial: str) -> str:
-    """
-    Return a serial that may go into files and onto screens; ValueError unless it is one short
-    printable line.
-    """
+    """Return a serial that may go into files and onto screens, or raise ValueError."""
     if not serial or len(serial) > LONGEST_SERIAL or not serial.isprintable():
         shown = one_line(serial[:LONGEST_SERIAL])
         raise ValueError(

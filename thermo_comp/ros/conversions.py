@@ -52,9 +52,8 @@ _NATIVE = Struct('<25Q')
 @dataclass(frozen=True, slots=True)
 class _Layout:
     """
-    Where a sample of one kind holds its values, and the Imu that it becomes.
-
-    What is passed on, of an Imu, begins at `passed`; 0 for counts.
+    Where a sample of one kind has its values (what of an Imu is passed on, from `passed`; 0 for
+    none).
     """
 
     unpack: Callable[[bytes], tuple[Any, ...]]
@@ -72,25 +71,8 @@ class _Layout:
             if self.is_foreign:
                 block = _NATIVE.pack(*_FOREIGN.unpack(block))
         fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
-        return self.pack(
-            _ENCAPSULATION,
-            sec,
-            nanosec,
-            self.frame,
-            block,
-            fx,
-            fy,
-            fz,
-            c00,
-            c01,
-            c02,
-            c01,
-            c11,
-            c12,
-            c02,
-            c12,
-            c22,
-        )
+        covariance = (c00, c01, c02, c01, c11, c12, c02, c12, c22)
+        return self.pack(_ENCAPSULATION, sec, nanosec, self.frame, block, fx, fy, fz, *covariance)
 
 
 def _unpack_nothing(_data: bytes) -> tuple[Any, ...]:
@@ -106,8 +88,7 @@ _UNKNOWN = _Layout(_unpack_nothing, b'', b'', _pack_nothing, b'', 0, False)
 
 class SampleConverter:
     """
-    Turns serialized Vector3Stamped (counts) or Imu into serialized Imu through a compensating
-    function; an empty `frame_id` keeps that of the input.
+    Turns serialized samples into serialized Imu; an empty `frame_id` keeps that of the input.
     """
 
     def __init__(self, message_type: Any, frame_id: str = '') -> None:

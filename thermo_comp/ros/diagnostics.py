@@ -11,9 +11,13 @@ first; the key values hold the figures.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+from rclpy.subscription import Subscription
 
 from ..online.status import CompensatorStatus, Counters
 from ..text import one_line
@@ -31,7 +35,12 @@ SILENT_CYCLES, SILENT_S = 5.0, 0.5
 GRAVITY_SIGMAS = 5.0
 
 _REGIMES = {Regime.UNKNOWN: 'unknown', Regime.STATIC: 'static', Regime.DYNAMIC: 'dynamic'}
+_ERROR, _WARN = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
 _DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
+
+
+#: Level and text.
+Finding = tuple[int, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +66,7 @@ class Traffic:
 @dataclass(frozen=True, slots=True)
 class Input:
     """
-    A topic that the node reads: what comes in there, its name remapped, the publishers that the
-    node hears, and why it does not hear one that is there.
+    A topic that the node reads, remapped, with those it hears, and why it does not hear another.
     """
 
     name: str
@@ -70,8 +78,7 @@ class Input:
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """
-    The node at one moment: the diagonal of the covariance last published [m^2/s^4], for how long
-    there have been no samples, and the inputs, samples first.
+    The node at one moment: variances as last published [m^2/s^4], silence [s], samples first.
     """
 
     status: CompensatorStatus
@@ -81,14 +88,29 @@ class Snapshot:
     inputs: tuple[Input, ...]
 
 
+def look_at(node: Node, name: str, subscription: Subscription) -> Input:
+    """Count the publishers of an input; where there is none, say why one is not heard."""
+    topic, kind = subscription.topic_name, subscription.msg_type
+    n_publishers = subscription.get_publisher_count()
+    if n_publishers:
+        return Input(name, topic, n_publishers)
+    expected = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+    for found in node.get_publishers_info_by_topic(topic):
+        if found.topic_type != expected:
+            return Input(name, topic, 0, f'its type is {found.topic_type}, not {expected}')
+        fit, reason = qos_check_compatible(found.qos_profile, subscription.qos_profile)
+        if fit == QoSCompatibility.ERROR:
+            said = reason.replace('ERROR: ', '').rstrip('; ')
+            return Input(name, topic, 0, f'{said} (qos_overrides.{topic}.subscription)')
+    return Input(name, topic, 0)
+
+
 def build(
     name: str, loaded: LoadedCalibration, now: Snapshot, before: Snapshot
 ) -> DiagnosticStatus:
-    """
-    Say how the compensation of a node (two units are two entries) is doing; differences to the
-    last report tell what happened in between.
-    """
-    findings = sorted(_findings(loaded, now, before), key=lambda finding: -finding[0])
+    """Say how the compensation of a node is doing now, and what has happened since before."""
+    findings = [*_input_findings(now, before), *_findings(loaded, now, before)]
+    findings.sort(key=lambda finding: -finding[0])
     return DiagnosticStatus(
         level=bytes([findings[0][0] if findings else 0]),
         name=f'{name}: compensation',
@@ -100,53 +122,58 @@ def build(
     )
 
 
-def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
-    """List everything that is not as it should be, with its level."""
-    error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
-    status, new = now.status, _since(now.status.counters, before.status.counters)
-    found = _input_findings(now, before)
-    silent_s = max(SILENT_S, SILENT_CYCLES * loaded.calibration.unit.cycle_time_s)
-    if new.n_in == 0 and now.silence_s > silent_s:
-        found.append((error, 'no samples are coming in'))
+def _input_findings(now: Snapshot, before: Snapshot) -> Iterator[Finding]:
+    """Say what is wrong with those who send, and with the node itself."""
+    for k, one in enumerate(now.inputs):
+        if one.n_publishers > 1:
+            text = f'{one.n_publishers} publishers on {one.topic}'
+            yield _ERROR, f'{text}, it is not used until one is left'
+        if one.mismatch:
+            level = _ERROR if k < 2 else _WARN
+            yield level, f'no messages of a publisher on {one.topic}: {one.mismatch}'
+    n_contested = now.traffic.n_contested - before.traffic.n_contested
+    if n_contested:
+        yield _ERROR, f'{n_contested} messages of more than one publisher, dropped'
+    n_failures = now.traffic.n_failures - before.traffic.n_failures
+    if n_failures:
+        yield _ERROR, f'{n_failures} callbacks failed, see the log of the node'
+
+
+def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> Iterator[Finding]:
+    """Say what is wrong with what comes in and what is made of it."""
+    status, unit = now.status, loaded.calibration.unit
+    new = _since(status.counters, before.status.counters)
+    if new.n_in == 0 and now.silence_s > max(SILENT_S, SILENT_CYCLES * unit.cycle_time_s):
+        yield _ERROR, 'no samples are coming in'
     if status.state is None:
-        found.append((error, 'no board temperature yet, nothing is published'))
+        yield _ERROR, 'no board temperature yet, nothing is published'
     elif status.is_board_lost:
-        found.append(
-            (error, f'board temperature {status.board_age_s:.1f} s old, nothing is published')
-        )
+        yield _ERROR, f'board temperature {status.board_age_s:.1f} s old, nothing is published'
     elif status.is_board_stale:
-        found.append((warn, f'board temperature {status.board_age_s:.1f} s old, held'))
-    found += _sensor_findings(status)
-    if status.is_lead_reversed:
-        found.append(
-            (
-                error,
-                'the board leads the case in ramps: are temperature/board and temperature/case '
-                'swapped, or is it heated from inside?',
-            )
-        )
-    found += _sample_findings(status, new)
+        yield _WARN, f'board temperature {status.board_age_s:.1f} s old, held'
+    yield from _sensor_findings(status)
+    if new.n_stuck:
+        yield _ERROR, f'{new.n_stuck} samples stuck or all zero, dropped'
+    if new.n_too_fast:
+        yield _ERROR, f'{new.n_too_fast} samples too fast for their conversion cycle, dropped'
+    gravity = status.gravity
+    if gravity is not None:
+        missed = f'|f| at rest misses gravity by {gravity.residual:+.2e}'
+        missed += f' +- {gravity.residual_sd:.1e} m/s^2'
+        if status.is_refuted:
+            yield _ERROR, f'{missed}: another unit, or an axis reversed? Nothing is published'
+        elif gravity.sigmas > GRAVITY_SIGMAS:
+            yield _WARN, f'{missed}: has the unit aged?'
     if new.n_saturated:
-        full_scale = loaded.calibration.unit.full_scale
-        found.append((error, f'{new.n_saturated} samples saturated (+-{full_scale:g}), dropped'))
+        yield _ERROR, f'{new.n_saturated} samples saturated (+-{unit.full_scale:g}), dropped'
     if status.state is not None and status.is_case_lost:
-        found.append((warn, 'case temperature lost, the board sensor decides the regime'))
-    if status.temperature_excess_k:
-        found.append(
-            (
-                warn,
-                f'board temperature {status.temperature_excess_k:+.2f} K outside the '
-                'calibrated range, held at its edge',
-            )
-        )
-    if status.rate_excess_k_min:
-        found.append(
-            (
-                warn,
-                f'temperature rate {status.rate_excess_k_min:+.2f} K/min outside the '
-                'calibrated range, held at its edge',
-            )
-        )
+        yield _WARN, 'case temperature lost, the board sensor decides the regime'
+    for excess, what in (
+        (status.temperature_excess_k, 'board temperature {:+.2f} K'),
+        (status.rate_excess_k_min, 'temperature rate {:+.2f} K/min'),
+    ):
+        if excess:
+            yield _WARN, f'{what.format(excess)} outside the calibrated range, held at its edge'
     for count, text in (
         (new.n_not_finite, 'samples not finite, dropped'),
         (new.n_out_of_order, 'samples out of order, dropped'),
@@ -156,91 +183,33 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> lis
         (now.traffic.n_unpublished - before.traffic.n_unpublished, 'messages not accepted by DDS'),
     ):
         if count:
-            found.append((warn, f'{count} {text}'))
-    rate, calibrated = _sample_rate(now, before), 1.0 / loaded.calibration.unit.cycle_time_s
+            yield _WARN, f'{count} {text}'
+    rate, calibrated = _sample_rate(now, before), 1.0 / unit.cycle_time_s
     if rate is not None and abs(rate / calibrated - 1.0) > RATE_TOLERANCE:
-        found.append((warn, f'{rate:.4g} samples/s, calibrated for {calibrated:.4g}'))
-    return found
+        yield _WARN, f'{rate:.4g} samples/s, calibrated for {calibrated:.4g}'
 
 
-def _input_findings(now: Snapshot, before: Snapshot) -> list[tuple[int, str]]:
-    """Say what is wrong with those who send, and with the node itself."""
-    error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
-    found: list[tuple[int, str]] = []
-    for k, one in enumerate(now.inputs):
-        if one.n_publishers > 1:
-            text = f'{one.n_publishers} publishers on {one.topic}'
-            found.append((error, f'{text}, it is not used until one is left'))
-        if one.mismatch:
-            level = error if k < 2 else warn
-            found.append((level, f'no messages of a publisher on {one.topic}: {one.mismatch}'))
-    n_contested = now.traffic.n_contested - before.traffic.n_contested
-    if n_contested:
-        found.append((error, f'{n_contested} messages of more than one publisher, dropped'))
-    n_failures = now.traffic.n_failures - before.traffic.n_failures
-    if n_failures:
-        found.append((error, f'{n_failures} callbacks failed, see the log of the node'))
-    return found
-
-
-def _sensor_findings(status: CompensatorStatus) -> list[tuple[int, str]]:
+def _sensor_findings(status: CompensatorStatus) -> Iterator[Finding]:
     """Say what is wrong with the thermometers themselves."""
-    found = []
     for name, fault, step in (
         ('board', status.board_fault, status.board_step_k),
         ('case', status.case_fault, status.case_step_k),
     ):
         if fault == Fault.STILL:
-            text = 'stands still to the bit, its uncertainty grows'
+            yield _WARN, f'{name} temperature stands still to the bit, its uncertainty grows'
         elif fault == Fault.FROZEN:
-            text = 'frozen: the other one moves; its readings are not used'
+            yield (_WARN, f'{name} temperature frozen: the other moves; its readings are not used')
         elif fault == Fault.STEP:
-            text = f'jumped by {step:+.2f} K; its readings are not used'
-        else:
-            continue
-        found.append((DiagnosticStatus.WARN[0], f'{name} temperature {text}'))
-    if status.pending_ahead_s > AHEAD_S:
-        found.append(
-            (
-                DiagnosticStatus.WARN[0],
-                f'temperatures are stamped {status.pending_ahead_s:.0f} s ahead of the samples',
-            )
-        )
-    if status.gradient_excess_k:
-        found.append(
-            (
-                DiagnosticStatus.WARN[0],
-                f'case minus board {status.gradient_excess_k:+.2f} K outside the calibrated '
-                'range, held at its edge',
-            )
-        )
-    return found
-
-
-def _sample_findings(status: CompensatorStatus, new: Counters) -> list[tuple[int, str]]:
-    """Say what is wrong with the samples themselves, and with the calibration for them."""
-    error, warn = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
-    found = []
-    if new.n_stuck:
-        found.append((error, f'{new.n_stuck} samples stuck or all zero, dropped'))
-    if new.n_too_fast:
-        found.append(
-            (error, f'{new.n_too_fast} samples too fast for their conversion cycle, dropped')
-        )
-    gravity = status.gravity
-    if gravity is not None:
-        figure = f'{gravity.residual:+.2e} +- {gravity.residual_sd:.1e} m/s^2'
-        if status.is_refuted:
-            found.append(
-                (
-                    error,
-                    f'|f| at rest misses gravity by {figure}: another unit, or an axis '
-                    'reversed? Nothing is published',
-                )
-            )
-        elif gravity.sigmas > GRAVITY_SIGMAS:
-            found.append((warn, f'|f| at rest misses gravity by {figure}: has the unit aged?'))
-    return found
+            yield _WARN, f'{name} temperature jumped by {step:+.2f} K; its readings are not used'
+    ahead_s, excess_k = status.pending_ahead_s, status.gradient_excess_k
+    if ahead_s > AHEAD_S:
+        yield _WARN, f'temperatures are stamped {ahead_s:.0f} s ahead of the samples'
+    if excess_k:
+        text = f'case minus board {excess_k:+.2f} K'
+        yield _WARN, f'{text} outside the calibrated range, held at its edge'
+    if status.is_lead_reversed:
+        text = 'are temperature/board and temperature/case swapped, or is it heated from inside?'
+        yield _ERROR, f'the board leads the case in ramps: {text}'
 
 
 def _all_well(now: Snapshot) -> str:
@@ -294,13 +263,10 @@ def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[
         ('samples out', str(counters.n_out - now.traffic.n_unpublished)),
     ]
     values += [
-        (entry.name.removeprefix('n_').replace('_', ' '), str(getattr(counters, entry.name)))
-        for entry in fields(Counters)
+        (entry.name.removeprefix('n_').replace('_', ' '), str(getattr(holder, entry.name)))
+        for holder in (counters, now.traffic)
+        for entry in fields(holder)
         if entry.name != 'n_out'
-    ]
-    values += [
-        (entry.name.removeprefix('n_').replace('_', ' '), str(getattr(now.traffic, entry.name)))
-        for entry in fields(Traffic)
     ]
     values += [(f'{one.name} publishers', str(one.n_publishers)) for one in now.inputs]
     return [
@@ -321,9 +287,7 @@ def _since(now: Counters, before: Counters) -> Counters:
 
 
 def _sample_rate(now: Snapshot, before: Snapshot) -> float | None:
-    """
-    Return samples per second of data time since the last report; None where it can't be told.
-    """
+    """Return samples per second of data time since the last report; None where nothing tells."""
     start_ns, end_ns = before.status.stamp_ns, now.status.stamp_ns
     n_new = now.status.counters.n_in - before.status.counters.n_in
     if start_ns is None or end_ns is None or end_ns <= start_ns:

@@ -29,7 +29,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
@@ -41,13 +40,11 @@ from ..online.stamped_flag import STAMPED_TOPIC
 from ..text import hold_standard_streams, one_line
 from . import parameters
 from .conversions import SampleConverter
-from .diagnostics import Input, Snapshot, Traffic, build
-from .discovery import mismatch
-from .loading import check, load
+from .diagnostics import Snapshot, Traffic, build, look_at
 from .middleware import use_profile
 from .parameters import NodeConfig, ParameterError
 from .raw import RawSubscription
-from .reader import LoadedCalibration, Reader, read
+from .reader import LoadedCalibration, Reader, check, load, read
 from .relay import Relay
 from .requests import ParameterRequests
 from .signals import SignalWatch
@@ -96,8 +93,7 @@ _INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompe
 
 class CompensationNode:
     """
-    The node around one `Compensator`; ThermoCompError if a parameter or the calibration can't be
-    used.
+    The node around a `Compensator`; ThermoCompError if a parameter or the file can't be used.
     """
 
     def __init__(self, context: Context | None = None) -> None:
@@ -221,15 +217,10 @@ class CompensationNode:
             variances,
             time.monotonic() - self._last_samples,
             tuple(
-                self._look_at(name, one.subscription)
+                look_at(self.node, name, one.subscription)
                 for name, one in zip(names, relay.inputs, strict=True)
             ),
         )
-
-    def _look_at(self, name: str, subscription: Subscription) -> Input:
-        n_publishers = subscription.get_publisher_count()
-        reason = '' if n_publishers else mismatch(self.node, subscription)
-        return Input(name, subscription.topic_name, n_publishers, reason)
 
     def _report(self) -> None:
         """Publish diagnostics; log when the level changes."""
@@ -256,9 +247,7 @@ class CompensationNode:
                 self._log.error(status.message)
 
     def _count_lost(self) -> None:
-        """
-        Count gaps in the driver's numbering, which mean something only while there is one driver.
-        """
+        """Count gaps in the driver's numbering, which mean something only while it is one."""
         samples = self._relay.samples
         n_lost, samples.n_lost = samples.n_lost, 0
         before, self._n_publishers = self._n_publishers, samples.subscription.get_publisher_count()
@@ -341,10 +330,7 @@ class CompensationNode:
 
 
 def main(args: list[str] | None = None) -> int:
-    """
-    Run the node and return its exit code: 0 after an orderly end, 1 if it could not start, 2 for a
-    wrong usage.
-    """
+    """Run the node; 0 after an orderly end, 1 if it could not start, 2 for a wrong usage."""
     args = sys.argv if args is None else args
     hold_standard_streams()
     try:

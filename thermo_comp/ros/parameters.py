@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -25,7 +25,7 @@ from .conversions import LONGEST_FRAME
 
 _DEFAULTS = CompensatorConfig()
 
-_TYPES = {str: Parameter.Type.STRING, float: Parameter.Type.DOUBLE, int: Parameter.Type.INTEGER}
+_TYPES = {str: Parameter.Type.STRING, float: Parameter.Type.DOUBLE}
 
 
 def _parameter(
@@ -50,8 +50,8 @@ def _parameter(
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
     """
-    The node's parameters, all of them live but `calibration_directory`; the units are in their
-    descriptions.
+    The node's parameters, all of them live but `calibration_directory`; descriptions have the
+    units.
     """
 
     calibration_file: str = _parameter(
@@ -134,10 +134,7 @@ class ParameterError(ThermoCompError):
 
 
 def declare(node: Node) -> NodeConfig:
-    """
-    Declare every parameter and return what the user's overrides make of them; ParameterError where
-    one does not fit.
-    """
+    """Declare every parameter with the user's value; ParameterError where it does not fit."""
     values: dict[str, Any] = {}
     for name, entry in _TABLE.items():
         # Looked at before it is declared for good: an integer override of a float is welcome.
@@ -160,10 +157,7 @@ def descriptor(name: str) -> ParameterDescriptor:
     )
     if entry.metadata['bounds']:
         lower, upper = entry.metadata['bounds']
-        if isinstance(entry.default, int):
-            described.integer_range = [IntegerRange(from_value=lower, to_value=upper, step=1)]
-        else:
-            described.floating_point_range = [FloatingPointRange(from_value=lower, to_value=upper)]
+        described.floating_point_range = [FloatingPointRange(from_value=lower, to_value=upper)]
     if entry.metadata['choices']:
         described.additional_constraints = f'one of: {", ".join(entry.metadata["choices"])}'
     return described
@@ -182,10 +176,7 @@ def coerce(parameters: Iterable[Parameter]) -> list[Parameter]:
 
 
 def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
-    """
-    Apply values set together; others' parameters are passed over, ParameterError where one does
-    not fit.
-    """
+    """Apply values set together, passing over others' parameters; ParameterError as above."""
     values = {one.name: _checked(one.name, one.value) for one in parameters if one.name in _TABLE}
     return replace(config, **values)
 
@@ -235,13 +226,11 @@ def _checked(name: str, value: Any) -> Any:
                 f'parameter `{name}` must be one of {", ".join(choices)}, got {value!r:.60}'
             )
         return value
-    is_whole = isinstance(entry.default, int)
-    if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float):
-        kind = 'whole number' if is_whole else 'number'
-        raise ParameterError(f'parameter `{name}` must be a {kind}, got {value!r:.60}')
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ParameterError(f'parameter `{name}` must be a number, got {value!r:.60}')
     lower, upper = entry.metadata['bounds']
     if not (math.isfinite(value) and lower <= value <= upper):
         raise ParameterError(
             f'parameter `{name}` must be between {lower:g} and {upper:g}, got {value:g}'
         )
-    return value if is_whole else float(value)
+    return float(value)

@@ -34,9 +34,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
 
 from ..errors import ThermoCompError
-from ..recording import Block, Input, RecordingReader, Role, Topics, open_recording
-from ..recording.encode import stamped_payloads
-from ..typing import Bytes
+from ..recording import Block, Input, RawMessages, RecordingReader, Role, Topics, open_recording
 
 NODE_NAME = 'thermo_comp_player'
 
@@ -89,22 +87,17 @@ def play(
     """
     Publish a bag's samples and temperatures.
 
-    At `rate` seconds of the bag per second, 0 as fast as the subscribers take it; `n_loops` times,
-    0 until interrupted; after at most `wait_s` for a subscriber on every topic. `is_found` tells
-    whether the subscribers have found the player's topics of these roles: what is sent before that
-    can come late; a little time is given to them without it. `throttle` gets the number of samples
-    sent after each window and may block for a while.
-
-    ValueError if `rate` or `n_loops` is negative, RecordingError if the bag can't be read,
-    ThermoCompError if a reliable subscriber stopped taking messages.
+    At `rate` seconds of the bag per second, 0 as fast as they are taken; `n_loops` times, 0 until
+    interrupted; after at most `wait_s` for subscribers. `is_found` tells whether these have found
+    the topics of some roles: what is sent before can come late. `throttle` gets the number of
+    samples sent after each window and may block. ThermoCompError if a reliable subscriber stops.
     """
     if not rate >= 0.0:
         raise ValueError(f'`rate` must be zero or positive, got {rate}')
     if n_loops < 0:
         raise ValueError(f'`n_loops` must be zero or positive, got {n_loops}')
     context = Context()
-    required: tuple[Role, ...] = ('accel',)
-    with open_recording(path, topics, input, require=required) as reader:
+    with open_recording(path, topics, input, require=('accel',)) as reader:
         rclpy.init(args=['--ros-args', *ros_args], context=context)
         try:
             player = _Player(context, reader, rate, clock, throttle)
@@ -180,7 +173,7 @@ class _Player:
         start_wall = time.monotonic()
         start_ns: int | None = None
         n_before = sum(self._n_sent.values())
-        for block in self._reader.blocks(raw=self._reader.info.storage != 'ros1'):
+        for block in self._reader.blocks(raw=True):
             for log_ns, role, data in _in_order(block, self._reader.topics):
                 start_ns = log_ns if start_ns is None else start_ns
                 if self._rate:
@@ -246,59 +239,21 @@ def _qos(depth: int) -> QoSProfile:
 
 
 def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, Role, bytes]]:
-    """Serialize a block's messages in the order of the bag: log time, role, bytes."""
-    columns: list[tuple[Role, Any, Any, Iterator[bytes]]] = [
-        (name, block.log_ns[name], one.after - 0.5, _readings(block, name, topics))
-        for name, one in block.temperatures.items()
-    ]
-    columns.append(
-        ('accel', block.log_ns['accel'], np.arange(len(block)), _samples(block, topics))
-    )
-    log_ns = np.concatenate([times for _, times, _, _ in columns])
-    places = np.concatenate([place for _, _, place, _ in columns])
-    which = np.repeat(np.arange(len(columns)), [len(times) for _, times, _, _ in columns])
+    """Give a block's messages in the order of the bag: log time, role, bytes."""
+    messages = {one.topic: _split(one) for one in block.raw}
+    roles: list[Role] = [*block.temperatures, 'accel']
+    places: list[Any] = [one.after - 0.5 for one in block.temperatures.values()]
+    places.append(np.arange(len(block)))
+    log_ns = np.concatenate([block.log_ns[role] for role in roles])
+    which = np.repeat(np.arange(len(roles)), [len(one) for one in places])
     # Readings between the same two samples: by log time.
-    for index in np.lexsort((log_ns, places)).tolist():
-        role, _, _, messages = columns[which[index]]
-        yield int(log_ns[index]), role, next(messages)
+    for index in np.lexsort((log_ns, np.concatenate(places))).tolist():
+        role = roles[which[index]]
+        yield int(log_ns[index]), role, next(messages[topics[role]])
 
 
-def _samples(block: Block, topics: Mapping[Role, str]) -> Iterator[bytes]:
-    if block.raw:
-        return _raw(block, topics.get('accel'))
-    numbers = block.accel
-    if block.imu is not None:
-        imu = block.imu
-        numbers = np.hstack(
-            [
-                imu.orientation,
-                imu.orientation_covariance,
-                imu.angular_velocity,
-                imu.angular_velocity_covariance,
-                block.accel,
-                imu.linear_acceleration_covariance,
-            ]
-        )
-    return _rows(stamped_payloads(block.accel_stamp_ns, block.frame_id, numbers))
-
-
-def _readings(block: Block, role: Role, topics: Mapping[Role, str]) -> Iterator[bytes]:
-    if block.raw:
-        return _raw(block, topics.get(role))
-    stamps, celsius, _ = block.temperatures[role]
-    numbers = np.stack([celsius, np.zeros_like(celsius)], axis=1)
-    return _rows(stamped_payloads(stamps, '', numbers))
-
-
-def _raw(block: Block, topic: str | None) -> Iterator[bytes]:
-    for messages in block.raw:
-        if messages.topic == topic:
-            start = 0
-            data = messages.data.tobytes()
-            for end in messages.ends.tolist():
-                yield data[start:end]
-                start = end
-
-
-def _rows(payloads: Bytes) -> Iterator[bytes]:
-    return (row.tobytes() for row in payloads)
+def _split(messages: RawMessages) -> Iterator[bytes]:
+    start, data = 0, messages.data.tobytes()
+    for end in messages.ends.tolist():
+        yield data[start:end]
+        start = end

@@ -23,9 +23,7 @@ DRAIN_LIMIT = 4096
 
 
 class RawSubscription:
-    """
-    A subscription of `WaitLoop.subscribe`, read by whoever runs the loop and not by an executor.
-    """
+    """A subscription of `WaitLoop.subscribe`, read by whoever runs the loop."""
 
     def __init__(self, subscription: Subscription) -> None:
         self.subscription = subscription
@@ -44,12 +42,10 @@ class RawSubscription:
 
     def drain(self, *, is_paced: bool = False) -> tuple[list[bytes], list[int]]:
         """
-        Take what waits in the queue, oldest first: at most `DRAIN_LIMIT` serialized messages, and
-        when the middleware got each [ns], comparable between subscriptions.
+        Take at most `DRAIN_LIMIT` waiting messages, oldest first, and when each was received [ns].
 
-        Where it is paced, for subscriptions that wake, it does not look whether there is another
-        message before its turn, going by the last two: one that comes early is there at the next
-        wake-up.
+        Paced, it does not look for another message before its turn, going by the last two: one
+        that comes early is there at the next wake-up.
         """
         messages: list[bytes] = []
         received_ns: list[int] = []

@@ -17,12 +17,15 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, TYPE_CHECKING, cast
 
 from ..errors import CalibrationError
 from ..files import read_bounded
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
+
+if TYPE_CHECKING:
+    from .parameters import NodeConfig
 
 #: Added to the niceness of the process: the samples go first.
 NICENESS = 5
@@ -30,9 +33,7 @@ NICENESS = 5
 
 @dataclass(frozen=True, slots=True)
 class LoadedCalibration:
-    """
-    A calibration, its file as the user named it, and the hash of the very bytes that were parsed.
-    """
+    """A calibration, its file as the user named it, and the hash of the bytes that were parsed."""
 
     calibration: Calibration
     path: str
@@ -62,6 +63,37 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
             f'cannot be read: {reason or type(error).__name__}', name
         ) from error
     return LoadedCalibration(calibration, name, hashlib.sha256(content).hexdigest())
+
+
+def load(config: NodeConfig) -> LoadedCalibration:
+    """
+    Read the calibration that a configuration asks for; CalibrationError where it can't be used.
+    """
+    if not config.calibration_file:
+        raise CalibrationError(
+            'parameter `calibration_file` is not set; start with '
+            '--ros-args -p calibration_file:=PATH'
+        )
+    loaded = read(config.calibration_file, config.calibration_directory)
+    check(loaded, config)
+    return loaded
+
+
+def check(loaded: LoadedCalibration, config: NodeConfig) -> None:
+    """Make sure that a calibration is for the serial number and the input of a configuration."""
+    unit = loaded.calibration.unit
+    if config.serial and unit.serial != config.serial:
+        raise CalibrationError(
+            f'must be {config.serial!r} (parameter `serial`), got {unit.serial!r}',
+            loaded.path,
+            'unit.serial',
+        )
+    if config.input == 'imu' and unit.input != 'm/s^2':
+        raise CalibrationError(
+            f"must be 'm/s^2' (parameter `input` is imu), got {unit.input!r}",
+            loaded.path,
+            'unit.input',
+        )
 
 
 def _allowed(name: str, directory: str) -> Path:

@@ -45,10 +45,7 @@ _STAMP = Struct('<iI')
 
 
 class Recorder:
-    """
-    Records topics in a thread of its own for as long as the context lasts; ``*.mcap`` makes a bare
-    file, anything else a rosbag2 directory.
-    """
+    """Records topics into a bag, in a thread of its own, for as long as the context lasts."""
 
     def __init__(
         self,
@@ -112,8 +109,7 @@ class Recorder:
 
     def newest(self, name: str) -> Any | None:
         """
-        Return the newest message of a topic, recorded or still waiting for a stamp; None before
-        any.
+        Return the newest message of a topic, recorded or waiting for a stamp; None before any.
         """
         data = self._newest.get(name)
         return None if data is None else deserialize_message(data, self._topics[name])
@@ -121,10 +117,7 @@ class Recorder:
     def wait_for_publishers(
         self, timeout_s: float, while_true: Callable[[], bool] = lambda: True
     ) -> bool:
-        """
-        Wait until every topic has a publisher; False after the time-out or once `while_true` says
-        False.
-        """
+        """Wait until every topic has a publisher; False after the time-out or at a False."""
         deadline = time.monotonic() + timeout_s
         ends = [one.subscription for one in self._subscriptions.values()]
         while not all(end.get_publisher_count() for end in ends):
@@ -185,46 +178,3 @@ class Recorder:
 
 def _type_name(message_type: Any) -> str:
     return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
-
-
-def record(
-    path: str | Path,
-    until: Callable[[Mapping[str, int]], bool],
-    *,
-    topics: Mapping[str, Any] = OUTPUTS,
-    timeout_s: float = 10.0,
-    ros_args: Sequence[str] = (),
-    overwrite: bool = False,
-) -> dict[str, int]:
-    """
-    Record topics until the counts of their messages are as wanted.
-
-    Parameters
-    ----------
-    path : str or Path
-        The bag; ``*.mcap`` makes a bare file, anything else a rosbag2 directory.
-    until : callable
-        Gets the number of messages per topic after each change; True ends the recording.
-    topics : mapping of str to type, optional
-        Relative topic names and message classes; the node's outputs if not given.
-    timeout_s : float, optional
-        The recording also ends when nothing came for this long [s].
-    ros_args : sequence of str, optional
-        ROS arguments.
-    overwrite : bool, optional
-        Replace a bag that is there.
-
-    Returns
-    -------
-    dict of str to int
-        Messages recorded per topic.
-
-    Raises
-    ------
-    OutputError
-        If the bag can't be written.
-
-    """
-    with Recorder(path, topics=topics, ros_args=ros_args, overwrite=overwrite) as recorder:
-        recorder.wait_until(until, timeout_s)
-        return recorder.counts

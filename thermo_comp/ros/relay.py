@@ -43,8 +43,7 @@ _Reading = tuple[int, int, float, Push]
 
 class Relay:
     """
-    What stands between the node's inputs and its outputs; each thermometer comes with who takes
-    its readings.
+    What stands between inputs and outputs; each thermometer comes with who takes its readings.
     """
 
     def __init__(
@@ -98,9 +97,7 @@ class Relay:
         self._relay(messages)
 
     def _is_of_one(self, subscription: RawSubscription, n: int) -> bool:
-        """
-        Tell whether messages are of an input's only publisher; count them where they are not.
-        """
+        """Tell whether messages are of an input's only publisher; count them if not."""
         is_contested = subscription.count_publishers() > 1
         if not (is_contested or self._contested):
             return True
@@ -115,10 +112,10 @@ class Relay:
 
     def advance_without_samples(self, silence_ns: int) -> None:
         """
-        Let readings take effect that no sample will come to, so that the flag stays alive.
+        Let readings take effect without samples, so that the flag stays alive.
 
-        After so long without samples a reading cannot be newer than the last one by much more,
-        whatever its stamp says.
+        After so long a silence none is newer than the last one by much more, whatever its stamp
+        says.
         """
         if self._newest_reading_ns is None:
             return

@@ -55,8 +55,7 @@ class RequestError(ThermoCompError):
 
 class ParameterRequests:
     """
-    What answers the parameter services of a node; exceptions of the two halves of a change are
-    refusals.
+    What answers a node's parameter services; exceptions of the halves of a change are refusals.
     """
 
     def __init__(self, node: Node, loop: WaitLoop, prepare: Prepare, apply: Apply) -> None:
@@ -147,9 +146,7 @@ class ParameterRequests:
             raise
 
     def _is_in_force(self, change: Parameter) -> bool:
-        """
-        Tell whether a change leaves what cannot be set as it is: `param load` of a `param dump`.
-        """
+        """Tell whether it leaves a fixed parameter as it is, as `param load` of a dump does."""
         node = self._node
         return bool(
             node.has_parameter(change.name)

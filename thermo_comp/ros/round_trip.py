@@ -110,10 +110,7 @@ class NodeProcess:
 
 
 def lossless(namespace: str = '') -> list[str]:
-    """
-    Give the ROS arguments under which a node of this namespace loses nothing, at the price of
-    latency.
-    """
+    """Give the ROS arguments under which a node loses nothing, at the price of latency."""
     overrides = [
         *(f'{topic}.subscription.reliability:=reliable' for topic in _INPUTS),
         *(f'{topic}.subscription.history:=keep_all' for topic in _INPUTS),
@@ -141,12 +138,7 @@ def round_trip(
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> RoundTrip:
-    """
-    Play a bag into a node of its own and record what comes out, in a namespace of its own that no
-    other node hears, if none is given.
-
-    ThermoCompError if a bag can't be read or written, or the node did not start or did not last.
-    """
+    """Play a bag into a node and record what comes out, in a namespace of its own by default."""
     namespace = f'/round_trip_{os.getpid()}' if namespace is None else namespace
     ros_args = ['-r', f'__ns:={namespace}'] if namespace else []
     arguments = [*ros_args, *lossless(namespace), '-p', f'calibration_file:={calibration}']
@@ -211,9 +203,7 @@ def _is_found(recorder: Recorder, player: Node, roles: Collection[Role]) -> bool
 
 
 def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
-    """
-    Wait until the node has taken all samples and the recorder has all that the node published.
-    """
+    """Wait until the node has taken all, and the recorder all that the node published."""
     deadline = time.monotonic() + COMPLETION_S
     account: dict[str, str] = {}
 

@@ -58,9 +58,7 @@ class SignalWatch:
         os.close(self._reader)
 
     def on_signal(self, stop: Callable[[], None]) -> None:
-        """
-        Say what is to be called, by the watching thread; at once where a signal has come already.
-        """
+        """Say what the watching thread is to call; called at once after a signal."""
         with self._changed:
             self._stop = stop
             is_over = self._is_over

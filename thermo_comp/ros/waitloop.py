@@ -64,8 +64,7 @@ Serve = Callable[[Any, Callable[[Any], None]], None]
 @dataclass(frozen=True, slots=True)
 class _Entities:
     """
-    A wait set, and what goes into it; the first two guards are those that stop the loop, and the
-    first services those that the loop itself serves.
+    A wait set and its content: first the guards that stop the loop, and the loop's own services.
     """
 
     wait_set: Any
@@ -97,12 +96,10 @@ class _Entities:
 
 class WaitLoop:
     """
-    A loop over a node, which is in no other executor: raw subscriptions for the caller, the rest
-    for an executor.
+    A loop over a node of no other executor: raw subscriptions for the caller, the rest for one.
 
-    The node's entities are made before `run` or in a callback while it runs. Messages of a
-    best-effort subscription gather until `rest_s` after each wake-up [s], where they come often
-    enough for it: four within three such times, so that a rest is not for one alone.
+    Messages of a best-effort subscription gather until `rest_s` after each wake-up [s], where they
+    come often enough for it: four within three such times, so that a rest is not for one alone.
     """
 
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
@@ -115,7 +112,8 @@ class WaitLoop:
         self._signal_guard = SignalHandlerGuardCondition(context=node.context)
         # Keeps the hot subscriptions and the services of this loop from the executor.
         self._reserved = ReentrantCallbackGroup()
-        self._reserved.can_execute = _is_event
+        # Middleware events are the executor's.
+        self._reserved.can_execute = lambda one: not isinstance(one, Subscription | Service)
         self._raw: list[RawSubscription] = []
         self._hot: list[RawSubscription] = []
         self._services: list[tuple[Service, Serve]] = []
@@ -127,22 +125,20 @@ class WaitLoop:
         self._is_stale = True
         self._period_ns = _NEVER_NS
         self._call_ns = _NEVER_NS
-        self._callback: Callable[[], None] = _nothing
+        self._callback: Callable[[], None] = lambda: None
         node.context.on_shutdown(self.stop)
 
     def subscribe(
         self, message_type: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
     ) -> RawSubscription:
         """
-        Subscribe in serialized form, QoS overridable through parameters.
-
-        Each message of a hot one wakes the loop; others may be `OTHERS_PERIOD_NS` late while those
-        flow.
+        Subscribe in serialized form; each message of a hot one wakes the loop, others wait a
+        little.
         """
         subscription = self._node.create_subscription(
             message_type,
             topic,
-            _never_called,
+            lambda _: None,  # never called: that is for an executor to do
             copy(qos),  # rclpy writes the overrides into it
             raw=True,
             callback_group=self._reserved,
@@ -164,9 +160,7 @@ class WaitLoop:
         self._node.destroy_subscription(raw.subscription)
 
     def serve(self, service: Service, callback: Serve) -> None:
-        """
-        Take a service of the node over from the executor, whose callback has to answer at once.
-        """
+        """Take a service over from the executor, whose callback has to answer at once."""
         service.callback_group = self._reserved
         self._services.append((service, callback))
         self._is_stale = True
@@ -179,8 +173,7 @@ class WaitLoop:
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
         """
-        Call back at regular times [s], in place of the last such callback; for a timer of rclpy
-        the executor does ten times the work.
+        Call back every so often [s], instead of the last one; a timer of rclpy costs ten times it.
         """
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
@@ -194,8 +187,7 @@ class WaitLoop:
 
     def run(self, on_data: Callable[[], None]) -> None:
         """
-        Serve until the context shuts down, a signal arrives or `stop` is called; `on_data` is
-        called after a wake-up and drains all raw subscriptions.
+        Serve until the end; `on_data` is called after a wake-up and drains all subscriptions.
         """
         try:
             while not self._is_stopping:
@@ -223,9 +215,7 @@ class WaitLoop:
         self._signal_guard.destroy()
 
     def _collect(self, in_use: ExitStack) -> list[_Entities]:
-        """
-        Build wait sets: of the hot subscriptions, of what the executor serves, of everything.
-        """
+        """Build wait sets: hot subscriptions, what the executor serves, everything."""
         node = self._node
         raw = [one.subscription for one in self._raw]
         hot = [one.subscription for one in self._hot]
@@ -246,9 +236,7 @@ class WaitLoop:
         ]
 
     def _entities(self, kinds: list[list[Any]], other_subscriptions: range) -> _Entities:
-        """
-        Build one wait set, for subscriptions, guard conditions, timers, clients and services.
-        """
+        """Build one, for subscriptions, guard conditions, timers, clients and services."""
         counts = [len(kind) for kind in kinds]
         wait_set = rclpy_implementation.WaitSet(*counts, 0, self._node.context.handle)
         adds = (
@@ -356,19 +344,6 @@ def _take_request(service: Service, callback: Serve) -> None:
         request, header = service.handle.service_take_request(service.srv_type.Request)
     if header is not None:
         callback(request, lambda response: service.send_response(response, header))
-
-
-def _nothing() -> None:
-    """Stand in for a callback that nobody has asked for."""
-
-
-def _is_event(entity: Any) -> bool:
-    """Leave middleware events to the executor, but neither messages nor requests."""
-    return not isinstance(entity, Subscription | Service)
-
-
-def _never_called(message: bytes) -> None:
-    """Stand in for the callback that an executor would call."""
 
 
 def undeclared_overrides(node: Node) -> list[str]:
