@@ -34,7 +34,7 @@ EXTRAS = {
     'test': ['pytest>=7.4', 'pytest-xdist>=3.4', 'hypothesis>=6.98'],
     'dev': ['ruff>=0.15', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs', 'pre-commit>=3.5'],
     'fuzz': ['atheris>=3.0'],
-    'docs': ['mkdocs-material>=9.5'],
+    'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.27', 'mkdocs-jupyter>=0.25'],
 }
 
 

@@ -10,6 +10,7 @@ Run ``python docs/make_reference.py`` after changing a key or a parameter; a tes
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ same file.
 The parameters of the posterior are, for each axis x, y, z: the bias (level of the static set, free
 coefficients of its Fs, level of the dynamic set, free coefficients of its Fs, weights of the response
 in the order of the file), in input units; then the scale in the same order, relative; at the end
-M[1][0], M[2][0], M[2][1]. `covariance = factor @ factor.T + diag(rest)`.
+`M[1][0]`, `M[2][0]`, `M[2][1]`. `covariance = factor @ factor.T + diag(rest)`.
 """
 
 INTERFACE = """\
@@ -52,7 +53,7 @@ stamps are carried through; the node never stamps with its own clock and needs n
 |---|---|---|---|
 | in | `accel/counts` | geometry_msgs/Vector3Stamped, counts per cycle | best effort, keep last 2000 |
 | in, with `input:=imu` | `imu/uncompensated` | sensor_msgs/Imu, m/s^2; angular rate, orientation and their covariances pass through | same |
-| in | `temperature/board`, `temperature/case` | sensor_msgs/Temperature, degC | best effort, keep last 50 |
+| in | `temperature/board`, `temperature/case`, and `temperature/<name>` for any more that the calibration names | sensor_msgs/Temperature, degC | best effort, keep last 50 |
 | out | `imu/data_raw` | sensor_msgs/Imu, specific force in m/s^2 | reliable |
 | out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every case temperature; nothing while unknown | reliable, transient local |
 | out | `regime/stamped` | diagnostic_msgs/DiagnosticArray: the same flag with the stamp of the reading that decides; `status[0].message` is `dynamic` or `static` | reliable, transient local |
@@ -157,6 +158,8 @@ def _section(
         meaning = (
             value.get('description', '') or told.get(key, '') or _described(value, definitions)
         )
+        # An element of a matrix is no link.
+        meaning = re.sub(r'\w+(\[\d\]){2}', r'`\g<0>`', meaning)
         lines.append(f'| `{key}` | {_type(value)} | {default} | {meaning} |')
     return [*lines, '']
 

@@ -6,19 +6,25 @@ What the pages tell a reader to type works: every command, every snippet, every 
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 import yaml
 from conftest import ROOT, Cli, Once
 from desk_helpers import Desk, same_words
+from matplotlib import pyplot as plt
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
+TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
 # README's console blocks run with their output in test_readme; a bag that plays for minutes, and
 # the demo, have tests of their own (test_player, test_cli_demo).
@@ -89,11 +95,12 @@ def test_every_page_is_in_the_site_s_menu() -> None:
         return [page for one in inner for page in listed(one)]
 
     nav = yaml.safe_load((ROOT / 'mkdocs.yml').read_text())['nav']
-    assert sorted(listed(nav)) == sorted(page.name for page in PAGES[1:])
+    assert sorted(listed(nav)) == sorted(page.name for page in [*PAGES[1:], TUTORIAL])
 
 
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    pytest.importorskip('material', reason='mkdocs-material is not installed: the extra `docs`')
+    for module in ('material', 'mkdocstrings', 'mkdocs_jupyter'):
+        pytest.importorskip(module, reason=f'{module} is not installed: the extra `docs`')
     finished = subprocess.run(
         [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site'],
         cwd=ROOT,
@@ -103,6 +110,26 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     )
     assert finished.returncode == 0, finished.stderr
     assert (tmp_path / 'site' / 'index.html').is_file()
+
+
+def test_the_tutorial_prints_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    mpl.use('Agg')
+    monkeypatch.chdir(ROOT / 'docs')
+    names: dict[str, object] = {}
+    n_figures = 0
+    for cell in json.loads(TUTORIAL.read_text())['cells']:
+        if cell['cell_type'] != 'code':
+            continue
+        shown = ''.join(''.join(out.get('text', '')) for out in cell['outputs'])
+        drawn = [out for out in cell['outputs'] if 'image/png' in out.get('data', {})]
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said):
+            exec(''.join(cell['source']), names)  # noqa: S102 - our own page
+        assert same_words(said.getvalue(), shown), said.getvalue()
+        assert len(plt.get_fignums()) == len(drawn)
+        n_figures += len(drawn)
+        plt.close('all')
+    assert n_figures == 2
 
 
 def test_imu_calib_s_matrix_is_taken_apart_as_shown() -> None:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 #: A temperature: one value for each sample, or (time_s, value) of readings of their own.
 Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
 
+#: What a fit reads of a thermometer that is not there.
+_NOTHING: dict[str, Temperature] = {'board': ([], []), 'case': ([], [])}
 #: `Columns.start_ns` is a multiple of this, so that times count from a whole minute.
 MINUTE_NS = 60_000_000_000
 #: A temperature that is given for each sample, and stays, is a reading again after this.
@@ -96,7 +98,7 @@ class Corrected:
 
 @dataclass(frozen=True)
 class _Block:
-    """What `process_block` takes."""
+    """What `process_block` takes, and a fit."""
 
     accel_stamp_ns: Ints
     accel: Floats
@@ -265,20 +267,22 @@ def fit(
 
 
 def _source(columns: Columns) -> FitSource:
-    from .fitting import ArrayBlock, FitSource
+    from .fitting import FitSource
 
     stamps = _stamps('time_s', columns.time_s)
     samples = _numbers('counts', columns.counts)
     if samples.shape != (len(stamps), 3):
         raise ValueError(f'`counts` must have the shape ({len(stamps)}, 3), got {samples.shape}')
-    empty: tuple[list[float], list[float]] = ([], [])
+    readings = {
+        name: _readings(name, value, stamps, _is_date(columns.time_s))
+        for name, value in {**_NOTHING, **columns.temperatures}.items()
+    }
     start = columns.start_ns
-    given: dict[str, Temperature] = {'board': empty, 'case': empty, **columns.temperatures}
-    found = {}
-    for name, value in given.items():
-        own, celsius, _ = _readings(name, value, stamps, _is_date(columns.time_s))
-        found[name] = own + start, celsius
-    block = ArrayBlock(stamps + start, samples, *found.pop('board'), *found.pop('case'), found)
+    block = _Block(
+        stamps + start,
+        samples,
+        {name: (own + start, value, place) for name, (own, value, place) in readings.items()},
+    )
     return FitSource(columns.name, lambda: [block], serial=columns.serial)
 
 
