@@ -9,6 +9,8 @@ forbids it to run or load anything.
 
 from __future__ import annotations
 
+import datetime as dt
+import math
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -59,12 +61,21 @@ def _templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {'number': number, 'minus': minus, 'ug': _micro_g, 'css': _css_text}
+    made.filters |= {
+        'number': number,
+        'minus': minus,
+        'fixed': lambda value, form: minus(format(value, form)),
+        'ug': lambda acceleration, digits=3: number(acceleration / MICRO_G, digits),
+        'of': lambda key, values: values.get(key, math.nan),
+        'utc': lambda ns: f'{utc(ns):%Y-%m-%d %H:%M}',
+        'css': _css_text,
+    }
     return made
 
 
-def _micro_g(acceleration: float, digits: int = 3) -> str:
-    return number(acceleration / MICRO_G, digits)
+def utc(stamp_ns: int) -> dt.datetime:
+    """Give a stamp as a date with time, in UTC."""
+    return dt.datetime.fromtimestamp(stamp_ns // 10**9, dt.timezone.utc)
 
 
 def _css_text(value: str) -> Markup:
