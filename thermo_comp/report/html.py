@@ -46,7 +46,7 @@ def render(template: str, *, script: str = '', nonce: str = '', **context: Any) 
         policy += f"; script-src 'nonce-{nonce}'; connect-src 'self'"
     found = _templates().get_template(template)
     return found.render(
-        {'margin': '', 'footer': '', 'is_simulated': False}
+        {'margin': '', 'is_simulated': False}
         | context
         | {'policy': Markup(policy), 'script': Markup(script), 'nonce': nonce}  # noqa: S704 - our own
     )
