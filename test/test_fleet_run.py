@@ -284,8 +284,12 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(
     assert '- u: the board temperature leads the case' in said.out
     assert '0 of 1 tests calibrated, 0 of them in this run' in said.out
     assert said.err == ''
+    assert command(*arguments, '--with-prior') == 1
+    said = '- fitted without a prior: 0 units whose own bags tell all of them, need 3'
+    assert said in capsys.readouterr().out
     assert command(*arguments, '--json') == 1
     data = json.loads(capsys.readouterr().out)
+    assert data['prior'] is None
     assert (data['n_fitted'], data['n_done'], data['verdicts']) == (0, 0, {'refused': 1})
 
 
@@ -330,4 +334,7 @@ def test_a_prior_needs_units_that_hold(client: Any, tmp_path: Path) -> None:
     result = fit_fleet(
         str(tmp_path / 'bags'), tmp_path / 'out', OPTIONS, client=client, with_prior=True
     )
-    assert (result.prior, result.no_prior) == (None, '0 calibrations, need 3 for a population')
+    assert (result.prior, result.no_prior) == (
+        None,
+        '0 units whose own bags tell all of them, need 3',
+    )

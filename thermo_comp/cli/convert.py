@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -78,7 +79,7 @@ def convert(
       thermo_comp convert log.csv --columns map.yaml -o unit42
       thermo_comp convert flight.ulg --imu 1 -o unit43
     """
-    from ..convert import write_log
+    from ..convert import bag_log, write_log
     from ..files import bag_kind, check_output
 
     out = Output(as_json, quiet)
@@ -86,8 +87,14 @@ def convert(
     check_output(output, bag_kind(output), overwrite=force, others=[log, *read_too])
     is_bag = log.is_dir() or log.suffix.lower() in _BAGS
     if is_bag:
-        _refuse_for_bags(columns, imu, baro, allow_compensated)
-        read = _bag_reader(log, imu_topic, board_topic, case_topic, unit)
+        if columns is not None or imu is not None or baro is not None or allow_compensated:
+            raise options.usage(
+                '--columns is for tables, --imu, --baro and --allow-compensated for logs; a bag '
+                'has --imu-topic, --board-topic and --case-topic'
+            )
+        read: Callable[[], ForeignLog] = partial(
+            bag_log, log, imu_topic, board_topic, case_topic, unit.value
+        )
     else:
         if imu_topic or board_topic or case_topic or unit is not UnitChoice.m_s2:
             raise options.usage('--*-topic and --unit are for bags')
@@ -98,24 +105,6 @@ def convert(
     if report.missing:
         out.note(f'{log}: {report.missing}')
     out.end(is_torn=bool(report.missing))
-
-
-def _refuse_for_bags(
-    columns: Path | None, imu: int | None, baro: int | None, allow_compensated: bool
-) -> None:
-    if columns is not None or imu is not None or baro is not None or allow_compensated:
-        raise options.usage(
-            '--columns is for tables, --imu, --baro and --allow-compensated for logs; a bag has '
-            '--imu-topic, --board-topic and --case-topic'
-        )
-
-
-def _bag_reader(
-    log: Path, imu: str | None, board: str | None, case: str | None, unit: UnitChoice
-) -> Callable[[], ForeignLog]:
-    from ..convert import bag_log
-
-    return lambda: bag_log(log, imu, board, case, unit.value)
 
 
 def _reader(
@@ -131,29 +120,18 @@ def _reader(
     if allow_compensated and suffix != '.bin':
         raise options.usage('--allow-compensated is for ArduPilot logs (.bin)')
     if suffix == '.ulg':
-        return lambda: ulog_log(log, imu, baro)
+        return partial(ulog_log, log, imu, baro)
     if suffix == '.bin':
-        return lambda: dataflash_log(log, imu, baro, allow_compensated)
+        return partial(dataflash_log, log, imu, baro, allow_compensated)
     if imu is not None or baro is not None:
         raise options.usage('--imu and --baro are for PX4 and ArduPilot logs (.ulg, .bin)')
     if columns is None:
         raise options.usage('a table needs --columns MAP')
-    column_map = load_column_map(columns)
-    return lambda: table_log(log, column_map)
+    return partial(table_log, log, load_column_map(columns))
 
 
 def say(out: Output, report: ConversionReport) -> None:
-    """
-    Print the account of a conversion.
-
-    Parameters
-    ----------
-    out : Output
-        Where to.
-    report : ConversionReport
-        The account.
-
-    """
+    """Print the account of a conversion."""
     out.line(
         f'{report.source}: {report.rows} rows, {report.duration_s:.1f} s '
         f'at {report.rate_hz:.4g} Hz'

@@ -13,7 +13,7 @@ from typing import Any
 from ..errors import FitError, FleetError
 from ..files import PAGE as PAGE_FILE
 from ..files import write_atomically
-from ..fitting.priors import population
+from ..fitting.priors import UNITS_NEEDED, population
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import load_calibration, save_calibration
 from .cluster import connected, require_libraries, run
@@ -179,6 +179,8 @@ def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, 
     # A unit that was tested twice is one unit: the later test speaks.
     tests = sorted((row for row in rows if _speaks(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: row for row in tests}
+    if len(latest) < UNITS_NEEDED:
+        return None, f'{len(latest)} units whose own bags tell all of them, need {UNITS_NEEDED}'
     units = [load_calibration(results.files_of(row)[0]) for row in latest.values()]
     try:
         prior = population(sorted(units, key=lambda one: one.unit.serial))

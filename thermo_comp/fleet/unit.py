@@ -27,7 +27,7 @@ from .table import FAILED, NOT_JUDGED, REFUSED, Cell, empty_row, fitted_cells, j
 
 _NEEDED: tuple[Role, ...] = ('accel', 'board')
 # What the fit has to say of bags that leave something of the unit to its prior.
-_LACKS = frozenset({'temperature', 'span', 'ramps', 'directions', 'misfit'})
+_LACKS = frozenset({'temperature', 'ramps', 'directions', 'misfit'})
 
 
 @dataclass(frozen=True)

@@ -283,9 +283,7 @@ def _switched(
 
 
 def _wander(unit: UnitModel, grid: Floats, seed: int) -> Floats:
-    """
-    Return what the bias does of itself, counts/cycle: a walk.
-    """
+    """Return what the bias does of itself: a walk, counts/cycle."""
     result = np.zeros((len(grid), 3))
     step_h = grid[1] / 3600.0
     for i, density in enumerate(unit.bias_walk):
