@@ -36,6 +36,7 @@ from recording_helpers import (
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import (
+    BagWriter,
     Recording,
     Topics,
     inspect_recording,
@@ -340,6 +341,46 @@ def test_a_topic_is_found_under_its_namespace(tmp_path: Path) -> None:
     write_mcap(path, regular_messages(8))
     with open_recording(path, Topics(counts='counts', board='/temperature/board/')) as reader:
         assert reader.topics == {'accel': ACCEL, 'board': BOARD, 'case': CASE}
+
+
+def written(path: Path, *topics: str, counts: str = 'accel/counts') -> Path:
+    """Write three samples, and a reading of 20, 21, ... degC on each topic."""
+    with BagWriter(path) as bag:
+        bag.write_counts(counts, START_NS + np.arange(3), np.zeros((3, 3)))
+        for row, topic in enumerate(topics):
+            bag.write_temperature(topic, [START_NS + 1], [20.0 + row])
+    return path
+
+
+def test_further_thermometers_are_found_beside_the_board(tmp_path: Path) -> None:
+    names = ('board', 'case', 'lid', 'Tip', 'accel', 'a/b')
+    topics = [f'imu0/temperature/{name}' for name in names]
+    path = written(tmp_path / 'bag', *topics, 'temperature/lid', counts='imu0/accel/counts')
+    found = read_recording(path).columns.temperatures
+    assert {name: one.celsius.tolist() for name, one in found.items()} == {
+        'board': [20.0],
+        'case': [21.0],
+        'lid': [22.0],
+    }
+    assert found['lid'].after.tolist() == [2]
+
+
+def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path: Path) -> None:
+    path = written(tmp_path / 'one', 'imu/die', counts='imu/ticks')
+    with open_recording(path, require=('accel', 'board')) as reader:
+        assert reader.topics == {'accel': '/imu/ticks', 'board': '/imu/die'}
+    # Neither where the user has named another, nor where there are two, nor a case for a board.
+    with pytest.raises(RecordingError, match='my/die: no such topic'):
+        open_recording(path, Topics(board='my/die'), require=('board',))
+    for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):
+        several = written(tmp_path / topics[0].replace('/', '_'), *topics)
+        with pytest.raises(RecordingError, match='temperature/board: no such topic'):
+            open_recording(several, require=('board',))
+    # What was corrected already is no input.
+    with BagWriter(tmp_path / 'corrected') as bag:
+        bag.write_imu('imu/data_raw', [START_NS], np.zeros((1, 3)), np.zeros(9))
+    with pytest.raises(RecordingError, match='no such topic'):
+        open_recording(tmp_path / 'corrected', require=('accel',))
 
 
 def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,11 +56,11 @@ def test_a_good_recording(tmp_path: Path) -> None:
     assert result.rate_hz == pytest.approx(5.0)
     assert result.n_still == 1
     assert result.still_s == pytest.approx(3600.0, abs=15.0)
-    assert result.board is not None
-    assert (result.board.lowest, result.board.highest, result.board.span) == (5.0, 35.0, 30.0)
+    board = result.thermometers['board']
+    assert (board.lowest, board.highest, board.span) == (5.0, 35.0, 30.0)
     # 30 K in 20 minutes, and again down.
-    assert result.board.steepest_heating_k_min == pytest.approx(1.5, rel=0.01)
-    assert result.board.steepest_cooling_k_min == pytest.approx(-1.5, rel=0.01)
+    assert board.steepest_heating_k_min == pytest.approx(1.5, rel=0.01)
+    assert board.steepest_cooling_k_min == pytest.approx(-1.5, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -81,9 +81,9 @@ def test_a_quantum_is_no_ramp(tmp_path: Path) -> None:
     # Whole degrees that flip: 1 K within a second is a step of the sensor, not 60 K/min.
     flips = 20.0 + (np.arange(3600) % 2)
     result = survey(tmp_path / 'bag', flips)
-    assert result.board is not None
-    assert result.board.quantum == 1.0
-    assert result.board.steepest_heating_k_min < 0.1
+    board = result.thermometers['board']
+    assert board.quantum == 1.0
+    assert board.steepest_heating_k_min < 0.1
 
 
 def test_no_temperatures(tmp_path: Path) -> None:

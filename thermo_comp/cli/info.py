@@ -70,8 +70,7 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
             sensor.steepest_heating_k_min,
             sensor.steepest_cooling_k_min,
         )
-        for name, sensor in (('board', survey.board), ('case', survey.case))
-        if sensor is not None
+        for name, sensor in survey.thermometers.items()
     ]
     if rows:
         out.table(('sensor', 'Hz', 'min degC', 'max degC', 'max K/min', 'min K/min'), rows)
@@ -95,8 +94,9 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
             'duration_s': survey.duration_s,
             'still_intervals': survey.n_still,
             'still_s': survey.still_s,
-            'board': survey.board,
-            'case': survey.case,
+            'board': survey.thermometers.get('board'),
+            'case': survey.thermometers.get('case'),
+            'thermometers': survey.thermometers,
             'findings': survey.findings,
         }
     )

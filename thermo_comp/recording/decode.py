@@ -154,7 +154,7 @@ class Decoder:
         except RecordingError as error:
             raise RecordingError(error.message, topic=shown(feed.topic)) from error
         is_framed = role == 'accel' or (self._keep_raw and feed.encoding == 'ros1')
-        frames = frame_runs(own.data, stamped) if is_framed else [(0, '')]
+        frames = frame_runs(stamped.frame) if is_framed else [(0, '')]
         return _Rows(rank, own.log_ns, own, stamped, frames)
 
     def _raw(self, role: Role, rows: _Rows, part: slice) -> RawMessages:

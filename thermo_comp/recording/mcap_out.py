@@ -39,14 +39,7 @@ from mcap.records import (
 from .. import __version__
 from ..typing import Bytes
 from .encode import Merged, Stretch
-from .rosbag2_metadata import (
-    Definition,
-    FileSummary,
-    TopicSummary,
-    dump_yaml,
-    information,
-    offered_qos,
-)
+from .rosbag2_metadata import Definition, FileSummary, dump_yaml, information, offered_qos
 
 MAGIC = b'\x89MCAP0\r\n'
 #: Name of the metadata record that holds the writer's key-value pairs.
@@ -163,7 +156,7 @@ class McapFile:
             self._close_chunk()
         self._put_packed(0)
         topics = (
-            TopicSummary(topic, *self._topics[topic], self._counts[channel.id])
+            (topic, *self._topics[topic], self._counts[channel.id])
             for topic, channel in self._channels.items()
         )
         summary = FileSummary(self._name, self._start_ns or 0, self._end_ns, tuple(topics))

@@ -6,14 +6,14 @@ Owns the look at a recording before a fit: how long, how fast, how warm, how sti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ..typing import Floats, Ints
-from .columns import RecordingInfo
+from ..typing import Ints
+from .columns import Readings, RecordingInfo
 from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 from .topics import Topics
@@ -69,8 +69,7 @@ class Survey:
     n_not_finite: int
     n_still: int
     still_s: float
-    board: ThermometerSurvey | None
-    case: ThermometerSurvey | None
+    thermometers: Mapping[str, ThermometerSurvey]
 
     @property
     def findings(self) -> list[str]:
@@ -83,14 +82,15 @@ class Survey:
                 'no accelerometer samples: record accel/counts or imu/uncompensated, or name '
                 'yours with --counts-topic or --imu-topic'
             )
-        if self.board is None:
+        board = self.thermometers.get('board')
+        if board is None:
             found.append(
                 'no board temperature: a thermal fit needs temperature/board, or name yours with '
                 '--board-topic'
             )
         else:
-            found += self._thermal_findings(self.board)
-        if self.case is None:
+            found += _thermal_findings(board)
+        if 'case' not in self.thermometers:
             found.append(
                 'no case temperature: the regime will follow the slower board sensor; name yours '
                 'with --case-topic'
@@ -103,20 +103,18 @@ class Survey:
             found.append(f'{self.n_gaps} gaps, the longest {self.longest_gap_s:.3g} s')
         return found
 
-    @staticmethod
-    def _thermal_findings(board: ThermometerSurvey) -> list[str]:
-        found = []
-        if board.span < ADVISED_SPAN_K:
-            found.append(
-                f'board temperature spans {board.span:.1f} K: {ADVISED_SPAN_K:g} are advised'
-            )
-        for name, rate in (
-            ('heating', board.steepest_heating_k_min),
-            ('cooling', -board.steepest_cooling_k_min),
-        ):
-            if rate < _RAMP_K_MIN:
-                found.append(f'no {name} ramp: the dynamic set would not know {name}')
-        return found
+
+def _thermal_findings(board: ThermometerSurvey) -> list[str]:
+    found = []
+    if board.span < ADVISED_SPAN_K:
+        found.append(f'board temperature spans {board.span:.1f} K: {ADVISED_SPAN_K:g} are advised')
+    for name, rate in (
+        ('heating', board.steepest_heating_k_min),
+        ('cooling', -board.steepest_cooling_k_min),
+    ):
+        if rate < _RAMP_K_MIN:
+            found.append(f'no {name} ramp: the dynamic set would not know {name}')
+    return found
 
 
 def survey_recording(
@@ -128,18 +126,19 @@ def survey_recording(
     `progress` is called with the fraction read. Raises RecordingError if it cannot be read.
     """
     with open_recording(path, topics, require=()) as reader:
-        name = reader.topics.get('accel')
-        total = reader.info.topics[name][1] if name else 0
+        topic = reader.topics.get('accel')
+        total = reader.info.topics[topic][1] if topic else 0
         cells = CellAccumulator(_CELL_S, None)
         stamps = _Stamps()
         n_not_finite = 0
-        board, case = _Readings(), _Readings()
+        # A thermal test has few readings beside its samples.
+        readings: dict[str, list[Readings]] = {}
         for block in reader.blocks():
             stamps.add(block.accel_stamp_ns)
             n_not_finite += int((~np.isfinite(block.accel).all(axis=1)).sum())
             cells.add(block.accel_stamp_ns, block.accel)
-            board.add(*block.temperatures['board'][:2])
-            case.add(*block.temperatures['case'][:2])
+            for name, one in block.temperatures.items():
+                readings.setdefault(name, []).append(one)
             if progress is not None and total:
                 progress(stamps.n / total)
         info = reader.info
@@ -162,8 +161,9 @@ def survey_recording(
         n_not_finite=n_not_finite,
         n_still=len(still),
         still_s=still_s,
-        board=board.survey(),
-        case=case.survey(),
+        thermometers={
+            name: survey for name, own in readings.items() if (survey := _survey_of(own))
+        },
     )
 
 
@@ -204,41 +204,30 @@ class _Stamps:
         return 0.0 if self._first_ns is None else (self._last_ns - self._first_ns) * 1e-9
 
 
-class _Readings:
-    """Gathers one thermometer; a thermal test has few readings beside its samples."""
-
-    def __init__(self) -> None:
-        self._stamp_ns: list[Ints] = []
-        self._celsius: list[Floats] = []
-
-    def add(self, stamp_ns: Ints, celsius: Floats) -> None:
-        self._stamp_ns.append(stamp_ns)
-        self._celsius.append(celsius)
-
-    def survey(self) -> ThermometerSurvey | None:
-        stamp_ns = np.concatenate(self._stamp_ns) if self._stamp_ns else np.empty(0, np.int64)
-        celsius = np.concatenate(self._celsius) if self._celsius else np.empty(0)
-        use = np.isfinite(celsius)
-        stamp_ns, celsius = stamp_ns[use], celsius[use]
-        if not len(celsius):
-            return None
-        # Rates from means over two minutes, so that a quantum is not a ramp.
-        time = (stamp_ns - stamp_ns[0]) * 1e-9
-        bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
-        _, place = np.unique(bins, return_inverse=True)
-        count = np.bincount(place)
-        mean_time = np.bincount(place, time) / count
-        mean = np.bincount(place, celsius) / count
-        rates = np.diff(mean) / np.maximum(np.diff(mean_time), 1e-9) * 60.0
-        steps = np.abs(np.diff(celsius))
-        intervals = np.diff(stamp_ns)
-        intervals = intervals[intervals > 0]
-        return ThermometerSurvey(
-            n=len(celsius),
-            rate_hz=1e9 / float(np.median(intervals)) if len(intervals) else float('nan'),
-            lowest=float(np.min(celsius)),
-            highest=float(np.max(celsius)),
-            steepest_heating_k_min=max(0.0, float(np.max(rates, initial=0.0))),
-            steepest_cooling_k_min=min(0.0, float(np.min(rates, initial=0.0))),
-            quantum=float(np.min(steps[steps > 0.0], initial=np.inf)),
-        )
+def _survey_of(readings: Sequence[Readings]) -> ThermometerSurvey | None:
+    stamp_ns = np.concatenate([one.stamp_ns for one in readings])
+    celsius = np.concatenate([one.celsius for one in readings])
+    use = np.isfinite(celsius)
+    stamp_ns, celsius = stamp_ns[use], celsius[use]
+    if not len(celsius):
+        return None
+    # Rates from means over two minutes, so that a quantum is not a ramp.
+    time = (stamp_ns - stamp_ns[0]) * 1e-9
+    bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
+    _, place = np.unique(bins, return_inverse=True)
+    count = np.bincount(place)
+    mean_time = np.bincount(place, time) / count
+    mean = np.bincount(place, celsius) / count
+    rates = np.diff(mean) / np.maximum(np.diff(mean_time), 1e-9) * 60.0
+    steps = np.abs(np.diff(celsius))
+    intervals = np.diff(stamp_ns)
+    intervals = intervals[intervals > 0]
+    return ThermometerSurvey(
+        n=len(celsius),
+        rate_hz=1e9 / float(np.median(intervals)) if len(intervals) else float('nan'),
+        lowest=float(np.min(celsius)),
+        highest=float(np.max(celsius)),
+        steepest_heating_k_min=max(0.0, float(np.max(rates, initial=0.0))),
+        steepest_cooling_k_min=min(0.0, float(np.min(rates, initial=0.0))),
+        quantum=float(np.min(steps[steps > 0.0], initial=np.inf)),
+    )

@@ -86,28 +86,22 @@ def offered_qos(kind: str) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class TopicSummary:
-    """One topic of a finished file."""
-
-    name: str
-    type: str
-    type_hash: str
-    n_messages: int
-
-
-@dataclass(frozen=True, slots=True)
 class FileSummary:
-    """What stands in a finished MCAP file; first and last log time are 0 without messages."""
+    """
+    What stands in a finished MCAP file; first and last log time are 0 without messages.
+
+    Of each topic there are name, type, hash of the type and number of messages.
+    """
 
     name: str
     start_ns: int
     end_ns: int
-    topics: tuple[TopicSummary, ...]
+    topics: tuple[tuple[str, str, str, int], ...]
 
 
 def information(summary: FileSummary, custom: Mapping[str, str]) -> dict[str, Any]:
     """Build the content of metadata.yaml below its only key."""
-    n_messages = sum(topic.n_messages for topic in summary.topics)
+    n_messages = sum(count for *_, count in summary.topics)
     start = {'nanoseconds_since_epoch': summary.start_ns}
     duration = {'nanoseconds': summary.end_ns - summary.start_ns}
     return {
@@ -119,15 +113,15 @@ def information(summary: FileSummary, custom: Mapping[str, str]) -> dict[str, An
         'topics_with_message_count': [
             {
                 'topic_metadata': {
-                    'name': topic.name,
-                    'type': topic.type,
+                    'name': name,
+                    'type': kind,
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': [offered_qos(topic.type)],
-                    'type_description_hash': topic.type_hash,
+                    'offered_qos_profiles': [offered_qos(kind)],
+                    'type_description_hash': type_hash,
                 },
-                'message_count': topic.n_messages,
+                'message_count': count,
             }
-            for topic in summary.topics
+            for name, kind, type_hash, count in summary.topics
         ],
         'compression_format': '',
         'compression_mode': '',
