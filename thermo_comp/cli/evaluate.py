@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,7 @@ from .output import Cell, Output, micro_g
 
 if TYPE_CHECKING:
     from ..judging import Evaluation, Judgement
+    from ..judging.history import Drift
 
 
 def evaluate(
@@ -58,6 +60,7 @@ def evaluate(
     """
     from ..files import CSV, check_output, write_atomically
     from ..judging import evaluate as run
+    from ..judging.history import drifts_of, history_of
     from ..judging.windows import csv_of
     from ..unit.calibration_file import load_calibration
 
@@ -90,12 +93,14 @@ def evaluate(
     if csv is not None:
         text = csv_of(judged.windows, [bag.name for bag in bags])
         write_atomically(csv, text.encode(), CSV, overwrite=force)
-    say(out, result)
+    drifts = drifts_of(history_of([one for _, one in models]))
+    _say(out, result, drifts)
     out.json(
         {
             'bags': bags,
             'notes': result.notes,
             **judged.facts(),
+            'history': drifts,
             'calibrations': {name: one.facts() for name, one in result.judgements.items()},
         }
     )
@@ -104,7 +109,7 @@ def evaluate(
     out.end(is_torn=is_torn)
 
 
-def say(out: Output, result: Evaluation) -> None:
+def _say(out: Output, result: Evaluation, drifts: Sequence[Drift]) -> None:
     """
     Print an evaluation: a table of all calibrations, what is known of the first one, its verdict.
     """
@@ -134,6 +139,19 @@ def say(out: Output, result: Evaluation) -> None:
         'ranges',
     )
     _say_axes(out, judged)
+    if drifts:
+        out.table(
+            ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
+            [
+                (
+                    *(one.earlier[:10], one.later[:10], one.constant),
+                    *(f'{one.change:+.3g}', micro_g(one.sd), one.unit),
+                    'yes' if one.is_sure else 'no',
+                )
+                for one in drifts
+            ],
+            title='what drifted between the calibrations, in a soak at the reference temperature',
+        )
     for line in result.notes:
         out.line(f'- {line}')
     out.line(str(judged))

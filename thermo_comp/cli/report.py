@@ -21,7 +21,10 @@ def report(
         list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option('--calibration', '-c', help='Calibration of the unit (YAML).')
+        list[Path] | None,
+        typer.Option(
+            '--calibration', '-c', help='Calibration of the unit; more make its history (YAML).'
+        ),
     ] = None,
     figures: Annotated[
         Path | None, typer.Option(help='Folder for the figures as PNG files.', metavar='DIR')
@@ -59,21 +62,23 @@ def report(
     """
     from ..files import PAGE, check_output
     from ..judging import open_bag
+    from ..judging.history import drifts_of
     from ..replay import input_for
     from ..report import evidence_of_bags, load_certificate_info, write_report
     from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
-    if not bags and calibration is None:
+    if not bags and not calibration:
         raise options.usage('give bags, a calibration, or both')
     gravity = options.place(gravity, latitude, height)
-    read = [*(bags or []), *([calibration] if calibration is not None else [])]
+    read = [*(bags or []), *(calibration or [])]
     check_output(output, PAGE, overwrite=force, others=read)
     limit = options.acceleration(tolerance)
     options.positive(window, '--window')
     topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
     paths = bags or []
-    loaded = None if calibration is None else load_calibration(calibration)
+    known = [load_calibration(path) for path in calibration or []]
+    loaded = known[0] if known else None
     info = None
     if certificate_info is not None:
         info = load_certificate_info(
@@ -104,6 +109,7 @@ def report(
             tolerance=limit,
             serial=serial,
             program=program,
+            others=known[1:],
         )
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
@@ -118,6 +124,7 @@ def report(
             'output': output,
             'headline': evidence.headline,
             'findings': evidence.findings,
+            'history': drifts_of(evidence.history),
             **({} if judgement is None else judgement.facts()),
         }
     )

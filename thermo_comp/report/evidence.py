@@ -20,6 +20,7 @@ import numpy as np
 from ..fitting import ResidualRow
 from ..fitting.reduction import Readings
 from ..judging import Judgement, Verdict, Windows
+from ..judging.history import Epoch
 from ..simulation import Cyclogram
 from ..typing import Floats
 from ..unit.calibration import Calibration, Source
@@ -105,6 +106,8 @@ class Evidence:
         unit [m/s^2].
     findings, checks : tuple of str
         What speaks against calibration or bags; what the fit looked at and found good.
+    history : tuple of Epoch
+        The unit's calibrations by date, where there are several.
     is_fit : bool
         Whether the calibration was fitted on these very bags.
     is_simulated : bool
@@ -124,6 +127,7 @@ class Evidence:
     left_out: Mapping[int, float] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
+    history: tuple[Epoch, ...] = ()
     is_fit: bool = False
     is_simulated: bool = False
 

@@ -30,7 +30,7 @@ from .style import (
     log_axis,
     new_figure,
 )
-from .text import number
+from .text import label_text, number
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
@@ -239,6 +239,34 @@ def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
             states[:, place] = sign * np.maximum(width - travelled, -width)
         ways.append(bias_and_scale(calibration, states)[0] / MICRO_G)
     return temperature, ways[0], ways[1]
+
+
+def draw_history(evidence: Evidence, sheet: Sheet) -> Figure:
+    """Draw bias and scale of each calibration of the unit against the first one, by date."""
+    history = evidence.history
+    figure = new_figure(sheet, 4.8 if sheet.is_narrow else 2.6)
+    panels = figure.subplots(*((2, 1) if sheet.is_narrow else (1, 2)))
+    places = np.arange(len(history))
+    for axes, name, unit in ((panels[0], 'bias', 'µg'), (panels[1], 'scale', 'ppm')):
+        value, sd = (
+            np.array([getattr(one, key) for one in history]) for key in (name, f'{name}_sd')
+        )
+        for i, (axis, marker) in enumerate(zip(AXES, 'os^', strict=True)):
+            axes.errorbar(
+                places + 0.08 * (i - 1),
+                value[:, i] - value[0, i],
+                yerr=BAND_SDS * np.nan_to_num(sd[:, i]),
+                marker=marker,
+                markersize=3.5,
+                capsize=2.0,
+                label=axis,
+                **AXIS_LINES[i],
+            )
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        axes.set_xticks(places, [label_text(one.created, 10) for one in history])
+        axes.set_ylabel(f'change, {unit}')
+        legend_above(axes, sheet, share=0.5, title=name, alignment='left')
+    return figure
 
 
 def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:

@@ -20,6 +20,7 @@ from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector
 from ..fitting.verdict import Finding
 from ..judging import WINDOW_S, OpenedBag, judge_bags
+from ..judging.history import history_of
 from ..judging.windows import raw_windows, usual_window
 from ..recording import inspect_recording
 from ..replay import check_unit
@@ -46,6 +47,7 @@ def evidence_of_bags(
     tolerance: float | None = None,
     serial: str | None = None,
     program: str | None = None,
+    others: Sequence[Calibration] = (),
 ) -> Evidence:
     """
     Judge bags, with a calibration or without.
@@ -66,6 +68,8 @@ def evidence_of_bags(
     program : str or None, optional
         The chamber's program, as `simulation.parse_cyclogram` reads it; by default what a
         simulated bag says of itself.
+    others : sequence of Calibration, optional
+        Other calibrations of the unit, for its history.
 
     Raises
     ------
@@ -107,6 +111,7 @@ def evidence_of_bags(
         windows=windows,
         judgement=judgement,
         findings=() if calibration is None else _against(calibration),
+        history=() if calibration is None or not others else history_of([calibration, *others]),
         is_simulated=any(_SIMULATED in one for one in metadata),
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 from .. import __version__
 from ..files import PAGE, PICTURE, write_atomically
 from ..fitting import FitResult
+from ..judging.history import drifts_of
 from ..thermal.regime import Regime
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .certificate import CertificateInfo, budget, combined, conformity_rule, results
@@ -121,6 +122,7 @@ def render_page(
         error=position_error,
         schuler=schuler_peak,
         plates=plates,
+        drifts=drifts_of(evidence.history),
         rungs=rungs,
         rung_headings=[f'{rung}, µg RMS' for rung in rungs],
         now=f'{dt.datetime.now(dt.timezone.utc):%Y-%m-%d %H:%M}',

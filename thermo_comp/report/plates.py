@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from .evidence import Evidence
 from .figures_residual import draw_gravity, draw_histograms, draw_residuals
 from .figures_thermal import draw_dynamics, draw_temperatures
-from .figures_unit import draw_functions, draw_hysteresis, draw_positions, draw_step
+from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_positions, draw_step
 from .style import NARROW, WIDE, Sheet, drawing, png, svg
 from .text import label_text
 
@@ -227,6 +227,16 @@ PLATES = (
             evidence.calibration is not None
             and any(term.kind == 'play' for term in evidence.calibration.response)
         ),
+    ),
+    Plate(
+        'history',
+        'What has drifted between the calibrations of this unit?',
+        lambda _: (
+            'Bias and scale in a soak at the reference temperature, by the date of each '
+            'calibration, less those of the first; bars: 95 % of what each leaves open.'
+        ),
+        draw_history,
+        lambda evidence: len(evidence.history) > 1,
     ),
     Plate(
         'histograms',

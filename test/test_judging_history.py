@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The history of a unit: changes and their covariance known by hand, in the order of the dates."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import axis_set, calibration, regime_set
+from report_helpers import evidence, fitted, write_bag
+
+from thermo_comp.judging.history import drifts_of, history_of
+from thermo_comp.report.page import render_page
+from thermo_comp.unit.calibration import AxisReference, Calibration, Source
+from thermo_comp.unit.calibration_file import save_calibration
+from thermo_comp.unit.gravity import MICRO_G
+
+K = 300.0
+
+
+def dated(created: str, bias_ug: float = 0.0, ppm: float = 0.0, sd_ug: float = 3.0) -> Calibration:
+    """Move the z axis of a unit; claim so much for its bias."""
+    scale = K * (1.0 + 1e-6 * ppm)
+    axes = dataclasses.replace(
+        calibration().axes, z=AxisReference(scale, bias_ug * MICRO_G * scale)
+    )
+    part = regime_set(*[axis_set(residual_sd_m_s2=sd_ug * MICRO_G)] * 3)
+    one = calibration(axes=axes, static=part, dynamic=part)
+    provenance = dataclasses.replace(
+        one.provenance, created=created, sources=(Source(created, created),)
+    )
+    return dataclasses.replace(one, provenance=provenance)
+
+
+def test_changes_and_their_sd_by_hand() -> None:
+    # The later one is given first: dates decide. 3 and 4 ug of doubt make 5.
+    drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
+    assert [one.constant for one in drifts] == [
+        *('bias x', 'bias y', 'bias z', 'scale x', 'scale y', 'scale z')
+    ]
+    *still, z = drifts[:3]
+    assert (z.earlier, z.later, z.unit) == ('2026-01-01', '2026-02-01', 'ug')
+    assert z.change == pytest.approx(20.0)
+    assert z.sd == pytest.approx(5.0)
+    assert z.is_sure
+    assert drifts[5].change == pytest.approx(50.0)
+    for one in still:
+        assert one.change == pytest.approx(0.0, abs=1e-9)
+        assert not one.is_sure
+
+
+def test_what_is_no_history() -> None:
+    one = dated('2026-01-01')
+    # Another model of the same bags, another unit, and a calibration alone.
+    other = dataclasses.replace(one, unit=dataclasses.replace(one.unit, serial='other'))
+    for calibrations in ([one], [one, one], [one, dataclasses.replace(other)]):
+        assert drifts_of(history_of(calibrations)) == []
+    # Without a claim a change is never sure.
+    import_ = dataclasses.replace(dated('2026-03-01', 500.0, sd_ug=0.0))
+    silent = drifts_of(history_of([one, import_]))
+    assert np.isnan([drift.sd for drift in silent]).all()
+    assert not any(drift.is_sure for drift in silent)
+
+
+def test_commands_tell_the_history(cli, tmp_path: Path) -> None:
+    now = fitted().calibration
+    axes = dataclasses.replace(
+        now.axes, x=dataclasses.replace(now.axes.x, bias=now.axes.x.bias + 10.0)
+    )
+    provenance = dataclasses.replace(now.provenance, created='2020-01-01T00:00:00Z', sources=())
+    save_calibration(
+        dataclasses.replace(now, axes=axes, provenance=provenance), tmp_path / 'a.yaml'
+    )
+    save_calibration(now, tmp_path / 'b.yaml')
+    bag = write_bag(tmp_path / 'held_out.mcap')
+    given = ('-c', tmp_path / 'b.yaml', '-c', tmp_path / 'a.yaml', '--json')
+    told = json.loads(cli('evaluate', bag, *given, code=None).stdout)
+    x = told['history'][0]
+    assert (x['constant'], x['earlier']) == ('bias x', '2020-01-01T00:00:00Z')
+    assert x['change'] == pytest.approx(-10.0 / now.axes.x.scale_factor / MICRO_G, rel=1e-3)
+    page = tmp_path / 'page.html'
+    drawn = json.loads(cli('report', *given, '-o', page).stdout)
+    assert drawn['history'] == told['history']
+    assert 'What has drifted between the calibrations' in page.read_text(encoding='utf-8')
+    assert '<h2>History</h2>' not in render_page(evidence(), [])

@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns the history of a unit: what has drifted between its calibrations, with their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ..typing import Floats
+from ..unit.calibration import AXES, Calibration, Source
+from ..unit.gravity import MICRO_G
+from ..unit.prediction import bias_and_scale, predicted_sd, ramp_states
+
+# A change must be this sure to be called one.
+_SURE_SDS = 3.0
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """
+    One calibration of a history: bias [ug] and scale [ppm of the first one], shapes (3,).
+
+    In a soak at the first one's reference temperature, with standard deviations, which are NaN of
+    a calibration that says nothing of them.
+    """
+
+    created: str
+    bias: Floats
+    bias_sd: Floats
+    scale: Floats
+    scale_sd: Floats
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What one constant changed by between two calibrations; sure beyond three sd."""
+
+    earlier: str
+    later: str
+    constant: str
+    unit: str
+    change: float
+    sd: float
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it is more than what both calibrations leave open."""
+        return abs(self.change) > _SURE_SDS * self.sd
+
+
+def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
+    """
+    Put calibrations in the order of their dates: those of the first one's unit.
+
+    Of those that were fitted on the same bags the first counts: two models are no history.
+    """
+    known: set[tuple[Source, ...]] = set()
+    ordered: list[Calibration] = []
+    for one in calibrations:
+        sources = one.provenance.sources
+        if one.unit.serial == calibrations[0].unit.serial and not (sources and sources in known):
+            ordered.append(one)
+        known.add(sources)
+    ordered.sort(key=lambda one: one.provenance.created)
+    reference = np.array([ordered[0].reference_temperature_c])
+    found: list[Epoch] = []
+    first = np.ones(3)
+    for number, one in enumerate(ordered):
+        bias, scale = bias_and_scale(one, ramp_states(one, reference, 0.0, 0.0))
+        first = first if number else scale[0]
+        sd = predicted_sd(one, reference, 0.0)
+        claim = 1.0 if one.has_uncertainty else np.nan
+        found.append(
+            Epoch(
+                created=one.provenance.created or f'no. {number + 1}',
+                bias=bias[0] / MICRO_G,
+                bias_sd=claim * sd.bias[0] / MICRO_G,
+                scale=1e6 * (scale[0] / first - 1.0),
+                scale_sd=claim * 1e6 * sd.scale[0],
+            )
+        )
+    return tuple(found)
+
+
+def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
+    """List what changed from each calibration to the next, as if both knew nothing in common."""
+    return [
+        Drift(
+            earlier=before.created,
+            later=after.created,
+            constant=f'{name} {axis}',
+            unit=unit,
+            change=float(getattr(after, name)[i] - getattr(before, name)[i]),
+            sd=float(np.hypot(getattr(before, f'{name}_sd')[i], getattr(after, f'{name}_sd')[i])),
+        )
+        for before, after in pairwise(history)
+        for name, unit in (('bias', 'ug'), ('scale', 'ppm'))
+        for i, axis in enumerate(AXES)
+    ]
