@@ -81,9 +81,9 @@ COLUMNS: tuple[Column, ...] = (
     *_by_axis('bias_{}_ug', 'bias at T_ref in still air'),
     *_by_axis('bias_sd_{}_ug', 'its standard deviation'),
     *_by_axis('bias_slope_{}_ug_k', 'slope of the static bias at T_ref'),
-    *(Column(f'm_{name}_urad', 'number', f'M[{i}][{j}]') for name, i, j in _SKEW),
+    *(Column(f'm_{name}_urad', 'number', f'`M[{i}][{j}]`') for name, i, j in _SKEW),
     *(
-        Column(f'm_sd_{name}_urad', 'number', f'standard deviation of M[{i}][{j}]')
+        Column(f'm_sd_{name}_urad', 'number', f'standard deviation of `M[{i}][{j}]`')
         for name, i, j in _SKEW
     ),
     *_by_axis('noise_{}_ug_sqrt_hz', 'white noise'),
