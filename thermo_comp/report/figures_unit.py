@@ -263,7 +263,7 @@ def draw_history(evidence: Evidence, sheet: Sheet) -> Figure:
                 **AXIS_LINES[i],
             )
         axes.axhline(0.0, color='black', linewidth=0.5)
-        axes.set_xticks(places, [label_text(one.created, 10) for one in history])
+        axes.set_xticks(places, [label_text(one.created[:10]) for one in history])
         axes.set_ylabel(f'change, {unit}')
         legend_above(axes, sheet, share=0.5, title=name, alignment='left')
     return figure
