@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration
-from conftest import Cli
+from conftest import ROOT, Cli
 
 from thermo_comp.recording import BagWriter, Topics
 from thermo_comp.unit.calibration import Axes, AxisReference
@@ -77,6 +77,8 @@ class TestUsage:
                 r'`temperature_timeout_s` must be positive',
             ),
             (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
+            (('fit', 'a', '-o', 'b', '--reference-temperature', 'nan'), r'reference-temperature'),
+            (('play', 'a', '--rate', 'inf'), r'--rate must be finite; 0 is as fast as it is'),
             (('fit', 'a', '-o', 'b', '--latitude', '60'), r'--latitude and --height'),
             (('evaluate', 'a', '-c', 'b', '--window', '0'), r'--window must be positive'),
             (('evaluate', 'a', '-c', 'b', '--tolerance', '9'), r'--tolerance: expected .*, got'),
@@ -102,6 +104,12 @@ class TestUsage:
     def test_no_command_prints_the_help(self, cli: Cli) -> None:
         finished = cli(code=2)
         assert 'Usage: thermo_comp' in finished.stdout + finished.stderr
+
+
+def test_a_prior_whose_curves_cannot_be_compared(cli: Cli, tmp_path: Path) -> None:
+    prior = ROOT / 'config' / 'calibration.example.yaml'
+    words = ('fit', bag(tmp_path / 'bag'), '-o', tmp_path / 'o.yaml', '--gravity', '9.81')
+    refused(cli, 1, r'the curves of the prior differ from axis to axis', *words, '--prior', prior)
 
 
 class TestBags:

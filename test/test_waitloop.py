@@ -24,7 +24,6 @@ from ros_helpers import DEEP, TIMEOUT, Peer
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from thermo_comp.ros.raw import RawPublisher
 from thermo_comp.ros.waitloop import OTHERS_PERIOD_NS, RCLError, WaitLoop, undeclared_overrides
 
 RELIABLE = QoSProfile(depth=2000)
@@ -163,7 +162,7 @@ def test_raw_publisher_sends_the_bytes(node: Node, peer: Peer) -> None:
     publisher = node.create_publisher(Vector3Stamped, 'copies', DEEP)
     peer.poll(publisher.get_subscription_count, 'the match')
     data = serialize_message(Vector3Stamped())
-    RawPublisher(publisher).publish(data)
+    publisher.handle.publish_raw(data)
     peer.wait_for(lambda: heard)
     assert heard[0] == data
 

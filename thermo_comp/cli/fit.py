@@ -54,7 +54,7 @@ def fit(
         float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
     ] = None,
     reference_temperature: Annotated[
-        float, typer.Option(help='Reference temperature in degC.')
+        float, typer.Option(help='Reference temperature in degC.', min=-273.15, max=1000.0)
     ] = 20.0,
     min_still: Annotated[float, typer.Option(help='Shortest still interval used, in s.')] = 3.0,
     allow: Annotated[

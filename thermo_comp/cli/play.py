@@ -49,6 +49,8 @@ def play(
       thermo_comp play chamber.mcap --rate 20
       thermo_comp play chamber.mcap --ros-args -r __ns:=/imu0
     """
+    if not rate < float('inf'):
+        raise options.usage('--rate must be finite; 0 is as fast as it is taken')
     require_ros()
     from ..ros.player import play as run
 

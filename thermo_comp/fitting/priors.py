@@ -111,6 +111,8 @@ def state_of(calibration: Calibration, regression: Regression, up: Floats) -> St
             ]
         )
         bias[axis] += static.delta
+    if len({len(row) for row in (*on_bias, *on_scale)}) > 1:
+        raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
     inverse = np.linalg.inv(np.array(calibration.misalignment))
     n_lags = len(regression.windows.start_covariance)
     return State(

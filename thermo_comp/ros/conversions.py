@@ -75,15 +75,8 @@ class _Layout:
         return self.pack(_ENCAPSULATION, sec, nanosec, self.frame, block, fx, fy, fz, *covariance)
 
 
-def _unpack_nothing(_data: bytes) -> tuple[Any, ...]:
-    raise StructError
-
-
-def _pack_nothing(*_values: Any) -> bytes:
-    raise StructError
-
-
-_UNKNOWN = _Layout(_unpack_nothing, b'', b'', _pack_nothing, b'', 0, False)
+_NOTHING = Struct('')
+_UNKNOWN = _Layout(_NOTHING.unpack, b'', b'', _NOTHING.pack, b'', 0, False)
 
 
 class SampleConverter:
@@ -109,7 +102,7 @@ class SampleConverter:
         try:
             encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
             is_known = name == layout.name and encapsulation == layout.encapsulation
-        except StructError:
+        except (StructError, ValueError):
             is_known = False
         if not is_known:
             found = self._layout_of(data)

@@ -47,20 +47,13 @@ Finding = tuple[int, str]
 class Traffic:
     """What the node itself counts, beside the compensator's counters."""
 
-    #: Samples that the driver sent and the node did not get.
-    n_lost: int = 0
-    #: Output messages that the middleware did not accept.
-    n_unpublished: int = 0
-    #: Messages that could not be read.
-    n_malformed: int = 0
-    #: Regime flags published.
-    n_flags: int = 0
-    #: Samples that took the slow way through rclpy's deserialization.
-    n_fallback: int = 0
-    #: Messages not used because their input had more than one publisher.
-    n_contested: int = 0
-    #: Callbacks of the node that ended in an exception.
-    n_failures: int = 0
+    n_lost: int = 0  # samples that the driver sent and the node did not get
+    n_unpublished: int = 0  # output messages that the middleware did not accept
+    n_malformed: int = 0  # messages that could not be read
+    n_flags: int = 0  # regime flags published
+    n_fallback: int = 0  # samples that took the slow way through rclpy's deserialization
+    n_contested: int = 0  # messages not used because their input had more than one publisher
+    n_failures: int = 0  # callbacks of the node that ended in an exception
 
 
 @dataclass(frozen=True, slots=True)

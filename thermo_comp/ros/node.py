@@ -13,10 +13,10 @@ import gc
 import os
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from copy import copy
 from functools import partial
-from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -85,10 +85,17 @@ NOT_GIVEN = 'not_given.'
 
 #: What files, values, the environment and the middleware do: RuntimeError is its own, too.
 _NOT_OURS = (ThermoCompError, OSError, RuntimeError, ParameterException)
-#: What a name or a quality of service of the user's does.
-_UNOPENED = (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError)
 
 _INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
+
+
+@contextmanager
+def _opening() -> Iterator[None]:
+    """Say what a name or a quality of service of the user's does."""
+    try:
+        yield
+    except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
+        raise ParameterError(f'a topic cannot be opened: {error}') from error
 
 
 class CompensationNode:
@@ -114,8 +121,6 @@ class CompensationNode:
         )
         self._n_publishers = 0
         self._n_lost = 0
-        self._n_malformed = 0
-        self._n_fallback = 0
         self._level = b''
         self._last_samples = time.monotonic()
         self._loop = WaitLoop(self.node, REST_S)
@@ -159,14 +164,16 @@ class CompensationNode:
         overridable, compensator = QoSOverridingOptions.with_default_policies(), self._compensator
         samples = self._open_samples(self._config)
         self._thermometers = compensator.thermal.inputs
-        temperatures = [
-            (
-                self._subscribe(Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False),
-                partial(compensator.push, name),
-            )
-            for name in self._thermometers
-        ]
-        try:
+        with _opening():
+            temperatures = [
+                (
+                    self._loop.subscribe(
+                        Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False
+                    ),
+                    partial(compensator.push, name),
+                )
+                for name in self._thermometers
+            ]
             imu, flag, stamped, self._diagnostics = (
                 self.node.create_publisher(
                     message_type, topic, copy(qos), qos_overriding_options=overridable
@@ -178,24 +185,19 @@ class CompensationNode:
                     (DiagnosticArray, '/diagnostics', DIAGNOSTICS_QOS),
                 )
             )
-        except _UNOPENED as error:
-            raise ParameterError(f'a topic cannot be opened: {error}') from error
         converter = self._new_converter(self._config)
         return Relay(self.node, compensator, converter, samples, temperatures, imu, flag, stamped)
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
-        return self._subscribe(*_INPUTS[config.input], SAMPLE_QOS)
+        with _opening():
+            return self._loop.subscribe(*_INPUTS[config.input], SAMPLE_QOS)
 
-    def _subscribe(
-        self, kind: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
-    ) -> RawSubscription:
-        try:
-            return self._loop.subscribe(kind, topic, qos, is_hot=is_hot)
-        except _UNOPENED as error:
-            raise ParameterError(f'a topic cannot be opened: {error}') from error
-
-    def _new_converter(self, config: NodeConfig) -> SampleConverter:
-        return SampleConverter(_INPUTS[config.input][0], config.frame_id)
+    @staticmethod
+    def _new_converter(config: NodeConfig, old: SampleConverter | None = None) -> SampleConverter:
+        converter = SampleConverter(_INPUTS[config.input][0], config.frame_id)
+        if old is not None:
+            converter.n_malformed, converter.n_fallback = old.n_malformed, old.n_fallback
+        return converter
 
     def _snapshot(self) -> Snapshot:
         relay, converter = self._relay, self._relay.converter
@@ -203,9 +205,9 @@ class CompensationNode:
         traffic = Traffic(
             n_lost=self._n_lost,
             n_unpublished=relay.n_unpublished,
-            n_malformed=self._n_malformed + relay.n_malformed + converter.n_malformed,
+            n_malformed=relay.n_malformed + converter.n_malformed,
             n_flags=relay.n_flags,
-            n_fallback=self._n_fallback + converter.n_fallback,
+            n_fallback=converter.n_fallback,
             n_contested=relay.n_contested,
             n_failures=self._loop.n_failures,
         )
@@ -313,9 +315,7 @@ class CompensationNode:
         if config.compensator_config() != before.compensator_config():
             self._compensator.reconfigure(config.compensator_config())
         if (config.input, config.frame_id) != (before.input, before.frame_id):
-            self._n_malformed += relay.converter.n_malformed
-            self._n_fallback += relay.converter.n_fallback
-            relay.converter = self._new_converter(config)
+            relay.converter = self._new_converter(config, relay.converter)
         if samples is not relay.samples:
             self._loop.unsubscribe(relay.samples)
             relay.samples = samples

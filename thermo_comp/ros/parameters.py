@@ -29,21 +29,10 @@ _TYPES = {str: Parameter.Type.STRING, float: Parameter.Type.DOUBLE}
 
 
 def _parameter(
-    default: Any,
-    description: str,
-    bounds: tuple[float, float] | None = None,
-    choices: tuple[str, ...] = (),
-    *,
-    longest: int = LONGEST_SERIAL,
-    is_fixed: bool = False,
+    default: Any, description: str, bounds: tuple[float, float] | None = None, **more: Any
 ) -> Any:
-    metadata = {
-        'description': description,
-        'bounds': bounds,
-        'choices': choices,
-        'longest': longest,
-        'is_fixed': is_fixed,
-    }
+    others = {'choices': (), 'longest': LONGEST_SERIAL, 'is_fixed': False, **more}
+    metadata = {'description': description, 'bounds': bounds, **others}
     return field(default=default, metadata=metadata)
 
 

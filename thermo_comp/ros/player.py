@@ -131,7 +131,11 @@ class _Player:
             role: self._node.create_publisher(
                 accel_type if role == 'accel' else Temperature,
                 accel_name if role == 'accel' else f'temperature/{role}',
-                _qos(WINDOW[role]),
+                QoSProfile(
+                    depth=WINDOW[role],
+                    reliability=ReliabilityPolicy.RELIABLE,
+                    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+                ),
             )
             for role in reader.topics
         }
@@ -228,14 +232,6 @@ class _Player:
                     f'{publisher.topic_name}: a subscriber took nothing for {PATIENCE:g} s'
                 )
             time.sleep(ACKNOWLEDGEMENT_NAP)
-
-
-def _qos(depth: int) -> QoSProfile:
-    return QoSProfile(
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
 
 
 def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, Role, bytes]]:

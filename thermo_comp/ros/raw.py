@@ -4,8 +4,8 @@
 Owns topics in serialized form: what the loop's caller reads from and writes to, without rclpy's
 conversion of messages.
 
-Beyond the documented API: the methods `take_message`, `get_publisher_count` and `publish_raw` of
-the handles; `test/test_waitloop.py` fails when any of them changes.
+Beyond the documented API: the methods `take_message` and `get_publisher_count` of the handle (and
+`publish_raw` in `relay.py`); `test/test_waitloop.py` fails when any of them changes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.publisher import Publisher
 from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 
@@ -74,12 +73,3 @@ class RawSubscription:
         if before is not None and sequence is not None:
             # Another publisher's numbers can go back.
             self.n_lost += max(0, sequence - before - n_taken)
-
-
-class RawPublisher:
-    """A publisher of the node for messages that are serialized already."""
-
-    def __init__(self, publisher: Publisher) -> None:
-        self.publisher = publisher
-        #: Called with the bytes of one message; raises `RCLError` when they can't go out.
-        self.publish: Callable[[bytes], None] = publisher.handle.publish_raw

@@ -24,7 +24,7 @@ from std_msgs.msg import Bool
 from ..online.compensator import Compensator
 from ..online.stamped_flag import stamped_flag
 from .conversions import SampleConverter, read_temperature
-from .raw import RawPublisher, RawSubscription
+from .raw import RawSubscription
 from .waitloop import RCLError
 
 #: Without samples, readings take effect but for those not older than the newest by this [ns]: a
@@ -63,9 +63,8 @@ class Relay:
         self.converter = converter
         self.samples = samples
         self._temperatures: list[tuple[RawSubscription, Push]] = list(temperatures)
-        self._publish = RawPublisher(imu).publish
-        self._publish_flag = RawPublisher(flag).publish
-        self._publish_stamped = RawPublisher(stamped).publish
+        self._publish: Callable[[bytes], None] = imu.handle.publish_raw
+        self._publish_flag, self._publish_stamped = flag.publish, stamped.publish
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
         #: Readings that were none.
@@ -98,17 +97,15 @@ class Relay:
 
     def _is_of_one(self, subscription: RawSubscription, n: int) -> bool:
         """Tell whether messages are of an input's only publisher; count them if not."""
-        is_contested = subscription.count_publishers() > 1
-        if not (is_contested or self._contested):
-            return True
         was_contested = subscription in self._contested
-        if is_contested:
+        if subscription.count_publishers() > 1:
             self._contested.add(subscription)
         elif was_contested:
             self._contested.remove(subscription)
-        if is_contested or was_contested:
-            self.n_contested += n
-        return not (is_contested or was_contested)
+        else:
+            return True
+        self.n_contested += n
+        return False
 
     def advance_without_samples(self, silence_ns: int) -> None:
         """

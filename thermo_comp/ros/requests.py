@@ -68,9 +68,9 @@ class ParameterRequests:
         self._thread.start()
         for service in node.services:
             if service.srv_type is SetParameters:
-                loop.serve(service, self._set_each)
+                loop.serve(service, partial(self._take, is_each=True))
             elif service.srv_type is SetParametersAtomically:
-                loop.serve(service, self._set_together)
+                loop.serve(service, partial(self._take, is_each=False))
             elif service.srv_type in _QUESTIONS:
                 loop.serve(service, partial(_reply, service))
 
@@ -79,31 +79,25 @@ class ParameterRequests:
         self._waiting.put(None)
         self._thread.join()
 
-    def _set_each(self, request: Any, answer: Callable[[Any], None]) -> None:
-        def respond(results: list[SetParametersResult]) -> None:
-            answer(SetParameters.Response(results=results))
-
-        self._take([[one] for one in request.parameters], respond)
-
-    def _set_together(self, request: Any, answer: Callable[[Any], None]) -> None:
-        def respond(results: list[SetParametersResult]) -> None:
-            answer(SetParametersAtomically.Response(result=results[0]))
-
-        self._take([request.parameters], respond)
-
-    def _take(
-        self,
-        groups: list[list[ParameterMessage]],
-        respond: Callable[[list[SetParametersResult]], None],
-    ) -> None:
+    def _take(self, request: Any, answer: Callable[[Any], None], *, is_each: bool) -> None:
         """Let a request wait for its turn."""
-        n = sum(len(group) for group in groups)
-        try:
-            if n > PARAMETERS_LIMIT:
-                raise RequestError(f'{n} parameters at once, at most {PARAMETERS_LIMIT}')
-            self._waiting.put_nowait(partial(self._work, groups, respond))
-        except (RequestError, queue.Full) as error:
-            reason = str(error) or 'too many requests wait already, try again'
+        groups = [[one] for one in request.parameters] if is_each else [request.parameters]
+
+        def respond(results: list[SetParametersResult]) -> None:
+            if is_each:
+                answer(SetParameters.Response(results=results))
+            else:
+                answer(SetParametersAtomically.Response(result=results[0]))
+
+        reason = ''
+        if len(request.parameters) > PARAMETERS_LIMIT:
+            reason = f'{len(request.parameters)} parameters at once, at most {PARAMETERS_LIMIT}'
+        else:
+            try:
+                self._waiting.put_nowait(partial(self._work, groups, respond))
+            except queue.Full:
+                reason = 'too many requests wait already, try again'
+        if reason:
             # Not one for each: to write so many would take as long as to read them.
             respond([_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT))
 

@@ -29,7 +29,7 @@ from rclpy.node import Node
 
 from ..errors import ThermoCompError
 from ..online.stamped_flag import STAMPED_TOPIC
-from ..recording import ROLES, Input, Role, Topics
+from ..recording import ROLES, Role
 from .node import NODE_NAME
 from .player import PlayReport, play
 from .recorder import OUTPUTS, Recorder
@@ -131,16 +131,13 @@ def round_trip(
     output: str | Path,
     *,
     rate: float = 0.0,
-    topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
     node_args: Sequence[str] = (),
-    namespace: str | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> RoundTrip:
-    """Play a bag into a node and record what comes out, in a namespace of its own by default."""
-    namespace = f'/round_trip_{os.getpid()}' if namespace is None else namespace
-    ros_args = ['-r', f'__ns:={namespace}'] if namespace else []
+    """Play a bag into a node and record what comes out, in a namespace of their own."""
+    namespace = f'/round_trip_{os.getpid()}'
+    ros_args = ['-r', f'__ns:={namespace}']
     arguments = [*ros_args, *lossless(namespace), '-p', f'calibration_file:={calibration}']
     arguments += ['-r', f'/diagnostics:={namespace}/diagnostics', *_ACCOUNT]
     with (
@@ -159,8 +156,6 @@ def round_trip(
         played = play(
             bag,
             rate=rate,
-            topics=topics,
-            input=input,
             wait_s=DISCOVERY_S,
             ros_args=ros_args,
             is_found=lambda player, roles: _is_found(recorder, player, roles),

@@ -14,8 +14,7 @@ faster than anybody waits for them may gather a little, so that one wake-up serv
 No exception of a callback ends the loop: it is logged and counted, and samples go on.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the method
-`service_take_request` of a service's handle, `SignalHandlerGuardCondition`, and the node's
-`_parameter_overrides`.
+`service_take_request` of a service's handle, and the node's `_parameter_overrides`;
 `test/test_waitloop.py` fails when any of them changes.
 """
 
@@ -40,7 +39,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
-from rclpy.signals import SignalHandlerGuardCondition
 from rclpy.subscription import Subscription
 
 from ..text import one_line
@@ -64,7 +62,7 @@ Serve = Callable[[Any, Callable[[Any], None]], None]
 @dataclass(frozen=True, slots=True)
 class _Entities:
     """
-    A wait set and its content: first the guards that stop the loop, and the loop's own services.
+    A wait set and its content: the loop's own services are the first ones.
     """
 
     wait_set: Any
@@ -77,11 +75,6 @@ class _Entities:
         self.wait_set.clear_entities()
         for add, handle in self.content:
             add(handle)
-
-    def is_stop_asked(self) -> bool:
-        """Tell whether one of the guards has been triggered."""
-        is_ready = self.wait_set.is_ready
-        return bool(is_ready('guard_condition', 0) or is_ready('guard_condition', 1))
 
     def is_other_ready(self) -> bool:
         """Tell whether something is ready that the executor serves."""
@@ -109,7 +102,6 @@ class WaitLoop:
         self._executor.add_node(node)
         self._stop_guard = GuardCondition(None, None, context=node.context)
         self._look_guard = GuardCondition(None, None, context=node.context)
-        self._signal_guard = SignalHandlerGuardCondition(context=node.context)
         # Keeps the hot subscriptions and the services of this loop from the executor.
         self._reserved = ReentrantCallbackGroup()
         # Middleware events are the executor's.
@@ -212,7 +204,6 @@ class WaitLoop:
         self._executor.shutdown()
         self._stop_guard.destroy()
         self._look_guard.destroy()
-        self._signal_guard.destroy()
 
     def _collect(self, in_use: ExitStack) -> list[_Entities]:
         """Build wait sets: hot subscriptions, what the executor serves, everything."""
@@ -220,7 +211,7 @@ class WaitLoop:
         raw = [one.subscription for one in self._raw]
         hot = [one.subscription for one in self._hot]
         others = [one for one in node.subscriptions if one not in raw]
-        guards = [self._stop_guard, self._signal_guard, self._look_guard]
+        guards = [self._stop_guard, self._look_guard]
         own = [service for service, _ in self._services]
         services = [*own, *[one for one in node.services if one not in own]]
         served = [guards, list(node.timers), list(node.clients), services]
@@ -306,9 +297,6 @@ class WaitLoop:
 
     def _look_after(self, entities: _Entities) -> None:
         """Serve one request of each service of this loop, and one other thing that is ready."""
-        if entities.is_stop_asked():
-            self._is_stopping = True
-            return
         for index, (service, callback) in enumerate(self._services):
             if entities.wait_set.is_ready('service', index):
                 self._guarded(partial(_take_request, service, callback))
