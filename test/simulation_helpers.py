@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermo_comp.simulation import SimulatedRun
-from thermo_comp.typing import Bools
+from thermo_comp.simulation import Cyclogram, SimulatedRun
+from thermo_comp.typing import Bools, Floats
 
 
 def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
@@ -15,3 +15,23 @@ def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
     truth = run.truth
     rate = np.gradient(truth.temperature(truth.unit.board.node), truth.grid_s)
     return np.asarray(np.abs(rate) * 60.0 > threshold_k_min)
+
+
+def rates_k_min(program: Cyclogram) -> Floats:
+    """Return the rate of each line between points, shape (n - 1,), K/min; 0 in a soak."""
+    return np.diff(program.temperature_c) / np.diff(program.time_s) * 60.0
+
+
+def rippled(
+    program: Cyclogram, seed: int = 1, amplitude: float = 0.1, period: float = 300.0
+) -> Cyclogram:
+    """Return a program with what a chamber's regulation leaves on it: a sine that wanders."""
+    # Twelve straight lines per period; the phase walks by half a radian per root of a period.
+    time = np.arange(0.0, program.duration_s, period / 12.0)
+    rng = np.random.default_rng(seed)
+    phase = rng.uniform(0.0, 2.0 * np.pi) + np.cumsum(
+        rng.normal(0.0, 0.5 / np.sqrt(12.0), len(time))
+    )
+    wave = amplitude * np.sin(phase + 2.0 * np.pi * time / period)
+    both = np.union1d(time, program.time_s)
+    return Cyclogram(tuple(both), tuple(program.at(both) + np.interp(both, time, wave)))

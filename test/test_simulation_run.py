@@ -9,12 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import welch
-from simulation_helpers import ideal_regime
+from simulation_helpers import ideal_regime, rippled
 
 from thermo_comp.simulation import (
     MICRO_G,
     START_NS,
-    ChamberRipple,
     SimulatedRun,
     UnitModel,
     cyclogram_preset,
@@ -47,8 +46,8 @@ def _joined(blocks: list[SimulatedRun], name: str, *, is_truth: bool = False) ->
 @pytest.mark.parametrize('block_size', [1777, 6000, 10**6])
 @pytest.mark.parametrize('name', ['thermostatted', 'mems'])
 def test_blocks_are_the_whole_bit_for_bit(name: str, block_size: int) -> None:
-    options = {'rate_hz': 20.0, 'seed': 9, 'ripple': ChamberRipple()}
-    arguments = (unit_preset(name, 1), SHORT, UP)
+    options = {'rate_hz': 20.0, 'seed': 9}
+    arguments = (unit_preset(name, 1), rippled(SHORT), UP)
     whole = simulate(*arguments, **options)
     blocks = list(simulate_blocks(*arguments, block_size=block_size, **options))
     assert len(blocks) == -(-len(whole.counts) // block_size)
@@ -209,8 +208,7 @@ def test_thermometers_have_their_rate_noise_and_offset(unit: UnitModel, rate_hz:
 
 
 def test_chamber_ripple_stays_within_its_amplitude(unit: UnitModel) -> None:
-    ripple = ChamberRipple(amplitude=0.1, period=240.0)
-    run = simulate(unit, DEMO, UP, rate_hz=1.0, ripple=ripple)
+    run = simulate(unit, rippled(DEMO, period=240.0), UP, rate_hz=1.0)
     deviation = run.truth.air - DEMO.at(run.truth.grid_s)
     assert np.abs(deviation).max() <= 0.1 + 1e-9
     # A sine's deviation is its amplitude over root two; the lines and the wander take a little.
@@ -269,10 +267,6 @@ def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:
             simulate(unit, SHORT, up)
     with pytest.raises(ValueError, match='`n` must be at least 1, got 0'):
         positions(0)
-    with pytest.raises(ValueError, match='`amplitude` must not be negative, got -1'):
-        ChamberRipple(amplitude=-1.0)
-    with pytest.raises(ValueError, match='`period` must be positive, got 0'):
-        ChamberRipple(period=0.0)
 
 
 @pytest.mark.parametrize(

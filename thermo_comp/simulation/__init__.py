@@ -26,7 +26,7 @@ from .cyclogram import (
     ramps_and_soaks,
 )
 from .presets import TRIAD_NAMES, UNIT_NAMES, unit_preset
-from .run import START_NS, ChamberRipple, simulate, simulate_blocks
+from .run import START_NS, simulate, simulate_blocks
 from .truth import SimulatedRun
 from .unit import UnitModel
 
@@ -38,7 +38,6 @@ __all__ = [
     'START_NS',
     'TRIAD_NAMES',
     'UNIT_NAMES',
-    'ChamberRipple',
     'Cyclogram',
     'Position',
     'Record',

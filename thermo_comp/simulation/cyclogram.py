@@ -61,13 +61,6 @@ class Cyclogram:
         """Length of the program, s."""
         return self.time_s[-1]
 
-    @property
-    def rates_k_min(self) -> Floats:
-        """Rate of each line between points, shape (n - 1,), K/min; 0 in a soak."""
-        minutes = np.diff(np.array(self.time_s)) / _MINUTE
-        rates: Floats = np.diff(np.array(self.temperature_c)) / minutes
-        return rates
-
     def at(self, time: ArrayLike) -> Floats:
         """Return the programmed air temperature [degC] at times [s] from the start, shape (m,)."""
         air: Floats = np.interp(np.asarray(time, dtype=float), self.time_s, self.temperature_c)

@@ -27,31 +27,6 @@ _GRID_S = 1.0  # step of the thermal grid; bias and scale are straight between i
 
 
 @dataclass(frozen=True)
-class ChamberRipple:
-    """
-    What the chamber's own regulation leaves on the air temperature: a sine that wanders.
-
-    Half of peak to peak [K], mean period [s], random walk of the phase [rad per root of a period].
-
-    Raises
-    ------
-    ValueError
-        If `amplitude` is negative or `period` is not positive.
-
-    """
-
-    amplitude: float = 0.1
-    period: float = 300.0
-    wander: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not self.amplitude >= 0.0:
-            raise ValueError(f'`amplitude` must not be negative, got {self.amplitude}')
-        if not self.period > 0.0:
-            raise ValueError(f'`period` must be positive, got {self.period}')
-
-
-@dataclass(frozen=True)
 class RunOptions:
     """
     The keywords of `simulate`, `simulate_blocks` and `arrays`.
@@ -71,8 +46,6 @@ class RunOptions:
         Local gravity, m/s^2.
     warm : bool, optional
         True starts in thermal equilibrium; False switches the unit on at the start.
-    ripple : ChamberRipple or None, optional
-        Regulation of the chamber; None is a perfect one.
 
     Raises
     ------
@@ -87,7 +60,6 @@ class RunOptions:
     start_ns: int = START_NS
     gravity: float = STANDARD_GRAVITY
     warm: bool = True
-    ripple: ChamberRipple | None = None
 
     def __post_init__(self) -> None:
         for name in ('rate_hz', 'gravity'):
@@ -143,7 +115,8 @@ class ThermalTruth:
     """The temperatures of a run and what they do to bias and scale, on the thermal grid."""
 
     def __init__(self, unit: UnitModel, cyclogram: Cyclogram, options: RunOptions) -> None:
-        knots, air = _knots(cyclogram, options)
+        knots = np.array(cyclogram.time_s)
+        air = np.array(cyclogram.temperature_c)
         power = None
         if unit.loads:
             knots, air, power = _switched(unit, knots, air, options.seed)
@@ -245,22 +218,6 @@ class Chamber:
             cycle_s=cycle_s,
             specific_force=self._force,
         )
-
-
-def _knots(cyclogram: Cyclogram, options: RunOptions) -> tuple[Floats, Floats]:
-    time = np.array(cyclogram.time_s)
-    ripple = options.ripple
-    if ripple is not None and ripple.amplitude > 0.0:
-        # A wandering sine through twelve straight lines per period.
-        step = ripple.period / 12.0
-        fine = np.arange(math.ceil(time[-1] / step)) * step
-        rng = generator(options.seed, Stream.CHAMBER_RIPPLE)
-        walk = rng.standard_normal(len(fine)) * (ripple.wander / math.sqrt(12.0))
-        walk[:1] = 2.0 * math.pi * rng.random(1)
-        wave = ripple.amplitude * np.sin(np.cumsum(walk) + 2.0 * math.pi * fine / ripple.period)
-        time = np.unique(np.concatenate([time, fine]))
-        return time, cyclogram.at(time) + np.interp(time, fine, wave)
-    return time, cyclogram.at(time)
 
 
 def _switched(

@@ -20,7 +20,6 @@ class Stream(IntEnum):
     CONVERTER_PHASE = 1
     BOARD_NOISE = 2
     CASE_NOISE = 3
-    CHAMBER_RIPPLE = 6
     UNIT = 8
     POSITIONS = 9
     CYCLOGRAM = 10
