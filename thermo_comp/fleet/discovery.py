@@ -11,7 +11,6 @@ serial in their metadata.
 from __future__ import annotations
 
 from collections import defaultdict
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -19,9 +18,6 @@ from ..errors import FleetError, RecordingError
 from ..recording import open_recording
 from ..text import one_line
 from .storage import Storage, StoredFile
-
-# To ask many bags on a far file system is to wait, not to compute.
-_N_READERS = 16
 
 
 @dataclass(frozen=True)
@@ -72,9 +68,9 @@ def find_units(storage: Storage) -> list[FoundUnit]:
         by_folder[str(PurePosixPath(bag.name).parent)].append(bag)
     loose = by_folder.pop('.', [])
     by_serial: dict[str, list[FoundBag]] = defaultdict(list)
-    with ThreadPoolExecutor(_N_READERS) as pool:
-        for bag, serial in zip(loose, pool.map(lambda b: _serial(storage, b), loose), strict=True):
-            by_serial[f'{serial} (in {storage.name})' if serial in by_folder else serial] += [bag]
+    for bag in loose:
+        serial = _serial(storage, bag)
+        by_serial[f'{serial} (in {storage.name})' if serial in by_folder else serial].append(bag)
     units = [FoundUnit(one_line(n), _lot(n), tuple(found)) for n, found in by_folder.items()]
     units += [FoundUnit(one_line(n), '', tuple(found)) for n, found in by_serial.items()]
     return sorted(units, key=lambda unit: unit.name)
