@@ -53,7 +53,7 @@ def view(
     Example:
       thermo_comp view unit42.yaml held_out.mcap
     """
-    from ..report.live import LiveOptions, LiveReport, LiveServer
+    from ..report.live import LiveReport, LiveServer
 
     for path in (calibration, *(bags or [])):
         if not path.exists():
@@ -62,13 +62,11 @@ def view(
     report = LiveReport(
         calibration,
         bags or [],
-        LiveOptions(
-            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
-            input=input_.value,
-            gravity=options.place(gravity, latitude, height),
-            serial=serial,
-            program=program,
-        ),
+        options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+        input_.value,
+        gravity=options.place(gravity, latitude, height),
+        serial=serial,
+        program=program,
     )
     try:
         server = LiveServer(report, port)

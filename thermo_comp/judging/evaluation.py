@@ -65,28 +65,10 @@ def open_bag(
     progress: Progress | None = None,
 ) -> OpenedBag:
     """
-    Read one bag, in bounded memory.
+    Read one bag, in bounded memory, for windows of `window_s` seconds.
 
-    Parameters
-    ----------
-    path : str or Path
-        The bag.
-    topics : Topics or None, optional
-        Names of the inputs.
-    input : {'auto', 'counts', 'imu'}, optional
-        Which accelerometer topic is read.
-    number : int, optional
-        Its place among several.
-    window_s : float, optional
-        Length of the windows that will be judged [s].
-    full_scale : float or None, optional
-        Magnitude of a saturated sample; None takes 32767 for counts.
-    require : collection of {'accel', 'board', 'case'}, optional
-        What it must hold.
-    is_hashed : bool, optional
-        Whether its hash is wanted, which takes reading it once more.
-    progress : callable or None, optional
-        Told the fraction read.
+    `number` is its place among several; a saturated sample has the magnitude `full_scale`, of
+    counts 32767 by default; its hash takes reading it once more; `progress` is told the fraction.
 
     Raises
     ------
@@ -160,35 +142,11 @@ def evaluate(
     progress: Progress | None = None,
 ) -> Evaluation:
     """
-    Judge one or more calibrations of a unit on recordings.
+    Judge one or more calibrations of a unit, given with their names, on its recordings.
 
-    Parameters
-    ----------
-    paths : sequence of str or Path
-        Recordings of the unit, in any number of positions.
-    calibrations : sequence of (str, Calibration)
-        With their names.
-    gravity : float or None, optional
-        Local gravity where they were made; the first calibration's by default.
-    window_s : float, optional
-        Length of a window [s].
-    tolerance : float or None, optional
-        The largest RMS that is accepted [m/s^2].
-    config : CompensatorConfig or None, optional
-        The node's settings.
-    topics : Topics or None, optional
-        Names of the inputs.
-    input : {'auto', 'counts', 'imu'}, optional
-        What is read; by default what the first calibration is for.
-    serial : str or None, optional
-        See `replay.check_unit`.
-    progress : callable or None, optional
-        Called with the fraction done.
-
-    Returns
-    -------
-    Evaluation
-        A judgement of each calibration.
+    Local gravity and what is read are those of the first calibration by default; `tolerance` is
+    the largest RMS that is accepted [m/s^2], `config` the node's settings, and of `serial` see
+    `replay.check_unit`.
 
     Raises
     ------

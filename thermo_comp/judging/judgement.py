@@ -75,31 +75,12 @@ class Section:
 @dataclass(frozen=True)
 class Judgement:
     """
-    What recordings tell of a calibration.
+    What recordings tell of a calibration: the verdict, and one sentence of its numbers.
 
-    Parameters
-    ----------
-    kind : Verdict
-        The verdict.
-    reason : str
-        One sentence of numbers.
-    sections : dict of {str: Section}
-        ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside`` them.
-    left_out_rms : float
-        Of windows that the fit has seen: what it left on positions left out [m/s^2], else NaN.
-    tolerance : float or None
-        The user's acceptance limit [m/s^2].
-    shifts : tuple of AxisShift
-        Per axis; empty with fewer than six distinct positions.
-    moved : tuple of str
-        The shifts that are sure, in words.
-    wander : ndarray, shape (2, 3)
-        See `shifts.wander`.
-    n_positions : int
-        Distinct positions.
-    windows : Windows
-        What it rests on.
-
+    Sections are ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside``
+    them. `left_out_rms` is, of windows that the fit has seen, what it left on positions left out,
+    else NaN; `tolerance` the user's limit [m/s^2]. Shifts are per axis, none with fewer than six
+    distinct positions; `moved` says those that are sure. For `wander` see there.
     """
 
     kind: Verdict
@@ -167,19 +148,10 @@ def judge(
     is_seen: bool = False,
 ) -> Judgement:
     """
-    Judge a calibration by its windows.
+    Judge a calibration by its windows, at least one.
 
-    Parameters
-    ----------
-    windows : Windows
-        At least one; see `corrected_windows`.
-    calibration : Calibration
-        The calibration.
-    tolerance : float or None, optional
-        The largest RMS that the user accepts in either regime [m/s^2]; it decides where given.
-    is_seen : bool, optional
-        Whether the calibration was fitted on such windows: then what its fit left on positions
-        left out stands for them.
+    A `tolerance`, the largest RMS that the user accepts in either regime [m/s^2], decides where
+    given. Of windows that the fit has seen, what it left on positions left out stands for them.
 
     Raises
     ------

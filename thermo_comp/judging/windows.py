@@ -153,25 +153,10 @@ def corrected_windows(
     config: CompensatorConfig | None = None,
 ) -> Windows:
     """
-    Correct the windows of bags.
+    Correct the windows of bags of the calibration's unit.
 
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        Bags of the calibration's unit.
-    calibration : Calibration
-        The calibration.
-    gravity : float or None, optional
-        Local gravity where they were recorded; the calibration's by default.
-    window_s : float, optional
-        Length of a window [s].
-    config : CompensatorConfig or None, optional
-        The node's settings.
-
-    Returns
-    -------
-    Windows
-        Empty where nothing rests for as long with a temperature.
+    Local gravity is the calibration's by default. Empty where nothing rests for as long with a
+    temperature.
 
     Raises
     ------

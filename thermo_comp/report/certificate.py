@@ -116,14 +116,7 @@ class CertificateInfo:
 
 def load_certificate_info(path: str | Path, serial: str | None = None) -> CertificateInfo:
     """
-    Read a laboratory's statements from a YAML file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    serial : str or None, optional
-        Serial of the unit that is certified.
+    Read a laboratory's statements on the unit with a serial from a YAML file.
 
     Raises
     ------

@@ -79,40 +79,14 @@ class Position:
 @dataclass(frozen=True)
 class Evidence:
     """
-    All that a report says.
+    All that a report says; what is missing is None or empty.
 
-    Parameters
-    ----------
-    serial : str
-        Unit serial, or what is known instead.
-    unit : {'counts', 'm/s^2'}
-        Unit of the raw samples.
-    gravity : float or None
-        Local gravity.
-    calibration : Calibration or None
-        What is certified.
-    bags : tuple of BagFacts
-        The bags.
-    shown : ShownBag or None
-        The bag of the time figures.
-    windows : Windows or None
-        At rest, of all bags.
-    judgement : Judgement or None
-        What they tell of the calibration.
-    steps : tuple of ResidualRow
-        What each step of the model leaves on the windows of the fit.
-    left_out : dict of {int: float}
-        By `Windows.position`: RMS of ``|f| - g`` with what the other positions alone say of the
-        unit [m/s^2].
-    findings, checks : tuple of str
-        What speaks against calibration or bags; what the fit looked at and found good.
-    history : tuple of Epoch
-        The unit's calibrations by date, where there are several.
-    is_fit : bool
-        Whether the calibration was fitted on these very bags.
-    is_simulated : bool
-        Whether a bag comes from our own simulator.
-
+    `serial` is the unit's, or what is known instead; `unit` that of the raw samples; `windows` are
+    at rest, of all bags, and `judgement` what they tell of the calibration; `steps` what each
+    step of the model leaves on the windows of the fit; `left_out`, by `Windows.position`, the RMS
+    of ``|f| - g`` with what the other positions alone say of the unit [m/s^2]; `findings` what
+    speaks against calibration or bags, `checks` what the fit looked at and found good; `history`
+    the unit's calibrations by date, where there are several. A fit is shown on its own bags.
     """
 
     serial: str

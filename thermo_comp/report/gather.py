@@ -50,26 +50,13 @@ def evidence_of_bags(
     others: Sequence[Calibration] = (),
 ) -> Evidence:
     """
-    Judge bags, with a calibration or without.
+    Judge bags, with a calibration or without; no bags report on the calibration alone.
 
-    Parameters
-    ----------
-    bags : sequence of OpenedBag
-        The bags; none reports on the calibration alone.
-    calibration : Calibration or None, optional
-        The unit's calibration; without it only the thermal side is reported, and ``|g|`` of a
-        unit that speaks m/s^2.
-    gravity : float or None, optional
-        Local gravity; the calibration's by default.
-    window_s, tolerance : float, optional
-        As for `judging.evaluate`.
-    serial : str or None, optional
-        Serial of the unit, instead of the bags'; empty accepts any calibration.
-    program : str or None, optional
-        The chamber's program, as `simulation.parse_cyclogram` reads it; by default what a
-        simulated bag says of itself.
-    others : sequence of Calibration, optional
-        Other calibrations of the unit, for its history.
+    Without a calibration only the thermal side is reported, and ``|g|`` of a unit that speaks
+    m/s^2. Gravity is the calibration's by default; `window_s` and `tolerance` are as for
+    `judging.evaluate`; an empty `serial` accepts any calibration; `program` is the chamber's, as
+    `simulation.parse_cyclogram` reads it, by default what a simulated bag says of itself;
+    `others` are further calibrations of the unit, for its history.
 
     Raises
     ------
@@ -126,16 +113,8 @@ def evidence_of_fit(
     """
     Gather what a fit has to show, on the bags that it was made of.
 
-    Parameters
-    ----------
-    result : FitResult
-        The fit.
-    paths : sequence of str or Path, optional
-        The bags it was made of, in its order, to look up what simulated ones say of themselves.
-    program : str or None, optional
-        The chamber's program, as `simulation.parse_cyclogram` reads it.
-    is_brief : bool, optional
-        Leave out what only figures show.
+    Its bags' `paths`, in its order, are looked up for what simulated ones say of themselves;
+    `program` is the chamber's, and a brief evidence lacks what only figures show.
 
     Raises
     ------

@@ -28,18 +28,10 @@ _LONGEST_MARGIN = 90
 
 def render(template: str, *, script: str = '', nonce: str = '', **context: Any) -> str:
     """
-    Fill a template that extends ``page.html``.
+    Fill a template that extends ``page.html`` with what it names; at least `title`.
 
-    Parameters
-    ----------
-    template : str
-        Its file's name.
-    script, nonce : str, optional
-        Script of the viewer that serves the page, and what makes the page's policy let this one
-        script run and talk to its server; a page in a file has none.
-    **context
-        What the template names; at least `title`.
-
+    A viewer that serves the page has a script, and a nonce by which the page's policy lets this
+    one script run and talk to its server; a page in a file has none.
     """
     policy = _POLICY
     if script:

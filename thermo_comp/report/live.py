@@ -16,7 +16,6 @@ import secrets
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -51,26 +50,21 @@ setInterval(async () => {
 """
 
 
-@dataclass(frozen=True)
-class LiveOptions:
-    """How the viewer reads the bags; see `evidence_of_bags`."""
-
-    topics: Topics | None = None
-    input: Input = 'auto'
-    gravity: float | None = None
-    serial: str | None = None
-    program: str | None = None
-
-
 class LiveReport:
     """The page of a calibration and bags, as the files are; a bag is read when it changes."""
 
     def __init__(
-        self, calibration: Path, bags: Sequence[Path] = (), options: LiveOptions | None = None
+        self,
+        calibration: Path,
+        bags: Sequence[Path] = (),
+        topics: Topics | None = None,
+        input: Input = 'auto',  # noqa: A002 - as everywhere
+        **judging: Any,
     ) -> None:
         self._calibration = calibration
         self._bags = list(bags)
-        self._options = options or LiveOptions()
+        self._topics, self._input = topics, input
+        self._judging = judging  # of `evidence_of_bags`
         self._lock = threading.Lock()
         self._opened: dict[Path, tuple[str, OpenedBag]] = {}
         self._version = ''
@@ -107,7 +101,6 @@ class LiveReport:
             self._notice = f'{error}{older}'
 
     def _evidence(self) -> Evidence:
-        options = self._options
         calibration = load_calibration(self._calibration)
         bags = []
         for number, path in enumerate(self._bags):
@@ -116,21 +109,15 @@ class LiveReport:
             if known is None or known[0] != signature:
                 bag = open_bag(
                     path,
-                    options.topics,
-                    input_for(calibration, options.input),
+                    self._topics,
+                    input_for(calibration, self._input),
                     number=number,
                     full_scale=calibration.unit.full_scale,
                 )
                 known = (signature, bag)
                 self._opened[path] = known
             bags.append(known[1])
-        return evidence_of_bags(
-            bags,
-            calibration,
-            gravity=options.gravity,
-            serial=options.serial,
-            program=options.program,
-        )
+        return evidence_of_bags(bags, calibration, **self._judging)
 
 
 class LiveServer(ThreadingHTTPServer):

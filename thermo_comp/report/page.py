@@ -38,27 +38,11 @@ def write_report(
     overwrite: bool = True,
 ) -> Evidence:
     """
-    Write a certificate as one self-contained HTML page.
+    Write a certificate as one self-contained HTML page; give what it is made of.
 
-    Parameters
-    ----------
-    subject : FitResult or Evidence
-        A fit, or what `evidence_of_bags` gathered.
-    path : str or Path
-        The page.
-    info : CertificateInfo or None, optional
-        What the laboratory states; what it does not stays blank.
-    figures : str or Path or None, optional
-        Folder that gets the figures as PNG files, made if it is not there.
-    paths, program : optional
-        Of a fit: see `evidence_of_fit`.
-    overwrite : bool, optional
-        Replace a page and pictures that are there.
-
-    Returns
-    -------
-    Evidence
-        What the page is made of.
+    What the laboratory does not state in `info` stays blank. The folder `figures` gets the figures
+    as PNG files. Of a fit, `paths` and `program` are as for `evidence_of_fit`. Page and pictures
+    that are there are replaced if `overwrite`.
 
     Raises
     ------
