@@ -125,8 +125,10 @@ def evidence_of_fit(
 
     """
     calibration = result.calibration
-    judgement = judge_bags(result.bags, calibration, window_s=usual_window(result.bags))
     metadata = [] if is_brief else [inspect_recording(path).metadata for path in paths]
+    # What can be refused comes before the judging, which takes seconds.
+    shown = None if is_brief else _shown(result.bags, calibration, program, metadata)
+    judgement = judge_bags(result.bags, calibration, window_s=usual_window(result.bags))
     rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
     against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
@@ -136,7 +138,7 @@ def evidence_of_fit(
         gravity=calibration.gravity_m_s2,
         calibration=calibration,
         bags=tuple(_facts(one) for one in result.bags),
-        shown=None if is_brief else _shown(result.bags, calibration, program, metadata),
+        shown=shown,
         windows=None if judgement is None else judgement.windows,
         judgement=judgement,
         steps=result.residuals,
