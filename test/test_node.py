@@ -244,6 +244,32 @@ def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[st
         wait(lambda s, _: '1 jumps of time backwards' in s.message)
 
 
+def test_diagnostics_tell_noise_and_bias_apart(
+    peer: Peer, saved: Callable[..., list[str]]
+) -> None:
+    wait, unit = diagnosis(peer), rich_calibration()
+    with node_in_thread(*saved(unit)) as node:
+        driver = drive(peer, node)
+        driver.temperatures(START_NS, 20.0, 20.0)
+        driver.counts(START_NS + 1, *standing(0))
+        _, _, values = wait(lambda _, values: values['samples out'] == '1')
+        for axis in 'xyz':
+            # What an INS needs beside the covariance: its own sd is noise, rounding and bias.
+            density, whole, bias = (
+                float(values[f'{name} {axis} {of}'])
+                for name, of in (
+                    ('noise density', '[m/s^2/sqrt(Hz)]'),
+                    ('sd', '[m/s^2]'),
+                    ('bias sd', '[m/s^2]'),
+                )
+            )
+            assert density == unit.noise_density_m_s2_sqrt_hz['xyz'.index(axis)]
+            counts = getattr(unit.axes, axis).scale_factor
+            noise = density**2 / unit.unit.cycle_time_s + 1.0 / 6.0 / counts**2
+            assert whole**2 == pytest.approx(bias**2 + noise, rel=1e-2)
+            assert bias > 0.0
+
+
 def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]) -> None:
     wait = diagnosis(peer)
     with node_in_thread(

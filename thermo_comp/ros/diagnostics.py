@@ -71,12 +71,14 @@ class Input:
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """
-    The node at one moment: variances as last published [m^2/s^4], silence [s], samples first.
+    The node at one moment: variances as last published and the sample's own noise in them
+    [m^2/s^4], silence [s], samples first.
     """
 
     status: CompensatorStatus
     traffic: Traffic
     variances: tuple[float, float, float] | None
+    noise: list[float]
     silence_s: float
     inputs: tuple[Input, ...]
 
@@ -243,11 +245,13 @@ def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[
             ('gravity windows', str(status.gravity.n_windows)),
             ('standing', str(status.gravity.is_still)),
         ]
-    if now.variances is not None:
-        values += [
-            (f'sd {axis} [m/s^2]', f'{math.sqrt(variance):.3e}')
-            for axis, variance in zip('xyz', now.variances, strict=True)
-        ]
+    densities = loaded.calibration.noise_density_m_s2_sqrt_hz
+    for axis, density in zip('xyz', densities, strict=True):
+        values.append((f'noise density {axis} [m/s^2/sqrt(Hz)]', f'{density:.3e}'))
+    for axis, variance, noise in zip('xyz', now.variances or (), now.noise):  # noqa: B905
+        values.append((f'sd {axis} [m/s^2]', f'{math.sqrt(variance):.3e}'))
+        bias_sd = math.sqrt(max(0.0, variance - noise))
+        values.append((f'bias sd {axis} [m/s^2]', f'{bias_sd:.3e}'))
     rate = _sample_rate(now, before)
     values += [
         ('sample rate [Hz]', 'unknown' if rate is None else f'{rate:.2f}'),

@@ -212,11 +212,14 @@ class CompensationNode:
             n_failures=self._loop.n_failures,
         )
         variances = None if last is None else (last[3], last[6], last[8])
+        thermal = self._compensator.thermal
+        noise = [(1.0 + thermal.noise_excess) * one for one in thermal.correction.noise]
         names = ('sample', *self._thermometers)
         return Snapshot(
             take_snapshot(self._compensator),
             traffic,
             variances,
+            noise,
             time.monotonic() - self._last_samples,
             tuple(
                 look_at(self.node, name, one.subscription)

@@ -58,16 +58,15 @@ _ACCEL = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompen
 class PlayReport:
     """What a player did."""
 
-    #: Messages sent, by the topic's full name.
-    n_messages: dict[str, int] = field(default_factory=dict)
-    #: Wall time from the first message to the last acknowledgement [s].
-    duration_s: float = 0.0
-    #: Topics to which nobody listened.
-    unheard: list[str] = field(default_factory=list)
-    #: Topics with a best-effort subscriber, which can lose messages.
-    lossy: list[str] = field(default_factory=list)
-    #: What of the bag could not be read.
-    missing: str | None = None
+    n_messages: dict[str, int] = field(
+        default_factory=dict
+    )  # messages sent, by the topic's full name
+    duration_s: float = 0.0  # wall time from the first message to the last acknowledgement [s]
+    unheard: list[str] = field(default_factory=list)  # topics to which nobody listened
+    lossy: list[str] = field(
+        default_factory=list
+    )  # topics with a best-effort subscriber, which can lose messages
+    missing: str | None = None  # what of the bag could not be read
 
 
 def play(
