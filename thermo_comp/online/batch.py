@@ -240,16 +240,10 @@ def _apply(
         source = np.concatenate([np.arange(first, after) for first, after in covered])
         index, stamps, samples = index[source], stamps[source], samples[source]
     lines = Lines(np.array(segments.start_ns, dtype=np.int64), columns, counts)
-    force, covariance, lowest, highest = correct(lines, correction.misalignment, stamps, samples)
+    force, covariance = correct(lines, correction.misalignment, stamps, samples)
     full_scale = compensator.calibration.unit.full_scale
-    # The extremes settle the usual case; a NaN fails both comparisons.
-    keep: Bools
-    if (lowest > -full_scale).all() and (highest < full_scale).all():
-        keep = np.ones(len(samples), dtype=bool)
-    else:
-        keep = np.asarray(((-full_scale < samples) & (samples < full_scale)).all(axis=1))
-    may_be_zero = not ((lowest > 0.0) | (highest < 0.0)).any()
-    is_stuck = _stuck(compensator, stamps, samples, may_be_zero)
+    keep: Bools = np.asarray((np.abs(samples) < full_scale).all(axis=1))
+    is_stuck = _stuck(compensator, stamps, samples)
     _judge(compensator, segments, counts, stamps, samples, force, covariance, keep, is_stuck)
     if not keep.all():
         index, stamps = index[keep], stamps[keep]
@@ -313,9 +307,7 @@ def _refuted(
     covariance: Floats,
     keep: Bools,
 ) -> list[bool]:
-    """
-    Let the first sample of each segment tell of gravity; say which segments are held back for it.
-    """
+    """Let each segment's first sample tell of gravity; say which segments that holds back."""
     gravity, trace = compensator.gravity, compensator.thermal.correction.noise_trace
     is_refuted: list[bool] = []
     firsts = zip(
@@ -337,18 +329,13 @@ def _refuted(
     return is_refuted
 
 
-def _stuck(
-    compensator: Compensator, stamps: Stamps, samples: Floats, may_be_zero: bool
-) -> Bools | None:
+def _stuck(compensator: Compensator, stamps: Stamps, samples: Floats) -> Bools | None:
     """Find the samples that are not believed: too long the same, or three exact zeros."""
     if not compensator.stuck.is_on:
         return None
     found = compensator.stuck.find(stamps, samples)
-    if not may_be_zero:
-        return found
     zeros = np.flatnonzero(samples[:, 0] == 0.0)
-    if len(zeros):
-        zeros = zeros[(samples[zeros, 1] == 0.0) & (samples[zeros, 2] == 0.0)]
+    zeros = zeros[(samples[zeros, 1:] == 0.0).all(axis=1)]
     if len(zeros):
         found = np.zeros(len(stamps), dtype=bool) if found is None else found
         found[zeros] = True

@@ -213,9 +213,7 @@ class Compensator:
         return self.thermal.queue.take()
 
     def flush(self, stamp_ns: int) -> None:
-        """
-        Let queued readings up to a stamp take effect without a sample (no samples are coming).
-        """
+        """Let queued readings up to a stamp take effect; no samples are coming."""
         self.thermal.flush(stamp_ns)
         self._event_ns = EVER_NS
 
@@ -243,12 +241,6 @@ class Compensator:
     def now_ns(self) -> int | None:
         """Stamp of the last sample; None before the first."""
         return self.last_ns if self.last_ns != EVER_NS else None
-
-    def pending_ahead(self, stamp_ns: int) -> float:
-        """
-        How far the farthest reading that waits for a sample lies ahead of a stamp [s]; 0 if none.
-        """
-        return self.thermal.queue.ahead(stamp_ns)
 
     def reset(self) -> None:
         """Forget temperatures, regime and queue; counters stay."""

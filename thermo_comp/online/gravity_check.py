@@ -78,10 +78,7 @@ class GravityCheck:
         covariance: Sequence[float],
         noise_variance: float,
     ) -> None:
-        """
-        Take a corrected sample [m/s^2], its covariance xx, xy, xz, yy, yz, zz and the part of the
-        trace that is noise of one sample [m^2/s^4].
-        """
+        """Take a sample, its covariance xx .. zz, and the noise of one in the trace [m^2/s^4]."""
         start = self._window_ns
         x, y, z = force
         if (

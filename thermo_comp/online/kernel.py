@@ -21,10 +21,7 @@ PIECE = 12288
 
 
 class Lines:
-    """
-    The coefficients of the segments of a block, as `segments.lay_lines` gives them, spread over
-    the samples on demand.
-    """
+    """The coefficients of a block's segments (`segments.lay_lines`), spread on demand."""
 
     def __init__(self, start_ns: Ints, columns: list[Floats], counts: Ints) -> None:
         self._start_ns = start_ns
@@ -43,9 +40,7 @@ class Lines:
         self._counts = ends - np.maximum(self._begins[self._rows], begin)
 
     def spread(self, column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """
-        Repeat the value of each selected segment for each of its samples, in an array of its own.
-        """
+        """Repeat the value of each selected segment for its samples, in a new array."""
         return np.repeat(column[self._rows], self._counts)
 
     def age(self, stamps: Stamps) -> Floats:
@@ -81,15 +76,11 @@ class Lines:
 
 def correct(
     lines: Lines, misalignment: tuple[float, ...], stamps: Stamps, samples: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats]:
     """
-    Correct the samples (n, 3) of segments, and find the extremes of each axis on the way.
-
-    Returns force (n, 3) [m/s^2], covariance (n, 9) [m^2/s^4], and the lowest and the highest
-    sample of each axis, NaN where one is.
+    Correct the samples (n, 3) of segments: force (n, 3) [m/s^2] and covariance (n, 9) [m^2/s^4].
     """
     n = len(stamps)
-    lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
     raw = np.empty((3, min(n, PIECE)))
     # The columns stand one after the other in memory: each is written in one run.
     force, covariance = np.empty((3, n)), np.empty((9, n))
@@ -100,12 +91,10 @@ def correct(
             lines.select(piece.start, piece.stop)
             columns = raw[:, : piece.stop - begin]
             np.copyto(columns, samples[piece].T)
-            np.minimum(lowest, columns.min(axis=1), out=lowest)
-            np.maximum(highest, columns.max(axis=1), out=highest)
             _correct(
                 lines, misalignment, stamps[piece], columns, force[:, piece], covariance[:, piece]
             )
-    return force.T, covariance.T, lowest, highest
+    return force.T, covariance.T
 
 
 def _correct(

@@ -20,10 +20,6 @@ from ..typing import Bools, Floats, Ints
 
 #: Fewer equal samples in a row than this are chance, however far they lie apart.
 STUCK_SAMPLES: Final = 50
-#: Of so many equal samples in a row two neighbouring probes are part, and all between them.
-_PROBE_STEP: Final = STUCK_SAMPLES // 2
-#: With more probes that equal their neighbour each sample is compared with the one before.
-_MAX_LOOKS: Final = 16
 #: Samples may come this many times as fast as the calibrated cycle in the long run ...
 LARGEST_RATE: Final = 1.5
 #: ... with so many of them, or so many seconds' worth, at once (a driver that empties a buffer).
@@ -35,10 +31,7 @@ _NEVER_NS: Final = 1 << 62
 
 
 class StuckCheck:
-    """
-    Counts equal samples in a row, in stream and batch; beyond the time-out [s] they are not
-    believed, with 0 they always are.
-    """
+    """Counts equal samples in a row; beyond the time-out [s], if any, they are not believed."""
 
     def __init__(self, timeout_s: float) -> None:
         self.limit_ns = round(timeout_s * 1e9) if timeout_s > 0.0 else _NEVER_NS
@@ -62,23 +55,7 @@ class StuckCheck:
         return self.n_same >= STUCK_SAMPLES and stamp_ns - self.run[3] > self.limit_ns
 
     def find(self, stamps: Ints, samples: Floats) -> Bools | None:
-        """
-        Find the samples (n, 3) of a batch, n > 0, that the stream would call stuck; None if none.
-        """
-        if len(stamps) < 2 * STUCK_SAMPLES or _may_stand_still(samples):
-            return self._find(stamps, samples)
-        # The run that came in ends among the first samples, the one that goes on begins among
-        # the last, and those between are too short.
-        head = self._find(stamps[:STUCK_SAMPLES], samples[:STUCK_SAMPLES])
-        self.reset()
-        self._find(stamps[-STUCK_SAMPLES:], samples[-STUCK_SAMPLES:])
-        if head is None:
-            return None
-        found = np.zeros(len(stamps), dtype=bool)
-        found[:STUCK_SAMPLES] = head
-        return found
-
-    def _find(self, stamps: Ints, samples: Floats) -> Bools | None:
+        """Find the samples (n > 0, 3) that the stream would call stuck; None if none."""
         x, y, z = samples.T
         same = np.empty(len(stamps), dtype=bool)
         same[0] = (x[0], y[0], z[0]) == self.run[:3]
@@ -106,21 +83,6 @@ class StuckCheck:
         else:
             self.n_same += len(row)
         return found
-
-
-def _may_stand_still(samples: Floats) -> bool:
-    """Look at a few samples whether `STUCK_SAMPLES` in a row may be equal anywhere."""
-    probes = samples[::_PROBE_STEP]
-    # Most differ in any one component already.
-    same = np.flatnonzero(probes[1:, 0] == probes[:-1, 0])
-    same = same[(probes[same + 1, 1:] == probes[same, 1:]).all(axis=1)]
-    if len(same) > _MAX_LOOKS:
-        return True
-    # Two probes may be equal by chance; all that lie between them hardly are.
-    for first in (same * _PROBE_STEP).tolist():
-        if bool((samples[first + 1 : first + _PROBE_STEP] == samples[first]).all()):
-            return True
-    return False
 
 
 class RateCheck:

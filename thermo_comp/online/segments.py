@@ -40,9 +40,7 @@ EVER_NS: Final = -(1 << 62)
 
 
 class ThermalSide:
-    """
-    What stream and batch share: readings, thermal state, and the gate that they open for samples.
-    """
+    """What stream and batch share: readings, thermal state, the gate they open for samples."""
 
     def __init__(
         self, calibration: Calibration, config: CompensatorConfig, counters: Counters
@@ -116,9 +114,7 @@ class ThermalSide:
         self._forget_segment()
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """
-        Queue a reading; one of a thermometer that the calibration does not know is nothing to it.
-        """
+        """Queue a reading, if the calibration knows its thermometer."""
         if name in self.inputs:
             kind = self.inputs.index(name)
             self.count_rejected(kind, self.queue.push(stamp_ns, kind, celsius))
@@ -183,16 +179,12 @@ class ThermalSide:
 
     @property
     def rate_refuses(self) -> bool:
-        """
-        Whether samples are held back because they cannot be conversions of the calibrated cycle.
-        """
+        """Whether samples come too fast to be conversions of the calibrated cycle."""
         return self.rate.is_too_fast and self._counts_cycles
 
     @property
     def noise_excess(self) -> float:
-        """
-        What the rate adds to the noise of a sample, relative to that of the calibrated cycle.
-        """
+        """What the rate adds to a sample's noise, relative to the calibrated cycle's."""
         excess = self.rate.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 

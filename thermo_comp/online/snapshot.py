@@ -25,7 +25,7 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     if stamp_ns is None:
         stamp_ns = tracker.updated_ns
     counters = replace(compensator.counters)
-    ahead_s = 0.0 if stamp_ns is None else compensator.pending_ahead(stamp_ns)
+    ahead_s = 0.0 if stamp_ns is None else thermal.queue.ahead(stamp_ns)
     board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
     if stamp_ns is None or board_ns is None:
         return CompensatorStatus(counters, stamp_ns, pending_ahead_s=ahead_s)

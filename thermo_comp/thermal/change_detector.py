@@ -97,10 +97,7 @@ class ChangeDetector:
         self._reading = nan
 
     def settle(self, sensor: Thermometer, least_doubt: float = 0.0) -> None:
-        """
-        Begin a soak: what the rate is now is its baseline, give or take `least_doubt` [K/s] at the
-        least.
-        """
+        """Begin a soak: its baseline is the rate, give or take `least_doubt` at the least."""
         self._baseline = self.rate
         self._doubt = max(self.swing, least_doubt, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # edges that were crossed before the soak tell of the ramp
@@ -232,9 +229,7 @@ class ChangeDetector:
         return departure
 
     def _follow(self, rate: float, dt: float) -> None:
-        """
-        Let the baseline follow what the rate has been over a while, at most a swing per memory.
-        """
+        """Let the baseline follow the rate of a while, at most a swing per memory."""
         baseline, doubt = self._baseline, self._doubt
         limit = self.swing + doubt
         share = dt / (dt + self._baseline_s)

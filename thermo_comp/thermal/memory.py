@@ -121,10 +121,7 @@ class LagBank:
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """
-        Take the next value of the input [K]; it moved there in a straight line, and may have been
-        wrong by `sd` since the last one [K].
-        """
+        """Take the input's next value [K], reached in a straight line, wrong by `sd` meanwhile."""
         seen_ns = self.stamp_ns
         if seen_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
@@ -179,10 +176,7 @@ class LagBank:
         return decays, gains
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """
-        Give ``u - L`` [K] of each lag at a stamp where the input is `value`, and variances beyond
-        start.
-        """
+        """Give ``u - L`` [K] of each lag at a stamp with the input `value`, and its variance."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra

@@ -143,9 +143,7 @@ class SensorCheck:
         return True
 
     def watch_other(self) -> None:
-        """
-        Note how the other sensor has moved since this one last changed; call after its readings.
-        """
+        """Note how the other sensor has moved since this one changed; after its readings."""
         other = self._other
         now_ns = other.stamp_ns
         moved = other.temperature - self._other_then
@@ -182,9 +180,7 @@ class SensorCheck:
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """
-        Note that the sensor has begun anew elsewhere: was it wrong before, or is it wrong now?
-        """
+        """Note that the sensor began anew elsewhere: was it wrong, or is it wrong now?"""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 

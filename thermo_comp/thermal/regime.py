@@ -80,10 +80,7 @@ class RegimeDetector:
         self._board_calm.reset()
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
-        """
-        Decide after an accepted reading of the leading sensor, the case while it is there; None
-        for a sensor that is lost.
-        """
+        """Decide after a used reading of the leading sensor, the case if it is not None."""
         if case is not None:
             lead, change = case, self._case_change
         elif board is not None:
@@ -145,9 +142,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """
-        Follow the direction once it has lasted: a reading that is held makes the rate a staircase.
-        """
+        """Follow the direction once it has lasted: a held reading makes the rate a staircase."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:

@@ -20,9 +20,7 @@ OBVIOUS_SHARE: Final = 1.5  # the hysteresis: opens above this many relaxed rate
 def refuse_outside(
     settings: object, *, positive: tuple[str, ...], not_negative: tuple[str, ...]
 ) -> None:
-    """
-    Refuse attributes that are not above zero, or not at least zero, or not finite: ValueError.
-    """
+    """Raise ValueError for attributes that are not above, or not at least, zero, and finite."""
     for name in (*positive, *not_negative):
         value = getattr(settings, name)
         if not 0.0 <= value < inf or (value == 0.0 and name in positive):
@@ -32,9 +30,7 @@ def refuse_outside(
 
 @dataclass(frozen=True, slots=True)
 class ThermometerSettings:
-    """
-    What is known of one temperature sensor, in physical terms; its keys are the file's keys.
-    """
+    """What is known of a temperature sensor, physically; its keys are the file's keys."""
 
     noise_sd_c: Annotated[
         float, 'Standard deviation of the white noise of one reading, before quantization, K.'

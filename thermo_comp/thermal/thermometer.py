@@ -91,10 +91,7 @@ class Thermometer:
         self._n_strange = 0
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
-        """
-        Take one reading [degC]; False when it was not used: no temperature, not newer than the
-        last one, an outlier.
-        """
+        """Take a reading [degC]; False if not used: no temperature, not newer, an outlier."""
         if not COLDEST <= reading_c <= HOTTEST:
             return False
         if self.stamp_ns is None:
@@ -259,9 +256,7 @@ class Thermometer:
     def _cell(
         self, reading: float, expected: float, variance: float, move: float, var_move: float
     ) -> tuple[float, float]:
-        """
-        Turn a quantized reading into the Gaussian measurement of the temperature it amounts to.
-        """
+        """Turn a quantized reading into the Gaussian measurement that it amounts to."""
         half = 0.5 * self._quantum
         noise = self._noise
         if variance < 4.0 * noise:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import Final
 
-from .memory import BOARD_INPUT, MemorySpec, ThermalMemory, start_covariance
+from .memory import BOARD_INPUT, LagBank, MemorySpec, ThermalMemory, start_covariance
 from .plausibility import Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
@@ -27,10 +27,7 @@ UNWATCHED_SHARE: Final = 0.25
 
 
 class ThermalTracker:
-    """
-    Thermal state from stamped readings of the board and of the thermometers beside it, under the
-    detector's settings that the coefficient sets were fitted under.
-    """
+    """Thermal state from stamped readings of the board and the thermometers beside it."""
 
     def __init__(
         self,
@@ -109,28 +106,10 @@ class ThermalTracker:
         return self._read_sensor(self._places[name], stamp_ns, celsius)
 
     def _read_board(self, stamp_ns: int, celsius: float) -> bool:
-        board, check = self.board, self._board_check
-        before_ns, before, n_restarts = board.stamp_ns, board.temperature, board.n_restarts
-        is_anew = False
-        if not check.admits(stamp_ns, celsius):
-            self._is_doubted = True
-            if not self._may_begin_anew(check, stamp_ns, self.config.temperature_timeout_s):
-                return False
-            is_anew = True
-        if is_anew or check.is_revived:
-            board.reset()
-        if not board.update(stamp_ns, celsius):
+        board, memory = self.board, self.memory
+        patience_s = self.config.temperature_timeout_s
+        if not self._use(board, self._board_check, memory, stamp_ns, celsius, patience_s):
             return False
-        memory = self.memory
-        if before_ns is not None:
-            has_restarted = board.n_restarts != n_restarts
-            is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > self.settings.board.lag_s
-            if is_anew or is_gap:
-                memory.forget()
-            if is_anew or check.is_revived or (has_restarted and not is_gap):
-                change = board.temperature - before
-                check.note_jump(stamp_ns, change)
-                memory.note_jump(change)
         if not memory.is_empty:
             memory.board_step(stamp_ns, board.temperature)
             self._guess_gradients(stamp_ns)
@@ -150,25 +129,9 @@ class ThermalTracker:
 
     def _read_sensor(self, place: int, stamp_ns: int, celsius: float) -> bool:
         sensor, check = self.sensors[place], self._checks[place]
-        before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
-        is_anew = False
-        if not check.admits(stamp_ns, celsius):
-            self._is_doubted = True
-            if not self._may_begin_anew(check, stamp_ns, self.config.case_timeout_s):
-                return False
-            is_anew = True
-        is_anew = is_anew or check.is_revived
-        if is_anew:
-            sensor.reset()
-        if not sensor.update(stamp_ns, celsius):
-            return False
         bank = self.memory.neighbours[place]
-        if before_ns is not None and (is_anew or sensor.n_restarts != n_restarts):
-            is_gap = (stamp_ns - before_ns) * 1e-9 > self.settings.case.lag_s
-            if is_anew or not is_gap:
-                change = sensor.temperature - before
-                check.note_jump(stamp_ns, change)
-                bank.note_jump(change)
+        if not self._use(sensor, check, bank, stamp_ns, celsius, self.config.case_timeout_s):
+            return False
         if bank.taus and self.board.stamp_ns is not None:
             bank.step(stamp_ns, sensor.temperature - self.board.at(stamp_ns)[0])
         self._note(stamp_ns)
@@ -181,11 +144,42 @@ class ThermalTracker:
             self.lead.update(detector.regime is Regime.STATIC)
         return True
 
+    def _use(
+        self,
+        sensor: Thermometer,
+        check: SensorCheck,
+        memory: ThermalMemory | LagBank,
+        stamp_ns: int,
+        celsius: float,
+        patience_s: float,
+    ) -> bool:
+        """Let a thermometer have a reading; the memory doubts a jump, and forgets over a gap."""
+        before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
+        is_anew = not check.admits(stamp_ns, celsius)
+        if is_anew:
+            self._is_doubted = True
+            if not self._may_begin_anew(check, stamp_ns, patience_s):
+                return False
+        if is_anew or check.is_revived:
+            sensor.reset()
+        if not sensor.update(stamp_ns, celsius):
+            return False
+        is_new = is_anew or check.is_revived
+        has_restarted = sensor.n_restarts != n_restarts
+        if before_ns is not None and (is_new or has_restarted):
+            lag_s = sensor.settings.lag_s
+            is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > lag_s
+            if isinstance(memory, ThermalMemory) and (is_anew or is_gap):
+                memory.forget()
+            if is_new or not is_gap:
+                change = sensor.temperature - before
+                check.note_jump(stamp_ns, change)
+                memory.note_jump(change)
+        return True
+
     @staticmethod
     def _may_begin_anew(check: SensorCheck, stamp_ns: int, patience_s: float) -> bool:
-        """
-        Let a sensor begin again that has stayed where it cannot have come to for long enough.
-        """
+        """Let a sensor begin again that has stayed for long where it cannot have come to."""
         seen_ns = check.own.stamp_ns
         if check.fault != Fault.STEP or seen_ns is None:
             return False
@@ -291,9 +285,7 @@ class ThermalTracker:
         return gradient, variance
 
     def state_at(self, stamp_ns: int) -> ThermalState:
-        """
-        Thermal state at a stamp, with names. ValueError before the first reading of the board.
-        """
+        """Thermal state at a stamp, with names; ValueError before the board's first reading."""
         if self.board.stamp_ns is None:
             raise ValueError('`state_at` needs a board temperature first')
         flat = self.sample(stamp_ns)
