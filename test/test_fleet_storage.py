@@ -158,8 +158,10 @@ class TestDiscovery:
         write_unit(tmp_path, 1, 1, serial='S1\nCAL_ACC0_ID 7', names=['loose.mcap'])
         found = find_units(Storage(str(tmp_path)))
         assert [one.name for one in found] == ['S1\\nCAL_ACC0_ID 7', 'lot\\x1b[31m/a\\nb']
-        for one in found:
-            row = process_unit(one, str(tmp_path), OPTIONS).row
+        rows = [process_unit(one, str(tmp_path), OPTIONS).row for one in found]
+        assert rows[0]['verdict'] == 'refused'
+        assert str(rows[0]['problem']).startswith('`serial` must be one printable line')
+        for row in rows:
             assert all(cell.isprintable() for cell in row.values() if isinstance(cell, str))
 
     def test_links_are_followed_but_not_in_circles(self, tmp_path: Path) -> None:

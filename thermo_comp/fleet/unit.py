@@ -105,10 +105,11 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
     bags = [_read(storage, bag, options) for bag in unit.bags]
     good = [one for one in bags if one.reduced is not None]
     serials = sorted({one.reduced.source.serial or '' for one in good if one.reduced} - {''})
+    serial = serials[0] if serials else unit.name.rpartition('/')[2]
     outcome = UnitOutcome(
         row=empty_row(
             name=unit.name,
-            serial=serials[0] if serials else unit.name.rpartition('/')[2],
+            serial=serial,
             lot=next((one.lot for one in good if one.lot), unit.lot),
             n_bags=len(bags),
             n_left_out=len(bags) - len(good),
@@ -124,7 +125,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
     try:
         if len(serials) > 1:
             raise FitError(f'the bags are of different units: {", ".join(serials)}')
-        outcome = _fitted(outcome, good, options)
+        outcome = _fitted(outcome, good, serial, options)
     except FitError as refusal:
         outcome.row.update(verdict=REFUSED, problem=one_line(str(refusal)))
     except ThermoCompError as failure:
@@ -162,7 +163,9 @@ def _read(storage: Storage, bag: FoundBag, options: FleetOptions) -> _Bag:
     )
 
 
-def _fitted(outcome: UnitOutcome, good: Sequence[_Bag], options: FleetOptions) -> UnitOutcome:
+def _fitted(
+    outcome: UnitOutcome, good: Sequence[_Bag], serial: str, options: FleetOptions
+) -> UnitOutcome:
     from ..report import evidence_of_fit, render_report
 
     row = outcome.row
@@ -172,7 +175,7 @@ def _fitted(outcome: UnitOutcome, good: Sequence[_Bag], options: FleetOptions) -
     if len(kinds) > 1:
         said = ', '.join(f'{name} holds {kind}' for kind, name in sorted(kinds.items()))
         raise FitError(f'{said}: choose one with --input')
-    settings = replace(options.fit, input=good[0].input, serial=str(row['serial']))
+    settings = replace(options.fit, input=good[0].input, serial=serial)
     result = fit_bags(_numbered([one.reduced for one in good if one.reduced]), settings)
     calibration = dump_calibration(result.calibration)
     lost = [one.note for one in good if one.note]
