@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import GRAVITY, SECOND_NS, calibration, rich_calibration
+from readme_helpers import FENCES
 from test_layers import loaded_after
 
 import thermo_comp as tc
@@ -199,6 +200,18 @@ def test_a_fit_of_arrays_is_the_fit_of_their_bags(
     assert replace(again, provenance=fitted.provenance) == fitted
     tc.save(again, tmp_path / 'unit.yaml')
     assert tc.load(tmp_path / 'unit.yaml') == again
+
+
+def test_the_lines_of_the_readme_run(
+    root: Path, tmp_path: Path, fitted: tc.Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (snippet,) = (body for kind, body in FENCES if kind == 'python')
+    (tmp_path / 'bags').symlink_to(root / 'bags')
+    tc.save(fitted, tmp_path / 'unit.yaml')
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, tc.Corrected] = {}
+    exec(snippet, names)  # noqa: S102 - our own page
+    assert names['out'].specific_force.shape == (15407, 3)
 
 
 def test_a_further_thermometer_goes_in_by_its_name(arrays: dict[str, np.ndarray]) -> None:
