@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 from report_helpers import evidence, fitted, write_bag
@@ -130,6 +131,16 @@ def test_a_mistake_in_the_statements_is_one_sentence(tmp_path, text, said):
     assert message.startswith(f'{path}: ')
     assert said in message
     assert '\n' not in message
+
+
+def test_the_example_is_accepted_and_is_what_the_page_shows():
+    example = ROOT / 'config' / 'lab.example.yaml'
+    info = load_certificate_info(example)
+    # All but the serial, which the calibration knows, and the remarks.
+    assert info.gravity.source == 'national gravity network'
+    assert [one.name for one in info.instruments] == ['chamber', 'thermometers']
+    page = (ROOT / 'docs' / 'recording.md').read_text(encoding='utf-8')
+    assert example.read_text(encoding='utf-8') in page
 
 
 def test_statements_that_are_no_text_file_are_refused(tmp_path):
