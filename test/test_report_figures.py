@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,18 +14,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
+from matplotlib.container import ErrorbarContainer
 from matplotlib.patches import StepPatch
 from report_helpers import evidence, run
 
 from thermo_comp.fitting.reduction import Readings
+from thermo_comp.judging.history import history_of
 from thermo_comp.report.figures_residual import draw_gravity, draw_histograms, draw_residuals
 from thermo_comp.report.figures_thermal import draw_dynamics, draw_temperatures
 from thermo_comp.report.figures_unit import (
     curves,
     draw_functions,
+    draw_history,
+    draw_hysteresis,
     draw_positions,
     draw_step,
     equal_area,
+    hysteresis_loop,
     step_answer,
 )
 from thermo_comp.report.page import position_error, schuler_peak
@@ -97,6 +103,19 @@ def test_bias_and_scale_curves_by_hand():
     assert not bias[:, 1:].any()
 
 
+def test_hysteresis_loop_by_hand():
+    # 3 counts per kelvin of a play of 2 K: it is pushed from one end to the other within 4 K.
+    one = calibration(response=(term('play', (3.0, 0.0, 0.0), width_k=2.0),))
+    temperature, heating, cooling = hysteresis_loop(one)
+    count = 1.0 / 300.0 / MICRO_G
+    lower, upper = one.static.temperature_range_c
+    up = np.maximum(2.0 - (temperature - lower), -2.0)
+    down = np.minimum(-2.0 + (upper - temperature), 2.0)
+    assert heating[:, 0] - cooling[:, 0] == pytest.approx(3.0 * (up - down) * count)
+    assert np.abs(heating - cooling)[len(temperature) // 2, 0] == pytest.approx(12.0 * count)
+    assert heating[:, 1:] == pytest.approx(cooling[:, 1:])
+
+
 def test_metres_of_a_navigator_by_hand():
     # 1 mg for 60 s: 9.80665e-3 * 1800 m; one micro-g at Schuler's frequency: 2 R 1e-6.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
@@ -137,8 +156,10 @@ def test_trace_without_a_case_sensor_follows_the_board():
     assert any(stretch.regime == Regime.DYNAMIC for stretch in trace.stretches)
 
 
-def look(line: Artist) -> tuple[object, ...]:
+def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
     """Give what a reader without colours tells lines apart by: dashes, marker, darkness."""
+    if isinstance(line, ErrorbarContainer):
+        line = line.lines[0]
     if isinstance(line, StepPatch):
         dashes, colour, marker = line.get_linestyle(), line.get_edgecolor(), ''
     else:
@@ -160,12 +181,16 @@ def look(line: Artist) -> tuple[object, ...]:
         draw_functions,
         draw_positions,
         draw_step,
+        draw_hysteresis,
+        draw_history,
     ],
 )
 def test_figures_are_legible_in_black_and_white(draw, sheet):
+    known = evidence().calibration
+    older = replace(known, provenance=replace(known.provenance, created='2020', sources=()))
     with drawing():
-        figure = draw(evidence(), sheet)
-        svg(figure, 'a', 'b')  # lays it out
+        figure = draw(replace(evidence(), history=history_of([known, older])), sheet)
+        figure.draw_without_rendering()
         for axes in figure.axes:
             looks = [look(line) for line in axes.get_legend_handles_labels()[0]]
             assert len(set(looks)) == len(looks)
