@@ -47,8 +47,8 @@ def _fuzz(name: str, seconds: int, n_inputs: int) -> None:
     with atheris.instrument_imports(include=['thermo_comp']):
         import targets
 
-        if name == 'cdr':
-            import thermo_comp.ros.conversions  # noqa: F401 - here it is instrumented
+        if name in {'cdr', 'parameters'}:
+            import thermo_comp.ros.requests  # noqa: F401 - here it is instrumented
     target = targets.targets()[name]
     folder = CORPUS / name
     folder.mkdir(parents=True, exist_ok=True)

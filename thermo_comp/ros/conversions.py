@@ -71,8 +71,10 @@ class _Layout:
             if self.is_foreign:
                 block = _NATIVE.pack(*_FOREIGN.unpack(block))
         fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
-        covariance = (c00, c01, c02, c01, c11, c12, c02, c12, c22)
-        return self.pack(_ENCAPSULATION, sec, nanosec, self.frame, block, fx, fy, fz, *covariance)
+        return self.pack(
+            _ENCAPSULATION, sec, nanosec, self.frame, block,
+            fx, fy, fz, c00, c01, c02, c01, c11, c12, c02, c12, c22,
+        )  # fmt: skip
 
 
 _NOTHING = Struct('')

@@ -355,7 +355,15 @@ def main(args: list[str] | None = None) -> int:
         try:
             use_profile()
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-            _serve(signals)
+            node = CompensationNode()
+            try:
+                signals.on_signal(node.stop)
+                # What start-up left behind is never looked at again by the garbage collector.
+                gc.collect()
+                gc.freeze()
+                node.run()
+            finally:
+                node.close()
         except ExternalShutdownException:
             pass
         except _NOT_OURS as error:
@@ -370,18 +378,6 @@ def _fail(error: Exception, code: int) -> int:
     with suppress(OSError):
         print(f'thermo_comp_node: {one_line(str(error))}', file=sys.stderr, flush=True)
     return code
-
-
-def _serve(signals: SignalWatch) -> None:
-    node = CompensationNode()
-    try:
-        signals.on_signal(node.stop)
-        # What start-up left behind is never looked at again by the garbage collector.
-        gc.collect()
-        gc.freeze()
-        node.run()
-    finally:
-        node.close()
 
 
 if __name__ == '__main__':
