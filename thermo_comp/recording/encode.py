@@ -20,6 +20,8 @@ from ..typing import Bytes, Floats, Ints
 from .wire import gather, scatter
 
 OPCODE_MESSAGE = 5
+#: Opcode and length, which the length does not count.
+PREFIX_BYTES = 9
 _NS = 1_000_000_000
 
 #: Values of some of the numbers of a message: first column and the columns' values.
@@ -51,26 +53,20 @@ RECORD_HEAD = layout(
 
 
 class Records(Protocol):
-    """
-    Messages of one channel that wait to be written, shape (n,); `size` is that of each whole
-    record [bytes].
-    """
+    """Messages of one channel that wait to be written, and the bytes of each, shape (n,)."""
 
     channel: int
     log_ns: Ints
     size: Ints
 
     def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
-        """
-        Build the records of the chosen messages: their places among the chosen, and rows of one
-        size.
-        """
+        """Serialize the chosen: their places among the chosen, and rows of bytes of one size."""
         ...
 
 
 class StampedRecords:
     """
-    Messages that are a header and float64 numbers.
+    Messages that are a header and float64 numbers, as CDR, little-endian.
 
     Each piece is the first column and the values of some of the numbers; those without are 0.
     """
@@ -87,34 +83,39 @@ class StampedRecords:
         self.channel = channel
         self.log_ns = log_ns
         self._stamp_ns = stamp_ns
-        payload = _stamped_layout(frame_id, n_numbers)
-        n_bytes = RECORD_HEAD.itemsize + payload.itemsize
-        self.size = np.broadcast_to(np.int64(n_bytes), log_ns.shape)
+        characters = frame_id.encode() + b'\0'
+        body = 4 + (12 + len(characters) + 7) // 8 * 8
         self._layout = layout(
-            n_bytes, head=(RECORD_HEAD, 0), payload=(payload, RECORD_HEAD.itemsize)
+            body + 8 * n_numbers,
+            order=('u1', 1),
+            sec=('<i4', 4),
+            nanosec=('<u4', 8),
+            length=('<u4', 12),
+            frame=(np.dtype((np.void, len(characters))), 16),
+            numbers=(('<f8', (n_numbers,)), body),
         )
-        # What all records have in common is written once, and copied with the rest.
+        self.size = np.broadcast_to(np.int64(self._layout.itemsize), log_ns.shape)
+        # What all have in common is written once, and copied with the rest.
         common: list[Piece] = []
         self._varying: list[Piece] = []
         for column, values in pieces:
             is_common = len(values) and values.strides[0] == 0
             (common if is_common else self._varying).append((column, values))
         pattern: NDArray[Any] = np.zeros(1, self._layout)
-        _fill_head(pattern, channel, np.zeros(1, np.int64))
-        _fill_frame(pattern['payload'], frame_id)
-        _fill_numbers(pattern['payload'], [(column, values[:1]) for column, values in common])
-        self._pattern = pattern.view((np.void, n_bytes))[0]
+        pattern['order'], pattern['length'] = 1, len(characters)
+        pattern['frame'] = np.void(characters)
+        _fill_numbers(pattern, [(column, values[:1]) for column, values in common])
+        self._pattern = _as_void(pattern)[0]
 
     def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
-        """Build the records of the chosen messages."""
+        """Serialize the chosen messages."""
         which = _run(chosen)
         rows: NDArray[Any] = np.empty(len(chosen), self._layout)
-        rows.view((np.void, self._layout.itemsize))[:] = self._pattern
-        rows['head']['log'] = self.log_ns[which]
-        rows['head']['publish'] = self.log_ns[which]
-        payload = rows['payload']
-        _fill_stamps(payload, self._stamp_ns[which])
-        _fill_numbers(payload, [(column, values[which]) for column, values in self._varying])
+        _as_void(rows)[:] = self._pattern
+        seconds = self._stamp_ns[which] // _NS
+        rows['sec'] = seconds
+        rows['nanosec'] = self._stamp_ns[which] - seconds * _NS
+        _fill_numbers(rows, [(column, values[which]) for column, values in self._varying])
         yield slice(None), _as_void(rows)
 
 
@@ -126,27 +127,14 @@ class RawRecords:
         self.log_ns = log_ns
         self._data = data
         self._ends = ends
-        self._length = np.diff(ends, prepend=0)
-        self.size = self._length + RECORD_HEAD.itemsize
+        self.size = np.diff(ends, prepend=0)
 
     def rows(self, chosen: Ints) -> Iterator[tuple[Ints | slice, NDArray[Any]]]:
-        """Build the records of the chosen messages."""
-        length = self._length[chosen]
-        for each in np.unique(length).tolist():
-            which = np.flatnonzero(length == each)
-            source = chosen[which]
-            rows: NDArray[Any] = np.zeros(
-                len(which),
-                layout(
-                    RECORD_HEAD.itemsize + each,
-                    head=(RECORD_HEAD, 0),
-                    payload=(np.dtype((np.void, each)), RECORD_HEAD.itemsize),
-                ),
-            )
-            _fill_head(rows, self.channel, self.log_ns[source])
-            if each:
-                rows['payload'] = gather(self._data, self._ends[source] - each, each)
-            yield which, _as_void(rows)
+        """Give the chosen messages."""
+        size = self.size[chosen]
+        for each in np.unique(size[size > 0]).tolist():
+            which = np.flatnonzero(size == each)
+            yield which, gather(self._data, self._ends[chosen[which]] - each, each)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +159,7 @@ class Merged:
         counts = [len(batch.log_ns) for batch in batches]
         self._first = np.cumsum([0, *counts])
         log_ns = np.concatenate([batch.log_ns for batch in batches])
-        size = np.concatenate([batch.size for batch in batches])
+        size = np.concatenate([batch.size for batch in batches]) + RECORD_HEAD.itemsize
         self._order = np.argsort(log_ns, kind='stable')
         self._log_ns = log_ns[self._order]
         self._size = size[self._order]
@@ -192,52 +180,30 @@ class Merged:
         data = np.empty(int(self._ends[end - 1]) - done, np.uint8)
         at = self._ends[begin:end] - self._size[begin:end] - done
         owner = self._owner[begin:end]
-        channel = np.empty(end - begin, np.uint16)
+        heads: NDArray[Any] = np.zeros(end - begin, RECORD_HEAD)
+        heads['opcode'] = OPCODE_MESSAGE
+        heads['size'] = self._size[begin:end] - PREFIX_BYTES
+        heads['log'] = heads['publish'] = self._log_ns[begin:end]
         for number in np.unique(owner).tolist():
             batch = self._batches[number]
             which = np.flatnonzero(owner == number)
-            channel[which] = batch.channel
+            heads['channel'][which] = batch.channel
             chosen = self._order[begin:end][which] - self._first[number]
             for some, rows in batch.rows(chosen):
-                scatter(data, at[which[some]], rows)
+                scatter(data, at[which[some]] + RECORD_HEAD.itemsize, rows)
+        scatter(data, at, _as_void(heads))
+        channel = heads['channel'].copy()
         return Stretch(data, channel, self._log_ns[begin:end], self._size[begin:end])
 
 
 def stamped_payloads(stamp_ns: Ints, frame_id: str, numbers: Floats) -> Bytes:
     """Serialize (CDR, little-endian) a header and `numbers`, shape (n, k), as rows of uint8."""
-    payload = _stamped_layout(frame_id, numbers.shape[1])
-    rows: NDArray[Any] = np.zeros(len(stamp_ns), payload)
-    _fill_frame(rows, frame_id)
-    _fill_stamps(rows, stamp_ns)
-    _fill_numbers(rows, [(0, numbers)])
-    return rows.view(np.uint8).reshape(len(stamp_ns), payload.itemsize)
-
-
-def _stamped_layout(frame_id: str, n_numbers: int) -> np.dtype[Any]:
-    length = len(frame_id.encode()) + 1
-    body = 4 + (12 + length + 7) // 8 * 8
-    return layout(
-        body + 8 * n_numbers,
-        order=('u1', 1),
-        sec=('<i4', 4),
-        nanosec=('<u4', 8),
-        length=('<u4', 12),
-        frame=(np.dtype((np.void, length)), 16),
-        numbers=(('<f8', (n_numbers,)), body),
-    )
-
-
-def _fill_frame(rows: NDArray[Any], frame_id: str) -> None:
-    characters = frame_id.encode() + b'\0'
-    rows['order'] = 1
-    rows['length'] = len(characters)
-    rows['frame'] = np.void(characters)
-
-
-def _fill_stamps(rows: NDArray[Any], stamp_ns: Ints) -> None:
-    seconds = stamp_ns // _NS
-    rows['sec'] = seconds
-    rows['nanosec'] = stamp_ns - seconds * _NS
+    pieces = [(0, numbers)]
+    records = StampedRecords(0, stamp_ns, stamp_ns, frame_id, numbers.shape[1], pieces)
+    if not len(stamp_ns):
+        return np.empty((0, 0), np.uint8)
+    ((_, rows),) = records.rows(np.arange(len(stamp_ns)))
+    return rows.view(np.uint8).reshape(len(rows), rows.itemsize)
 
 
 def _fill_numbers(rows: NDArray[Any], pieces: Sequence[Piece]) -> None:
@@ -253,15 +219,6 @@ def _run(chosen: Ints) -> Ints | slice:
     if last - first + 1 != len(chosen) or (chosen[1:] < chosen[:-1]).any():
         return chosen
     return slice(first, last + 1)
-
-
-def _fill_head(rows: NDArray[Any], channel: int, log_ns: Ints) -> None:
-    head = rows['head']
-    head['opcode'] = OPCODE_MESSAGE
-    head['size'] = rows.itemsize - 9
-    head['channel'] = channel
-    head['log'] = log_ns
-    head['publish'] = log_ns
 
 
 def _as_void(rows: NDArray[Any]) -> NDArray[Any]:
