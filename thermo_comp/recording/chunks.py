@@ -11,7 +11,7 @@ they do not, or there is no index, the records are walked one by one. Layout: ht
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,9 +34,9 @@ _INDEX_HEAD = struct.Struct('<BQHI')
 #: Log time and offset of one message, 8 bytes each.
 _INDEX_ROW_BYTES = 16
 #: Bytes of a message record before its serialized message; of these, after the prefix.
-_MESSAGE_HEAD_BYTES = 31
-_MESSAGE_FIELDS_BYTES = _MESSAGE_HEAD_BYTES - PREFIX.size
-_MESSAGE = int(Opcode.MESSAGE)
+MESSAGE_HEAD_BYTES = 31
+_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size
+MESSAGE = int(Opcode.MESSAGE)
 _LOOSE = (int(Opcode.MESSAGE), int(Opcode.SCHEMA), int(Opcode.CHANNEL))
 
 #: Why a walk stopped, besides damage that is said in other words.
@@ -95,6 +95,20 @@ class Messages:
         """Put their bytes behind each other, so that the others' can go."""
         data, ends = pack(self.data, self.start, self.size)
         return Messages(data, ends - self.size, self.size, self.channel, self.log_ns)
+
+
+def join_messages(pieces: Sequence[Messages]) -> Messages:
+    """Put messages, at least one piece, behind each other."""
+    if len(pieces) == 1:
+        return pieces[0]
+    begins = np.cumsum([0, *(len(one.data) for one in pieces)])
+    return Messages(
+        np.concatenate([one.data for one in pieces]),
+        np.concatenate([one.start + at for one, at in zip(pieces, begins, strict=False)]),
+        np.concatenate([one.size for one in pieces]),
+        np.concatenate([one.channel for one in pieces]),
+        np.concatenate([one.log_ns for one in pieces]),
+    )
 
 
 def pack(data: Bytes, start: Ints, size: Ints) -> tuple[Bytes, Ints]:
@@ -204,15 +218,15 @@ def _indexed(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages | 
     if not columns:
         return None
     at = np.sort(np.concatenate(columns), kind='stable')
-    if at[0] < 0 or at[-1] > len(data) - _MESSAGE_HEAD_BYTES:
+    if at[0] < 0 or at[-1] > len(data) - MESSAGE_HEAD_BYTES:
         return None
-    head = gather(data, at, _MESSAGE_HEAD_BYTES)
+    head = gather(data, at, MESSAGE_HEAD_BYTES)
     # Unsigned on purpose: a length that is too small wraps around to one that is too large.
     length = field(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
-    if int(np.max(length)) > len(data) or (field(head, 0, 'u1') != _MESSAGE).any():
+    if int(np.max(length)) > len(data) or (field(head, 0, 'u1') != MESSAGE).any():
         return None
     size = length.view(np.int64)
-    begins = np.concatenate(([0], at + size + _MESSAGE_HEAD_BYTES))
+    begins = np.concatenate(([0], at + size + MESSAGE_HEAD_BYTES))
     ends = np.concatenate((at, [len(data)]))
     if (begins > ends).any():
         return None
@@ -266,19 +280,19 @@ def walk(data: Bytes, on_record: OnRecord, *, is_loose: bool = False) -> tuple[M
             reason = ZERO_OPCODE
         elif is_loose and opcode not in _LOOSE:
             reason = OTHER_RECORD
-        elif opcode == _MESSAGE and length < _MESSAGE_FIELDS_BYTES:
+        elif opcode == MESSAGE and length < _MESSAGE_FIELDS_BYTES:
             reason = f'a message record has {length} bytes'
         elif end > len(data):
             reason = ENDS_EARLY
         if reason:
             break
-        if opcode == _MESSAGE:
+        if opcode == MESSAGE:
             places.append(at)
         else:
             on_record(opcode, bytes(view[at + PREFIX.size : end]))
         at = end
     found = np.array(places, np.int64)
-    head = gather(data, found, _MESSAGE_HEAD_BYTES)
+    head = gather(data, found, MESSAGE_HEAD_BYTES)
     size = field(head, 1, '<i8') - _MESSAGE_FIELDS_BYTES
     return _messages(data, found, size, head), at, reason
 
@@ -289,4 +303,4 @@ def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Mess
         raise DamagedError('a message has a log time beyond the year 2262')
     # Copied: each role looks at all of them.
     channel = field(head, 9, '<u2').astype(np.uint16)
-    return Messages(data, at + _MESSAGE_HEAD_BYTES, size, channel, log_ns)
+    return Messages(data, at + MESSAGE_HEAD_BYTES, size, channel, log_ns)

@@ -10,18 +10,15 @@ built, so that nothing larger than a chunk is ever laid out.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..typing import Bytes, Floats, Ints
+from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX, Messages
 from .wire import gather, scatter
 
-OPCODE_MESSAGE = 5
-#: Opcode and length, which the length does not count.
-PREFIX_BYTES = 9
 _NS = 1_000_000_000
 
 #: Values of some of the numbers of a message: first column and the columns' values.
@@ -41,8 +38,8 @@ def layout(n_bytes: int, /, **fields: tuple[Any, int]) -> np.dtype[Any]:
 
 
 #: Opcode, length, channel, sequence, log time, publish time.
-RECORD_HEAD = layout(
-    31,
+_RECORD_HEAD = layout(
+    MESSAGE_HEAD_BYTES,
     opcode=('u1', 0),
     size=('<u8', 1),
     channel=('<u2', 9),
@@ -137,16 +134,6 @@ class RawRecords:
             yield which, gather(self._data, self._ends[chosen[which]] - each, each)
 
 
-@dataclass(frozen=True, slots=True)
-class Stretch:
-    """Message records behind each other in `data`; `size` is that of each [bytes], shape (n,)."""
-
-    data: Bytes
-    channel: NDArray[np.uint16]
-    log_ns: Ints
-    size: Ints
-
-
 class Merged:
     """
     The messages of several channels in log-time order, cut into stretches on demand.
@@ -159,7 +146,7 @@ class Merged:
         counts = [len(batch.log_ns) for batch in batches]
         self._first = np.cumsum([0, *counts])
         log_ns = np.concatenate([batch.log_ns for batch in batches])
-        size = np.concatenate([batch.size for batch in batches]) + RECORD_HEAD.itemsize
+        size = np.concatenate([batch.size for batch in batches]) + MESSAGE_HEAD_BYTES
         self._order = np.argsort(log_ns, kind='stable')
         self._log_ns = log_ns[self._order]
         self._size = size[self._order]
@@ -167,7 +154,7 @@ class Merged:
         self._owner = np.repeat(np.arange(len(batches)), counts)[self._order]
         self._at = 0
 
-    def take(self, n_bytes: int) -> Stretch | None:
+    def take(self, n_bytes: int) -> Messages | None:
         """
         Build the next records, until they have at least so many bytes; None where nothing is left.
         """
@@ -180,9 +167,9 @@ class Merged:
         data = np.empty(int(self._ends[end - 1]) - done, np.uint8)
         at = self._ends[begin:end] - self._size[begin:end] - done
         owner = self._owner[begin:end]
-        heads: NDArray[Any] = np.zeros(end - begin, RECORD_HEAD)
-        heads['opcode'] = OPCODE_MESSAGE
-        heads['size'] = self._size[begin:end] - PREFIX_BYTES
+        heads: NDArray[Any] = np.zeros(end - begin, _RECORD_HEAD)
+        heads['opcode'] = MESSAGE
+        heads['size'] = self._size[begin:end] - PREFIX.size
         heads['log'] = heads['publish'] = self._log_ns[begin:end]
         for number in np.unique(owner).tolist():
             batch = self._batches[number]
@@ -190,10 +177,11 @@ class Merged:
             heads['channel'][which] = batch.channel
             chosen = self._order[begin:end][which] - self._first[number]
             for some, rows in batch.rows(chosen):
-                scatter(data, at[which[some]] + RECORD_HEAD.itemsize, rows)
+                scatter(data, at[which[some]] + MESSAGE_HEAD_BYTES, rows)
         scatter(data, at, _as_void(heads))
-        channel = heads['channel'].copy()
-        return Stretch(data, channel, self._log_ns[begin:end], self._size[begin:end])
+        size = self._size[begin:end] - MESSAGE_HEAD_BYTES
+        channel, log_ns = heads['channel'].copy(), self._log_ns[begin:end]
+        return Messages(data, at + MESSAGE_HEAD_BYTES, size, channel, log_ns)
 
 
 def stamped_payloads(stamp_ns: Ints, frame_id: str, numbers: Floats) -> Bytes:

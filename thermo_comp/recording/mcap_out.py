@@ -38,12 +38,10 @@ from mcap.records import (
 
 from .. import __version__
 from ..typing import Bytes
-from .encode import Merged, Stretch
+from .chunks import MESSAGE_HEAD_BYTES, Messages, join_messages
+from .encode import Merged
+from .mcap_file import MAGIC, METADATA_NAME
 from .rosbag2_metadata import Definition, FileSummary, dump_yaml, information, offered_qos
-
-MAGIC = b'\x89MCAP0\r\n'
-#: Name of the metadata record that holds the writer's key-value pairs.
-METADATA_NAME = 'thermo_comp'
 
 #: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
 _ZSTD_LEVEL = -1
@@ -53,7 +51,7 @@ _new_builder: Callable[[], Any] = RecordBuilder
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 
-class McapFile:
+class McapOutput:
     """
     One new MCAP file from its first byte to its footer.
 
@@ -80,8 +78,8 @@ class McapFile:
         self._counts: dict[int, int] = {}
         self._chunks: list[ChunkIndex] = []
         self._metadata_index: list[MetadataIndex] = []
-        self._tail: list[Stretch] = []
-        self._packing: deque[tuple[Stretch, Future[tuple[bytes | memoryview, int]]]] = deque()
+        self._tail: list[Messages] = []
+        self._packing: deque[tuple[Messages, Future[tuple[bytes | memoryview, int]]]] = deque()
         self._pool = ThreadPoolExecutor(1, 'recording')
         self._start_ns: int | None = None
         self._end_ns = 0
@@ -124,24 +122,24 @@ class McapFile:
     def append(self, merged: Merged) -> None:
         """Add messages; whole chunks are written, the rest waits for more."""
         while True:
-            waiting = sum(len(stretch.data) for stretch in self._tail)
-            stretch = merged.take(self._chunk_bytes - waiting)
-            if stretch is None:
+            waiting = sum(len(messages.data) for messages in self._tail)
+            messages = merged.take(self._chunk_bytes - waiting)
+            if messages is None:
                 return
-            self._tail.append(stretch)
-            if waiting + len(stretch.data) >= self._chunk_bytes:
+            self._tail.append(messages)
+            if waiting + len(messages.data) >= self._chunk_bytes:
                 self._close_chunk()
 
     def _close_chunk(self) -> None:
         """Have the waiting messages compressed, and write what was compressed meanwhile."""
-        stretch, self._tail = _joined(self._tail), []
-        self._packing.append((stretch, self._pool.submit(self._pack, stretch.data)))
+        messages, self._tail = join_messages(self._tail), []
+        self._packing.append((messages, self._pool.submit(self._pack, messages.data)))
         self._put_packed(_MAX_PACKING)
 
     def _put_packed(self, n_left: int) -> None:
         while len(self._packing) > n_left:
-            stretch, future = self._packing.popleft()
-            self._put_chunk(stretch, *future.result())
+            messages, future = self._packing.popleft()
+            self._put_chunk(messages, *future.result())
 
     def _pack(self, data: Bytes) -> tuple[bytes | memoryview, int]:
         return self._compress(data), zlib.crc32(data.data)
@@ -189,14 +187,14 @@ class McapFile:
         self._put_record(Metadata(name, dict(content)))
         self._metadata_index.append(MetadataIndex(begin, self._at - begin, name))
 
-    def _put_chunk(self, stretch: Stretch, packed: bytes | memoryview, checksum: int) -> None:
-        log_ns, size, channel = stretch.log_ns, stretch.size, stretch.channel
+    def _put_chunk(self, messages: Messages, packed: bytes | memoryview, checksum: int) -> None:
+        log_ns, channel = messages.log_ns, messages.channel
         start, end = int(np.min(log_ns)), int(np.max(log_ns))
         self._start_ns = start if self._start_ns is None else min(self._start_ns, start)
         self._end_ns = max(self._end_ns, end)
         name = self._compression.encode()
         begin = self._at
-        n_bytes = len(stretch.data)
+        n_bytes = len(messages.data)
         head = (Opcode.CHUNK, 40 + len(name) + len(packed), start, end, n_bytes, checksum)
         self._put(struct.pack(f'<BQQQQII{len(name)}sQ', *head, len(name), name, len(packed)))
         self._put(packed)
@@ -204,7 +202,7 @@ class McapFile:
         offsets: dict[int, int] = {}
         rows = np.empty(len(log_ns), _INDEX_ROW)
         rows['log'] = log_ns
-        rows['offset'] = np.cumsum(size) - size
+        rows['offset'] = messages.start - MESSAGE_HEAD_BYTES
         for number in np.unique(channel).tolist():
             own = rows[channel == number]
             self._counts[number] += len(own)
@@ -223,7 +221,7 @@ class McapFile:
                 message_index_length=self._at - begin - chunk_length,
                 message_index_offsets=offsets,
                 message_start_time=start,
-                uncompressed_size=len(stretch.data),
+                uncompressed_size=len(messages.data),
             )
         )
 
@@ -257,17 +255,6 @@ class McapFile:
             Footer(summary_start=summary_start, summary_offset_start=0, summary_crc=checksum)
         )
         self._put(MAGIC)
-
-
-def _joined(stretches: list[Stretch]) -> Stretch:
-    if len(stretches) == 1:
-        return stretches[0]
-    return Stretch(
-        np.concatenate([stretch.data for stretch in stretches]),
-        np.concatenate([stretch.channel for stretch in stretches]),
-        np.concatenate([stretch.log_ns for stretch in stretches]),
-        np.concatenate([stretch.size for stretch in stretches]),
-    )
 
 
 def _compressor(

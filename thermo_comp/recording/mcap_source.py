@@ -21,7 +21,7 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..typing import Ints
-from .chunks import Messages, Span, load, pack
+from .chunks import Messages, Span, join_messages, load, pack
 from .columns import Block, RawMessages, RecordingInfo, Role, count_topics
 from .decode import Decoder, Feed
 from .mcap_file import McapFile, translated
@@ -202,14 +202,7 @@ def _in_log_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterato
         if next_ns is not None and not any((m.log_ns < next_ns).any() for _, m in held):
             continue
         place = np.concatenate([one for one, _ in held])
-        begins = np.cumsum([0, *(len(messages.data) for _, messages in held)])
-        messages = Messages(
-            np.concatenate([m.data for _, m in held]),
-            np.concatenate([m.start + at for (_, m), at in zip(held, begins, strict=False)]),
-            np.concatenate([m.size for _, m in held]),
-            np.concatenate([m.channel for _, m in held]),
-            np.concatenate([m.log_ns for _, m in held]),
-        )
+        messages = join_messages([m for _, m in held])
         order = np.lexsort((place, messages.log_ns))
         messages = messages.take(order)
         n_done = len(order)

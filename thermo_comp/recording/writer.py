@@ -23,7 +23,7 @@ from ..files import Draft, bag_kind
 from ..typing import Ints
 from .columns import ImuColumns, RawMessages
 from .encode import Merged, Piece, RawRecords, Records, StampedRecords, as_numbers, as_times
-from .mcap_out import McapFile
+from .mcap_out import McapOutput
 from .rosbag2_metadata import Definition, dump_metadata, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
 from .wire import N_NUMBERS
@@ -70,13 +70,13 @@ class BagWriter:
         self._metadata = dict(metadata or {})
         self._batches: list[Records] = []
         self._n_buffered_bytes = 0
-        self._file: McapFile | None = None
+        self._file: McapOutput | None = None
         kind = bag_kind(path)
         self._is_file = not kind.is_folder
         self._draft = Draft(path, kind, overwrite=overwrite)
         with self._translated():
             name = self._path.name if self._is_file else f'{self._path.name}_0.mcap'
-            self._file = McapFile(
+            self._file = McapOutput(
                 self._draft.partial if self._is_file else self._draft.partial / name,
                 compression,
                 level,
@@ -273,7 +273,7 @@ class BagWriter:
             if self._n_buffered_bytes > _AUTO_FLUSH_BYTES:
                 self.flush()
 
-    def _open_file(self) -> McapFile:
+    def _open_file(self) -> McapOutput:
         if self._file is None:
             raise RecordingError('the bag is closed', self._path)
         return self._file
