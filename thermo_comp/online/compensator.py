@@ -15,7 +15,7 @@ per sample, and a batch comes to the same verdicts.
 from __future__ import annotations
 
 import math
-from typing import Final, cast
+from typing import Final
 
 from ..unit.calibration import Calibration
 from .gravity_check import GravityCheck
@@ -26,12 +26,8 @@ from .status import CompensatorConfig, Counters
 #: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
 TIME_JUMP_NS: Final = 1_000_000_000
 
-_Nine = tuple[float, float, float, float, float, float, float, float, float]
-_Twelve = tuple[
-    float, float, float, float, float, float, float, float, float, float, float, float
-]  # fmt: skip
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
-Corrected = _Nine
+Corrected = tuple[float, float, float, float, float, float, float, float, float]
 
 
 class Compensator:
@@ -150,8 +146,11 @@ class Compensator:
         start_ns = thermal.start_of(stamp_ns)
         is_new = thermal.open(start_ns, counters.n_in - counters.n_out_of_order, stamp_ns)
         self._event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
-        line, variance = self._lay_line(start_ns)
-        self._segment = (start_ns, line, variance, thermal.correction.misalignment)
+        start = thermal.tracker.sample(start_ns)
+        end = thermal.tracker.sample(start_ns + SEGMENT_NS)
+        slow = thermal.slow_at(start_ns, end)
+        line = lay_lines(thermal.correction, start, end, slow, thermal.noise_excess)
+        self._segment = (start_ns, line[:12], line[12:], thermal.correction.misalignment)
         if not is_new:
             return self.process(stamp_ns, x, y, z)
         self.is_refusing = thermal.rate_refuses
@@ -165,14 +164,6 @@ class Compensator:
         if row is not None and self.gravity.wants(stamp_ns):
             self.gravity.add(stamp_ns, row[:3], row[3:], thermal.correction.noise_trace)
         return None if self.is_refusing else row
-
-    def _lay_line(self, start_ns: int) -> tuple[_Twelve, _Nine]:
-        thermal = self.thermal
-        start = thermal.tracker.sample(start_ns)
-        end = thermal.tracker.sample(start_ns + SEGMENT_NS)
-        slow = thermal.slow_at(start_ns, end)
-        numbers = lay_lines(thermal.correction, start, end, slow, thermal.noise_excess)
-        return cast(_Twelve, tuple(numbers[:12])), cast(_Nine, tuple(numbers[12:]))
 
     def _admit(self, stamp_ns: int) -> bool:
         if stamp_ns > self.last_ns:
