@@ -283,7 +283,7 @@ TOLD = [
     ),
     Told(
         'a compressed file is a bomb',
-        'zeros that expand a thousandfold, in a file and in a message',
+        'zeros that expand a thousandfold, in a file, in a message, in a chunk of a ROS 1 bag',
         'refused at the limit that chunks have; what was expanded is removed',
         'one line: the file, and how much it holds',
         f'{_PROMISES}::test_a_compressed_file_expands_within_limits_and_leaves_nothing',

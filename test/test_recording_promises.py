@@ -23,6 +23,8 @@ from recording_helpers import (
     write_mcap,
     write_rosbag2,
 )
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import inspect_recording, open_recording, read_recording
@@ -138,6 +140,33 @@ def test_a_compressed_message_expands_within_limits(tmp_path: Path) -> None:
         database.execute('update messages set data = ? where id = 1', (bomb,))
     with pytest.raises(RecordingError, match=r'bag\.db3: .*a message of 268435456 bytes'):
         read_recording(bag)
+
+
+@pytest.mark.parametrize('packing', ['BZ2', 'LZ4'])
+def test_a_chunk_of_a_ros1_bag_expands_within_limits(tmp_path: Path, packing: str) -> None:
+    # WHY: a bag of 10 kB took a gigabyte.
+    store, kind = get_typestore(Stores.ROS1_NOETIC), 'sensor_msgs/msg/Temperature'
+    header, stamp = (
+        store.types[name] for name in ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time')
+    )
+    for n_bytes, is_read in ((1 << 20, True), (1 << 27, False)):
+        path = tmp_path / f'{n_bytes}.bag'
+        writer = Writer(path)
+        writer.set_compression(Writer.CompressionFormat[packing])
+        with writer:
+            board = writer.add_connection('/temperature/board', kind, typestore=store)
+            other = writer.add_connection('/other', kind, typestore=store)
+            head = header(seq=1, stamp=stamp(sec=5, nanosec=0), frame_id='')
+            message = store.types[kind](header=head, temperature=20.5, variance=0.0)
+            writer.write(board, 5, store.serialize_ros1(message, kind))
+            writer.write(other, 6, bytes(n_bytes))
+        assert path.stat().st_size < 1 << 20
+        if is_read:
+            columns = read_recording(path, require=('board',)).columns
+            assert columns.temperatures['board'].celsius.tolist() == [20.5]
+        else:
+            with pytest.raises(RecordingError, match=r'a chunk of \d+ bytes holds more than'):
+                read_recording(path, require=('board',))
 
 
 def test_a_fifo_or_a_device_is_never_waited_for(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from ..errors import RecordingError
 from .chunks import Messages
 from .columns import Block, RawMessages, RecordingInfo, Role, count_topics
 from .decode import Decoder, Feed
-from .unpack import unpack_message
+from .unpack import unpack_message, unpack_ros1_chunk
 from .wire import Encoding
 
 _BATCH_MESSAGES = 1 << 14
@@ -61,6 +61,8 @@ class ForeignSource:
                     reader: Any = Reader1(file) if suffix == '.bag' else Reader2(file)
                     reader.open()
                     self._readers.append((file, reader))
+                    for at, chunk in reader.chunks.items() if suffix == '.bag' else ():
+                        reader.chunks[at] = chunk._replace(decompressor=unpack_ros1_chunk)
                     if reader.message_count:
                         spans.append((int(reader.start_time), int(reader.end_time) - 1))
                 for connection in reader.connections:

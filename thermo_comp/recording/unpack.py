@@ -9,6 +9,7 @@ what the reader is willing to hold, and output beyond the claim is damage.
 
 from __future__ import annotations
 
+import bz2
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -28,6 +29,7 @@ MAX_CHUNK_BYTES = 1 << 26
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
+_LZ4_MAGIC = b'\x04\x22\x4d\x18'
 #: Up to so much before a damage is lost with it.
 _STEP_BYTES = 1 << 16
 
@@ -68,6 +70,23 @@ def unpack_message(packed: bytes) -> bytes:
         return _zstd().decompress(packed, max_output_size=_FREE_GROWTH_BYTES)
     except zstandard.ZstdError as error:
         raise DamagedError(f'zstd: {error}') from error
+
+
+def unpack_ros1_chunk(packed: bytes) -> bytes:
+    """Decompress a chunk of a ROS 1 bag; DamagedError where it holds more than a chunk may."""
+    engine: Any
+    if packed[:3] == b'BZh':
+        engine = bz2.BZ2Decompressor()
+    elif packed[:4] == _LZ4_MAGIC:
+        engine = lz4.frame.LZ4FrameDecompressor()
+    else:
+        return packed
+    data: bytes = engine.decompress(packed, max_length=MAX_CHUNK_BYTES + 1)
+    if len(data) > MAX_CHUNK_BYTES:
+        raise DamagedError(f'a chunk of {len(packed)} bytes holds more than {MAX_CHUNK_BYTES}')
+    if not engine.eof:
+        raise DamagedError('a chunk is cut off')
+    return data
 
 
 def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
