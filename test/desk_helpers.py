@@ -21,8 +21,8 @@ from conftest import ROOT, Cli, Once
 #: What is made when an example asks for it; all else an example itself writes, or it lies ready.
 MADE = (
     *('unit.yaml', 'unit42.yaml', 'unit01.yaml', 'unit02.yaml', 'unit03.yaml', 'map.yaml'),
-    *('autopilot.params', 'chamber.mcap', 'unit42_p01', 'freezer.mcap', 'bags/fleet', 'log.csv'),
-    *('flight.ulg', 'flight.bin'),
+    *('autopilot.params', 'chamber.mcap', 'unit42_p01', 'freezer.mcap', 'log.csv'),
+    *('flight.ulg', 'flight.bin', 'bags/fleet', 'bags/unit42'),
 )
 NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
@@ -50,7 +50,6 @@ class Desk:
         self._n = 0
         bags = self._ready / 'bags'
         bags.mkdir(parents=True)
-        (bags / 'unit42').symlink_to(ROOT / 'bags' / 'fit')
         (bags / 'fit').symlink_to(ROOT / 'bags' / 'fit')
         for name in ('bags/held_out.mcap', 'held_out.mcap', 'flight.mcap', 'new.mcap'):
             (self._ready / name).symlink_to(ROOT / 'bags' / 'held_out.mcap')
@@ -84,11 +83,13 @@ class Desk:
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
             self._cli('simulate', *program, '-o', path, '-q')
-        elif name == 'fleet':
-            pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
+        elif name == 'unit42':
             from fleet_helpers import write_unit
 
-            write_unit(path / 'unit42', 42)
+            write_unit(path, 42)
+        elif name == 'fleet':
+            pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
+            shutil.copytree(self._make('bags/unit42'), path / 'unit42')
         elif name == 'log.csv':
             rng = np.random.default_rng(3)
             rows = [
@@ -139,8 +140,9 @@ class Desk:
         here = self._folder / f'run{self._n}'
         (here / 'bags').mkdir(parents=True)
         for word in words:
-            if word in MADE and word not in outputs:
-                self._make(word)
+            made = word.partition('/*')[0]
+            if made in MADE and made not in outputs:
+                self._make(made)
         for path in [*self._ready.iterdir(), *(self._ready / 'bags').iterdir()]:
             name = path.relative_to(self._ready)
             if path.name != 'bags' and str(name) not in outputs:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from builders import rich_calibration
+from builders import calibration
 from conftest import ROOT, Cli
 
 from thermo_comp.recording import BagWriter, read_recording
@@ -51,7 +51,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
+    save_calibration(calibration(), tmp_path / 'unit.yaml')
     return tmp_path
 
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from builders import rich_calibration
+from builders import calibration
 from conftest import Cli
 from test_cli_errors import bag
 
@@ -53,7 +53,7 @@ def umask(mask: int) -> Iterator[None]:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Return a folder with a bag of each sort, a calibration, and other names of them."""
-    save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
+    save_calibration(calibration(), tmp_path / 'unit.yaml')
     bag(tmp_path / 'raw.mcap')
     bag(tmp_path / 'raw')
     for name in ('raw.mcap', 'raw', 'unit.yaml'):
@@ -199,7 +199,7 @@ def test_of_two_writers_one_wins_without_hard_links(
 @pytest.mark.parametrize('mask', [0o022, 0o077])
 def test_the_umask_decides_who_may_read(folder: Path, cli: Cli, mask: int) -> None:
     with umask(mask):
-        save_calibration(rich_calibration(), folder / 'private.yaml')
+        save_calibration(calibration(), folder / 'private.yaml')
         cli(*REPLAY, 'raw.mcap', '-o', 'private', code=None, cwd=folder)
         cli(*REPLAY, 'raw.mcap', '-o', 'private.mcap', code=None, cwd=folder)
     for name in ('private.yaml', 'private.mcap', 'private/private_0.mcap'):
@@ -209,9 +209,9 @@ def test_the_umask_decides_who_may_read(folder: Path, cli: Cli, mask: int) -> No
 
 def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path) -> None:
     path = tmp_path / 'unit.yaml'
-    save_calibration(rich_calibration(), path)
+    save_calibration(calibration(), path)
     path.chmod(0o640)
-    save_calibration(rich_calibration(), path)
+    save_calibration(calibration(), path)
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
 
 
@@ -220,12 +220,12 @@ def test_a_link_is_written_through(tmp_path: Path) -> None:
     link = tmp_path / 'current.yaml'
     link.symlink_to('store/unit.yaml')
     for overwrite in (False, True):  # it leads nowhere first
-        save_calibration(rich_calibration(), link, overwrite=overwrite)
+        save_calibration(calibration(), link, overwrite=overwrite)
         assert link.is_symlink()
         assert not (tmp_path / 'store' / 'unit.yaml').is_symlink()
     (tmp_path / 'round').symlink_to('round')
     with pytest.raises(OutputError):
-        save_calibration(rich_calibration(), tmp_path / 'round')
+        save_calibration(calibration(), tmp_path / 'round')
 
 
 def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:

@@ -20,10 +20,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from builders import calibration
 from conftest import ROOT
 from report_helpers import certificate, fitted, write_bag
 
 from thermo_comp.report.live import HOST, MOST_CLIENTS, LiveReport, LiveServer
+from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.calibration_file import save_calibration
 
 TIMEOUT_S = 60.0
@@ -42,10 +44,10 @@ def served(report: LiveReport) -> Iterator[LiveServer]:
         thread.join(TIMEOUT_S)
 
 
-def save(path: Path, note: str) -> Path:
-    calibration = fitted().calibration
-    provenance = replace(calibration.provenance, notes=(note,))
-    save_calibration(replace(calibration, provenance=provenance), path)
+def save(path: Path, note: str, one: Calibration | None = None) -> Path:
+    # The least to draw: what is drawn is tested with the page.
+    one = calibration() if one is None else one
+    save_calibration(replace(one, provenance=replace(one.provenance, notes=(note,))), path)
     return path
 
 
@@ -118,13 +120,15 @@ def test_first_bad_file_makes_a_page_that_goes_on_asking(tmp_path):
     assert 'No such file' in report.page()
 
 
-def test_bag_is_read_once_and_judged_again(unit, tmp_path):
+def test_bag_is_read_once_and_judged_again(tmp_path):
     # Without the drawing, which takes seconds: what is drawn is tested with the page.
+    one = fitted().calibration
+    unit = save(tmp_path / 'unit.yaml', 'first note', one)
     bag = write_bag(tmp_path / 'held_out.mcap')
     report = LiveReport(unit, [bag])
     assert report._evidence().bags[0].name == 'held_out.mcap'
     ((_, opened),) = report._opened.values()
-    save(unit, 'second note')
+    save(unit, 'second note', one)
     assert report._evidence().findings == ('second note',)
     ((_, again),) = report._opened.values()
     assert again is opened
