@@ -50,7 +50,8 @@ class GravityCheck:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
         self.is_refuted = False
-        self._n_against = self._n_for = 0
+        self._n_alike = 0
+        self._is_against = False
         self._window_ns: int | None = None
         self._last_ns = 0
         self._clear_window()
@@ -137,16 +138,11 @@ class GravityCheck:
         self._n_windows += 1
 
     def _judge(self, miss: float, sd: float) -> None:
-        if miss > self._tolerance + REFUTING_SIGMAS * sd:
-            self._n_against += 1
-            self._n_for = 0
-        else:
-            self._n_for += 1
-            self._n_against = 0
-        if self._n_against >= REFUTING_WINDOWS:
-            self.is_refuted = True
-        elif self._n_for >= RESTORING_WINDOWS:
-            self.is_refuted = False
+        is_against = miss > self._tolerance + REFUTING_SIGMAS * sd
+        self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1
+        self._is_against = is_against
+        if self._n_alike >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
+            self.is_refuted = is_against
 
     @property
     def result(self) -> GravityResidual | None:

@@ -237,7 +237,8 @@ class LeadCheck:
         self.is_reversed = False
         self.doubt = 0.0
         self._calm: tuple[float, float] | None = None
-        self._n_for = self._n_against = 0
+        self._n_alike = 0
+        self._is_against = False
 
     def update(self, is_static: bool) -> None:
         """Take both sensors' last estimates; call after a reading of the case."""
@@ -245,7 +246,7 @@ class LeadCheck:
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):
             self._calm = (case.temperature, board.temperature)
-            self._n_for = self._n_against = 0
+            self._n_alike = 0
             self.doubt = 0.0
             return
         if self._calm is None or not (case.is_ready and board.is_ready):
@@ -268,13 +269,8 @@ class LeadCheck:
         )
         if not is_telling:
             return
-        if lead < 0.0:
-            self._n_for += 1
-            self._n_against = 0
-        else:
-            self._n_against += 1
-            self._n_for = 0
-        if self._n_for >= LEAD_READINGS:
-            self.is_reversed = True
-        elif self._n_against >= LEAD_READINGS:
-            self.is_reversed = False
+        is_against = lead < 0.0
+        self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1
+        self._is_against = is_against
+        if self._n_alike >= LEAD_READINGS:
+            self.is_reversed = is_against

@@ -34,7 +34,10 @@ RESTART_READINGS: Final = 4  # ... unless that many in a row lie on one side
 SOAK_S: Final = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
 QUIET_SHARE: Final = 5e-3  # acceleration, quiet / bending, of a sensor without cells
 CELL_SHARE: Final = 0.2  # the same where wide cells hide slow changes
-#: What is outside is no temperature of an instrument [degC]; nor is NaN.
+# Of the normal distribution: 1 / sqrt(2), and 1 / sqrt(2 pi).
+_ROOT_HALF: Final = 0.7071067811865476
+_DENSITY_AT_0: Final = 0.3989422804014327
+#: What is outside, from absolute zero on, is no temperature of an instrument [degC]; nor is NaN.
 COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
 HORIZON_INTERVALS: Final = 5.0  # extrapolation is linear up to here, then held
@@ -266,11 +269,11 @@ class Thermometer:
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
             high = (reading + half - expected) / sd
-            inside = 0.5 * (erf(high * 0.7071067811865476) - erf(low * 0.7071067811865476))
+            inside = 0.5 * (erf(high * _ROOT_HALF) - erf(low * _ROOT_HALF))
             if inside < 1e-9:
                 return reading, self._flat
-            at_low = 0.3989422804014327 * exp(-0.5 * low * low) / inside
-            at_high = 0.3989422804014327 * exp(-0.5 * high * high) / inside
+            at_low = _DENSITY_AT_0 * exp(-0.5 * low * low) / inside
+            at_high = _DENSITY_AT_0 * exp(-0.5 * high * high) / inside
             shift = at_low - at_high
             loss = shift * shift + high * at_high - low * at_low
             if loss < 1e-6:
