@@ -165,6 +165,10 @@ def test_nothing_in_is_nothing_out() -> None:
     assert out.specific_force.shape == (0, 3)
     assert out.covariance.shape == (0, 3, 3)
     assert out.dynamic.shape == (0,)
+    dates = np.array(['2026-01-01', '2026-01-02'], 'M8[ns]')
+    unread = calibration().correct(dates, np.ones((2, 3)), board=([], []))
+    assert np.isnan(unread.specific_force).all()
+    assert unread.counters.n_no_temperature == 2
 
 
 @pytest.mark.parametrize(

@@ -328,7 +328,7 @@ def _readings(
 ) -> tuple[Ints, Floats, Ints]:
     """Give stamps and values of a thermometer's readings; a reading waits for its sample."""
     if isinstance(value, tuple) and len(value) == 2:
-        if _is_date(value[0]) != is_date:
+        if np.size(value[0]) and _is_date(value[0]) != is_date:
             raise ValueError(f'the times of `{name}` must be of the kind of `time_s`')
         own = _stamps(f'{name} time_s', value[0])
         values = _numbers(name, value[1])
