@@ -16,9 +16,8 @@ from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
 from matplotlib.container import ErrorbarContainer
 from matplotlib.patches import StepPatch
-from report_helpers import evidence, run
+from report_helpers import evidence, fitted
 
-from thermo_comp.fitting.reduction import Readings
 from thermo_comp.judging.history import history_of
 from thermo_comp.report.figures_residual import draw_gravity, draw_histograms, draw_residuals
 from thermo_comp.report.figures_thermal import draw_dynamics, draw_temperatures
@@ -131,11 +130,9 @@ def test_map_of_the_sphere_keeps_areas():
 
 
 def test_trace_covers_the_bag_without_a_gap():
-    one = run(0)
-    board = Readings(one.board_stamp_ns, one.board, len(one.board))
-    case = Readings(one.case_stamp_ns, one.case, len(one.case))
-    span = int(one.accel_stamp_ns[0]), int(one.accel_stamp_ns[-1])
-    trace = thermal_trace(board, case, span, DetectorSettings())
+    bag = fitted().bags[0]
+    span = bag.start_ns, bag.end_ns
+    trace = thermal_trace(bag, span, DetectorSettings())
     stretches = trace.stretches
     assert stretches[0].regime == Regime.UNKNOWN
     assert stretches[0].start == 0.0
@@ -146,11 +143,9 @@ def test_trace_covers_the_bag_without_a_gap():
 
 
 def test_trace_without_a_case_sensor_follows_the_board():
-    one = run(0)
-    board = Readings(one.board_stamp_ns, one.board, len(one.board))
-    none = Readings(one.case_stamp_ns[:0], one.case[:0], 0)
-    span = int(one.accel_stamp_ns[0]), int(one.accel_stamp_ns[-1])
-    trace = thermal_trace(board, none, span, DetectorSettings())
+    bag = fitted().bags[0]
+    bag = replace(bag, temperatures={'board': bag.board})
+    trace = thermal_trace(bag, (bag.start_ns, bag.end_ns), DetectorSettings())
     assert not trace.is_case_leading
     assert not np.isfinite(trace.case_rate).any()
     assert any(stretch.regime == Regime.DYNAMIC for stretch in trace.stretches)

@@ -14,14 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..fitting.verdict import POSITIONS_NEEDED, distinct_directions
 from ..typing import Floats
 from ..unit.gravity import MICRO_G
 from .windows import Windows
 
-#: Distinct positions that nine constants need; bias and scale of three axes are six of them.
-POSITIONS_NEEDED = 6
-# Directions closer than this are one position measured twice.
-_SAME_DIRECTION_DEG = 5.0
 # A shift must be this sure to be called one.
 _SURE_SDS = 3.0
 # Nobody knows a misalignment better than this [rad], nor the mean of a position [1].
@@ -46,13 +43,8 @@ class AxisShift:
 
 def distinct_positions(windows: Windows) -> int:
     """Count the directions that differ by more than five degrees."""
-    kept: list[Floats] = []
-    limit = np.cos(np.radians(_SAME_DIRECTION_DEG))
-    for mean in _means(windows, windows.force):
-        direction = mean / np.linalg.norm(mean)
-        if all(float(direction @ other) < limit for other in kept):
-            kept.append(direction)
-    return len(kept)
+    means = _means(windows, windows.force)
+    return len(distinct_directions(means / np.linalg.norm(means, axis=1, keepdims=True)))
 
 
 def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:

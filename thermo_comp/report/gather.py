@@ -230,7 +230,7 @@ def _shown(
     if cyclogram is None and index < len(metadata):
         cyclogram = _recorded_program(metadata[index])
     detector = learn_detector(bags) if calibration is None else calibration.detector
-    trace = thermal_trace(bag.board, bag.case, span_ns, detector)
+    trace = thermal_trace(bag, span_ns, detector)
     return ShownBag(index, span_ns[0], bag.board, bag.case, trace, cyclogram)
 
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..fitting.reduction import Readings
+from ..fitting.history import readings_in_order
+from ..fitting.reduction import ReducedBag
 from ..thermal.memory import BOARD_INPUT
 from ..thermal.regime import Regime
 from ..thermal.settings import DetectorSettings
@@ -50,7 +51,7 @@ class ThermalTrace:
 
 
 def thermal_trace(
-    board: Readings, case: Readings, span_ns: tuple[int, int], detector: DetectorSettings
+    bag: ReducedBag, span_ns: tuple[int, int], detector: DetectorSettings
 ) -> ThermalTrace:
     """
     Run the thermometers and the detector over a bag's readings, as the node would.
@@ -61,21 +62,18 @@ def thermal_trace(
     start_ns, end_ns = span_ns
     step_ns = max(round(_SHORTEST_STEP_S * 1e9), (end_ns - start_ns) // _N_GRID)
     grid = np.arange(start_ns, end_ns + 1, step_ns, dtype=np.int64)
-    stamps = np.concatenate((board.stamp_ns, case.stamp_ns))
-    names = np.repeat((BOARD_INPUT, 'case'), (len(board.value), len(case.value))).tolist()
-    values = np.concatenate((board.value, case.value)).tolist()
-    order = np.argsort(stamps, kind='stable').tolist()
+    names, stamps, values = readings_in_order(bag, (BOARD_INPUT, 'case'))
+    readings = zip(names, stamps.tolist(), values.tolist(), strict=True)
+    reading = next(readings, None)
     flags: list[tuple[int, Regime, int]] = []
     rows: list[tuple[float, ...]] = []
-    k = 0
     for grid_ns in grid.tolist():
-        while k < len(order) and stamps[order[k]] <= grid_ns:
-            stamp_ns = int(stamps[order[k]])
-            tracker.read(names[order[k]], stamp_ns, values[order[k]])
+        while reading is not None and reading[1] <= grid_ns:
+            tracker.read(*reading)
             now = (tracker.detector.regime, tracker.detector.direction)
             if not flags or flags[-1][1:] != now:
-                flags.append((stamp_ns, *now))
-            k += 1
+                flags.append((reading[1], *now))
+            reading = next(readings, None)
         b, c = tracker.board, tracker.case
         lead = b if c.stamp_ns is None else c
         bend = (lead.acceleration, lead.var_acceleration)
@@ -87,7 +85,7 @@ def thermal_trace(
         case_rate=_settled(columns[2], columns[3]),
         case_acceleration=_settled(columns[4], columns[5]),
         stretches=_stretches(flags, start_ns, end_ns),
-        is_case_leading=bool(len(case.value)),
+        is_case_leading=bool(len(bag.case.value)),
     )
 
 
