@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from rclpy.node import Node
 
 from ..errors import ThermoCompError
 from ..online.stamped_flag import STAMPED_TOPIC
-from ..recording import ROLES, Role
+from ..recording import ROLES, Role, open_recording
 from .node import NODE_NAME
 from .player import PlayReport, play
 from .recorder import OUTPUTS, Recorder
@@ -51,7 +51,6 @@ _TOPICS = {**OUTPUTS, 'diagnostics': DiagnosticArray}
 #: The node's own word for a role.
 _SPOKEN: dict[Role, str] = {'accel': 'sample'}
 _ACCOUNT = ('-p', 'diagnostics_period:=0.1')
-_INPUTS = ('accel/counts', 'imu/uncompensated', 'temperature/board', 'temperature/case')
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +108,12 @@ class NodeProcess:
             return self.process.wait()
 
 
-def lossless(namespace: str = '') -> list[str]:
+def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
     """Give the ROS arguments under which a node loses nothing, at the price of latency."""
+    inputs = ['accel/counts', 'imu/uncompensated', *(f'temperature/{n}' for n in thermometers)]
     overrides = [
-        *(f'{topic}.subscription.reliability:=reliable' for topic in _INPUTS),
-        *(f'{topic}.subscription.history:=keep_all' for topic in _INPUTS),
+        *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
+        *(f'{topic}.subscription.history:=keep_all' for topic in inputs),
         'imu/data_raw.publisher.history:=keep_all',
         'regime/dynamic.publisher.depth:=1000',
         f'{STAMPED_TOPIC}.publisher.depth:=1000',
@@ -138,7 +138,14 @@ def round_trip(
     """Play a bag into a node and record what comes out, in a namespace of their own."""
     namespace = f'/round_trip_{os.getpid()}'
     ros_args = ['-r', f'__ns:={namespace}']
-    arguments = [*ros_args, *lossless(namespace), '-p', f'calibration_file:={calibration}']
+    with open_recording(bag, require=()) as reader:
+        roles = {*ROLES, *reader.topics} - {'accel'}
+    arguments = [
+        *ros_args,
+        *lossless(namespace, sorted(roles)),
+        '-p',
+        f'calibration_file:={calibration}',
+    ]
     arguments += ['-r', f'/diagnostics:={namespace}/diagnostics', *_ACCOUNT]
     with (
         NodeProcess(*arguments, *node_args) as node,
