@@ -12,6 +12,8 @@ from .unknowns import Layout
 
 # Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
 JITTER = 1e-13
+# Start states of neighbouring lags are told apart to fewer digits.
+_LOCAL_JITTER = 1e-10
 
 
 class Factor:
@@ -27,7 +29,7 @@ class Factor:
         self.log_determinant = 2.0 * float(np.log(root).sum())
         self._locals = []
         for block in layout.blocks:
-            factor = cho_factor(scaled[block, block] + JITTER * np.eye(block.stop - block.start))
+            factor = cho_factor(scaled[block, block] + _LOCAL_JITTER * np.eye(block.stop - block.start))
             cross = cho_solve(factor, scaled[block, :n])
             unit -= scaled[:n, block] @ cross
             self._locals.append((factor, cross))
