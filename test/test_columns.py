@@ -16,7 +16,15 @@ from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.thermal.state import Layout
 from thermo_comp.thermal.tracker import ThermalTracker
-from thermo_comp.unit.columns import BANK_TAUS, UNBOUNDED, Column, bank, memory_of, values
+from thermo_comp.unit.columns import (
+    BANK_TAUS,
+    FINE_TAUS,
+    UNBOUNDED,
+    Column,
+    bank,
+    memory_of,
+    values,
+)
 
 WIDE = {'range': UNBOUNDED}
 
@@ -30,13 +38,14 @@ def by_group(columns):
 
 def test_the_bank():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
+    assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()) == {
-        'now': 1, 'board': 8, 'neighbour': 8, 'product': 8, 'mixed': 9, 'square': 8, 'even': 21,
-        'play': 8,
+        'now': 1, 'board': 15, 'neighbour': 15, 'product': 16, 'mixed': 9, 'square': 24,
+        'even': 21, 'play': 8,
     }  # fmt: skip
     assert by_group(bank(('case', 'tip'))) == {
-        'now': 2, 'board': 8, 'neighbour': 16, 'product': 8, 'mixed': 18, 'square': 8, 'even': 42,
-        'play': 8,
+        'now': 2, 'board': 15, 'neighbour': 30, 'product': 16, 'mixed': 18, 'square': 24,
+        'even': 42, 'play': 8,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
 
@@ -45,8 +54,8 @@ def test_what_the_bank_needs_remembered():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
     # A lag of its own for the plays that follow one.
-    assert spec.taus('board') == (*BANK_TAUS[:4], 900.0, *BANK_TAUS[4:])
-    assert spec.taus('case') == spec.taus('tip') == BANK_TAUS
+    assert spec.taus('board') == (*FINE_TAUS[:8], 900.0, *FINE_TAUS[8:])
+    assert spec.taus('case') == spec.taus('tip') == FINE_TAUS
     assert len(spec.plays) == 8
     assert memory_of(()) == MemorySpec()
     with pytest.raises(ValueError, match="one of \\('case',\\), got tip"):
@@ -66,6 +75,7 @@ def test_each_value_by_hand():
         Column('board', 'board', tau_s=60.0, during='static', **WIDE),
         Column('board', 'board', tau_s=60.0, during='dynamic', power=3, **WIDE),
         Column('square', 'square', tau_s=60.0, **WIDE),
+        Column('square', 'cube', tau_s=60.0, power=1, **WIDE),
         Column('even', 'square', 'tip', power=1, **WIDE),
         Column('even', 'size', 'tip', **WIDE),
         Column('even', 'size', 'tip', power=1, range=(0.0, 0.5)),
@@ -78,7 +88,7 @@ def test_each_value_by_hand():
     found = values(columns, state, 20.0, spec)
     expected = [
         -0.7, 0.01, 0.5, -0.3, -0.9, math.tanh(0.64) * 9.0, 0.1, 0.25, 0.375, 0.125 * 27.0,
-        0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0,
+        0.25, 0.125 * 3.0, 0.49 * 3.0, 0.7, 0.5 * 3.0,
     ]  # fmt: skip
     assert found == pytest.approx(expected)
     # t is held at the edge of the calibrated temperatures, the lag itself is not.

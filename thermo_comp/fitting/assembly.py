@@ -57,21 +57,12 @@ class UnitFacts:
     """
     What the calibration says of the unit besides the fit.
 
-    Parameters
-    ----------
-    unit : Unit
-        Serial, input, full scale, cycle.
-    detector : DetectorSettings
-        Settings under which the regimes were told apart.
-    board_lag : float
-        Time constant of the board behind the case [s].
-    reference_temperature : float
-        T_ref [degC].
-    model : str
-        Name of the model, for the provenance.
-    sensors : tuple of str
-        Thermometers beside the board; the first leads, the others stay where they are of use.
-
+    unit: serial, input, full scale, cycle
+    detector: settings under which the regimes were told apart
+    board_lag: time constant of the board behind the case [s]
+    reference_temperature: T_ref [degC]
+    model: name of the model, for the provenance
+    sensors: thermometers beside the board; the first leads, the others stay where they are of use
     """
 
     unit: Unit
@@ -105,29 +96,7 @@ def build_calibration(
     """
     Write a posterior as a calibration.
 
-    Parameters
-    ----------
-    windows : ThermalWindows
-        What it was fitted on.
-    regression : Regression
-        The regression on them.
-    learnt : Learnt
-        Its end.
-    columns : sequence of Column
-        The bank, in the order of the windows' columns behind those of the sets.
-    sets : Sets
-        The curves.
-    nominal : ndarray, shape (3,)
-        K0 [input units per m/s^2].
-    bags : sequence of ReducedBag
-        For the provenance.
-    facts : UnitFacts
-        The unit.
-    residuals : sequence of ResidualRow, optional
-        For the provenance.
-    findings : sequence of Finding, optional
-        For the provenance; what is good is left out.
-
+    `nominal`: K0 [input units per m/s^2], shape (3,).
     """
     state, prior = learnt.posterior.state, learnt.prior
     weights = _Weights(
@@ -275,26 +244,7 @@ def file_parameters(
     """
     Differentiate the file's parameters, in its order, by the regression's.
 
-    Parameters
-    ----------
-    regression : Regression
-        Whose columns are in units of their RMS.
-    layout : Layout
-        Places of the regression's parameters.
-    state : State
-        Where to differentiate.
-    sets : Sets
-        The curves.
-    nominal : ndarray, shape (3,)
-        K0 [input units per m/s^2].
-    used : iterable of int
-        Columns of the response that the file has, by their number in the bank.
-
-    Returns
-    -------
-    ndarray, shape (n_parameters, n_unit)
-        See `unit.calibration.parameter_layout`.
-
+    `nominal`: K0 [input units per m/s^2], shape (3,).
     """
     used = list(used)
     n_sets = len(sets.levels())

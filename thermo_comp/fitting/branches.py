@@ -43,27 +43,17 @@ class Event:
     """
     A step in the reading of a sensor at rest.
 
-    Parameters
-    ----------
-    kind : {'jump', 'turn', 'motion'}
-        The sensor changed by itself; it may have been turned, quietly; it was moved.
-    time : float
-        Since the bag's first sample [s].
-    stamp_ns : int
-        Stamp of the first sample after it.
-    duration_s : float
-        Interval between the samples before and after it [s].
-    step : tuple of float
-        Change of the reading, per axis [input units].
-    along, along_sd : float
-        Change of the norm, that is, along the specific force, and its sd [input units].
-    temperature_change, temperature_change_sd : float
-        Step of the board's readings at that time, beside a drift, and its sd [K]; NaN where too
-        few readings are near.
-    turn_needed, turn_seen : float
-        Angle by which the unit would have to turn for such a step, and what the gyroscope saw
-        [rad]; NaN without one.
-
+    kind: the sensor changed by itself; it may have been turned, quietly; it was moved
+    time: since the bag's first sample [s]
+    stamp_ns: stamp of the first sample after it
+    duration_s: interval between the samples before and after it [s]
+    step: change of the reading, per axis [input units]
+    along, along_sd: change of the norm, that is, along the specific force, and its sd [input
+        units]
+    temperature_change, temperature_change_sd: step of the board's readings at that time, beside a
+        drift, and its sd [K]; NaN where too few readings are near
+    turn_needed, turn_seen: angle by which the unit would have to turn for such a step, and what
+        the gyroscope saw [rad]; NaN without one
     """
 
     kind: Literal['jump', 'turn', 'motion']
@@ -84,14 +74,9 @@ class Branch:
     """
     A run at rest in one attitude without a step.
 
-    Parameters
-    ----------
-    start_s, end_s : float
-        From a step (or the first still interval's start) to the next step (or the last one's
-        end), since the bag's first sample [s].
-    still : tuple of (float, float)
-        Its still intervals [s].
-
+    start_s, end_s: from a step (or the first still interval's start) to the next step (or the last
+        one's end), since the bag's first sample [s]
+    still: its still intervals [s]
     """
 
     start_s: float
@@ -102,24 +87,7 @@ class Branch:
 def find_branches(
     source: FitSource, bag: ReducedBag
 ) -> tuple[tuple[Event, ...], tuple[Branch, ...]]:
-    """
-    Find the steps between a bag's still intervals, and the branches between the steps.
-
-    Parameters
-    ----------
-    source : FitSource
-        The bag's source, streamed once more for the samples beside the gaps.
-    bag : ReducedBag
-        Its still intervals and board temperatures.
-
-    Returns
-    -------
-    events : tuple of Event
-        Steps, in order. Gaps longer than 30 s are no events, and end a branch all the same.
-    branches : tuple of Branch
-        Runs between them.
-
-    """
+    """Find the steps between a bag's still intervals, and the branches between the steps."""
     spans = [
         ((i.start_ns - bag.start_ns) * 1e-9, (i.end_ns - bag.start_ns) * 1e-9)
         for i in bag.intervals

@@ -22,23 +22,7 @@ _E_FOLDS_K = (15.0, 30.0)
 
 
 def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
-    """
-    Choose the curves of the two sets.
-
-    Parameters
-    ----------
-    options : FitOptions
-        Model and curves.
-    bags : sequence of ReducedBag
-        Their temperatures span a spline.
-
-    Returns
-    -------
-    Sets
-        In the paper's model each regime has a curve of its own, linear and quadratic; in the
-        response model the dynamic curve is the static one, a cubic, and a quadratic difference.
-
-    """
+    """Choose the curves of the two sets."""
     readings = [bag.board.value for bag in bags if len(bag.board.value)]
     span = (
         (min(float(r.min()) for r in readings), max(float(r.max()) for r in readings))

@@ -42,15 +42,9 @@ class Design:
     """
     The data of a fit as combinations of base columns: one, the columns, and their start states.
 
-    Parameters
-    ----------
-    windows : Windows
-        The data.
-    gravity : float
-        Local gravity.
-    nominal_scale : ndarray, shape (3,)
-        K0 [input units per m/s^2].
-
+    windows: the data
+    gravity: local gravity
+    nominal_scale: K0 [input units per m/s^2], shape (3,)
     """
 
     def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:

@@ -28,21 +28,12 @@ class PositionReport:
     """
     One still interval as the fit saw it.
 
-    Parameters
-    ----------
-    source : str
-        The bag's name.
-    start_ns : int
-        Stamp of its start.
-    duration_s : float
-        Length [s].
-    up : tuple of float
-        Estimated direction of the specific force, in the output frame.
-    residual_rms : float
-        RMS of ``|f| - g`` over its windows [m/s^2].
-    left_out_rms : float
-        The same, with what the other positions alone say of the unit [m/s^2].
-
+    source: the bag's name
+    start_ns: stamp of its start
+    duration_s: length [s]
+    up: estimated direction of the specific force, in the output frame
+    residual_rms: RMS of ``|f| - g`` over its windows [m/s^2]
+    left_out_rms: the same, with what the other positions alone say of the unit [m/s^2]
     """
 
     source: str
@@ -58,19 +49,11 @@ class ResidualRow:
     """
     ``|f| - g`` of one section, by step of the model.
 
-    Parameters
-    ----------
-    section : str
-        ``static``, ``dynamic`` or ``all``.
-    raw : ResidualStatistics
-        With the constants at the reference temperature.
-    one_set, two_sets : ResidualStatistics
-        With one curve, blind to the regime; with a curve for each regime.
-    fitted : ResidualStatistics
-        With the calibration, on the data that it was fitted to.
-    left_out : ResidualStatistics
-        Each position with what the others say of the unit: what a new attitude will see.
-
+    section: ``static``, ``dynamic`` or ``all``
+    raw: with the constants at the reference temperature
+    one_set, two_sets: with one curve, blind to the regime; with a curve for each regime
+    fitted: with the calibration, on the data that it was fitted to
+    left_out: each position with what the others say of the unit: what a new attitude will see
     """
 
     section: str
@@ -87,22 +70,7 @@ def residual_rows(
     """
     Compare the steps of the model on the same windows.
 
-    Parameters
-    ----------
-    windows : ThermalWindows
-        The windows.
-    regression : Regression
-        The regression on them.
-    learnt : Learnt
-        Its end.
-
-    Returns
-    -------
-    tuple of ResidualRow
-        Static, dynamic, all.
-    ndarray, shape (n,)
-        ``|f| - g`` of each window by the other positions [m/s^2].
-
+    Returns ``|f| - g`` of each window by the other positions [m/s^2].
     """
     state = learnt.posterior.state
     nothing = np.zeros_like(state.on_bias)
@@ -163,24 +131,7 @@ def position_reports(
     """
     List the positions with what the fit left on each.
 
-    Parameters
-    ----------
-    windows : ThermalWindows
-        The windows.
-    bags : sequence of ReducedBag
-        Where they come from.
-    regression : Regression
-        The regression on them.
-    learnt : Learnt
-        Its end.
-    left_out : ndarray, shape (n,)
-        As `left_out_residual` gives it.
-
-    Returns
-    -------
-    tuple of PositionReport
-        In order.
-
+    `left_out`: as `left_out_residual` gives it, shape (n,).
     """
     data, state = windows.data, learnt.posterior.state
     residual = norm_residual(regression.force(state), regression.gravity)

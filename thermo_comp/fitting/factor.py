@@ -29,7 +29,9 @@ class Factor:
         self.log_determinant = 2.0 * float(np.log(root).sum())
         self._locals = []
         for block in layout.blocks:
-            factor = cho_factor(scaled[block, block] + _LOCAL_JITTER * np.eye(block.stop - block.start))
+            factor = cho_factor(
+                scaled[block, block] + _LOCAL_JITTER * np.eye(block.stop - block.start)
+            )
             cross = cho_solve(factor, scaled[block, :n])
             unit -= scaled[:n, block] @ cross
             self._locals.append((factor, cross))

@@ -59,23 +59,13 @@ class FitResult:
     """
     A fit and its evidence.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The result.
-    learnt : Learnt
-        Posterior, prior and what each group is worth.
-    residuals : tuple of ResidualRow
-        Over the windows of the fit.
-    positions : tuple of PositionReport
-        The still intervals.
-    findings : tuple of Finding
-        What the data lacked, or not.
-    windows : ThermalWindows
-        The windows of the regression.
-    bags : tuple of ReducedBag
-        The reduced bags.
-
+    calibration: the result
+    learnt: posterior, prior and what each group is worth
+    residuals: over the windows of the fit
+    positions: the still intervals
+    findings: what the data lacked, or not
+    windows: the windows of the regression
+    bags: the reduced bags
     """
 
     calibration: Calibration
@@ -93,25 +83,7 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Parameters
-    ----------
-    sources : sequence of FitSource
-        The bags, each streamed once.
-    options : FitOptions
-        What the user said.
-    progress : callable, optional
-        Told a stage's name and how far the whole is, 0..1.
-
-    Returns
-    -------
-    FitResult
-        Calibration and evidence.
-
-    Raises
-    ------
-    FitError
-        If the data contradict themselves, or there is no still interval.
-
+    Raises FitError if the data contradict themselves, or there is no still interval.
     """
     tell = progress or _no_progress
     check_serial(sources, options)
@@ -124,11 +96,7 @@ def reduce_sources(
     """
     Stream all sources into their sufficient statistics.
 
-    Raises
-    ------
-    FitError
-        If there is no source, or one has no samples or no still interval.
-
+    Raises FitError if there is no source, or one has no samples or no still interval.
     """
     if not sources:
         raise FitError('no bag was given')
@@ -143,25 +111,7 @@ def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBa
     """
     Stream one source into its sufficient statistics.
 
-    Parameters
-    ----------
-    source : FitSource
-        The bag.
-    number : int
-        Its place among the bags of the fit.
-    options : FitOptions
-        Lengths and full scale.
-
-    Returns
-    -------
-    ReducedBag
-        With all that a fit needs.
-
-    Raises
-    ------
-    FitError
-        If it has no samples or no still interval.
-
+    Raises FitError if it has no samples or no still interval.
     """
     full_scale = options.full_scale
     if full_scale is None and options.input == 'counts':
@@ -191,25 +141,7 @@ def fit_bags(
     """
     Fit a calibration to bags that have been reduced, by whomever.
 
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        One per bag; each interval's number of the bag is its place here.
-    options : FitOptions
-        What the user said; the lengths are those of the reduction.
-    progress : callable, optional
-        Told a stage's name and how far the whole is, 0..1.
-
-    Returns
-    -------
-    FitResult
-        Calibration and evidence.
-
-    Raises
-    ------
-    FitError
-        If the data contradict themselves.
-
+    Raises FitError if the data contradict themselves.
     """
     tell = progress or _no_progress
     _check_temperatures(bags)
@@ -325,23 +257,7 @@ def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibra
     """
     Guess the triad without temperature: by its ellipsoid, or by the norm where that is not seen.
 
-    Parameters
-    ----------
-    windows : ThermalWindows
-        The windows.
-    options : FitOptions
-        Local gravity, unit of the samples.
-
-    Returns
-    -------
-    ConstantCalibration
-        M is the identity.
-
-    Raises
-    ------
-    FitError
-        If the norms are no gravity.
-
+    Raises FitError if the norms are no gravity.
     """
     means = position_means(windows.data)
     gravity = options.gravity
@@ -420,23 +336,7 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     """
     Find the unit's serial.
 
-    Parameters
-    ----------
-    sources : sequence of FitSource
-        The bags.
-    options : FitOptions
-        Its serial wins.
-
-    Returns
-    -------
-    str
-        The serial; ``unknown`` when nothing says it.
-
-    Raises
-    ------
-    FitError
-        If the bags name different units and the user none, or the serial is none.
-
+    Raises FitError if the bags name different units and the user none, or the serial is none.
     """
     serials = {source.serial for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:

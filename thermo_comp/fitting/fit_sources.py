@@ -28,33 +28,8 @@ def fit_sources(
     """
     Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
 
-    Parameters
-    ----------
-    paths : sequence of str or Path
-        Recordings of one unit.
-    topics : Topics or None, optional
-        Names of the inputs.
-    input : {'auto', 'counts', 'imu'}, optional
-        What is read.
-    serial : str or None, optional
-        The unit as the user knows it; it wins over what the bags say.
-    hashed : bool, optional
-        Whether the bags' hashes are wanted, which takes reading each of them once.
-
-    Returns
-    -------
-    sources : list of FitSource
-        In the order given.
-    input : {'counts', 'imu'}
-        What all of them hold.
-
-    Raises
-    ------
-    RecordingError
-        If one cannot be read or lacks a topic.
-    FitError
-        If some hold counts and some Imu messages, or they are of different units.
-
+    Raises RecordingError if one cannot be read or lacks a topic. Raises FitError if some hold
+    counts and some Imu messages, or they are of different units.
     """
     sources: list[FitSource] = []
     kinds: dict[str, str] = {}
@@ -85,23 +60,7 @@ def recording_source(
     """
     Make a source of a recording: looked at now, and opened anew for each pass.
 
-    Parameters
-    ----------
-    path, topics, input, require
-        As for `recording.open_recording`.
-
-    Returns
-    -------
-    source : FitSource
-        Its `missing` tells what did not come, too, once it has been read.
-    info : RecordingInfo
-        What the recording says of itself.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be read or lacks a topic.
-
+    Raises RecordingError if it cannot be read or lacks a topic.
     """
     path = Path(path)
     with open_recording(path, topics, input, require=require) as reader:
@@ -125,12 +84,6 @@ def recording_source(
 def digest(path: Path) -> str:
     """
     Return the SHA-256 of a bag: of the file, or of a directory's files in the order of names.
-
-    Returns
-    -------
-    str
-        Hexadecimal.
-
     """
     total = hashlib.sha256()
     files = [path] if path.is_file() else sorted(p for p in path.rglob('*') if p.is_file())

@@ -35,18 +35,8 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     Real gravity differs by up to some 30 mGal (30 ug) in mountains; where a gravimeter value or
     a national gravity model is at hand it is better.
 
-    Parameters
-    ----------
-    latitude_deg : float
-        Geodetic latitude [deg], -90..90.
-    height_m : float
-        Height above the ellipsoid [m], -1000..10000.
-
-    Raises
-    ------
-    ValueError
-        If an argument is not finite or outside its range.
-
+    `latitude_deg`: geodetic latitude [deg], -90..90. `height_m`: height above the ellipsoid [m],
+    -1000..10000. Raises ValueError if an argument is not finite or outside its range.
     """
     if not -90.0 <= latitude_deg <= 90.0:
         raise ValueError(f'`latitude_deg` must be within -90..90, got {latitude_deg}')
@@ -69,18 +59,7 @@ def resolve_gravity(
     """
     Take local gravity from what the user gave, and refuse to guess.
 
-    Parameters
-    ----------
-    gravity : float or None
-        Local gravity as measured; it wins.
-    latitude_deg, height_m : float or None
-        Place, used when `gravity` is not given; both are needed.
-
-    Raises
-    ------
-    FitError
-        If nothing was given or the value is no gravity found on Earth's surface.
-
+    Raises FitError if nothing was given or the value is no gravity found on Earth's surface.
     """
     if gravity is None:
         if latitude_deg is None or height_m is None:

@@ -29,22 +29,8 @@ def thermal_states(
     """
     Drive a tracker with a bag's readings and sample it on a grid.
 
-    Parameters
-    ----------
-    bag : ReducedBag
-        The bag, with board readings.
-    tracker : ThermalTracker
-        A fresh one.
-    step_s : float
-        Grid step [s].
-
-    Returns
-    -------
-    start_s : float
-        Time of the first grid point since the bag's first sample [s].
-    states : ndarray, shape (n, width)
-        `ThermalTracker.sample` at each grid point.
-
+    `step_s`: grid step [s]. Returns time of the first grid point since the bag's first sample [s].
+    Returns `ThermalTracker.sample` at each grid point, shape (n, width).
     """
     names, stamps, values = readings_in_order(bag, ('board', *tracker.spec.sensors))
     step_ns = round(step_s * 1e9)

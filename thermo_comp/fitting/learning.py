@@ -72,29 +72,9 @@ def learn(
     """
     Find widths, noises and columns by the evidence.
 
-    Parameters
-    ----------
-    regression : Regression
-        The data.
-    state : State
-        Where to begin.
-    prior : Prior
-        Wide: its widths are where those of columns stay that the data do not see.
-    forced : ndarray of bool, shape (m,), optional
-        Columns that stay whatever they earn.
-    tell : callable, optional
-        Told how far it is, 0..1.
-    held : ndarray of bool, shape (m,), optional
-        Columns of the scale that keep their width, and their place: the data cannot tell them
-        from those of the bias.
-    walks : bool, optional
-        Whether slow noise is looked for.
-
-    Returns
-    -------
-    Learnt
-        The end.
-
+    `forced`: columns that stay whatever they earn, shape (m,). `held`: columns of the scale that
+    keep their width, and their place: the data cannot tell them from those of the bias, shape
+    (m,).
     """
     tell = tell or (lambda _part: None)
     kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced

@@ -26,13 +26,8 @@ class Ageing:
     """
     What a unit has changed by since its last calibration.
 
-    Parameters
-    ----------
-    bias : float
-        Standard deviation of each bias [m/s^2].
-    scale : float
-        Of each relative scale factor.
-
+    bias: standard deviation of each bias [m/s^2]
+    scale: of each relative scale factor
     """
 
     bias: float = 0.0
@@ -49,49 +44,30 @@ class FitOptions:
     """
     Options of a fit.
 
-    Parameters
-    ----------
-    gravity : float
-        Local gravity; see `gravity.resolve_gravity`.
-    model : {'response', 'golovach'}, optional
-        The whole bank, thinned by evidence; or the paper: a linear static and a quadratic dynamic
-        set, without a response.
-    static_curve, dynamic_curve : str or None, optional
-        ``linear``, ``quadratic``, ``cubic``, ``spline`` or ``exponential``; None takes the
-        model's own.
-    groups : tuple of str or None, optional
-        Groups of columns that may take part; None takes all.
-    forced : tuple of str, optional
-        Groups that stay whatever they earn.
-    prior : Calibration or None, optional
-        What is known beforehand: of the type of unit, or of this unit; its columns are the model.
-    ageing : Ageing, optional
-        What the prior's covariance has grown by since.
-    serial : str or None, optional
-        Unit serial; None takes the sources'.
-    input : {'counts', 'm/s^2'}, optional
-        Unit of the samples.
-    full_scale : float or None, optional
-        Magnitude of a saturated sample; None takes 32767 for counts, and for m/s^2 the smallest
-        usual range that holds the data.
-    reference_temperature : float, optional
-        T_ref; the paper uses 20.
-    detector : DetectorSettings or None, optional
-        Thermometer and detector settings; None learns them from the bags.
-    transition_time_s : float, optional
-        Cross-over time of the sets, as the node will use.
-    window_s, cell_s, min_still_s : float, optional
-        Lengths of a window, of a cell and of the shortest still interval.
-    regression_window_s : float, optional
-        Length up to which neighbouring windows of a position are merged for the regression.
-    allow : tuple of str, optional
-        Names of refusals that the user overrides, see `verdict`.
+    gravity: local gravity; see `gravity.resolve_gravity`
+    model: the whole bank, thinned by evidence; or the paper: a linear static and a quadratic
+        dynamic set, without a response
+    static_curve, dynamic_curve: ``linear``, ``quadratic``, ``cubic``, ``spline`` or
+        ``exponential``; None takes the model's own
+    groups: groups of columns that may take part; None takes all
+    forced: groups that stay whatever they earn
+    prior: what is known beforehand: of the type of unit, or of this unit; its columns are the
+        model
+    ageing: what the prior's covariance has grown by since
+    serial: unit serial; None takes the sources'
+    input: unit of the samples
+    full_scale: magnitude of a saturated sample; None takes 32767 for counts, and for m/s^2 the
+        smallest usual range that holds the data
+    reference_temperature: T_ref; the paper uses 20
+    detector: thermometer and detector settings; None learns them from the bags
+    transition_time_s: cross-over time of the sets, as the node will use
+    window_s, cell_s, min_still_s: lengths of a window, of a cell and of the shortest still
+        interval
+    regression_window_s: length up to which neighbouring windows of a position are merged for the
+        regression
+    allow: names of refusals that the user overrides, see `verdict`
 
-    Raises
-    ------
-    ValueError
-        If a value is outside its range.
-
+    Raises ValueError if a value is outside its range.
     """
 
     gravity: float

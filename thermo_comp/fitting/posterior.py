@@ -40,25 +40,14 @@ class Posterior:
     """
     The mode and its surroundings.
 
-    Parameters
-    ----------
-    state : State
-        The mode.
-    layout : Layout
-        Places of its elements.
-    told : ndarray, shape (n,)
-        What of each unknown the data told, not the prior, 0..1.
-    covariance : ndarray, shape (n_unit, n_unit)
-        Of what belongs to the unit.
-    variance : ndarray, shape (n,)
-        Of all unknowns.
-    residual : ndarray, shape (n_windows, 3)
-        Measured minus predicted [m/s^2].
-    whitened : ndarray, shape (n_windows, 3)
-        The same, whitened, in units of sigma.
-    log_evidence : float
-        Logarithm of the marginal likelihood, but for a constant of the data.
-
+    state: the mode
+    layout: places of its elements
+    told: what of each unknown the data told, not the prior, 0..1, shape (n,)
+    covariance: of what belongs to the unit, shape (n_unit, n_unit)
+    variance: of all unknowns, shape (n,)
+    residual: measured minus predicted [m/s^2], shape (n_windows, 3)
+    whitened: the same, whitened, in units of sigma, shape (n_windows, 3)
+    log_evidence: logarithm of the marginal likelihood, but for a constant of the data
     """
 
     state: State
@@ -174,25 +163,7 @@ class Regression(Design):
         return other, G, g
 
     def told_of_absent(self, state: State, prior: Prior, allowed: Prior) -> dict[str, Floats]:
-        """
-        Ask the data for columns that take no part, beside those that do.
-
-        Parameters
-        ----------
-        state : State
-            The mode.
-        prior : Prior
-            Its prior.
-        allowed : Prior
-            The columns that could take part.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (m,)
-            'bias' and 'scale': inverse variance of a weight, mean over the axes; 0 for columns
-            that take part or may not.
-
-        """
+        """Ask the data for columns that take no part, beside those that do."""
         everything = replace(
             prior,
             on_bias=np.maximum(prior.on_bias, allowed.on_bias),
@@ -231,21 +202,8 @@ class Regression(Design):
         """
         Find the mode that the other positions alone would give, to first order.
 
-        Parameters
-        ----------
-        posterior : Posterior
-            The mode of all.
-        prior : Prior
-            Its prior.
-        p : int
-            The position left out.
-
-        Returns
-        -------
-        State or None
-            What belongs to the unit has moved; the rest is as it was. None where the others do
-            not tell something that this one does.
-
+        What belongs to the unit has moved; the rest is as it was. None where the others do not
+        tell something that this one does.
         """
         layout, n = posterior.layout, posterior.layout.n_unit
         filtered = posterior.whitened * prior.sigma
@@ -288,26 +246,7 @@ class Regression(Design):
     def solve(
         self, state: State, prior: Prior, n_steps: int = 6, tolerance: float = 1e-3
     ) -> Posterior:
-        """
-        Find the mode under a prior.
-
-        Parameters
-        ----------
-        state : State
-            Where to begin.
-        prior : Prior
-            What is known, and the noise.
-        n_steps : int, optional
-            Gauss-Newton steps at most.
-        tolerance : float, optional
-            A step that promises less than this in log likelihood is the last.
-
-        Returns
-        -------
-        Posterior
-            The mode, its covariance and the evidence.
-
-        """
+        """Find the mode under a prior."""
         layout = self.layout(prior)
         precision = self.precision(prior, layout)
         matrices = self._inform(prior, layout)

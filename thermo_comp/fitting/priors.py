@@ -51,11 +51,7 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
     """
     Return the response of a calibration as columns.
 
-    Raises
-    ------
-    FitError
-        If a column belongs to one regime alone, as in files of version 1.
-
+    Raises FitError if a column belongs to one regime alone, as in files of version 1.
     """
     for term in calibration.response:
         if term.during != 'always':
@@ -133,24 +129,7 @@ def known_of(
     """
     Turn a calibration into the prior of a regression on its columns.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The earlier one, with a posterior.
-    regression : Regression
-        On windows with the columns of the calibration and no others.
-    state : State
-        As `state_of` gives it.
-    sets : Sets
-        As `prior_sets` gives them.
-    ageing : Ageing
-        What has come to the covariance since.
-
-    Raises
-    ------
-    FitError
-        If the calibration makes no claim.
-
+    Raises FitError if the calibration makes no claim.
     """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an import makes no claim to build on')
@@ -185,21 +164,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from the calibrations of some.
 
-    Parameters
-    ----------
-    calibrations : sequence of Calibration
-        Of different units of one type, with curves of the same families.
-
-    Returns
-    -------
-    Calibration
-        The mean unit; its posterior is the scatter over the units.
-
-    Raises
-    ------
-    FitError
-        If the units are too few or their calibrations not alike.
-
+    Raises FitError if the units are too few or their calibrations not alike.
     """
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')

@@ -34,15 +34,9 @@ class Readings:
     """
     One thermometer's readings over a bag.
 
-    Parameters
-    ----------
-    stamp_ns : ndarray of int64, shape (n,)
-        Rising stamps.
-    value : ndarray, shape (n,)
-        Temperatures.
-    n_read : int
-        Readings in the bag, before averaging.
-
+    stamp_ns: rising stamps, shape (n,)
+    value: temperatures, shape (n,)
+    n_read: readings in the bag, before averaging
     """
 
     stamp_ns: Ints
@@ -58,25 +52,14 @@ class StillInterval:
     """
     One interval without motion: one position.
 
-    Parameters
-    ----------
-    bag : int
-        Number of the bag in the order given.
-    start_ns, end_ns : int
-        Stamps of its first and last cell's middle.
-    begin_s : float
-        Where its first window begins, since the bag's first sample [s]; the others follow on.
-    n_whole : int
-        Windows of the full length; one that is shorter may come after them.
-    time : ndarray, shape (n,)
-        Mean time of each window's samples since the bag's first sample [s].
-    count : ndarray, shape (n,)
-        Samples per window.
-    mean : ndarray, shape (n, 3)
-        Window means of the raw samples.
-    sample_sd : ndarray, shape (3,)
-        Scatter of single samples.
-
+    bag: number of the bag in the order given
+    start_ns, end_ns: stamps of its first and last cell's middle
+    begin_s: where its first window begins, since the bag's first sample [s]; the others follow on
+    n_whole: windows of the full length; one that is shorter may come after them
+    time: mean time of each window's samples since the bag's first sample [s], shape (n,)
+    count: samples per window, shape (n,)
+    mean: window means of the raw samples, shape (n, 3)
+    sample_sd: scatter of single samples, shape (3,)
     """
 
     bag: int
@@ -95,27 +78,15 @@ class ReducedBag:
     """
     What the fit keeps of one bag.
 
-    Parameters
-    ----------
-    source : FitSource
-        Where it came from.
-    start_ns, end_ns : int
-        First and last stamp of the samples used.
-    intervals : tuple of StillInterval
-        Still intervals in order.
-    temperatures : mapping of str to Readings
-        By the name of the thermometer.
-    n_samples, n_dropped, n_saturated : int
-        Samples read; not finite or out of order; at the full scale.
-    n_cells, n_still_cells : int
-        Length of the bag, and of its still intervals, in cells.
-    window_s : float
-        Length of a window: as asked, or a multiple of it where the samples are slow [s].
-    cycle_s : float
-        Typical interval between samples.
-    is_integer : bool
-        Whether all samples were whole numbers.
-
+    source: where it came from
+    start_ns, end_ns: first and last stamp of the samples used
+    intervals: still intervals in order
+    temperatures: by the name of the thermometer
+    n_samples, n_dropped, n_saturated: samples read; not finite or out of order; at the full scale
+    n_cells, n_still_cells: length of the bag, and of its still intervals, in cells
+    window_s: length of a window: as asked, or a multiple of it where the samples are slow [s]
+    cycle_s: typical interval between samples
+    is_integer: whether all samples were whole numbers
     """
 
     source: FitSource
@@ -153,25 +124,7 @@ def reduce_source(
     full_scale: float | None,
     fewest_windows: int = 1,
 ) -> ReducedBag:
-    """
-    Stream one source and keep its sufficient statistics.
-
-    Parameters
-    ----------
-    source : FitSource
-        The bag.
-    bag : int
-        Its number.
-    window_s, cell_s : float
-        Length of a window and of a cell.
-    min_still_s : float
-        Shortest still interval.
-    full_scale : float or None
-        Magnitude of a saturated sample.
-    fewest_windows : int, optional
-        A still interval too short for so many has shorter ones.
-
-    """
+    """Stream one source and keep its sufficient statistics."""
     cells = CellAccumulator(cell_s, full_scale, window_s)
     collectors: dict[str, _ReadingCollector] = {}
     n_samples = 0

@@ -21,15 +21,7 @@ _NEAR_S, _NEAR_DEG = 30.0, 10.0
 
 
 def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
-    """
-    Find where a sensor jumped at rest; streams the bag again only where that may be.
-
-    Returns
-    -------
-    tuple of Event
-        Those of kind ``jump``.
-
-    """
+    """Find where a sensor jumped at rest; streams the bag again only where that may be."""
     if len(bag.intervals) < 2:
         return ()
     up = _directions(bag.intervals)
@@ -44,22 +36,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
 
 
 def judge_rests(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding]:
-    """
-    Judge whether the sensor kept still where the unit did.
-
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        The bags.
-    options : FitOptions
-        The unit of the samples.
-
-    Returns
-    -------
-    list of Finding
-        Refusals.
-
-    """
+    """Judge whether the sensor kept still where the unit did."""
     jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
     if not jumps:
         return []
@@ -77,22 +54,7 @@ def milli_g(bags: Sequence[ReducedBag], kind: str) -> float:
 
 
 def describe(event: Event, per_mg: float) -> str:
-    """
-    Say one step in words.
-
-    Parameters
-    ----------
-    event : Event
-        The step.
-    per_mg : float
-        Input units of a thousandth of g.
-
-    Returns
-    -------
-    str
-        Time, size, and what it is.
-
-    """
+    """Say one step in words."""
     vector = ', '.join(f'{v / per_mg:+.3g}' for v in event.step)
     along = f'{event.along / per_mg:+.3g} mg along gravity'
     size = f'{along} ({vector}) within {event.duration_s:.2g} s'

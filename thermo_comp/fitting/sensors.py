@@ -36,13 +36,8 @@ class Course:
     """
     One thermometer's course over one bag, seen from both sides.
 
-    Parameters
-    ----------
-    rate : ndarray, shape (n,)
-        Rate on a grid of ten seconds [K/s].
-    rate_sd : float
-        Noise of it.
-
+    rate: rate on a grid of ten seconds [K/s], shape (n,)
+    rate_sd: noise of it
     """
 
     rate: Floats
@@ -62,20 +57,7 @@ class Course:
 
 
 def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
-    """
-    Set the detector to the sensors and ramps that the bags show.
-
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        The bags of the fit.
-
-    Returns
-    -------
-    DetectorSettings
-        Settings; what the bags cannot say keeps its default.
-
-    """
+    """Set the detector to the sensors and ramps that the bags show."""
     base = DetectorSettings()
     board = learn_thermometer([bag.board for bag in bags], base.board)
     case = learn_thermometer([bag.case for bag in bags], base.case)
@@ -94,17 +76,7 @@ def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
 def learn_thermometer(
     recorded: Sequence[Readings], base: ThermometerSettings
 ) -> ThermometerSettings:
-    """
-    Estimate one sensor's quantum, noise, lag and fastest ramp.
-
-    Parameters
-    ----------
-    recorded : sequence of Readings
-        Its readings, bag by bag.
-    base : ThermometerSettings
-        What to keep where there are too few readings, or no ramp.
-
-    """
+    """Estimate one sensor's quantum, noise, lag and fastest ramp."""
     long = [readings.value for readings in recorded if len(readings.value) >= 30]
     if not long:
         return base
@@ -137,16 +109,7 @@ def quantum_of(values: Floats) -> float:
     """
     Find the step of a rounded sensor.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Readings.
-
-    Returns
-    -------
-    float
-        The step, 0 when the readings are not multiples of any that matters.
-
+    `values`: readings, shape (n,).
     """
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):

@@ -37,19 +37,11 @@ class ArrayBlock:
     """
     A block made of arrays at hand: a simulated run, or a whole recording in memory.
 
-    Parameters
-    ----------
-    accel_stamp_ns : ndarray of int64, shape (n,)
-        Stamps of the samples.
-    accel : ndarray, shape (n, 3)
-        Counts, or m/s^2.
-    board_stamp_ns, case_stamp_ns : ndarray of int64, shape (m,) and (k,)
-        Stamps of the temperature readings.
-    board, case : ndarray, shape (m,) and (k,)
-        Temperatures.
-    others : mapping of str to (ndarray of int64, ndarray), optional
-        Stamps and temperatures of further thermometers.
-
+    accel_stamp_ns: stamps of the samples, shape (n,)
+    accel: counts, or m/s^2, shape (n, 3)
+    board_stamp_ns, case_stamp_ns: stamps of the temperature readings, shape (m,)
+    board, case: temperatures, shape (m,)
+    others: stamps and temperatures of further thermometers
     """
 
     accel_stamp_ns: Ints
@@ -79,19 +71,11 @@ class FitSource:
     """
     One bag (or what stands for one), to be streamed in file order.
 
-    Parameters
-    ----------
-    name : str
-        What messages and provenance call it.
-    blocks : callable
-        Gives a fresh iterable of blocks; called once per pass.
-    sha256 : str or None, optional
-        Hash of the content, for the provenance.
-    serial : str or None, optional
-        Unit serial found in the source's metadata.
-    missing : callable, optional
-        Tells what of the bag is missing, as far as it has been read; None where nothing is.
-
+    name: what messages and provenance call it
+    blocks: gives a fresh iterable of blocks; called once per pass
+    sha256: hash of the content, for the provenance
+    serial: unit serial found in the source's metadata
+    missing: tells what of the bag is missing, as far as it has been read; None where nothing is
     """
 
     name: str

@@ -27,13 +27,8 @@ class ConstantCalibration:
     """
     The nine parameters of a triad at one temperature.
 
-    Parameters
-    ----------
-    bias, scale : ndarray, shape (3,)
-        Input units; input units per m/s^2.
-    misalignment : ndarray, shape (3, 3)
-        M, lower triangular with a unit diagonal.
-
+    bias, scale: input units; input units per m/s^2, shape (3,)
+    misalignment: M, lower triangular with a unit diagonal, shape (3, 3)
     """
 
     bias: Floats
@@ -51,25 +46,8 @@ def constant_calibration(
     """
     Fit bias, scale and, if asked, misalignment to position means.
 
-    Parameters
-    ----------
-    means : ndarray, shape (n, 3)
-        Mean raw vector of each position.
-    gravity : float
-        Local gravity.
-    with_misalignment : bool
-        Whether M is estimated; otherwise it is the identity.
-
-    Returns
-    -------
-    ConstantCalibration
-        The least squares of ``|f| - g``.
-
-    Raises
-    ------
-    FitError
-        If the positions lie on no ellipsoid.
-
+    `means`: mean raw vector of each position, shape (n, 3). Raises FitError if the positions lie
+    on no ellipsoid.
     """
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
     half = 0.5 * (means.max(axis=0) - means.min(axis=0))

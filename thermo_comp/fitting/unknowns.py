@@ -16,29 +16,17 @@ class Windows:
     """
     The data: windows sorted by position and time, with every column of the table.
 
-    Parameters
-    ----------
-    position, bag : ndarray of int, shape (n,)
-        Numbers from 0; a position lies in one bag.
-    time : ndarray, shape (n,)
-        Time since the bag's first sample [s].
-    weight : ndarray, shape (n,)
-        Samples of the window over those of a typical one.
-    mean : ndarray, shape (n, 3)
-        Mean raw samples, in input units.
-    columns : ndarray, shape (n, m)
-        Values of the columns, in their physical units, with start states at their prior mean.
-    groups : tuple of str
-        Group of each column.
-    lag : ndarray of int, shape (m,)
-        The lag whose start state moves a column; -1 for none.
-    start : ndarray, shape (n, m)
-        Derivative of each column by that state.
-    start_covariance : ndarray, shape (n_lags, n_lags)
-        Prior of the start states [K^2].
-    in_scale : ndarray of bool, shape (m,)
-        Which columns the scale may have as well as the bias.
-
+    position, bag: numbers from 0; a position lies in one bag, shape (n,)
+    time: time since the bag's first sample [s], shape (n,)
+    weight: samples of the window over those of a typical one, shape (n,)
+    mean: mean raw samples, in input units, shape (n, 3)
+    columns: values of the columns, in their physical units, with start states at their prior mean,
+        shape (n, m)
+    groups: group of each column
+    lag: the lag whose start state moves a column; -1 for none, shape (m,)
+    start: derivative of each column by that state, shape (n, m)
+    start_covariance: prior of the start states [K^2], shape (n_lags, n_lags)
+    in_scale: which columns the scale may have as well as the bias, shape (m,)
     """
 
     position: Ints
@@ -69,13 +57,9 @@ class Known:
     """
     What is known of the unit's own parameters together, e.g. by an earlier calibration.
 
-    Parameters
-    ----------
-    mean : ndarray, shape (n_unit,)
-        In the order of `Layout`: kappa, bias, weights of each axis, then the skew.
-    precision : ndarray, shape (n_unit, n_unit)
-        Inverse covariance.
-
+    mean: in the order of `Layout`: kappa, bias, weights of each axis, then the skew, shape
+        (n_unit,)
+    precision: inverse covariance, shape (n_unit, n_unit)
     """
 
     mean: Floats
@@ -87,27 +71,16 @@ class Prior:
     """
     What is known beforehand; standard deviations, inf for nothing.
 
-    Parameters
-    ----------
-    bias_mean, bias_sd : ndarray, shape (3,)
-        [m/s^2].
-    scale_sd : float
-        Of kappa, about 1.
-    skew_sd : float
-        Of the elements of M [rad].
-    on_bias, on_scale : ndarray, shape (m,)
-        Of the weights of each column, in units of its RMS ([m/s^2], relative); 0 for a column
-        that takes no part.
-    offset_sd : float
-        Of the offset of each position and axis [m/s^2].
-    sigma : ndarray, shape (3,)
-        White noise of a typical window [m/s^2].
-    rho : ndarray, shape (3,)
-        Variance per second of the walk over that of the white noise.
-    known : Known or None, optional
-        Takes the place of all widths of the unit's own parameters; these say only which columns
-        take part.
-
+    bias_mean, bias_sd: [m/s^2], shape (3,)
+    scale_sd: of kappa, about 1
+    skew_sd: of the elements of M [rad]
+    on_bias, on_scale: of the weights of each column, in units of its RMS ([m/s^2], relative); 0
+        for a column that takes no part, shape (m,)
+    offset_sd: of the offset of each position and axis [m/s^2]
+    sigma: white noise of a typical window [m/s^2], shape (3,)
+    rho: variance per second of the walk over that of the white noise, shape (3,)
+    known: takes the place of all widths of the unit's own parameters; these say only which columns
+        take part
     """
 
     bias_mean: Floats

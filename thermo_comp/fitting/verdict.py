@@ -41,15 +41,9 @@ class Finding:
     """
     One thing that the fit noticed of the data.
 
-    Parameters
-    ----------
-    name : str
-        Short name; a refusal is overridden by it.
-    level : {'refusal', 'advice', 'good'}
-        What it means.
-    message : str
-        One line with the number found, the number needed and what to do.
-
+    name: short name; a refusal is overridden by it
+    level: what it means
+    message: one line with the number found, the number needed and what to do
     """
 
     name: str
@@ -61,23 +55,7 @@ def enforce(findings: Sequence[Finding], options: FitOptions) -> tuple[Finding, 
     """
     Stop at the first refusal that the user does not allow.
 
-    Parameters
-    ----------
-    findings : sequence of Finding
-        What was found.
-    options : FitOptions
-        Gives what the user allows.
-
-    Returns
-    -------
-    tuple of Finding
-        The findings, allowed refusals turned into advice.
-
-    Raises
-    ------
-    FitError
-        If there is a refusal; its text says how to mend it and how to override it.
-
+    Raises FitError if there is a refusal; its text says how to mend it and how to override it.
     """
     result = []
     for finding in findings:
@@ -91,17 +69,7 @@ def enforce(findings: Sequence[Finding], options: FitOptions) -> tuple[Finding, 
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding]:
-    """
-    Judge the raw data: saturation, units, numbers that are no counts.
-
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        The bags.
-    options : FitOptions
-        What the user said of them.
-
-    """
+    """Judge the raw data: saturation, units, numbers that are no counts."""
     findings = []
     n_samples = sum(bag.n_samples for bag in bags)
     n_saturated = sum(bag.n_saturated for bag in bags)
@@ -163,15 +131,7 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> list[F
     Nothing that is missing is refused: the posterior says what it costs. Refused is what
     contradicts itself.
 
-    Parameters
-    ----------
-    windows : ThermalWindows
-        The windows.
-    up : ndarray, shape (n_positions, 3)
-        Directions, to first order.
-    has_case : bool
-        Whether there are case temperatures.
-
+    `up`: directions, to first order, shape (n_positions, 3).
     """
     findings = _judge_positions(up)
     if not windows.has_temperature:
@@ -277,16 +237,7 @@ def distinct_directions(up: Floats) -> Floats:
     """
     Drop directions that repeat another.
 
-    Parameters
-    ----------
-    up : ndarray, shape (n, 3)
-        Unit vectors.
-
-    Returns
-    -------
-    ndarray, shape (m, 3)
-        Those further than 5 degrees from all before.
-
+    `up`: unit vectors, shape (n, 3).
     """
     kept: list[Floats] = []
     limit = np.cos(np.radians(_SAME_DIRECTION_DEG))
@@ -300,18 +251,7 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
     """
     Worst standard deviation of bias, scale and misalignment per unit of norm noise.
 
-    Parameters
-    ----------
-    up : ndarray, shape (n, 3)
-        Directions.
-    with_misalignment : bool
-        Whether M is among the parameters.
-
-    Returns
-    -------
-    float
-        In units of the noise of ``|f|``, g = 1; infinite when a parameter is free.
-
+    `up`: directions, shape (n, 3).
     """
     x, y, z = up.T
     # d|f| by the biases, relative scales and the three elements of M.
@@ -335,19 +275,8 @@ def judge_result(
     """
     Judge what the fit left.
 
-    Parameters
-    ----------
-    K : ndarray, shape (3,)
-        Scale factors.
-    rows : sequence of ResidualRow
-        Residuals before and after.
-    slow : float
-        RMS over the axes of what no temperature explains [m/s^2].
-    options : FitOptions
-        The unit of the samples.
-    has_temperature : bool, optional
-        Whether there was a temperature to explain anything.
-
+    `K`: scale factors, shape (3,). `slow`: RMS over the axes of what no temperature explains
+    [m/s^2].
     """
     findings = []
     overall = rows[-1]

@@ -27,13 +27,9 @@ class Whitener:
     """
     Filters series of windows, position by position, side by side.
 
-    Parameters
-    ----------
-    position : ndarray of int, shape (n,)
-        Position of each window; windows of a position are consecutive and in time order.
-    time : ndarray, shape (n,)
-        Their times [s].
-
+    position: position of each window; windows of a position are consecutive and in time order,
+        shape (n,)
+    time: their times [s], shape (n,)
     """
 
     def __init__(self, position: Ints, time: Floats) -> None:
@@ -55,18 +51,8 @@ class Whitener:
         """
         Run the filter's variances.
 
-        Parameters
-        ----------
-        weight : ndarray, shape (n,)
-            Relative information of each window.
-        rho : float
-            Variance that the walk gains per second, over that of the white noise.
-
-        Returns
-        -------
-        gain, root : ndarray, shape (n_steps, n_positions)
-            Kalman gain, and sd of the innovation in units of sigma.
-
+        `weight`: relative information of each window, shape (n,). Returns kalman gain, and sd of
+        the innovation in units of sigma, shape (n_steps, n_positions).
         """
         noise = 1.0 / weight[self._row]
         gain, root = np.zeros_like(noise), np.sqrt(noise)
@@ -85,18 +71,7 @@ class Whitener:
         """
         Whiten series.
 
-        Parameters
-        ----------
-        series : ndarray, shape (n, k)
-            One series per column.
-        gains : (ndarray, ndarray)
-            As `gains` gives them.
-
-        Returns
-        -------
-        ndarray, shape (n, k)
-            Innovations over their sd, in the order of the table.
-
+        `series`: one series per column, shape (n, k).
         """
         gain, root = gains
         result = np.empty_like(series)

@@ -36,13 +36,8 @@ class Sets:
     """
     How the curves of the two sets are made.
 
-    Parameters
-    ----------
-    static, dynamic : TemperatureFunction
-        The families and their shapes; only `basis` counts.
-    is_shared : bool
-        Whether the dynamic curve is the static one plus a difference: else each has its own.
-
+    static, dynamic: the families and their shapes; only `basis` counts
+    is_shared: whether the dynamic curve is the static one plus a difference: else each has its own
     """
 
     static: TemperatureFunction
@@ -68,21 +63,12 @@ class ThermalWindows:
     """
     The regression's windows, and what the calibration says of the states they were taken in.
 
-    Parameters
-    ----------
-    data : Windows
-        Samples and columns, for the regression.
-    names : tuple of str
-        Source of each bag.
-    temperature, rate, weight : ndarray, shape (n,)
-        Board temperature, its rate, weight of the dynamic set.
-    gradient : ndarray, shape (n,)
-        T - T_board of the sensor that leads.
-    raw : ndarray, shape (n, k)
-        The response's columns before powers of t and ranges.
-    typical_count : float
-        Samples in a typical window.
-
+    data: samples and columns, for the regression
+    names: source of each bag
+    temperature, rate, weight: board temperature, its rate, weight of the dynamic set, shape (n,)
+    gradient: T - T_board of the sensor that leads, shape (n,)
+    raw: the response's columns before powers of t and ranges, shape (n, k)
+    typical_count: samples in a typical window
     """
 
     data: Windows
@@ -116,28 +102,8 @@ def thermal_windows(
     Windows before the board's first reading, or while its estimate is still settling, are left
     out. A bag without any temperature stands at the reference, where no column says anything.
 
-    Parameters
-    ----------
-    bags : sequence of ReducedBag
-        The bags.
-    columns : sequence of Column
-        The response.
-    sets : Sets
-        The curves.
-    detector, config : DetectorSettings, ThermalConfig
-        Of the tracker.
-    reference_temperature : float
-        T_ref [degC].
-    window_s : float
-        Neighbouring windows of a position are merged up to this length [s].
-    sensors : sequence of str, optional
-        Thermometers beside the board.
-
-    Returns
-    -------
-    ThermalWindows
-        The table; a position none of whose windows is usable is left out.
-
+    `reference_temperature`: T_ref [degC]. `window_s`: neighbouring windows of a position are
+    merged up to this length [s].
     """
     spec = memory_of(columns, sensors)
     table = ColumnTable(columns, spec, reference_temperature)

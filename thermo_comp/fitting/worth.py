@@ -26,19 +26,11 @@ class GroupWorth:
     """
     What one group of columns is worth.
 
-    Parameters
-    ----------
-    part, group : str
-        'bias' or 'scale', and its name.
-    explains : float
-        RMS over windows and axes of what it adds to the prediction [m/s^2].
-    effective : float
-        Effective parameters, of all axes.
-    evidence : float
-        How much the log evidence falls without it.
-    sd : tuple of float
-        Prior sd of the weights of its columns, for columns of unit RMS ([m/s^2], relative).
-
+    part, group: 'bias' or 'scale', and its name
+    explains: RMS over windows and axes of what it adds to the prediction [m/s^2]
+    effective: effective parameters, of all axes
+    evidence: how much the log evidence falls without it
+    sd: prior sd of the weights of its columns, for columns of unit RMS ([m/s^2], relative)
     """
 
     part: str
@@ -74,15 +66,7 @@ def earned(posterior: Posterior, places: Ints, sd: float | Floats) -> float:
     """
     How much the log evidence falls when some weights are held at 0 (Savage-Dickey).
 
-    Parameters
-    ----------
-    posterior : Posterior
-        The posterior with them.
-    places : ndarray of int, shape (k,)
-        Their places.
-    sd : float or ndarray, shape (k,)
-        Their prior.
-
+    `places`: their places, shape (k,). `sd`: their prior, shape (k,).
     """
     mode = _mode(posterior, places)
     covariance = posterior.covariance[np.ix_(places, places)]
@@ -106,24 +90,7 @@ def _mode(posterior: Posterior, places: Ints) -> Floats:
 def group_worth(
     regression: Regression, posterior: Posterior, prior: Prior
 ) -> tuple[GroupWorth, ...]:
-    """
-    Say what each group explains, spends and earns.
-
-    Parameters
-    ----------
-    regression : Regression
-        The data.
-    posterior : Posterior
-        The mode under `prior`.
-    prior : Prior
-        The widths.
-
-    Returns
-    -------
-    tuple of GroupWorth
-        Bias, then scale, in the order of the columns.
-
-    """
+    """Say what each group explains, spends and earns."""
     names = np.array(regression.windows.groups)
     columns = regression.windows.columns / regression.rms
     force = regression.gravity * posterior.state.up[regression.windows.position]

@@ -31,22 +31,8 @@ def load_calibration(path: str | Path) -> Calibration:
     """
     Read and validate a calibration file.
 
-    Parameters
-    ----------
-    path : str or Path
-        The YAML file.
-
-    Returns
-    -------
-    Calibration
-        The one object it holds.
-
-    Raises
-    ------
-    CalibrationError
-        If the file cannot be read, is not YAML of the accepted kind, or holds a value that is
-        not acceptable; names the file, the key, the value and what was expected.
-
+    Raises CalibrationError if the file cannot be read, is not YAML of the accepted kind, or holds
+    a value that is not acceptable; names the file, the key, the value and what was expected.
     """
     try:
         content = read_bounded(path, SIZE_LIMIT)
@@ -60,23 +46,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     """
     Build a Calibration from the bytes of a calibration file.
 
-    Parameters
-    ----------
-    content : bytes
-        YAML text in UTF-8.
-    path : str or Path or None, optional
-        Named in errors.
-
-    Returns
-    -------
-    Calibration
-        The one object it holds.
-
-    Raises
-    ------
-    CalibrationError
-        As `load_calibration`.
-
+    Raises CalibrationError if as `load_calibration`.
     """
     try:
         data = load_plain_yaml(content.decode('utf-8'))
@@ -109,21 +79,7 @@ def dump_calibration(calibration: Calibration) -> str:
     """
     Write a Calibration as YAML text with all digits.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The value.
-
-    Returns
-    -------
-    str
-        A text that `parse_calibration` turns into an equal value.
-
-    Raises
-    ------
-    CalibrationError
-        If the value would not be accepted when read back.
-
+    Raises CalibrationError if the value would not be accepted when read back.
     """
     text: str = yaml.dump(
         plain(calibration),
@@ -149,22 +105,8 @@ def save_calibration(
     """
     Write a calibration file atomically.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The value.
-    path : str or Path
-        The file.
-    overwrite : bool, optional
-        Replace a calibration that is there.
-
-    Raises
-    ------
-    CalibrationError
-        If the value is not valid.
-    OutputError
-        If the file may not or cannot be written; an old one is then untouched.
-
+    Raises CalibrationError if the value is not valid. Raises OutputError if the file may not or
+    cannot be written; an old one is then untouched.
     """
     text = dump_calibration(calibration)
     write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)

@@ -62,11 +62,7 @@ class Column:
     """
     One regressor of the thermal response; its keys are the calibration file's.
 
-    Raises
-    ------
-    ValueError
-        If the keys contradict each other: naming the key, the rule and the value.
-
+    Raises ValueError if the keys contradict each other: naming the key, the rule and the value.
     """
 
     group: Annotated[
@@ -76,7 +72,8 @@ class Column:
     kind: Annotated[
         Literal['now', 'rate', 'board', 'neighbour', 'square', 'cube', 'size', 'even', 'play'],
         'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without '
-        'lag; (T - lagged T)^3; abs(g_s); tanh((g_s / width)^2); play of t minus t, where g_s = T_s - T_board.',
+        'lag; (T - lagged T)^3; abs(g_s); tanh((g_s / width)^2); play of t minus t, where '
+        'g_s = T_s - T_board.',
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
     tau_s: Annotated[
@@ -99,7 +96,10 @@ class Column:
             raise ValueError(
                 f'`range` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
             )
-        for key, kinds in (('tau_s', ('board', 'neighbour', 'cube')), ('width_k', ('even', 'play'))):
+        for key, kinds in (
+            ('tau_s', ('board', 'neighbour', 'cube')),
+            ('width_k', ('even', 'play')),
+        ):
             if self.kind in kinds and not getattr(self, key) > 0.0:
                 raise ValueError(
                     f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
@@ -119,20 +119,7 @@ class Column:
 
 
 def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
-    """
-    Return all columns that a response may have, none held to a range yet.
-
-    Parameters
-    ----------
-    sensors : sequence of str, optional
-        Names of the thermometers beside the board.
-
-    Returns
-    -------
-    tuple of Column
-        Group by group.
-
-    """
+    """Return all columns that a response may have, none held to a range yet."""
     now = [Column('now', 'now', sensor, range=UNBOUNDED) for sensor in sensors]
     board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
     neighbour = [
@@ -147,10 +134,11 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
     ]
     mixed = [replace(column, group='mixed', power=1) for column in flow]
     # A part's own curve bends over its own temperature t - m: (t - m)^2 = t^2 - 2 t m + m^2.
+    squared = [replace(column, group='square', kind='square') for column in coarse]
     square = [
-        replace(column, group='square', kind=kind, power=power)
-        for kind, power in (('square', 0), ('square', 1), ('cube', 0))
-        for column in coarse
+        *squared,
+        *(replace(column, power=1) for column in squared),
+        *(replace(column, kind='cube') for column in squared),
     ]
     even = [
         Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
@@ -176,23 +164,7 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     """
     Find what a tracker must remember for some columns.
 
-    Parameters
-    ----------
-    columns : iterable of Column
-        The columns.
-    sensors : sequence of str, optional
-        Names of the thermometers beside the board; the first leads.
-
-    Returns
-    -------
-    MemorySpec
-        Lags by rising time constant; a play on a lag needs that lag.
-
-    Raises
-    ------
-    ValueError
-        If a column is of a sensor that is not among them.
-
+    Raises ValueError if a column is of a sensor that is not among them.
     """
     lags: set[tuple[str, float]] = set()
     plays: set[tuple[float, float]] = set()
@@ -221,24 +193,8 @@ def values(
     """
     Evaluate columns.
 
-    Parameters
-    ----------
-    columns : sequence of Column
-        The columns.
-    state : sequence of float or of ndarray
-        As `ThermalTracker.sample` gives it, or many of them as columns.
-    reference_temperature : float
-        T_ref [degC].
-    memory : MemorySpec
-        That of the tracker; it may remember more than these columns need.
-    temperature_range_c : tuple of float, optional
-        At the edges of which t is held [degC].
-
-    Returns
-    -------
-    list of float or of ndarray
-        phi of each column.
-
+    `reference_temperature`: T_ref [degC]. `temperature_range_c`: at the edges of which t is held
+    [degC].
     """
     table = ColumnTable(columns, memory, reference_temperature, temperature_range_c)
     return table.values(state)
@@ -248,11 +204,7 @@ class ColumnTable:
     """
     Columns, ready to be evaluated; the same bits for one state and for many.
 
-    Parameters
-    ----------
-    columns, memory, reference_temperature, temperature_range_c
-        See `values`.
-
+    columns, memory, reference_temperature, temperature_range_c: see `values`
     """
 
     def __init__(
@@ -328,24 +280,7 @@ class ColumnTable:
     def slopes(
         self, state: Sequence[Number], raw: Sequence[Number]
     ) -> tuple[list[Number], list[Number]]:
-        """
-        Differentiate phi, ranges aside.
-
-        Parameters
-        ----------
-        state : sequence of float or of ndarray
-            See `values`.
-        raw : sequence of float or of ndarray
-            What `raw` gives for it.
-
-        Returns
-        -------
-        on_input : list of float or of ndarray
-            By what u is made of: rate, gradient, lag or play.
-        on_power : list of float or of ndarray
-            By the t that multiplies u.
-
-        """
+        """Differentiate phi, ranges aside."""
         board, weight = state[BOARD], state[WEIGHT]
         one = board * 0.0 + 1.0
         inner = []

@@ -41,22 +41,11 @@ class Correction:
     """
     Both sets of a calibration, blended by the weight of the thermal state, and its response.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-
-    Attributes
-    ----------
-    memory : MemorySpec
-        What the tracker must remember.
-    noise : tuple of float
-        Variance of the noise of one message per axis, rounding included [m^2/s^4].
-    noise_trace : float
-        Their sum.
-    misalignment : tuple of float
-        yx, zx, zy of the misalignment and their variances.
-
+    calibration: the unit
+    memory: what the tracker must remember
+    noise: variance of the noise of one message per axis, rounding included [m^2/s^4]
+    noise_trace: their sum
+    misalignment: yx, zx, zy of the misalignment and their variances
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -92,20 +81,7 @@ class Correction:
         self.misalignment = (M[1][0], M[2][0], M[2][1], *variances)
 
     def bias_scale(self, state: Sequence[Number]) -> list[BiasScale[Number]]:
-        """
-        Evaluate the bias and the scale of the three axes.
-
-        Parameters
-        ----------
-        state : tuple of float or of ndarray
-            As `ThermalTracker.sample` gives it, for `memory`.
-
-        Returns
-        -------
-        list of (bias, scale)
-            Per axis, in input units and input units per m/s^2.
-
-        """
+        """Evaluate the bias and the scale of the three axes."""
         return self._bias_scale(state, self.table.values(state))
 
     def _bias_scale(
@@ -129,16 +105,8 @@ class Correction:
         """
         Stretch a transition time to what an INS would overlook.
 
-        Parameters
-        ----------
-        given_s : float
-            The time over which the sets are to cross over [s]; 0 = a hard switch.
-
-        Returns
-        -------
-        float
-            The time that the difference of the two sets needs, in soaks [s].
-
+        `given_s`: the time over which the sets are to cross over [s]; 0 = a hard switch. Returns
+        the time that the difference of the two sets needs, in soaks [s].
         """
         needed = self._largest_gap() / GENTLE_RATE
         return min(max(given_s, needed), LONGEST_TRANSITION * given_s)
@@ -196,20 +164,7 @@ class Correction:
         ranges. While the regime is unknown either set may be the right one, and the variances of
         both count.
 
-        Parameters
-        ----------
-        state : tuple of float or of ndarray
-            See `bias_scale`.
-        slow : sequence of (a, b, c)
-            What parameters and starts leave uncertain of each axis (`SlowUncertainty.at`).
-
-        Returns
-        -------
-        list of (bias, scale)
-            Per axis, in input units and input units per m/s^2.
-        list of (a, b, c)
-            Per axis, ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
-
+        Returns per axis, ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
         """
         weight, unknown = state[WEIGHT], state[UNKNOWN]
         rest = 1.0 - weight

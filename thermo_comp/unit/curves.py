@@ -30,15 +30,9 @@ class SetCurves:
     """
     One regime's curves, ready to be evaluated.
 
-    Parameters
-    ----------
-    regime_set : RegimeSet
-        The set.
-    other : RegimeSet
-        The other regime's: where this one ends and that one goes on, its curve is followed.
-    calibration : Calibration
-        The unit they belong to.
-
+    regime_set: the set
+    other: the other regime's: where this one ends and that one goes on, its curve is followed
+    calibration: the unit they belong to
     """
 
     def __init__(self, regime_set: RegimeSet, other: RegimeSet, calibration: Calibration) -> None:

@@ -20,18 +20,7 @@ def extreme_values(
     """
     Find the smallest and the largest value of a function over a range.
 
-    Parameters
-    ----------
-    function : Polynomial or CubicSpline or Exponential
-        The function.
-    lower, upper : float
-        The range of t [K].
-
-    Returns
-    -------
-    smallest, largest : float
-        Infinite where the function is not finite somewhere.
-
+    `lower, upper`: the range of t [K].
     """
     t = np.linspace(lower, upper, _GRID)
     if isinstance(function, Polynomial):

@@ -43,17 +43,10 @@ class Polynomial:
     """
     ``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10), with the leading constant where it belongs).
 
-    Parameters
-    ----------
-    coefficients : tuple of float
-        By rising power; the first is the value at the reference: 0 for a bias function, 1 for a
-        scale function. Unit of the function per K^power.
+    coefficients: by rising power; the first is the value at the reference: 0 for a bias function,
+        1 for a scale function. Unit of the function per K^power
 
-    Raises
-    ------
-    ValueError
-        If there are no coefficients or one is not finite.
-
+    Raises ValueError if there are no coefficients or one is not finite.
     """
 
     coefficients: tuple[float, ...]
@@ -109,19 +102,11 @@ class CubicSpline:
 
     Outside the outermost knots the end value is held.
 
-    Parameters
-    ----------
-    knots_k : tuple of float
-        Rising deviations from the reference temperature [K]; 0 is one of them.
-    values : tuple of float
-        The function at the knots; at knot 0 it is 0 (bias) or 1 (scale).
+    knots_k: rising deviations from the reference temperature [K]; 0 is one of them
+    values: the function at the knots; at knot 0 it is 0 (bias) or 1 (scale)
 
-    Raises
-    ------
-    ValueError
-        If there are fewer than three knots, they do not rise, 0 is missing, the lengths differ,
-        or a number is not finite.
-
+    Raises ValueError if there are fewer than three knots, they do not rise, 0 is missing, the
+    lengths differ, or a number is not finite.
     """
 
     knots_k: tuple[float, ...]
@@ -213,20 +198,13 @@ class Exponential:
     """
     ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``.
 
-    Parameters
-    ----------
-    constant : float
-        Together with the amplitudes it makes the value at the reference 0 (bias) or 1 (scale).
-    amplitudes : tuple of float
-        In the unit of the function.
-    e_fold_k : tuple of float
-        The temperature change that multiplies a term by e [K]; any sign, not 0.
+    constant: together with the amplitudes it makes the value at the reference 0 (bias) or 1
+        (scale)
+    amplitudes: in the unit of the function
+    e_fold_k: the temperature change that multiplies a term by e [K]; any sign, not 0
 
-    Raises
-    ------
-    ValueError
-        If there is no term, the lengths differ, an e-fold is 0, or a number is not finite.
-
+    Raises ValueError if there is no term, the lengths differ, an e-fold is 0, or a number is not
+    finite.
     """
 
     constant: float

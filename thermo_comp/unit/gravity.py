@@ -37,16 +37,7 @@ def parse_acceleration(text: str) -> float:
     """
     Read an acceleration with its unit, like ``100ug``, ``0.5 mg`` or ``1e-3 m/s^2``.
 
-    Parameters
-    ----------
-    text : str
-        Number and unit.
-
-    Raises
-    ------
-    ValueError
-        If it is not a positive number with a unit.
-
+    Raises ValueError if it is not a positive number with a unit.
     """
     found = re.fullmatch(r'\s*(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)\s*(\S+)\s*', text)
     value = float(found[1]) * _UNITS.get(found[2].replace('\u03bc', 'µ'), 0.0) if found else 0.0

@@ -23,14 +23,9 @@ class ResidualStatistics:
     """
     What is said of a set of residuals.
 
-    Parameters
-    ----------
-    n : int
-        How many residuals were finite and counted.
-    mean, rms, peak : float
-        Mean, root of the mean square and largest magnitude, in the residual's unit; NaN when
-        there are none.
-
+    n: how many residuals were finite and counted
+    mean, rms, peak: mean, root of the mean square and largest magnitude, in the residual's unit;
+        NaN when there are none
     """
 
     n: int
@@ -54,17 +49,8 @@ def residual_statistics(residual: Floats) -> ResidualStatistics:
     """
     Summarise residuals; those that are not finite are left out.
 
-    Parameters
-    ----------
-    residual : array_like, shape (n,) or (n, 3)
-        Scalar residuals, or vectors, of which the norm is summarised (the mean is then the
-        length of the mean vector).
-
-    Returns
-    -------
-    ResidualStatistics
-        In the unit of `residual`.
-
+    `residual`: scalar residuals, or vectors, of which the norm is summarised (the mean is then the
+    length of the mean vector), shape (n,).
     """
     values = np.asarray(residual, dtype=np.float64)
     if values.ndim == 2:
@@ -86,18 +72,7 @@ def norm_residual(specific_force: Floats, gravity: float) -> Floats:
     """
     Form ``|f| - g``, the residual that needs no attitude.
 
-    Parameters
-    ----------
-    specific_force : array_like, shape (..., 3)
-        Corrected specific force.
-    gravity : float
-        Local gravity.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Norm residual.
-
+    `specific_force`: corrected specific force, shape (..., 3).
     """
     force = np.asarray(specific_force, dtype=np.float64)
     return np.asarray(np.sqrt(np.einsum('...i,...i->...', force, force)) - gravity)
@@ -107,18 +82,8 @@ def statistics_by_regime(residual: Floats, is_dynamic: Bools) -> dict[str, Resid
     """
     Summarise residuals over the static sections, the dynamic ones and all together.
 
-    Parameters
-    ----------
-    residual : array_like, shape (n,) or (n, 3)
-        Residuals.
-    is_dynamic : array_like of bool, shape (n,)
-        Which of them fall on a dynamic section.
-
-    Returns
-    -------
-    dict
-        Keys ``static``, ``dynamic`` and ``all``.
-
+    `residual`: residuals, shape (n,). `is_dynamic`: which of them fall on a dynamic section, shape
+    (n,).
     """
     values = np.asarray(residual, dtype=np.float64)
     dynamic = np.asarray(is_dynamic, dtype=bool)

@@ -33,12 +33,8 @@ class Posterior:
 
     The order of the parameters is that of `ParameterLayout`.
 
-    Raises
-    ------
-    ValueError
-        If a text is not base64 of float32 numbers, the sizes differ, a number is not finite, or a
-        variance is negative.
-
+    Raises ValueError if a text is not base64 of float32 numbers, the sizes differ, a number is not
+    finite, or a variance is negative.
     """
 
     rank: Annotated[int, Bounds(at_least=0), 'Number of columns of the factor.']
@@ -122,26 +118,7 @@ def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
     """
     Find the smallest factor that holds a covariance matrix.
 
-    Parameters
-    ----------
-    covariance : ndarray
-        Covariance of the parameters, shape (n, n); only its symmetric part counts.
-    tolerance : float, optional
-        The largest share of a parameter's variance that the factor may leave to the diagonal;
-        what single precision cannot resolve is left there in any case. The columns of a response
-        make up for each other, so that what they predict together is known far better than each
-        weight: with a share of 1e-3 the predicted standard deviation grows by up to a half.
-
-    Returns
-    -------
-    Posterior
-        With each parameter's variance as given.
-
-    Raises
-    ------
-    ValueError
-        If `covariance` has a negative variance or is not positive semidefinite.
-
+    Raises ValueError if `covariance` has a negative variance or is not positive semidefinite.
     """
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):

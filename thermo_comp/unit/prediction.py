@@ -28,13 +28,9 @@ class PredictedSd:
     """
     How well bias and scale are known in some states.
 
-    Parameters
-    ----------
-    bias : ndarray, shape (n, 3)
-        Standard deviation of each axis' bias, what the sets leave unexplained included [m/s^2].
-    scale : ndarray, shape (n, 3)
-        Of each axis' relative scale.
-
+    bias: standard deviation of each axis' bias, what the sets leave unexplained included [m/s^2],
+        shape (n, 3)
+    scale: of each axis' relative scale, shape (n, 3)
     """
 
     bias: Floats
@@ -45,20 +41,7 @@ def predicted_sd(calibration: Calibration, temperature: Floats, rate: float) -> 
     """
     Predict the uncertainty in a soak, or in a ramp that has lasted for ever.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit; without a posterior its parameters are taken for known.
-    temperature : ndarray, shape (n,)
-        Board temperatures.
-    rate : float
-        Rate of the board [K/s]; 0 in a soak.
-
-    Returns
-    -------
-    PredictedSd
-        At each temperature.
-
+    `temperature`: board temperatures, shape (n,). `rate`: rate of the board [K/s]; 0 in a soak.
     """
     return sd_of_states(calibration, ramp_states(calibration, temperature, rate, np.inf))
 
@@ -82,20 +65,8 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
     """
     Evaluate bias and scale.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-    states : ndarray, shape (n, width)
-        As `ramp_states` gives them.
-
-    Returns
-    -------
-    bias : ndarray, shape (n, 3)
-        Of each axis [m/s^2].
-    scale : ndarray, shape (n, 3)
-        Of each axis [input units per m/s^2].
-
+    `states`: as `ramp_states` gives them, shape (n, width). Returns of each axis [m/s^2], shape
+    (n, 3). Returns of each axis [input units per m/s^2], shape (n, 3).
     """
     pairs = Correction(calibration).bias_scale([np.ascontiguousarray(c) for c in states.T])
     one = np.ones(len(states))
@@ -111,22 +82,8 @@ def ramp_states(
     """
     Think up the states of a soak or of a ramp.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit: what it remembers, and how far its board lags.
-    temperature : ndarray, shape (n,)
-        Board temperatures.
-    rate : float
-        Rate of the board [K/s]; 0 in a soak.
-    lasted_s : ndarray, shape (n,), or float
-        For how long the ramp has lasted, inf for ever [s].
-
-    Returns
-    -------
-    ndarray, shape (n, width)
-        A sample of `ThermalTracker` each, for the memory of `Correction`.
-
+    `temperature`: board temperatures, shape (n,). `rate`: rate of the board [K/s]; 0 in a soak.
+    `lasted_s`: for how long the ramp has lasted, inf for ever [s], shape (n,).
     """
     gradient = calibration.board_lag_s * rate
     states, layout = _soaked(calibration, temperature)
@@ -145,20 +102,7 @@ def step_states(calibration: Calibration, temperature: float, since_s: Floats) -
     """
     Think up the states after board and case have jumped by 1 K together, out of a soak.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-    temperature : float
-        Board temperature after the step.
-    since_s : ndarray, shape (n,)
-        Time since the step [s]; inf gives the soak that follows.
-
-    Returns
-    -------
-    ndarray, shape (n, width)
-        See `ramp_states`; no play moves, and the static set holds.
-
+    `since_s`: time since the step [s]; inf gives the soak that follows, shape (n,).
     """
     states, layout = _soaked(calibration, np.full(len(since_s), temperature))
     for (name, tau), place in layout.lags.items():

@@ -23,15 +23,9 @@ class Weights:
     """
     The weights of the columns on one axis.
 
-    Parameters
-    ----------
-    response : sequence of ResponseTerm
-        The columns.
-    axis : int
-        0, 1, 2 for x, y, z.
-    factor : callable, optional
-        By what the weights of a term are multiplied; by default by 1.
-
+    response: the columns
+    axis: 0, 1, 2 for x, y, z
+    factor: by what the weights of a term are multiplied; by default by 1
     """
 
     def __init__(
@@ -65,15 +59,9 @@ class Sensitivity:
 
     Plays are taken to follow their input, so they feel nothing.
 
-    Parameters
-    ----------
-    response : sequence of ResponseTerm
-        The columns.
-    axis : int
-        0, 1, 2 for x, y, z.
-    memory : MemorySpec
-        That of the tracker.
-
+    response: the columns
+    axis: 0, 1, 2 for x, y, z
+    memory: that of the tracker
     """
 
     def __init__(self, response: Sequence[ResponseTerm], axis: int, memory: MemorySpec) -> None:
@@ -88,17 +76,7 @@ class Sensitivity:
     def on_board(
         self, on_input: Sequence[Number], on_power: Sequence[Number], nil: Number
     ) -> tuple[Number, Number]:
-        """
-        Differentiate (bias, relative scale) by the board temperature [per K].
-
-        Parameters
-        ----------
-        on_input, on_power : sequence of float or of ndarray
-            As `ColumnTable.slopes` gives them.
-        nil : float or ndarray
-            Zero, of their shape.
-
-        """
+        """Differentiate (bias, relative scale) by the board temperature [per K]."""
         bias, scale = self._on_board.add(nil, nil, on_input)
         return self._on_power.add(bias, scale, on_power)
 

@@ -98,25 +98,7 @@ def build(hint: type[Value], data: Any, key: str = '') -> Value:
     """
     Build what a type hint says from plain values.
 
-    Parameters
-    ----------
-    hint : type
-        Usually a dataclass.
-    data : object
-        Mappings, lists, texts, numbers, as YAML or JSON give them.
-    key : str, optional
-        Path of the value in its file.
-
-    Returns
-    -------
-    object
-        An instance of `hint`.
-
-    Raises
-    ------
-    SchemaError
-        If a key is unknown or missing, or a value is not what the hint says.
-
+    Raises SchemaError if a key is unknown or missing, or a value is not what the hint says.
     """
     result: Value = _build(hint, data, key)
     return result

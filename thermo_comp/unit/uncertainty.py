@@ -25,13 +25,8 @@ class SlowUncertainty:
     """
     What the posterior and the start of the lags leave uncertain.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit.
-    correction : Correction
-        Its correction.
-
+    calibration: the unit
+    correction: its correction
     """
 
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
@@ -61,18 +56,7 @@ class SlowUncertainty:
         """
         Evaluate (a, b, c) of each axis at one state.
 
-        Parameters
-        ----------
-        state : sequence of float
-            As `ThermalTracker.sample` gives it.
-        start_shares : sequence of float
-            What is left of each lag's start, 1 to 0 (`ThermalMemory.start_shares`).
-
-        Returns
-        -------
-        list of (a, b, c)
-            ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
-
+        Returns ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
         """
         table = self._correction.table
         raw = table.raw(state)

@@ -92,21 +92,7 @@ def read_version_1(data: dict[str, Any]) -> Calibration:
     """
     Build a Calibration from the plain values of a file of version 1.
 
-    Parameters
-    ----------
-    data : dict
-        The file's keys and values.
-
-    Returns
-    -------
-    Calibration
-        With the same correction.
-
-    Raises
-    ------
-    SchemaError
-        If a key is unknown or missing, or a value is not acceptable.
-
+    Raises SchemaError if a key is unknown or missing, or a value is not acceptable.
     """
     for key in _NEW_KEYS:
         if key in data:
