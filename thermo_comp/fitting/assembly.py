@@ -46,7 +46,6 @@ _EDGE_MARGIN = 0.02
 # The response of a unit to heat flowing through it is linear: a ramp twice as fast as the
 # chamber's has twice the terms. A curve over temperature has no such law: it ends where the data
 # end.
-_ORDERS = {'square': 2, 'cube': 3}
 _LINEAR_REACH = 2.0
 # Bags without any temperature say nothing of a range: the curve is flat, its prior wide.
 _UNSEEN_RANGE_C = 0.5
@@ -310,7 +309,8 @@ def _triple(values: Floats) -> tuple[float, float, float]:
 def _column_range(column: Column, values: Floats) -> tuple[float, float]:
     if column.kind == 'even':
         return column.range
-    return _widened(values, _LINEAR_REACH ** _ORDERS.get(column.kind, 1), 0.01)
+    reach = _LINEAR_REACH**2 if column.kind == 'square' else _LINEAR_REACH
+    return _widened(values, reach, 0.01)
 
 
 def _widened(values: Floats, reach: float, margin: float) -> tuple[float, float]:

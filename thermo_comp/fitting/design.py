@@ -27,17 +27,6 @@ class _Whitened:
     determinant: float
 
 
-# Start states of neighbouring lags are almost one number; they differ by this part of a variance.
-_APART = 3e-4
-
-
-def _information(covariance: Floats) -> Floats:
-    root = np.sqrt(np.diag(covariance))
-    both = np.outer(root, root)
-    inverse = np.linalg.inv(covariance / both + _APART * np.eye(len(root)))
-    return np.asarray((inverse + inverse.T) / (2.0 * both))
-
-
 class Design:
     """
     The data of a fit as combinations of base columns: one, the columns, and their start states.
@@ -67,7 +56,7 @@ class Design:
         self._rows = [slice(a, b) for a, b in pairwise(edges.tolist())]
         self._bags = windows.bag_of_position
         self.n_bags = int(windows.bag.max()) + 1
-        self._start_information = _information(windows.start_covariance)
+        self._start_information = np.asarray(np.linalg.inv(windows.start_covariance))
         self._cache: list[_Whitened | None] = [None] * 3
 
     def reweight(self, weight: Floats) -> None:

@@ -13,7 +13,7 @@ from .unknowns import Layout
 # Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
 JITTER = 1e-13
 # Start states of neighbouring lags are told apart to fewer digits.
-_LOCAL_JITTER = 1e-10
+_START_JITTER = 1e-10
 
 
 class Factor:
@@ -28,10 +28,10 @@ class Factor:
         unit = scaled[:n, :n].copy()
         self.log_determinant = 2.0 * float(np.log(root).sum())
         self._locals = []
+        jitter = np.full(len(hessian), JITTER)
+        jitter[layout.start] = _START_JITTER
         for block in layout.blocks:
-            factor = cho_factor(
-                scaled[block, block] + _LOCAL_JITTER * np.eye(block.stop - block.start)
-            )
+            factor = cho_factor(scaled[block, block] + np.diag(jitter[block]))
             cross = cho_solve(factor, scaled[block, :n])
             unit -= scaled[:n, block] @ cross
             self._locals.append((factor, cross))

@@ -137,7 +137,7 @@ def thermal_windows(
     lag = [-1] * len(groups)
     lag += [
         spec.lags.index(column.lag)
-        if column.lag and column.kind in ('board', 'neighbour', 'square', 'cube')
+        if column.lag and column.kind in ('board', 'neighbour', 'square')
         else -1
         for column in columns
     ]
@@ -224,8 +224,6 @@ def _moved(
         share = shares[:, spec.lags.index(column.lag)]
         if column.kind == 'square':
             share = 2.0 * by_lag[column.lag] * share
-        elif column.kind == 'cube':
-            share = 3.0 * by_lag[column.lag] ** 2 * share
         result[:, k] = share * t**column.power
     return result
 

@@ -21,6 +21,8 @@ from ..typing import Floats
 
 #: The input of a lag or play that is the board's own temperature.
 BOARD_INPUT: Final = 'board'
+#: Neighbouring lags are almost one number: to this part of a variance they are not.
+START_APART: Final = 3e-4
 #: What nobody knows at the start: sd of lags of `START_TAU_S`, the board's and a gradient's [K].
 START_TAU_S: Final = 3600.0
 BOARD_START_SD: Final = 3.0
@@ -94,6 +96,7 @@ def start_covariance(lags: Sequence[tuple[str, float]]) -> Floats:
     with np.errstate(invalid='ignore'):
         shape = tau[:, np.newaxis] * tau / (tau[:, np.newaxis] + tau)
     is_same = names[:, np.newaxis] == names
+    shape[np.diag_indices_from(shape)] *= 1.0 + START_APART
     result: Floats = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
     return result
 

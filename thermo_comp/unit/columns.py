@@ -15,7 +15,6 @@ board      T_board - L_tau(T_board)    parts that lag the board
 neighbour  L_tau(g_s)                  parts between the thermometers
 square     (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a flow
            g_s^2 where tau is 0
-cube       (T_board - L_tau)^3         the same curves, where they bend more
 even       tanh((g_s / width)^2)       heat load whichever way the heat flows
 size       abs(g_s)                    the same, as a heat pump's
 play       P_r(v) - v, v = t or        rate-independent hysteresis
@@ -70,14 +69,14 @@ class Column:
         'What evidence judges together.',
     ]
     kind: Annotated[
-        Literal['now', 'rate', 'board', 'neighbour', 'square', 'cube', 'size', 'even', 'play'],
+        Literal['now', 'rate', 'board', 'neighbour', 'square', 'size', 'even', 'play'],
         'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without '
-        'lag; (T - lagged T)^3; abs(g_s); tanh((g_s / width)^2); play of t minus t, where '
+        'lag; abs(g_s); tanh((g_s / width)^2); play of t minus t, where '
         'g_s = T_s - T_board.',
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
     tau_s: Annotated[
-        NotNegative, 'Time constant of the lag (board, neighbour, square, cube; play: 0 = none).'
+        NotNegative, 'Time constant of the lag (board, neighbour, square; play: 0 = none).'
     ] = 0.0
     width_k: Annotated[NotNegative, 'Width of even, half-width of play.'] = 0.0
     power: Annotated[int, Bounds(at_least=0), 'The value is multiplied by t to this power.'] = 0
@@ -96,10 +95,7 @@ class Column:
             raise ValueError(
                 f'`range` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
             )
-        for key, kinds in (
-            ('tau_s', ('board', 'neighbour', 'cube')),
-            ('width_k', ('even', 'play')),
-        ):
+        for key, kinds in (('tau_s', ('board', 'neighbour')), ('width_k', ('even', 'play'))):
             if self.kind in kinds and not getattr(self, key) > 0.0:
                 raise ValueError(
                     f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
@@ -129,17 +125,10 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
     ]
     coarse = [column for column in board if column.tau_s in BANK_TAUS]
     flow = [*now, *(column for column in neighbour if column.tau_s in BANK_TAUS)]
-    product = [
-        replace(column, group='product', power=power) for power in (1, 2) for column in coarse
-    ]
+    product = [replace(column, group='product', power=1) for column in coarse]
     mixed = [replace(column, group='mixed', power=1) for column in flow]
     # A part's own curve bends over its own temperature t - m: (t - m)^2 = t^2 - 2 t m + m^2.
-    squared = [replace(column, group='square', kind='square') for column in coarse]
-    square = [
-        *squared,
-        *(replace(column, power=1) for column in squared),
-        *(replace(column, kind='cube') for column in squared),
-    ]
+    square = [replace(column, group='square', kind='square') for column in coarse]
     even = [
         Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
         for sensor in sensors
@@ -227,7 +216,7 @@ class ColumnTable:
         self._plan: list[tuple[int, float, float, int, str]] = []
         for column in columns:
             width = column.width_k if column.kind == 'even' else 0.0
-            bend = column.kind if column.kind in ('even', 'size', 'square', 'cube') else ''
+            bend = column.kind if column.kind in ('even', 'size', 'square') else ''
             key = (bend, _place(column, layout), width)
             source = sources.setdefault(key, len(sources))
             self._plan.append((source, *column.range, column.power, column.during))
@@ -291,8 +280,6 @@ class ColumnTable:
                 slope = 2.0 / (width * width) * state[place] * (1.0 - u * u)
             elif bend == 'square':
                 slope = 2.0 * state[place]
-            elif bend == 'cube':
-                slope = 3.0 * state[place] * state[place]
             elif bend == 'size':
                 slope = _sign(state[place])
             inner.append(slope)
@@ -335,8 +322,6 @@ def _value(bend: str, u: Number, width: float) -> Number:
         return u
     if bend == 'square':
         return u * u
-    if bend == 'cube':
-        return u * u * u
     if bend == 'size':
         return abs(u)
     x = u / width

@@ -90,7 +90,7 @@ class Sensitivity:
 
 
 def _sign(term: ResponseTerm) -> float:
-    if term.kind in ('board', 'cube') or (term.kind == 'square' and term.tau_s):
+    if term.kind == 'board' or (term.kind == 'square' and term.tau_s):
         return 1.0
     return -1.0 if term.is_of_gradient else 0.0
 
