@@ -49,34 +49,15 @@ _LEAST_FILLED = 0.9
 @dataclass(frozen=True)
 class Windows:
     """
-    Windows at rest, of all bags, in order.
+    Windows at rest, of all bags, in order; arrays of n rows.
 
-    Parameters
-    ----------
-    window_s, gravity : float
-        Length of each [s], and local gravity where they were recorded.
-    bag, position : ndarray of int64, shape (n,)
-        Number of the bag, and of the still interval, counted through all bags.
-    start_ns : ndarray of int64, shape (n,)
-        Stamp at which the window begins.
-    time : ndarray, shape (n,)
-        Its middle since the bag's first sample [s].
-    count : ndarray, shape (n,)
-        Samples in it.
-    mean : ndarray, shape (n, 3)
-        Mean of the raw samples.
-    board, rate : ndarray, shape (n,)
-        Board temperature and its rate [K/s].
-    is_dynamic, is_inside : ndarray of bool, shape (n,)
-        Whether the dynamic set prevails; whether all of it lies inside the calibrated ranges.
-    raw, force : ndarray, shape (n, 3)
-        Specific force by the constants at the reference temperature, and by the calibration.
-    claimed_sd : ndarray, shape (n,)
-        Standard deviation claimed for the norm of `force`: the calibration's error and the white
-        noise of the mean.
-    noise_sd : ndarray, shape (n,)
-        The white noise alone.
-
+    Each is `window_s` long, and begins at `start_ns`; `time` is its middle since the bag's first
+    sample [s], `count` and `mean` are of its raw samples. A position is a still interval, counted
+    through all bags. The rate is the board's [K/s]. Dynamic are those in which the dynamic set
+    prevails, inside those that lie inside the calibrated ranges as a whole. `raw` is the specific
+    force by the constants at the reference temperature, `force` that by the calibration, shapes
+    (n, 3); `claimed_sd` is claimed for the norm of `force`: the calibration's error and the white
+    noise of the mean, which is `noise_sd` alone.
     """
 
     window_s: float

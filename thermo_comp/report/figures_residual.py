@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from ..typing import Bools, Floats
 from ..unit.gravity import MICRO_G
 from .evidence import RAW, Evidence
-from .figures_thermal import shade_dynamic, shown_bag
+from .figures_thermal import plot_windows, shade_dynamic, shown_bag, time_axis
 from .style import (
     AXIS_LINES,
     DYNAMIC_LINE,
@@ -20,12 +20,10 @@ from .style import (
     STATIC_LINE,
     Line,
     Sheet,
-    broken,
     few_ticks,
     legend_above,
     log_axis,
     new_figure,
-    plot_thinned,
     time_unit,
 )
 from .text import number
@@ -34,7 +32,7 @@ from .text import number
 def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw the residual of each axis, without and with the calibration (the paper's Fig. 6)."""
     shown, facts = shown_bag(evidence)
-    unit, name = time_unit(facts.duration_s)
+    unit, _ = time_unit(facts.duration_s)
     windows = evidence.windows
     residuals = evidence.axis_residuals()
     if windows is None or not residuals:
@@ -47,10 +45,8 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
     for axes, (rung, residual) in zip(panels, residuals.items(), strict=True):
         shade_dynamic(axes, shown, unit)
         for i, axis in enumerate('xyz'):
-            time, value = broken(
-                windows.time[rows], residual[rows, i] / MICRO_G, windows.position[rows]
-            )
-            plot_thinned(axes, time / unit, value, sheet, label=axis, **AXIS_LINES[i])
+            value = residual[:, i] / MICRO_G
+            plot_windows(axes, windows, rows, value, unit, sheet, label=axis, **AXIS_LINES[i])
         axes.set_ylabel('µg')
         axes.axhline(0.0, color='black', linewidth=0.5)
         few_ticks(axes, 5)
@@ -62,8 +58,7 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
             legend_above(axes, sheet, title=title, alignment='left')
         else:
             axes.set_title(title)
-    panels[-1].set_xlabel(name)
-    panels[-1].set_xlim(0.0, facts.duration_s / unit)
+    time_axis(panels[-1], facts)
     figure.align_ylabels(panels)
     return figure
 
@@ -71,7 +66,7 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
 def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw |g| over time, before and after, and after in detail (the paper's Fig. 7)."""
     shown, facts = shown_bag(evidence)
-    unit, name = time_unit(facts.duration_s)
+    unit, _ = time_unit(facts.duration_s)
     windows = evidence.windows
     residuals = evidence.residuals
     if windows is None or evidence.gravity is None or not residuals:
@@ -85,10 +80,8 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
     for axes, drawn in zip(panels, sets, strict=True):
         shade_dynamic(axes, shown, unit)
         for rung in drawn:
-            time, value = broken(
-                windows.time[rows], residuals[rung][rows] / MICRO_G, windows.position[rows]
-            )
-            plot_thinned(axes, time / unit, value, sheet, label=rung, **RUNG_LINES[rung])
+            value = residuals[rung] / MICRO_G
+            plot_windows(axes, windows, rows, value, unit, sheet, label=rung, **RUNG_LINES[rung])
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_ylabel('|g| − g, µg')
         _absolute_scale(axes, evidence.gravity)
@@ -96,8 +89,7 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
     if corrected:
         limit = _shared_limit([residuals[rung][rows][:, None] for rung in corrected])
         panels[-1].set_ylim(-limit, limit)
-    panels[-1].set_xlabel(name)
-    panels[-1].set_xlim(0.0, facts.duration_s / unit)
+    time_axis(panels[-1], facts)
     return figure
 
 

@@ -4,12 +4,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..judging import Windows
 from ..thermal.regime import Regime
-from ..typing import Floats
+from ..typing import Bools, Floats
 from ..unit.gravity import MICRO_G
 from .evidence import BagFacts, Evidence, ShownBag
 from .style import (
@@ -52,10 +55,31 @@ def shade_dynamic(axes: Axes, shown: ShownBag, unit: float) -> None:
         axes.axvspan(start / unit, stop / unit, color=_SHADE, lw=0, zorder=0)
 
 
+def plot_windows(
+    axes: Axes,
+    windows: Windows,
+    rows: Bools,
+    value: Floats,
+    unit: float,
+    sheet: Sheet,
+    **line: Any,
+) -> None:
+    """Draw a value of some windows over time, with a gap between positions."""
+    time, value = broken(windows.time[rows], value[rows], windows.position[rows])
+    plot_thinned(axes, time / unit, value, sheet, **line)
+
+
+def time_axis(axes: Axes, facts: BagFacts) -> None:
+    """Make the x axis that of a bag's time."""
+    unit, name = time_unit(facts.duration_s)
+    axes.set_xlabel(name)
+    axes.set_xlim(0.0, facts.duration_s / unit)
+
+
 def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw the readings of both sensors and the chamber's program (the paper's Fig. 3)."""
     shown, facts = shown_bag(evidence)
-    unit, name = time_unit(facts.duration_s)
+    unit, _ = time_unit(facts.duration_s)
     figure = new_figure(sheet, 3.2 if sheet.is_narrow else 2.5)
     axes = figure.subplots()
     shade_dynamic(axes, shown, unit)
@@ -70,8 +94,7 @@ def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
         if len(readings.value):
             seconds: Floats = np.asarray((readings.stamp_ns - shown.start_ns) * 1e-9, np.float64)
             plot_thinned(axes, seconds / unit, readings.value, sheet, label=label, **line)
-    axes.set_xlim(0.0, facts.duration_s / unit)
-    axes.set_xlabel(name)
+    time_axis(axes, facts)
     axes.set_ylabel('temperature, °C')
     legend_above(axes, sheet)
     return figure
@@ -82,7 +105,7 @@ def draw_dynamics(evidence: Evidence, sheet: Sheet) -> Figure:
     Draw the drift of the readings, the temperatures' derivatives and the flag (Fig. 4 a, b, c).
     """
     shown, facts = shown_bag(evidence)
-    unit, name = time_unit(facts.duration_s)
+    unit, _ = time_unit(facts.duration_s)
     has_drift = evidence.windows is not None and bool(np.any(evidence.windows.bag == shown.index))
     ratios = ([1.5] if has_drift else []) + [1.3, 1.0, 0.75]
     figure = new_figure(sheet, (1.5 if sheet.is_narrow else 1.15) * sum(ratios))
@@ -109,8 +132,7 @@ def draw_dynamics(evidence: Evidence, sheet: Sheet) -> Figure:
     bend.set_title(f'     second derivative of T {sensor}')
     few_ticks(bend, 4)
     _draw_flag(flag, shown, unit)
-    flag.set_xlabel(name)
-    flag.set_xlim(0.0, facts.duration_s / unit)
+    time_axis(flag, facts)
     figure.align_ylabels(panels[:-1])
     return figure
 
@@ -124,8 +146,7 @@ def _draw_drift(
         return
     rows = windows.bag == shown.index
     for i, axis in enumerate('xyz'):
-        time, value = broken(windows.time[rows], drift[rows, i], windows.position[rows])
-        plot_thinned(axes, time / unit, value, sheet, label=axis, **AXIS_LINES[i])
+        plot_windows(axes, windows, rows, drift[:, i], unit, sheet, label=axis, **AXIS_LINES[i])
     axes.set_ylabel(unit_name)
     legend_above(axes, sheet, title='a  drift of the readings since the start', alignment='left')
 
