@@ -37,7 +37,7 @@ from .evidence import ResidualRow
 from .learning import Learnt
 from .posterior import Regression
 from .reduction import ReducedBag
-from .unknowns import Layout, State, inverse_misalignment
+from .unknowns import Layout, State
 from .verdict import Finding
 from .windows import Sets, ThermalWindows
 
@@ -125,7 +125,7 @@ def build_calibration(
         )
         for name, is_dynamic in (('static', False), ('dynamic', True))
     }
-    matrix = np.linalg.inv(inverse_misalignment(state.skew))
+    matrix = np.linalg.inv(state.inverse)
     K = state.kappa * nominal
     to_file = file_parameters(regression, learnt.posterior.layout, state, sets, nominal, used)
     covariance = to_file @ learnt.posterior.covariance @ to_file.T

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..typing import Floats, Ints
-from .unknowns import Layout, Prior, State, Windows, inverse_misalignment, tangent_basis
+from .unknowns import Layout, Prior, State, Windows
 from .whitening import Whitener
 
 
@@ -186,7 +186,7 @@ class Design:
 
     def _moved(self, state: State, step: Floats, layout: Layout) -> State:
         padded = np.append(step, 0.0)
-        up = state.up + np.einsum('pij,pj->pi', tangent_basis(state.up), padded[layout.up])
+        up = state.up + np.einsum('pij,pj->pi', state.tangents, padded[layout.up])
         start = state.start
         if layout.start.size:
             start = start + padded[layout.start]
@@ -217,7 +217,7 @@ class Design:
 
     def residual(self, state: State) -> Floats:
         """Measured minus predicted, shape (n, 3) [m/s^2]."""
-        force = self.gravity * state.up @ inverse_misalignment(state.skew).T
+        force = self.gravity * state.up @ state.inverse.T
         result = np.empty_like(self.measured)
         for p, rows in enumerate(self._rows):
             for axis in range(3):
@@ -231,4 +231,4 @@ class Design:
         """
         along = self.measured - state.bias - self._columns @ state.on_bias.T
         along /= state.kappa * (1.0 + self._columns @ state.on_scale.T)
-        return np.asarray(along @ np.linalg.inv(inverse_misalignment(state.skew)).T)
+        return np.asarray(along @ np.linalg.inv(state.inverse).T)

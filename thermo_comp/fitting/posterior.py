@@ -28,7 +28,7 @@ from scipy.linalg import cho_factor, cho_solve
 from ..typing import Floats, Ints
 from .design import Design
 from .factor import JITTER, Factor
-from .unknowns import Layout, Prior, State, inverse_misalignment, tangent_basis
+from .unknowns import Layout, Prior, State
 
 # Of what is known of a direction, the least that is left without one position.
 _LEAST_LEFT = 1e-5
@@ -115,7 +115,7 @@ class Regression(Design):
         n_columns = len(self.windows.groups)
         moved, lag = self.moved, self.windows.lag
         found = self._whitened(axis, float(prior.rho[axis]))
-        A = inverse_misalignment(state.skew)
+        A = state.inverse
         a = self.gravity * float(A[axis] @ state.up[p])
         kappa = float(state.kappa[axis])
         used_b = np.flatnonzero(layout.on_bias[0] >= 0)
@@ -147,7 +147,7 @@ class Regression(Design):
         for k, (row, source) in enumerate(_SKEW_ROWS):
             if row == axis:
                 T[:, width + k] = state.up[p, source] * turned
-        T[:, width + 3 : width + 5] = np.outer(turned, A[axis] @ tangent_basis(state.up[[p]])[0])
+        T[:, width + 3 : width + 5] = np.outer(turned, A[axis] @ state.tangents[p])
         T[0, width + 5] = 1.0
         rows, variance = self._rows[p], float(prior.sigma[axis]) ** 2
         G = T.T @ (found.grams[p] @ T) / variance

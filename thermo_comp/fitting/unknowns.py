@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -107,6 +108,16 @@ class State:
     up: Floats
     offset: Floats
     start: Floats
+
+    @cached_property
+    def inverse(self) -> Floats:
+        """Return the inverse of M."""
+        return inverse_misalignment(self.skew)
+
+    @cached_property
+    def tangents(self) -> Floats:
+        """Return two unit vectors across each attitude, shape (n, 3, 2)."""
+        return tangent_basis(self.up)
 
 
 @dataclass(frozen=True)
