@@ -32,7 +32,7 @@ Column = str | int
 _CHUNK_ROWS = 65536
 _SNIFF_BYTES = 65536
 #: What packs numbers more tightly holds no measurement.
-_MOST_ROWS_PER_BYTE = 1000
+_MOST_ROWS_PER_BYTE = 4
 _STAMP_UNITS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 
