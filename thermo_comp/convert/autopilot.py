@@ -59,11 +59,8 @@ def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = No
     """
     Take one IMU and one barometer out of an autopilot's log; None takes the lowest instance.
 
-    Raises
-    ------
-    RecordingError
-        If the instance is not there, or the readings have no noise: a simulator's.
-
+    Raises RecordingError if the instance is not there, or the readings have no noise: a
+    simulator's.
     """
     rows = _choose(log.imus, imu, 'IMU', log.path)
     _refuse_noiseless(log.path, rows)

@@ -44,11 +44,8 @@ def bag_log(
 
     Topics that are None are found by type and neighbourhood; `unit` is what the driver publishes.
 
-    Raises
-    ------
-    RecordingError
-        If the bag cannot be read, a topic is not there, or there are several to choose from.
-
+    Raises RecordingError if the bag cannot be read, a topic is not there, or there are several to
+    choose from.
     """
     path = Path(path)
     found = find_topics(path, inspect_recording(path).topics, imu, board, case)
@@ -88,12 +85,8 @@ def find_topics(
     Tell ``imu``, ``board`` and ``case`` among a bag's topics; None where there is no such
     thermometer.
 
-    Raises
-    ------
-    RecordingError
-        If there is no Imu topic, or several and none was chosen; or more thermometers than
-        neighbourhood can tell apart.
-
+    Raises RecordingError if there is no Imu topic, or several and none was chosen; or more
+    thermometers than neighbourhood can tell apart.
     """
     imu = imu or _only(path, _of_type(present, _IMU), 'Imu', '--imu-topic')
     thermometers = [name for name in _of_type(present, _TEMPERATURE) if name not in (board, case)]

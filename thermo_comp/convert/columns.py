@@ -158,16 +158,8 @@ def load_column_map(path: str | Path) -> ColumnMap:
     """
     Read and validate a column map.
 
-    Parameters
-    ----------
-    path : str or Path
-        The YAML file.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, or a key is unknown, missing or wrong; names the key.
-
+    Raises RecordingError if the file cannot be read, or a key is unknown, missing or wrong; names
+    the key.
     """
     try:
         data = load_plain_yaml(read_bounded(path, _SIZE_LIMIT).decode())
@@ -189,11 +181,7 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
     """
     Read all rows of a table as its column map says, with the temperatures thinned.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read or lacks a column.
-
+    Raises RecordingError if the file cannot be read or lacks a column.
     """
     path = Path(path)
     wanted, stamp = _wanted(columns), columns.stamp

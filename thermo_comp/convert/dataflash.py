@@ -52,12 +52,8 @@ def dataflash_log(
     IMUs are counted from 0: the old type ``IMU2`` is 1. `allow_compensated` takes a log whose
     thermal drift ArduPilot has already corrected.
 
-    Raises
-    ------
-    RecordingError
-        If pymavlink is not installed, the file is no DataFlash log, it holds no such instance, its
-        drift is already corrected, or its accelerometer has no noise.
-
+    Raises RecordingError if pymavlink is not installed, the file is no DataFlash log, it holds no
+    such instance, its drift is already corrected, or its accelerometer has no noise.
     """
     log, parameters = read_dataflash(path)
     number = min(log.imus, default=0) if imu is None else imu

@@ -69,11 +69,7 @@ def export_px4(
     `instance` is the ``n`` of ``TC_An``, `device_id` the sensor's id, by which PX4 matches the
     set. At the attitude `up`, a unit vector, the drift of the scale is folded into the offset.
 
-    Raises
-    ------
-    ValueError
-        If `instance` is not 0..3 or `up` is not a unit vector.
-
+    Raises ValueError if `instance` is not 0..3 or `up` is not a unit vector.
     """
     if not 0 <= instance <= 3:
         raise ValueError(f'`instance` must be 0..3, got {instance}')
@@ -101,11 +97,7 @@ def export_ardupilot(
     """
     Write a calibration's static set as ArduPilot parameters; `imu` is the ``n`` of ``INS_TCALn``.
 
-    Raises
-    ------
-    ValueError
-        If `imu` is not 1..3 or `up` is not a unit vector.
-
+    Raises ValueError if `imu` is not 1..3 or `up` is not a unit vector.
     """
     if not 1 <= imu <= 3:
         raise ValueError(f'`imu` must be 1..3, got {imu}')
@@ -143,12 +135,8 @@ def import_parameters(
     an instance (PX4, from 0) or IMU (ArduPilot, from 1); None takes the only one there is. The
     result has scale 1, no misalignment and the same set in both regimes.
 
-    Raises
-    ------
-    CalibrationError
-        If the text holds no thermal parameters, several sets and none was chosen, an incomplete or
-        disabled one, or an empty temperature range.
-
+    Raises CalibrationError if the text holds no thermal parameters, several sets and none was
+    chosen, an incomplete or disabled one, or an empty temperature range.
     """
     values = _parse(text)
     px4 = sorted({int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)})

@@ -48,29 +48,16 @@ class ForeignLog:
     """
     What a log of any format holds, in file order.
 
-    Parameters
-    ----------
-    path : str
-        The log.
-    input, unit : str
-        What the accelerometer's messages become, and the unit that the log states.
-    factor : float
-        From that unit to the message's.
-    stamp_ns : ndarray of int64, shape (n,)
-        Stamps of the rows; `NO_STAMP` of `table` where there is none.
-    accel : ndarray, shape (n, 3)
-        Readings in the stated unit; NaN where a cell is no number.
-    gyro : ndarray, shape (n, 3), or None
-        Angular rate [rad/s].
-    line : ndarray of int64, shape (n,)
-        Where each row stands in the file.
-    counts_per_g, clip : optional
-        The stated sensitivity; readings at and beyond which the sensor saturates.
-    n_short : int
-        Rows that were left out because they are too short.
-    missing : str or None
-        What of the log could not be read.
-
+    path: the log
+    input, unit: what the accelerometer's messages become, and the unit that the log states
+    factor: from that unit to the message's
+    stamp_ns: stamps of the rows; `NO_STAMP` of `table` where there is none, shape (n,)
+    accel: readings in the stated unit; NaN where a cell is no number, shape (n, 3)
+    gyro: angular rate [rad/s], shape (n, 3)
+    line: where each row stands in the file, shape (n,)
+    counts_per_g, clip: the stated sensitivity; readings at and beyond which the sensor saturates
+    n_short: rows that were left out because they are too short
+    missing: what of the log could not be read
     """
 
     path: str
@@ -168,13 +155,8 @@ def write_log(
     """
     Check a log and write it as a bag: ``*.mcap`` makes a bare file, else a rosbag2 directory.
 
-    Raises
-    ------
-    RecordingError
-        If no row is usable, a stated unit contradicts the readings, or the serial is none.
-    OutputError
-        If the bag may not or cannot be written.
-
+    Raises RecordingError if no row is usable, a stated unit contradicts the readings, or the
+    serial is none. Raises OutputError if the bag may not or cannot be written.
     """
     if log.serial:
         try:

@@ -41,17 +41,10 @@ class Table:
     """
     Columns of one table, in file order.
 
-    Parameters
-    ----------
-    line : ndarray of int64, shape (n,)
-        Line of each row in the file, counted from 1 (the row number for Parquet).
-    values : dict of {str or int: ndarray, shape (n,)}
-        The columns asked for; NaN where a cell is no number.
-    stamp_ns : ndarray of int64, shape (n,), or None
-        The stamp column; `NO_STAMP` where a cell is no number.
-    n_short : int
-        Rows with too few cells (the last line of a log that was cut off), left out.
-
+    line: line of each row in the file, counted from 1 (the row number for Parquet), shape (n,)
+    values: the columns asked for; NaN where a cell is no number, shape (n,)
+    stamp_ns: the stamp column; `NO_STAMP` where a cell is no number, shape (n,)
+    n_short: rows with too few cells (the last line of a log that was cut off), left out
     """
 
     path: str
@@ -79,11 +72,7 @@ def read_text(
     blank for any run of white space, and whether there are headings are found out where they are
     not said.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, is empty, or lacks a column.
-
+    Raises RecordingError if the file cannot be read, is empty, or lacks a column.
     """
     try:
         with TextIOWrapper(
@@ -196,11 +185,7 @@ def place(path: Path, name: Column, headings: Sequence[str], width: int) -> int:
     """
     Return the number of a column, counted from 0.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such column, or more than one.
-
+    Raises RecordingError if there is no such column, or more than one.
     """
     if isinstance(name, int):
         if not 0 <= name < width:
@@ -270,11 +255,8 @@ def read_parquet(
 
     A stamp column of Parquet's own timestamp type states its unit itself.
 
-    Raises
-    ------
-    RecordingError
-        If pyarrow is not installed, the file is no Parquet file, is empty, or lacks a column.
-
+    Raises RecordingError if pyarrow is not installed, the file is no Parquet file, is empty, or
+    lacks a column.
     """
     try:
         from pyarrow import parquet as pq

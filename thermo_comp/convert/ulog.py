@@ -37,12 +37,8 @@ def ulog_log(path: str | Path, imu: int | None = None, baro: int | None = None) 
     """
     Read one IMU and one barometer of a PX4 log; None takes the lowest instance.
 
-    Raises
-    ------
-    RecordingError
-        If pyulog is not installed, the file is no ULog, it holds no such instance, or its
-        accelerometer has no noise.
-
+    Raises RecordingError if pyulog is not installed, the file is no ULog, it holds no such
+    instance, or its accelerometer has no noise.
     """
     return foreign_log(read_ulog(path), imu, baro)
 

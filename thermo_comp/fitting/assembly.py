@@ -97,7 +97,7 @@ def build_calibration(
 
     `nominal`: K0 [input units per m/s^2], shape (3,).
     """
-    state, prior = learnt.posterior.state, learnt.prior
+    state, prior, layout = learnt.posterior.state, learnt.prior, learnt.claim.layout
     weights = _Weights(
         state.on_bias / regression.rms * nominal[:, None], state.on_scale / regression.rms
     )
@@ -105,7 +105,7 @@ def build_calibration(
     used = [
         k
         for k in range(len(columns))
-        if prior.on_bias[n_sets + k] > 0.0 or prior.on_scale[n_sets + k] > 0.0
+        if layout.on_bias[0, n_sets + k] >= 0 or layout.on_scale[0, n_sets + k] >= 0
     ]
     terms = tuple(
         ResponseTerm(
@@ -127,8 +127,8 @@ def build_calibration(
     }
     matrix = np.linalg.inv(state.inverse)
     K = state.kappa * nominal
-    to_file = file_parameters(regression, learnt.posterior.layout, state, sets, nominal, used)
-    covariance = to_file @ learnt.posterior.covariance @ to_file.T
+    to_file = file_parameters(regression, layout, state, sets, nominal, used)
+    covariance = to_file @ learnt.claim.covariance @ to_file.T
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     walk = prior.sigma * np.sqrt(prior.rho * 3600.0)
     return Calibration(

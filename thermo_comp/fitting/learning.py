@@ -44,7 +44,7 @@ _EARNED = 0.5
 # No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
 _LEAST_SIGMA = 1e-8
 # Of the noise of a window, what a column may add unseen before it counts.
-_OPEN = 0.3
+_OPEN = 4.0
 # Windows more sds off than this lose weight.
 _FAR_SDS, _FARTHEST_SDS = 3.0, 1e3
 # ... as seen against the median of so many windows on both sides.
@@ -53,11 +53,16 @@ _NEIGHBOURS = 3
 
 @dataclass(frozen=True)
 class Learnt:
-    """A posterior under the prior that the data chose."""
+    """
+    A posterior under the prior that the data chose.
+
+    claim: the same mode with the covariance to claim, which leaves open what nobody has seen
+    """
 
     posterior: Posterior
     prior: Prior
     worth: tuple[GroupWorth, ...]
+    claim: Posterior
 
 
 def learn(
@@ -111,11 +116,12 @@ def learn(
     if walks:
         prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
+    claim = posterior
     if prior.known is None and not kept.all():
-        prior = _left_open(regression, posterior, prior, allowed)
-        posterior = regression.solve(posterior.state, prior)
+        wider = _left_open(regression, posterior, prior, allowed)
+        claim = regression.solve(posterior.state, wider, n_steps=1)
     tell(1.0)
-    return Learnt(posterior, prior, group_worth(regression, posterior, prior))
+    return Learnt(posterior, prior, group_worth(regression, posterior, prior), claim)
 
 
 def _idle(posterior: Posterior, prior: Prior, part: str, kept: Bools) -> list[int]:
@@ -132,11 +138,11 @@ def _left_open(
     regression: Regression, posterior: Posterior, prior: Prior, allowed: Prior
 ) -> Prior:
     """
-    Take columns back that the data could not have seen, lest they be claimed to be 0.
+    Let the claim keep open what the data could not have seen, lest it be claimed to be 0.
 
     A column that left was not needed; whether it is 0 the data tell to ``1 / sqrt(S)``, S what
-    they say of it beside the columns that stayed. Where that is more than the noise of a window
-    it comes back, with this width.
+    they say of it beside the columns that stayed. Where that is more than some sds of a window's
+    noise the covariance has it back, with this width; its weight stays 0, the likeliest.
     """
     told = regression.told_of_absent(posterior.state, prior, allowed)
     widths = {}

@@ -35,11 +35,7 @@ def require_libraries() -> None:
     """
     Say at once what is missing.
 
-    Raises
-    ------
-    FleetError
-        If a library of the extra `fleet` is not installed.
-
+    Raises FleetError if a library of the extra `fleet` is not installed.
     """
     try:
         import distributed
@@ -57,21 +53,10 @@ def connected(
     """
     Give a client of a cluster with at least one worker.
 
-    Parameters
-    ----------
-    scheduler : str or None, optional
-        Address of a running one, e.g. ``tcp://host:8786``; None makes one on this machine, and
-        ends it at the end.
-    n_workers : int or None, optional
-        Processes of the own cluster; None takes one per processor.
-    most : int, optional
-        What there is to do at a time: more processes than that are not started.
-
-    Raises
-    ------
-    FleetError
-        If nobody answers, there is no worker, or they run another version.
-
+    `scheduler`: address of a running one, e.g. ``tcp://host:8786``; None makes one on this
+    machine, and ends it at the end. `n_workers`: processes of the own cluster; None takes one per
+    processor. Raises FleetError if nobody answers, there is no worker, or they run another
+    version.
     """
     import dask
     from distributed import Client, LocalCluster

@@ -51,11 +51,7 @@ def find_units(storage: Storage) -> list[FoundUnit]:
     """
     Find the units of a fleet, in the order of their names.
 
-    Raises
-    ------
-    FleetError
-        If the folder cannot be listed, or holds no bag.
-
+    Raises FleetError if the folder cannot be listed, or holds no bag.
     """
     bags = group_files(storage.files())
     if not bags:

@@ -32,11 +32,7 @@ class Results:
     """
     The folder of a fleet's results; made if it is not there.
 
-    Raises
-    ------
-    FleetError
-        If it cannot be made.
-
+    Raises FleetError if it cannot be made.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -88,11 +84,7 @@ class Results:
         An outcome without a calibration, or from a file system that failed, takes no earlier
         calibration away.
 
-        Raises
-        ------
-        OutputError
-            If it cannot be written.
-
+        Raises OutputError if it cannot be written.
         """
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row

@@ -33,21 +33,12 @@ class FleetResult:
     """
     A fleet, done.
 
-    Parameters
-    ----------
-    rows : tuple of mapping
-        The fleet table, in the order of names.
-    summary : Summary
-        What it tells.
-    n_done : int
-        Fits of this run; the others were there.
-    parquet, csv, page : Path
-        The files.
-    prior : Path or None
-        What the units that hold have in common; None where that cannot be said.
-    no_prior : str
-        Why not.
-
+    rows: the fleet table, in the order of names
+    summary: what it tells
+    n_done: fits of this run; the others were there
+    parquet, csv, page: the files
+    prior: what the units that hold have in common; None where that cannot be said
+    no_prior: why not
     """
 
     rows: tuple[Row, ...]
@@ -87,33 +78,8 @@ def fit_fleet(
     """
     Fit all units of a fleet whose results are not there yet.
 
-    Parameters
-    ----------
-    url : str
-        Folder of the fleet, on any file system that fsspec knows.
-    output : str or Path
-        Folder of the results on this machine.
-    options : FleetOptions
-        What the user said.
-    with_prior : bool, optional
-        Fit the units whose bags do not tell all of them again, with what the others have in
-        common.
-    scheduler, n_workers : optional
-        As for `cluster.connected`.
-    client : distributed.Client or None, optional
-        A client that is there already, instead of the two.
-    earlier : sequence of mapping, optional
-        Rows of earlier fleet tables, for the drift.
-    tell : callable or None, optional
-        Told, after each fit: units done, units in all, its row.
-
-    Raises
-    ------
-    FleetError
-        If a library is missing, there is no bag or no scheduler.
-    OutputError
-        If results cannot be written.
-
+    Raises FleetError if a library is missing, there is no bag or no scheduler. Raises OutputError
+    if results cannot be written.
     """
     require_libraries()
     storage = Storage(url)

@@ -35,11 +35,7 @@ class Storage:
     """
     A folder: a path of this machine, or a URL such as ``s3://bucket/bags``.
 
-    Raises
-    ------
-    FleetError
-        If no library knows the protocol.
-
+    Raises FleetError if no library knows the protocol.
     """
 
     def __init__(self, url: str) -> None:
@@ -105,11 +101,7 @@ class Storage:
         """
         Give the path of a bag on this machine; one from elsewhere is a copy while it is read.
 
-        Raises
-        ------
-        OSError
-            If it cannot be brought here.
-
+        Raises OSError if it cannot be brought here.
         """
         if self.is_local:
             yield Path(self._root) / name

@@ -243,11 +243,7 @@ def read_parquet(path: Path) -> list[Row]:
     """
     Read a fleet.parquet of an earlier run; columns that it lacks are empty.
 
-    Raises
-    ------
-    FleetError
-        If it is no such table.
-
+    Raises FleetError if it is no such table.
     """
     from pyarrow import ArrowException, parquet
 

@@ -64,17 +64,10 @@ class UnitOutcome:
     """
     What came out of one unit; small enough to travel.
 
-    Parameters
-    ----------
-    row : dict of str to str, int, float or None
-        Its row of the fleet table.
-    hashes : dict of str to str
-        SHA-256 of its bags by name; empty where one could not be read.
-    is_final : bool
-        Whether the same bags would give the same again; a failed file system may not.
-    calibration, certificate : str
-        The files; empty where there are none.
-
+    row: its row of the fleet table
+    hashes: SHA-256 of its bags by name; empty where one could not be read
+    is_final: whether the same bags would give the same again; a failed file system may not
+    calibration, certificate: the files; empty where there are none
     """
 
     row: dict[str, Cell]

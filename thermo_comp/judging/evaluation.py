@@ -70,13 +70,8 @@ def open_bag(
     `number` is its place among several; a saturated sample has the magnitude `full_scale`, of
     counts 32767 by default; its hash takes reading it once more; `progress` is told the fraction.
 
-    Raises
-    ------
-    RecordingError
-        If it cannot be read or has no board temperature.
-    ValueError
-        If `window_s` is not positive.
-
+    Raises RecordingError if it cannot be read or has no board temperature. Raises ValueError if
+    `window_s` is not positive.
     """
     path = Path(path)
     sum_s = sum_length(window_s)
@@ -148,15 +143,9 @@ def evaluate(
     the largest RMS that is accepted [m/s^2], `config` the node's settings, and of `serial` see
     `replay.check_unit`.
 
-    Raises
-    ------
-    ValueError
-        If there is no recording or no calibration, or `window_s` or `tolerance` is not positive.
-    RecordingError
-        If a recording cannot be read, or none of them rests for a window.
-    CalibrationError
-        If a calibration is for another unit.
-
+    Raises ValueError if there is no recording or no calibration, or `window_s` or `tolerance` is
+    not positive. Raises RecordingError if a recording cannot be read, or none of them rests for a
+    window. Raises CalibrationError if a calibration is for another unit.
     """
     if not paths or not calibrations:
         raise ValueError('`paths` and `calibrations` must hold at least one each')

@@ -153,11 +153,7 @@ def judge(
     A `tolerance`, the largest RMS that the user accepts in either regime [m/s^2], decides where
     given. Of windows that the fit has seen, what it left on positions left out stands for them.
 
-    Raises
-    ------
-    ValueError
-        If there is no window, or `tolerance` is not positive.
-
+    Raises ValueError if there is no window, or `tolerance` is not positive.
     """
     if not len(windows):
         raise ValueError('`windows` must hold at least one')

@@ -105,11 +105,7 @@ def sum_length(window_s: float) -> float:
     """
     Choose the longest part of a window up to ten seconds, for the sums of `fitting.reduction`.
 
-    Raises
-    ------
-    ValueError
-        If `window_s` is not positive.
-
+    Raises ValueError if `window_s` is not positive.
     """
     if not 0.0 < window_s < np.inf:
         raise ValueError(f'`window_s` must be positive, got {window_s:g}')
@@ -139,11 +135,7 @@ def corrected_windows(
     Local gravity is the calibration's by default. Empty where nothing rests for as long with a
     temperature.
 
-    Raises
-    ------
-    RecordingError
-        If the samples of a bag are too slow for such windows.
-
+    Raises RecordingError if the samples of a bag are too slow for such windows.
     """
     # A window's mean is no sample: what looks for stuck or too large ones would misread it.
     config = replace(

@@ -118,12 +118,8 @@ def load_certificate_info(path: str | Path, serial: str | None = None) -> Certif
     """
     Read a laboratory's statements on the unit with a serial from a YAML file.
 
-    Raises
-    ------
-    ThermoCompError
-        If it cannot be read, a key is unknown or of another type, or it is about another unit;
-        names the file and the key.
-
+    Raises ThermoCompError if it cannot be read, a key is unknown or of another type, or it is
+    about another unit; names the file and the key.
     """
     try:
         data = load_plain_yaml(read_bounded(path, _SIZE_LIMIT).decode())

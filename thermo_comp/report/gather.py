@@ -58,15 +58,8 @@ def evidence_of_bags(
     `simulation.parse_cyclogram` reads it, by default what a simulated bag says of itself;
     `others` are further calibrations of the unit, for its history.
 
-    Raises
-    ------
-    CalibrationError
-        If the calibration is for another unit.
-    RecordingError
-        If a bag's samples are too slow for such windows.
-    ValueError
-        If `program` cannot be read.
-
+    Raises CalibrationError if the calibration is for another unit. Raises RecordingError if a
+    bag's samples are too slow for such windows. Raises ValueError if `program` cannot be read.
     """
     reduced = [bag.reduced for bag in bags]
     metadata = [bag.info.metadata for bag in bags]
@@ -116,13 +109,8 @@ def evidence_of_fit(
     Its bags' `paths`, in its order, are looked up for what simulated ones say of themselves;
     `program` is the chamber's, and a brief evidence lacks what only figures show.
 
-    Raises
-    ------
-    RecordingError
-        If one of `paths` cannot be opened.
-    ValueError
-        If `program` cannot be read.
-
+    Raises RecordingError if one of `paths` cannot be opened. Raises ValueError if `program` cannot
+    be read.
     """
     calibration = result.calibration
     metadata = [] if is_brief else [inspect_recording(path).metadata for path in paths]

@@ -124,11 +124,7 @@ class LiveServer(ThreadingHTTPServer):
     """
     Serves one live report on the loopback interface; port 0 takes any that is free.
 
-    Raises
-    ------
-    OSError
-        If the port is taken.
-
+    Raises OSError if the port is taken.
     """
 
     daemon_threads = True

@@ -44,15 +44,8 @@ def write_report(
     as PNG files. Of a fit, `paths` and `program` are as for `evidence_of_fit`. Page and pictures
     that are there are replaced if `overwrite`.
 
-    Raises
-    ------
-    OutputError
-        If a file may not or cannot be written.
-    RecordingError
-        If one of `paths` cannot be opened.
-    ValueError
-        If `program` cannot be read.
-
+    Raises OutputError if a file may not or cannot be written. Raises RecordingError if one of
+    `paths` cannot be opened. Raises ValueError if `program` cannot be read.
     """
     evidence = subject
     if isinstance(evidence, FitResult):

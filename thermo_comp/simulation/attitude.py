@@ -36,11 +36,7 @@ def positions(n: int, seed: int = 0) -> Floats:
     sets take the faces of a cube, then its edges, then its corners; beyond 26, an even spiral over
     the sphere. 6, 9, 12, 18, 24 and 26 are balanced. `seed` turns each by a small random angle.
 
-    Raises
-    ------
-    ValueError
-        If `n` is below 1.
-
+    Raises ValueError if `n` is below 1.
     """
     if n < 1:
         raise ValueError(f'`n` must be at least 1, got {n}')

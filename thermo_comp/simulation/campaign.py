@@ -40,20 +40,13 @@ class Record:
     """
     What one position recorded, and its truth.
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-        Ends of the cycles from the start, s.
-    counts : ndarray, shape (n, 3)
-        Output per cycle, counts.
-    board_time_s, board, case_time_s, case : ndarray, shape (m,)
-        Readings of the thermometers: instants [s] and values [degC].
-    specific_force : ndarray, shape (3,)
-        True specific force in the orthogonal frame, m/s^2.
-    bias, scale : ndarray, shape (k, 3)
-        What the unit's temperatures make of bias [counts/cycle] and relative scale, every second
-        from 0; without the wander of the bias, which no model can know.
-
+    time_s: ends of the cycles from the start, s, shape (n,)
+    counts: output per cycle, counts, shape (n, 3)
+    board_time_s, board, case_time_s, case: readings of the thermometers: instants [s] and values
+        [degC], shape (m,)
+    specific_force: true specific force in the orthogonal frame, m/s^2, shape (3,)
+    bias, scale: what the unit's temperatures make of bias [counts/cycle] and relative scale, every
+        second from 0; without the wander of the bias, which no model can know, shape (k, 3)
     """
 
     name: str
@@ -94,11 +87,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     (3 positions with other ramps and attitudes, for judging). `seed` is that of the attitudes and
     of the room's temperature.
 
-    Raises
-    ------
-    ValueError
-        If there is no such plan.
-
+    Raises ValueError if there is no such plan.
     """
     if name not in PLAN_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')

@@ -30,11 +30,7 @@ class Converter:
 
     It balances charge, or rounds every cycle by itself, as a sampling converter does.
 
-    Raises
-    ------
-    ValueError
-        If `bits` is not in 2..31.
-
+    Raises ValueError if `bits` is not in 2..31.
     """
 
     bits: int = 16
@@ -68,20 +64,9 @@ class Converter:
         Charge beyond the output range is lost, as in an integrator at its rail; the fraction of a
         count is carried on even then.
 
-        Parameters
-        ----------
-        charge : ndarray, shape (n, 3)
-            Input of each cycle, counts (real-valued).
-        remainder : ndarray of int64, shape (3,)
-            Charge left by the cycle before, as `start` or this method returned it.
-
-        Returns
-        -------
-        counts : ndarray of int32, shape (n, 3)
-            Output of each cycle.
-        remainder : ndarray of int64, shape (3,)
-            Charge left by the last cycle.
-
+        `charge`: input of each cycle, counts (real-valued), shape (n, 3). `remainder`: charge left
+        by the cycle before, as `start` or this method returned it, shape (3,). Returns output of
+        each cycle, shape (n, 3). Returns charge left by the last cycle, shape (3,).
         """
         if not self.carries_remainder:
             return self._clip(np.rint(charge)), remainder

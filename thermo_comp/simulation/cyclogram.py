@@ -32,12 +32,8 @@ class Cyclogram:
 
     Before the first point the air rests at the first temperature, after the last one at the last.
 
-    Raises
-    ------
-    ValueError
-        If there are fewer than two points, the lengths differ, a value is not finite, or the
-        times do not start at 0 and increase.
-
+    Raises ValueError if there are fewer than two points, the lengths differ, a value is not
+    finite, or the times do not start at 0 and increase.
     """
 
     time_s: tuple[float, ...]
@@ -82,11 +78,7 @@ def ramps_and_soaks(start: float, soak: float, steps: Sequence[Sequence[float]])
     """
     Build a program from a first soak [min] and steps: target [degC], rate [K/min], soak [min].
 
-    Raises
-    ------
-    ValueError
-        If a rate is 0 or a soak is negative.
-
+    Raises ValueError if a rate is 0 or a soak is negative.
     """
     time, temperature = [0.0], [float(start)]
 
@@ -117,11 +109,8 @@ def parse_cyclogram(text: str) -> Cyclogram:
     starting temperature and takes no rate; a later one without a rate keeps the last rate (1 K/min
     if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
 
-    Raises
-    ------
-    ValueError
-        If a step cannot be read, with its number and text, or the program has no duration.
-
+    Raises ValueError if a step cannot be read, with its number and text, or the program has no
+    duration.
     """
     if text.strip() in _PROGRAMS:
         return cyclogram_preset(text.strip())
@@ -181,11 +170,7 @@ def cyclogram_preset(name: str) -> Cyclogram:
     """
     Return one of the ready-made programs, `CYCLOGRAM_NAMES`.
 
-    Raises
-    ------
-    ValueError
-        If there is no such program.
-
+    Raises ValueError if there is no such program.
     """
     if name not in _PROGRAMS:
         raise ValueError(f'`name` must be one of {", ".join(CYCLOGRAM_NAMES)}, got {name!r}')

@@ -59,12 +59,8 @@ class ThermalNetwork:
 
     The keys of `capacity` name the parts and fix their order.
 
-    Raises
-    ------
-    ValueError
-        If a capacity or conductance is not positive, a link, power or thermostat names an
-        unknown part, or a part has no heat path to the air.
-
+    Raises ValueError if a capacity or conductance is not positive, a link, power or thermostat
+    names an unknown part, or a part has no heat path to the air.
     """
 
     capacity: Mapping[str, float]

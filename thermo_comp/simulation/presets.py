@@ -376,11 +376,7 @@ def unit_preset(name: str, seed: int = 0) -> UnitModel:
     heat by turns), 'paper' (a load while the ambient changes), 'slow-noise' (a bias that walks),
     'plain' (no thermal error at all), 'demo' (the sample unit: paper and lags).
 
-    Raises
-    ------
-    ValueError
-        If there is no such kind.
-
+    Raises ValueError if there is no such kind.
     """
     if name not in _PRESETS:
         raise ValueError(f'`name` must be one of {", ".join(UNIT_NAMES)}, got {name!r}')

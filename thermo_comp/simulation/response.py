@@ -28,24 +28,16 @@ class ThermalResponse:
     """
     Temperatures of a network over a program, at any instant.
 
-    Parameters
-    ----------
-    network : ThermalNetwork
-        The parts.
-    knot_time, knot_air : array_like, shape (m,)
-        Times [s] and air temperatures [degC] of knots; straight between them.
-    power : array_like, shape (m - 1, n_parts), optional
-        What the parts dissipate between the knots beside the network's constant powers, W.
-    is_warm : bool, optional
-        True starts in equilibrium with everything on; False has the unit switched on at the first
-        knot, every part at the air's temperature.
+    network: the parts
+    knot_time, knot_air: times [s] and air temperatures [degC] of knots; straight between them,
+        shape (m,)
+    power: what the parts dissipate between the knots beside the network's constant powers, W,
+        shape (m - 1, n_parts)
+    is_warm: true starts in equilibrium with everything on; False has the unit switched on at the
+        first knot, every part at the air's temperature
 
-    Raises
-    ------
-    ValueError
-        If the program drives the thermostat's heater out of its power range, or the network's
-        modes cannot be told apart.
-
+    Raises ValueError if the program drives the thermostat's heater out of its power range, or the
+    network's modes cannot be told apart.
     """
 
     def __init__(

@@ -31,27 +31,15 @@ class RunOptions:
     """
     The keywords of `simulate`, `simulate_blocks` and `arrays`.
 
-    Parameters
-    ----------
-    rate_hz : float, optional
-        Conversion cycles per second. The elementary charge is sized to the cycle, so K in counts
-        per cycle does not depend on it.
-    temperature_rate_hz : float or None, optional
-        Readings per second of both thermometers; None takes each one's own.
-    seed : int, optional
-        Seed of everything random in this run; the specimen has its own.
-    start_ns : int, optional
-        Stamp of the start of the run, ns.
-    gravity : float, optional
-        Local gravity, m/s^2.
-    warm : bool, optional
-        True starts in thermal equilibrium; False switches the unit on at the start.
+    rate_hz: conversion cycles per second. The elementary charge is sized to the cycle, so K in
+        counts per cycle does not depend on it
+    temperature_rate_hz: readings per second of both thermometers; None takes each one's own
+    seed: seed of everything random in this run; the specimen has its own
+    start_ns: stamp of the start of the run, ns
+    gravity: local gravity, m/s^2
+    warm: true starts in thermal equilibrium; False switches the unit on at the start
 
-    Raises
-    ------
-    ValueError
-        If rate or gravity is not positive.
-
+    Raises ValueError if rate or gravity is not positive.
     """
 
     rate_hz: float = 100.0
@@ -74,12 +62,8 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
     `up`, shape (3,), is the direction of the specific force in the orthogonal frame of the
     accelerometer.
 
-    Raises
-    ------
-    ValueError
-        If the program is shorter than a cycle, or the options, `up` or the thermostat's power do
-        not fit (see `RunOptions` and `ThermalResponse`).
-
+    Raises ValueError if the program is shorter than a cycle, or the options, `up` or the
+    thermostat's power do not fit (see `RunOptions` and `ThermalResponse`).
     """
     chamber = Chamber(unit, cyclogram, up, RunOptions(**options))
     return next(chamber.blocks(chamber.n_cycles))
@@ -100,11 +84,7 @@ def simulate_blocks(
     the block before, up to the last of its own; those after the very last cycle are in the last
     block. Each truth holds the whole thermal grid.
 
-    Raises
-    ------
-    ValueError
-        As in `simulate`, or if `block_size` is below 1.
-
+    Raises ValueError if as in `simulate`, or if `block_size` is below 1.
     """
     if block_size < 1:
         raise ValueError(f'`block_size` must be at least 1, got {block_size}')

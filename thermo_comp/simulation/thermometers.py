@@ -24,11 +24,7 @@ class ThermometerModel:
     White noise, quantum (0 is continuous) and offset in K; `phase` is the instant of the first
     reading within its period, 0..1.
 
-    Raises
-    ------
-    ValueError
-        If the rate is not positive, or noise, quantum or phase is out of range.
-
+    Raises ValueError if the rate is not positive, or noise, quantum or phase is out of range.
     """
 
     node: str

@@ -21,25 +21,15 @@ class Truth:
     """
     What really happened, on the thermal grid and at the accelerometer's cycles.
 
-    Parameters
-    ----------
-    unit : UnitModel
-        The unit, with K, M, bias at the reference.
-    gravity : float
-        Local gravity, m/s^2.
-    nodes : tuple of str
-        Parts, the columns of the temperatures.
-    grid_s, air : ndarray, shape (m,)
-        Instants of the thermal grid from the start of the run, s, and air temperature, degC.
-    temperatures : ndarray, shape (m, n_parts)
-        Of the parts, degC.
-    bias_grid, scale_grid : ndarray, shape (m, 3)
-        Bias [counts/cycle] and relative scale on the grid.
-    cycle_s : ndarray, shape (n,)
-        Middles of the accelerometer's cycles from the start of the run, s.
-    specific_force : ndarray, shape (3,)
-        In the orthogonal frame, m/s^2.
-
+    unit: the unit, with K, M, bias at the reference
+    gravity: local gravity, m/s^2
+    nodes: parts, the columns of the temperatures
+    grid_s, air: instants of the thermal grid from the start of the run, s, and air temperature,
+        degC, shape (m,)
+    temperatures: of the parts, degC, shape (m, n_parts)
+    bias_grid, scale_grid: bias [counts/cycle] and relative scale on the grid, shape (m, 3)
+    cycle_s: middles of the accelerometer's cycles from the start of the run, s, shape (n,)
+    specific_force: in the orthogonal frame, m/s^2, shape (3,)
     """
 
     unit: UnitModel

@@ -35,24 +35,15 @@ class UnitModel:
     Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where ``s =
     inverse(M) @ f`` is the specific force along the sensitivity axes.
 
-    Parameters
-    ----------
-    scale_factor : tuple of float
-        K per axis at the reference temperature, counts/cycle per m/s^2.
-    bias_at_reference : tuple of float
-        Bias per axis at the reference temperature, counts/cycle.
-    misalignment : tuple of tuple of float, shape (3, 3)
-        M, lower triangular with unit diagonal: from the sensitivity axes to the orthogonal frame.
-    noise_density : tuple of float
-        White noise of the acceleration per axis, ug/sqrt(Hz): the mean over `T` seconds has the
-        standard deviation ``noise_density / sqrt(T)``.
-    reference_temperature : float, optional
-        Reading of the board's part at which K and bias hold in still air, degC.
-    bias_walk : tuple of float, optional
-        Random walk of the bias per axis within a run, ug per square root of an hour.
-    loads : tuple of SwitchedLoad, optional
-        Loads beside the constant powers.
-
+    scale_factor: K per axis at the reference temperature, counts/cycle per m/s^2
+    bias_at_reference: bias per axis at the reference temperature, counts/cycle
+    misalignment: M, lower triangular with unit diagonal: from the sensitivity axes to the
+        orthogonal frame, shape (3, 3)
+    noise_density: white noise of the acceleration per axis, ug/sqrt(Hz): the mean over `T` seconds
+        has the standard deviation ``noise_density / sqrt(T)``
+    reference_temperature: reading of the board's part at which K and bias hold in still air, degC
+    bias_walk: random walk of the bias per axis within a run, ug per square root of an hour
+    loads: loads beside the constant powers
     """
 
     name: str
