@@ -242,8 +242,8 @@ def test_the_file_corrects_as_the_regression(result: FitResult) -> None:
 
 def test_covariance_of_the_file_is_that_of_the_posterior(result: FitResult) -> None:
     # The variance of the bias at some state, through the file's parameters and through the
-    # regression's: the same linear form of the same posterior.
-    calibration, posterior = result.calibration, result.learnt.posterior
+    # regression's: the same linear form of the claim.
+    calibration, posterior = result.calibration, result.learnt.claim
     assert calibration.posterior is not None
     layout = parameter_layout(calibration)
     covariance = calibration.posterior.covariance()
