@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, widths
 
-from thermo_comp.fitting.learning import Learnt, learn
+from thermo_comp.fitting.learning import Learnt, _downweight, learn
 from thermo_comp.fitting.posterior import Regression
 from thermo_comp.fitting.unknowns import Prior
 from thermo_comp.fitting.worth import group_worth
@@ -184,6 +184,22 @@ def test_outliers_do_not_pull() -> None:
     assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.prior.sigma, truth.sigma, rtol=0.2)
     np.testing.assert_array_equal(other.prior.on_bias > 0.0, one.prior.on_bias > 0.0)
+
+
+def test_means_of_few_values_are_no_knocks() -> None:
+    # A converter that carries its remainder: most means are equal, others a count more or less.
+    windows, up = table_of(Truth(), 9, np.random.default_rng(2))
+    regression, state = begin(windows, up)
+    posterior = regression.solve(state, wide(Truth()), n_steps=1)
+    values = np.random.default_rng(3).choice(
+        [-2.0, 0.0, 2.0], posterior.whitened.shape, p=[0.15, 0.7, 0.15]
+    )
+    values[100] = 50.0
+    before = regression.weight.copy()
+    _downweight(regression, replace(posterior, whitened=values))
+    changed = regression.weight / before
+    assert changed[100].max() < 0.02
+    np.testing.assert_array_equal(np.delete(changed, 100, axis=0), 1.0)
 
 
 def test_progress_is_told() -> None:

@@ -47,6 +47,8 @@ _LEAST_SIGMA = 1e-8
 _OPEN = 4.0
 # Windows more sds off than this lose weight.
 _FAR_SDS, _FARTHEST_SDS = 3.0, 1e3
+# A fifth of a normal sample lies farther off than so many sds.
+_FIFTH_SDS = 1.2816
 # ... as seen against the median of so many windows on both sides.
 _NEIGHBOURS = 3
 
@@ -278,7 +280,9 @@ def _downweight(regression: Regression, posterior: Posterior) -> None:
             usual = sliding_window_view(around, 2 * _NEIGHBOURS + 1, axis=0)
             np.subtract(part, np.median(usual, axis=-1), out=part)
     size = np.abs(size)
-    usual = 1.4826 * np.median(size, axis=0)
+    # A converter that carries its remainder makes means of few values, most of them equal: their
+    # median deviation is 0, where that of the largest fifth is not.
+    usual = np.quantile(size, 0.8, axis=0) / _FIFTH_SDS
     size = np.minimum(size / np.maximum(usual, 1e-300), _FARTHEST_SDS)
     regression.reweight(base * (_FAR_SDS / np.maximum(size, _FAR_SDS)) ** 2)
 
