@@ -9,6 +9,7 @@ case feels that, so what the lid's temperature does to the axes is seen by its o
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -120,5 +121,8 @@ def test_a_third_thermometer_explains_what_the_others_do_not_see(
     # The switched load alone is worth this much on the axes together, RMS.
     switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0
     assert errors[False] > 0.3 * switched
-    assert errors[True] < 0.05 * errors[False]
-    assert spreads[True] < 0.2 * spreads[False]
+    assert errors[True] < 0.05 * switched
+    # With the lid's temperature the noise of a minute is what is left.
+    noise = float(np.mean(calibration.noise_density_m_s2_sqrt_hz)) / math.sqrt(60.0) / MICRO_G
+    assert spreads[False] > 2.0 * noise
+    assert spreads[True] < 1.3 * noise

@@ -252,7 +252,7 @@ def _either(arguments: tuple[Any, ...], data: Any, key: str) -> Any:
         for hint in hints:
             if type(data) is hint:
                 return data
-        _refuse(key, f'must be a valid {_choice([_WORDS[hint] for hint in hints])}', data)
+        _refuse(key, f'must be a valid {_choice(sorted(_WORDS[hint] for hint in hints))}', data)
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
     kinds = {_kind(hint): hint for hint in hints}
