@@ -214,7 +214,8 @@ def _reloader(arguments: argparse.Namespace) -> None:
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
 
-    from thermo_comp.unit.calibration_file import NODE_LIMIT, SIZE_LIMIT
+    from thermo_comp.plain_yaml import NODE_LIMIT
+    from thermo_comp.unit.calibration_file import SIZE_LIMIT
 
     rclpy.init()
     node = rclpy.create_node('reloader')
