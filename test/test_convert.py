@@ -257,7 +257,7 @@ class TestColumnMap:
                 'stamp.unit',
                 "'s', 'ms', 'us' or 'ns', got 'min'",
             ),
-            ({'stamp': {'column': 1.5, 'unit': 's'}}, 'stamp.column', 'text or integer, got 1.5'),
+            ({'stamp': {'column': 1.5, 'unit': 's'}}, 'stamp.column', 'integer or text, got 1.5'),
             (
                 {'accel': {'columns': ['x', 'y'], 'unit': 'g', 'output': 'imu'}},
                 'accel.columns',

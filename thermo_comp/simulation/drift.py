@@ -12,6 +12,7 @@ constants.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +54,7 @@ class PartHistory:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Effect:
+class Effect(ABC):
     """
     One cause of errors; per axis ``bias * first + bias_curvature * second``, the scale likewise.
 
@@ -65,9 +66,9 @@ class Effect:
     bias: Triple = ZERO
     bias_curvature: Triple = ZERO
 
+    @abstractmethod
     def _signals(self, history: PartHistory) -> tuple[Floats, Floats | float]:
-        # The first and the second signal, shape (m,).
-        raise NotImplementedError
+        """Return the first and the second signal, shape (m,)."""
 
     def change(self, history: PartHistory) -> tuple[Floats, Floats]:
         """Return the change of the bias [ug] and of the scale [ppm], shape (m, 3)."""
