@@ -46,8 +46,8 @@ Progress = Callable[[str, float], None]
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 # Stands in where the bags do not tell how far the board lags behind the case.
 _USUAL_BOARD_LAG_S = 900.0
-# Built-in prior, wide for any triad: bias [m/s^2], relative scale, elements of M [rad].
-_BIAS_SD, _SCALE_SD, _SKEW_SD = 1.0, 0.05, 1e-3
+#: Built-in prior, wide for any triad: bias [m/s^2], relative scale, elements of M [rad].
+BIAS_SD, SCALE_SD, SKEW_SD = 1.0, 0.05, 1e-3
 # Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
 _COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
 # A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
@@ -303,9 +303,9 @@ def _wide_prior(
         wide, scale_wide = 50.0 * wide, 50.0 * scale_wide
     return Prior(
         bias_mean=start.bias / start.scale,
-        bias_sd=np.full(3, _BIAS_SD),
-        scale_sd=_SCALE_SD,
-        skew_sd=_SKEW_SD,
+        bias_sd=np.full(3, BIAS_SD),
+        scale_sd=SCALE_SD,
+        skew_sd=SKEW_SD,
         on_bias=np.where(allowed, wide * _COLUMN_BIAS_SD, 0.0),
         on_scale=np.where(in_scale, scale_wide * _COLUMN_SCALE_SD, 0.0),
         offset_sd=_OFFSET_SD,

@@ -115,13 +115,12 @@ class CellAccumulator:
         self._accumulate(stamp_ns, samples)
 
     def finish(self) -> Cells:
-        """Close the last cell and return all of them."""
+        """Return all cells so far, the last one as it is."""
+        ids, sums_of = self._ids, self._sums
         if self._open_id >= 0:
-            self._ids.append(np.array([self._open_id]))
-            self._sums.append(self._open)
-        self._open_id = -1
-        index = np.concatenate(self._ids) if self._ids else np.zeros(0, dtype=np.int64)
-        sums = np.concatenate(self._sums) if self._sums else np.zeros((0, 8))
+            ids, sums_of = [*ids, np.array([self._open_id])], [*sums_of, self._open]
+        index = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)
+        sums = np.concatenate(sums_of) if sums_of else np.zeros((0, 8))
         count = sums[:, 0]
         mean = sums[:, 2:5] / count[:, None]
         spread = np.maximum(sums[:, 5:8] - count[:, None] * mean**2, 0.0)
