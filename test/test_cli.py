@@ -21,7 +21,7 @@ from conftest import Cli
 
 from thermo_comp.cli import output
 from thermo_comp.cli.app import app, split_ros_arguments
-from thermo_comp.recording import inspect_recording, read_recording
+from thermo_comp.recording import BagWriter, inspect_recording, read_recording
 from thermo_comp.unit.calibration_file import save_calibration
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -264,6 +264,55 @@ class TestInfo:
         said = cli('info', unit).stdout
         assert 'unit T-1, counts up to 32767' in said
         assert re.search(r'dynamic\s+5\.0 \.\. 35\.0', said)
+
+
+class TestTopics:
+    """Inputs by name: from the command line, from a laboratory's file, or told by their type."""
+
+    @pytest.fixture
+    def named(self, tmp_path: Path) -> Path:
+        with BagWriter(tmp_path / 'bag') as writer:
+            writer.write_counts(
+                '/imu/raw', np.arange(1, 1001) * 10_000_000, np.arange(3000.0).reshape(-1, 3)
+            )
+            for row, topic in enumerate(('/t1', '/t2', '/t3')):
+                writer.write_temperature(topic, [10_000_000], [20.0 + row])
+        return tmp_path / 'bag'
+
+    def test_a_file_for_all_and_an_option_for_one(self, named: Path, cli: Cli) -> None:
+        profile = named.with_name('lab.yaml')
+        profile.write_text('counts: /imu/raw\nboard: /t2\ntemperature/magnet: /t3\n')
+        topics = ('--topics', profile, '--topic', 'board=/t1', '--case-topic', '/t2')
+        for arguments in (topics, (*topics[:4], '--case-topic=/t2')):
+            seen = json.loads(cli('info', named, *arguments, '--json').stdout)
+            degrees = {name: one['lowest'] for name, one in seen['thermometers'].items()}
+            assert degrees == {'board': 20.0, 'case': 21.0, 'magnet': 22.0}
+            assert seen['chosen'] is None
+
+    def test_the_only_one_of_its_type_is_said(self, named: Path, unit: Path, cli: Cli) -> None:
+        said = '/imu/raw, its only Vector3Stamped, is taken for counts'
+        assert said in cli('info', named).stdout
+        topics = ('--topic', 'board=/t1', '--topic', 'case=/t2')
+        arguments = ('-o', named.with_name('out.mcap'), '--serial', '', *topics)
+        assert f'{named}: {said}' in cli('replay', named, '-c', unit, *arguments).stderr
+
+    @pytest.mark.parametrize(
+        ('given', 'said'),
+        [
+            ('/t1', 'expected INPUT=TOPIC, got /t1'),
+            ('bord=/t1', '`bord` is no input; expected counts, imu, board, case or temp'),
+            ('board=', '`board` needs the name of a topic'),
+        ],
+    )
+    def test_what_names_no_input(self, given: str, said: str, named: Path, cli: Cli) -> None:
+        assert said in cli('info', named, '--topic', given, code=2).stderr
+
+    def test_a_file_that_is_no_profile(self, named: Path, cli: Cli) -> None:
+        profile = named.with_name('lab.yaml')
+        profile.write_text('board: [1]\n')
+        refused = cli('info', named, '--topics', profile, code=1).stderr
+        assert f'{profile}: expected INPUT: TOPIC, one a line' in refused
+        assert 'cannot be read' in cli('info', named, '--topics', named, code=1).stderr
 
 
 class TestCells:

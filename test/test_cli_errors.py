@@ -147,12 +147,12 @@ class TestBags:
     def test_missing_topic_says_what_there_is(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
         path = bag(tmp_path / 'bag', counts=False)
         self.replayed(
-            cli, unit, path, r'no such topic; the bag has .*/temperature/board.*--counts-topic'
+            cli, unit, path, r'no such topic; the bag has .*/temperature/board.*--topic counts='
         )
 
     def test_missing_board_temperature(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
         path = bag(tmp_path / 'bag', board=False)
-        self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--board-topic')
+        self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')
         refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
         # A fit takes it for what it is.
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')

@@ -129,9 +129,9 @@ def test_neighbours_tell_the_thermometers(temperature, pressure, board, case):
 
 def test_what_neighbours_cannot_tell_is_asked():
     path = Path('bag')
-    with pytest.raises(RecordingError, match=r'several topics may be the Imu.*--imu-topic'):
+    with pytest.raises(RecordingError, match=r'several topics may be the Imu.*--topic imu='):
         find_topics(path, present(['/a/data', '/b/data']), None, None, None)
-    with pytest.raises(RecordingError, match=r'several topics may be the board.*--board-topic'):
+    with pytest.raises(RecordingError, match=r'several topics may be the board.*--topic board='):
         find_topics(path, present(['/imu/data'], ['/imu/t1', '/imu/t2']), None, None, None)
     with pytest.raises(RecordingError, match='no Imu messages'):
         find_topics(path, present([], ['/t']), None, None, None)
@@ -148,7 +148,7 @@ def test_command(tmp_path, rng, cli):
     finished = cli('convert', bag, '--unit', 'g', '-o', tmp_path / 'out.mcap')
     assert f'{N:8} imu/uncompensated' in finished.stdout
     wrong = cli('convert', bag, '--imu', '1', '-o', tmp_path / 'two.mcap', code=2)
-    assert '--imu-topic' in wrong.stderr
+    assert '--topic' in wrong.stderr
     table = tmp_path / 'table.csv'
     table.write_text('1,2,3\n')
     wrong = cli('convert', table, '--unit', 'g', '-o', tmp_path / 'two.mcap', code=2)

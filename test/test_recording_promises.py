@@ -66,7 +66,7 @@ def test_a_conversion_tells_what_the_bag_lacks(tmp_path: Path, cli: Cli) -> None
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     with sqlite3.connect(tmp_path / 'bag' / 'bag.db3') as database:
         database.execute('delete from messages where id > 400')
-    topics = ('--board-topic', BOARD, '--case-topic', CASE)
+    topics = ('--topic', f'board={BOARD}', '--topic', f'case={CASE}')
     done = cli('convert', tmp_path / 'bag', '-o', tmp_path / 'o.mcap', *topics, code=1)
     assert 'messages promised are there' in done.stderr
 

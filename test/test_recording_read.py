@@ -365,10 +365,38 @@ def test_further_thermometers_are_found_beside_the_board(tmp_path: Path) -> None
     assert found['lid'].after.tolist() == [2]
 
 
+def test_topics_by_the_names_of_their_inputs(tmp_path: Path) -> None:
+    path = written(tmp_path / 'bag', 't1', 't2', 't3', 'temperature/lid', counts='raw')
+    names = {'counts': '/raw', 'board': 't1', 'temperature/case': 't2', 'temperature/magnet': 't3'}
+    found = read_recording(path, Topics.named(names))
+    assert found.info.chosen is None
+    assert {name: one.celsius.tolist() for name, one in found.columns.temperatures.items()} == {
+        'board': [20.0],
+        'case': [21.0],
+        'lid': [23.0],
+        'magnet': [22.0],
+    }
+    with pytest.raises(RecordingError, match=r'/t9: no such topic.*--topic temperature/magnet='):
+        open_recording(path, Topics.named({**names, 'temperature/magnet': '/t9'}))
+    with pytest.raises(RecordingError, match=r'/raw: the topic has type geometry_msgs/msg/Vector'):
+        open_recording(path, Topics.named({**names, 'temperature/magnet': '/raw'}))
+    for wrong in ('bord', 'temperature/', 'temperature/A b', 'magnet'):
+        with pytest.raises(
+            ValueError, match=f'`{wrong}` is no input; expected counts, imu, board'
+        ):
+            Topics.named({wrong: '/t1'})
+    with pytest.raises(ValueError, match='`case` needs the name of a topic'):
+        Topics.named({'case': '/'})
+
+
 def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path: Path) -> None:
     path = written(tmp_path / 'one', 'imu/die', counts='imu/ticks')
     with open_recording(path, require=('accel', 'board')) as reader:
         assert reader.topics == {'accel': '/imu/ticks', 'board': '/imu/die'}
+        assert reader.info.chosen == (
+            '/imu/ticks, its only Vector3Stamped, is taken for counts; '
+            '/imu/die, its only Temperature, is taken for board'
+        )
     # Neither where the user has named another, nor where there are two, nor a case for a board.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))

@@ -142,10 +142,10 @@ def test_topics_that_are_not_there_or_are_something_else(tmp_path: Path) -> None
     with pytest.raises(RecordingError, match=r'counts: no such topic; the bag has /accel/counts '):
         open_recording(path, Topics(counts='my/counts'), input='counts')
     with pytest.raises(
-        RecordingError, match=r'or x/imu: no such topic.*--counts-topic or --imu-t'
+        RecordingError, match=r'or x/imu: no such topic.*--topic counts=TOPIC or --topic imu='
     ):
         open_recording(path, Topics(counts='x/counts', imu='x/imu'))
-    with pytest.raises(RecordingError, match='name another with --case-topic'):
+    with pytest.raises(RecordingError, match='name another with --topic case='):
         open_recording(path, Topics(case='other/case'))
     with pytest.raises(RecordingError, match='has type sensor_msgs/msg/Temperature, expected geo'):
         open_recording(path, Topics(counts=BOARD))
@@ -177,7 +177,9 @@ def test_two_topics_that_fit_are_ambiguous(tmp_path: Path) -> None:
     with BagWriter(path) as bag:
         for unit in ('a', 'b'):
             bag.write_counts(f'{unit}/accel/counts', [1], np.zeros((1, 3)))
-    with pytest.raises(RecordingError, match=r'several topics end in it: /a/.*, /b/.*--counts-to'):
+    with pytest.raises(
+        RecordingError, match=r'several topics end in it: /a/.*, /b/.*--topic counts='
+    ):
         open_recording(path)
     with open_recording(path, Topics(counts='b/accel/counts'), require=('accel',)) as reader:
         assert reader.topics == {'accel': '/b/accel/counts'}

@@ -11,13 +11,19 @@ recursion, so no depth and no number of nodes is reached before it is refused.
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import yaml
 
+from .errors import ThermoCompError
+from .files import read_bounded
+
 DEPTH_LIMIT = 12
 #: Keys, values, lists and mappings: some ten times those of the largest calibration.
 NODE_LIMIT = 20_000
+#: What a user writes by hand takes some kB.
+_FILE_LIMIT = 1 << 16
 #: Digits of the longest integer accepted; a float64 needs no more.
 _INTEGER_DIGITS = 20
 _INTEGER = re.compile(r'[-+]?[0-9]+')
@@ -54,6 +60,18 @@ def load_plain_yaml(
         raise PlainYamlError('not valid YAML', line, problem) from error
     except UnicodeEncodeError as error:
         raise PlainYamlError('not valid YAML', detail=error.reason) from error
+
+
+def read_plain_yaml(path: str | Path) -> Any:
+    """Read a small YAML file of a user's; ThermoCompError, which names it, where it is none."""
+    try:
+        return load_plain_yaml(read_bounded(path, _FILE_LIMIT).decode())
+    except OSError as error:
+        raise ThermoCompError(f'{path}: cannot be read: {error.strerror or error}') from error
+    except UnicodeDecodeError as error:
+        raise ThermoCompError(f'{path}: not UTF-8 text (byte {error.start})') from error
+    except ValueError as error:  # of YAML, of the size
+        raise ThermoCompError(f'{path}: {error}') from error
 
 
 def is_plain_text(text: str) -> bool:

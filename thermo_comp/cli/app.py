@@ -9,6 +9,7 @@ Heavy libraries are imported by the commands when they run, so that ``--help`` i
 from __future__ import annotations
 
 import os
+import re
 import sys
 from typing import Annotated
 
@@ -37,6 +38,8 @@ from . import (
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
 
+#: How 0.1 spelt `--topic`.
+_OLD_TOPIC = re.compile(r'--(counts|imu|board|case)-topic(?:=(.*))?')
 #: EX_SOFTWARE of sysexits.h.
 _SOFTWARE = 70
 
@@ -99,7 +102,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def run(arguments: list[str]) -> int:
     """Run a command line without the program's name and return its exit code."""
-    arguments, ros_arguments = split_ros_arguments(arguments)
+    arguments, ros_arguments = split_ros_arguments(_with_topics(arguments))
     if not arguments:
         app(['--help'], prog_name='thermo_comp', standalone_mode=False)
         return 2
@@ -145,6 +148,18 @@ def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
         else:
             target.append(argument)
     return own, ros
+
+
+def _with_topics(arguments: list[str]) -> list[str]:
+    """Read ``--counts-topic T`` and its like, the spelling of 0.1, as ``--topic counts=T``."""
+    given, said = iter(arguments), []
+    for argument in given:
+        if old := _OLD_TOPIC.fullmatch(argument):
+            topic = next(given, '') if old[2] is None else old[2]
+            said += ['--topic', f'{old[1]}={topic}']
+        else:
+            said.append(argument)
+    return said
 
 
 def _unexpected(failure: Exception) -> int:

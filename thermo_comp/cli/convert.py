@@ -52,13 +52,8 @@ def convert(
     allow_compensated: Annotated[
         bool, typer.Option(help='Take an ArduPilot log corrected by INS_TCAL.')
     ] = False,
-    imu_topic: Annotated[str | None, typer.Option(help='Imu topic of a bag.')] = None,
-    board_topic: Annotated[
-        str | None, typer.Option(help='Temperature topic of a bag: the board.')
-    ] = None,
-    case_topic: Annotated[
-        str | None, typer.Option(help='Temperature topic of a bag: the case.')
-    ] = None,
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     unit: Annotated[
         UnitChoice, typer.Option(help='What the Imu topic of a bag is in.')
     ] = UnitChoice.m_s2,
@@ -85,19 +80,22 @@ def convert(
     out = Output(as_json, quiet)
     read_too = [] if columns is None else [columns]
     check_output(output, bag_kind(output), overwrite=force, others=[log, *read_too])
+    names = options.named_topics(topic, topics)
     is_bag = log.is_dir() or log.suffix.lower() in _BAGS
     if is_bag:
+        if not names.keys() <= {'imu', 'board', 'case'}:
+            raise options.usage('--topic: of a bag, imu, board and case are converted')
         if columns is not None or imu is not None or baro is not None or allow_compensated:
             raise options.usage(
                 '--columns is for tables, --imu, --baro and --allow-compensated for logs; a bag '
-                'has --imu-topic, --board-topic and --case-topic'
+                'has --topic'
             )
         read: Callable[[], ForeignLog] = partial(
-            bag_log, log, imu_topic, board_topic, case_topic, unit.value
+            bag_log, log, names.get('imu'), names.get('board'), names.get('case'), unit.value
         )
     else:
-        if imu_topic or board_topic or case_topic or unit is not UnitChoice.m_s2:
-            raise options.usage('--*-topic and --unit are for bags')
+        if names or unit is not UnitChoice.m_s2:
+            raise options.usage('--topic and --unit are for bags')
         read = _reader(log, columns, imu, baro, allow_compensated)
     with out.progress('converting', total=1.0) as done:
         report = write_log(read(), output, force, done)

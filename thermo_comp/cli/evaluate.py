@@ -39,10 +39,8 @@ def evaluate(
     ] = None,
     serial: options.Serial = None,
     input_: options.InputOption = options.InputChoice.auto,
-    counts_topic: options.CountsTopic = 'accel/counts',
-    imu_topic: options.ImuTopic = 'imu/uncompensated',
-    board_topic: options.BoardTopic = 'temperature/board',
-    case_topic: options.CaseTopic = 'temperature/case',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     force: options.Force = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -83,12 +81,12 @@ def evaluate(
             gravity=gravity,
             window_s=window_s,
             tolerance=limit,
-            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            topics=options.topics_of(topic, topics),
             input=input_.value,
             serial=serial,
             progress=done,
         )
-    is_torn = out.torn(bag.info for bag in result.bags)
+    is_torn = out.told(bag.info for bag in result.bags)
     judged = result.judgements[names[0]]
     if csv is not None:
         text = csv_of(judged.windows, [bag.name for bag in bags])

@@ -61,10 +61,8 @@ def fit(
         list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
     ] = None,
     input_: options.InputOption = options.InputChoice.auto,
-    counts_topic: options.CountsTopic = 'accel/counts',
-    imu_topic: options.ImuTopic = 'imu/uncompensated',
-    board_topic: options.BoardTopic = 'temperature/board',
-    case_topic: options.CaseTopic = 'temperature/case',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     force: options.Force = False,
     verbose: Annotated[
         bool, typer.Option('--verbose', '-v', help='List the positions that were found, too.')
@@ -101,8 +99,7 @@ def fit(
     check_output(output, CALIBRATION, overwrite=force, others=inputs)
     if report is not None:
         check_output(report, PAGE, overwrite=force, others=[*inputs, output])
-    topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
-    sources, kind = fit_sources(bags, topics, input_.value, serial)
+    sources, kind = fit_sources(bags, options.topics_of(topic, topics), input_.value, serial)
     try:
         settings = FitOptions(
             gravity=resolve_gravity(gravity, None, None),
@@ -124,6 +121,9 @@ def fit(
         raise options.usage(str(mistake)) from mistake
     with out.progress('fitting', total=1.0) as done:
         result = run(sources, settings, lambda _stage, part: done(part))
+    for source in sources:
+        if source.chosen:
+            out.note(f'{source.name}: {source.chosen}')
     losses = [f'{source.name}: {loss}' for source in sources if (loss := source.missing())]
     for loss in losses:
         out.note(loss)

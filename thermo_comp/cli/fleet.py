@@ -69,10 +69,8 @@ def fit(
         list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
     ] = None,
     input_: options.InputOption = options.InputChoice.auto,
-    counts_topic: options.CountsTopic = 'accel/counts',
-    imu_topic: options.ImuTopic = 'imu/uncompensated',
-    board_topic: options.BoardTopic = 'temperature/board',
-    case_topic: options.CaseTopic = 'temperature/case',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -106,7 +104,7 @@ def fit(
                 min_still_s=min_still,
                 allow=tuple(allow or ()),
             ),
-            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            topics=options.topics_of(topic, topics),
             input=input_.value,
             certificates=certificates,
         )

@@ -7,20 +7,21 @@ Owns ``thermo_comp info``: what is in a bag or a calibration, and whether it is 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from . import options
 from .output import Cell, Output, micro_g
 
+if TYPE_CHECKING:
+    from ..recording import Topics
+
 
 def info(
     path: Annotated[Path, typer.Argument(help='Bag or calibration file.', metavar='BAG|YAML')],
-    counts_topic: options.CountsTopic = 'accel/counts',
-    imu_topic: options.ImuTopic = 'imu/uncompensated',
-    board_topic: options.BoardTopic = 'temperature/board',
-    case_topic: options.CaseTopic = 'temperature/case',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -37,14 +38,14 @@ def info(
     if path.suffix in ('.yaml', '.yml'):
         _calibration(out, path)
     else:
-        _bag(out, path, (counts_topic, imu_topic, board_topic, case_topic))
+        _bag(out, path, options.topics_of(topic, topics))
 
 
-def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
+def _bag(out: Output, path: Path, topics: Topics) -> None:
     from ..recording.overview import survey_recording
 
     with out.progress(f'reading {path.name}', total=1.0) as done:
-        survey = survey_recording(path, options.topics_of(*topics), done)
+        survey = survey_recording(path, topics, done)
     found = survey.info
     out.line(f'{path}: {found.storage}, {found.n_messages} messages')
     for key, value in found.metadata.items():
@@ -72,6 +73,8 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
         )
         for name, sensor in survey.thermometers.items()
     ]
+    if found.chosen:
+        out.line(found.chosen)
     if rows:
         out.table(('sensor', 'Hz', 'min degC', 'max degC', 'max K/min', 'min K/min'), rows)
     for finding in survey.findings:
@@ -89,6 +92,7 @@ def _bag(out: Output, path: Path, topics: tuple[str, str, str, str]) -> None:
                 for name, (kind, count) in found.topics.items()
             },
             'input': found.input,
+            'chosen': found.chosen,
             'samples': survey.n,
             'rate_hz': survey.rate_hz,
             'duration_s': survey.duration_s,

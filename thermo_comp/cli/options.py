@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..errors import ThermoCompError
 from ..text import valid_serial
 
 if TYPE_CHECKING:
@@ -71,10 +72,16 @@ CalibrationFile = Annotated[
 Bag = Annotated[
     Path, typer.Argument(help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
 ]
-CountsTopic = Annotated[str, typer.Option(help='Topic of the counts.', show_default=True)]
-ImuTopic = Annotated[str, typer.Option(help='Topic of the uncompensated Imu.')]
-BoardTopic = Annotated[str, typer.Option(help='Topic of the board temperature.')]
-CaseTopic = Annotated[str, typer.Option(help='Topic of the case temperature.')]
+Topic = Annotated[
+    list[str] | None,
+    typer.Option(
+        help='Where an input stands: counts, imu, board, case, temperature/NAME.',
+        metavar='INPUT=TOPIC',
+    ),
+]
+TopicsFile = Annotated[
+    Path | None, typer.Option(help='The same from a file, INPUT: TOPIC a line.', metavar='YAML')
+]
 InputOption = Annotated[InputChoice, typer.Option('--input', help='What is read from the bag.')]
 Gravity = Annotated[
     float | None, typer.Option('--gravity', help='Local gravity in m/s^2.', metavar='G')
@@ -128,11 +135,34 @@ def positive(value: float, name: str) -> float:
     return value
 
 
-def topics_of(counts: str, imu: str, board: str, case: str) -> Topics:
-    """Collect the topic options."""
+def named_topics(given: list[str] | None, profile: Path | None) -> dict[str, str]:
+    """Collect what `--topic` says, and what of the profile it does not."""
+    names = {} if profile is None else _read_profile(profile)
+    for one in given or ():
+        name, equals, topic = one.partition('=')
+        if not equals:
+            raise usage(f'--topic: expected INPUT=TOPIC, got {one}')
+        names[name] = topic
+    return names
+
+
+def _read_profile(path: Path) -> dict[str, str]:
+    from ..plain_yaml import read_plain_yaml
+
+    names = read_plain_yaml(path)
+    if not isinstance(names, dict) or not all(isinstance(one, str) for one in names.values()):
+        raise ThermoCompError(f'{path}: expected INPUT: TOPIC, one a line')
+    return names
+
+
+def topics_of(given: list[str] | None, profile: Path | None) -> Topics:
+    """Read where the inputs stand in a bag."""
     from ..recording import Topics
 
-    return Topics(counts, imu, board, case)
+    try:
+        return Topics.named(named_topics(given, profile))
+    except ValueError as mistake:
+        raise usage(f'--topic: {mistake}') from mistake
 
 
 def place(gravity: float | None, latitude: float | None, height: float | None) -> float | None:

@@ -49,12 +49,14 @@ class Output:
         if not self.quiet:
             _print(f'thermo_comp: {text}', sys.stderr)
 
-    def torn(self, infos: Iterable[RecordingInfo]) -> bool:
-        """Say of each bag that was cut off where it was; tell whether there is one."""
-        found = [info for info in infos if info.truncated]
-        for info in found:
-            self.note(f'{info.path}: {info.truncated}')
-        return bool(found)
+    def told(self, infos: Iterable[RecordingInfo]) -> bool:
+        """Say what was chosen in each bag, and where it was cut off; tell whether one was."""
+        is_torn = False
+        for info in infos:
+            for said in filter(None, (info.chosen, info.truncated)):
+                self.note(f'{info.path}: {said}')
+            is_torn |= bool(info.truncated)
+        return is_torn
 
     @staticmethod
     def end(*, is_torn: bool) -> None:

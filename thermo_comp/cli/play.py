@@ -30,10 +30,8 @@ def play(
         float, typer.Option(help='Longest wait for a subscriber on every topic, in s.', min=0.0)
     ] = 10.0,
     input_: options.InputOption = options.InputChoice.auto,
-    counts_topic: options.CountsTopic = 'accel/counts',
-    imu_topic: options.ImuTopic = 'imu/uncompensated',
-    board_topic: options.BoardTopic = 'temperature/board',
-    case_topic: options.CaseTopic = 'temperature/case',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -62,15 +60,17 @@ def play(
             n_loops=0 if loop else 1,
             clock=clock,
             wait_s=wait,
-            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            topics=options.topics_of(topic, topics),
             input=input_.value,
             ros_args=context.obj or (),
             progress=done,
         )
-    for topic in report.unheard:
-        out.note(f'nobody listened to {topic}')
-    for topic in report.lossy:
-        out.note(f'{topic} has a best-effort subscriber, which can lose messages')
+    for name in report.unheard:
+        out.note(f'nobody listened to {name}')
+    for name in report.lossy:
+        out.note(f'{name} has a best-effort subscriber, which can lose messages')
+    if report.chosen:
+        out.note(f'{bag}: {report.chosen}')
     if report.missing:
         out.note(f'{bag}: {report.missing}')
     out.table(('topic', 'messages'), sorted(report.n_messages.items()))

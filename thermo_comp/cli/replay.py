@@ -43,10 +43,8 @@ def replay(
         float | None, typer.Option(help='As the parameter of the node, in s.')
     ] = None,
     input_: options.InputOption = options.InputChoice.auto,
-    counts_topic: options.CountsTopic = 'accel/counts',
-    imu_topic: options.ImuTopic = 'imu/uncompensated',
-    board_topic: options.BoardTopic = 'temperature/board',
-    case_topic: options.CaseTopic = 'temperature/case',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     force: options.Force = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -88,7 +86,7 @@ def replay(
             load_calibration(calibration),
             output,
             config=config,
-            topics=options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+            topics=options.topics_of(topic, topics),
             input=input_.value,
             serial=serial,
             frame_id=frame_id,
@@ -104,7 +102,7 @@ def _say(out: Output, result: ReplayResult) -> None:
     from ..online.status import DROPPED
 
     counters = result.counters
-    is_bad = out.torn([result.info]) or not counters.n_out
+    is_bad = out.told([result.info]) or not counters.n_out
     dropped = {
         name.removeprefix('n_').replace('_', ' '): n
         for name, n in asdict(counters).items()

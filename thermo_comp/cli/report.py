@@ -42,10 +42,8 @@ def report(
         str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
     ] = None,
     input_: options.InputOption = options.InputChoice.auto,
-    counts_topic: options.CountsTopic = 'accel/counts',
-    imu_topic: options.ImuTopic = 'imu/uncompensated',
-    board_topic: options.BoardTopic = 'temperature/board',
-    case_topic: options.CaseTopic = 'temperature/case',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     force: options.Force = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -75,7 +73,7 @@ def report(
     check_output(output, PAGE, overwrite=force, others=read)
     limit = options.acceleration(tolerance)
     options.positive(window, '--window')
-    topics = options.topics_of(counts_topic, imu_topic, board_topic, case_topic)
+    where = options.topics_of(topic, topics)
     paths = bags or []
     known = [load_calibration(path) for path in calibration or []]
     loaded = known[0] if known else None
@@ -92,7 +90,7 @@ def report(
             opened.append(
                 open_bag(
                     path,
-                    topics,
+                    where,
                     kind,
                     number=number,
                     window_s=window,
@@ -113,7 +111,7 @@ def report(
         )
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
-    is_torn = out.torn(bag.info for bag in opened)
+    is_torn = out.told(bag.info for bag in opened)
     write_report(evidence, output, info=info, figures=figures, overwrite=force)
     for finding in evidence.findings:
         out.line(f'- {finding}')

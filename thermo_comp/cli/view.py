@@ -37,10 +37,8 @@ def view(
         str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
     ] = None,
     input_: options.InputOption = options.InputChoice.auto,
-    counts_topic: options.CountsTopic = 'accel/counts',
-    imu_topic: options.ImuTopic = 'imu/uncompensated',
-    board_topic: options.BoardTopic = 'temperature/board',
-    case_topic: options.CaseTopic = 'temperature/case',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
     quiet: options.Quiet = False,
 ) -> None:
     """
@@ -62,7 +60,7 @@ def view(
     report = LiveReport(
         calibration,
         bags or [],
-        options.topics_of(counts_topic, imu_topic, board_topic, case_topic),
+        options.topics_of(topic, topics),
         input_.value,
         gravity=options.place(gravity, latitude, height),
         serial=serial,

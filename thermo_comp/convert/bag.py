@@ -88,7 +88,7 @@ def find_topics(
     Raises RecordingError if there is no Imu topic, or several and none was chosen; or more
     thermometers than neighbourhood can tell apart.
     """
-    imu = imu or _only(path, _of_type(present, _IMU), 'Imu', '--imu-topic')
+    imu = imu or _only(path, _of_type(present, _IMU), 'Imu')
     thermometers = [name for name in _of_type(present, _TEMPERATURE) if name not in (board, case)]
     if case is None:
         baros = _of_type(present, _PRESSURE)
@@ -97,15 +97,15 @@ def find_topics(
             for name in thermometers
             if max((_common(name, baro) for baro in baros), default=0) > _common(name, imu)
         ]
-        case = _most(path, nearer, 'case', '--case-topic')
+        case = _most(path, nearer, 'case')
         thermometers = [name for name in thermometers if name != case]
     if board is None:
         beside = max((_common(name, imu) for name in thermometers), default=0)
         nearest = [name for name in thermometers if _common(name, imu) == beside]
-        board = _most(path, nearest, 'board', '--board-topic')
+        board = _most(path, nearest, 'board')
         thermometers = [name for name in thermometers if name != board]
     if case is None:
-        case = _most(path, thermometers, 'case', '--case-topic')
+        case = _most(path, thermometers, 'case')
     return {'imu': imu, 'board': board, 'case': case}
 
 
@@ -124,17 +124,18 @@ def _common(one: str, other: str) -> int:
     return shared
 
 
-def _only(path: Path, names: list[str], what: str, option: str) -> str:
+def _only(path: Path, names: list[str], what: str) -> str:
     if not names:
         raise RecordingError(f'the bag holds no {what} messages', path=path)
-    found = _most(path, names, what, option)
+    found = _most(path, names, what)
     return found or names[0]
 
 
-def _most(path: Path, names: list[str], what: str, option: str) -> str | None:
+def _most(path: Path, names: list[str], what: str) -> str | None:
     if len(names) > 1:
         raise RecordingError(
-            f'several topics may be the {what}: {", ".join(names)}; choose one with {option}',
+            f'several topics may be the {what}: {", ".join(names)}; choose one with '
+            f'--topic {what.lower()}=TOPIC',
             path=path,
         )
     return names[0] if names else None

@@ -76,6 +76,7 @@ def recording_source(
         shown_name(path),
         blocks,
         serial=info.metadata.get('serial'),
+        chosen=info.chosen,
         missing=lambda: latest.truncated,
     )
     return source, info

@@ -75,6 +75,7 @@ class FitSource:
     blocks: gives a fresh iterable of blocks; called once per pass
     sha256: hash of the content, for the provenance
     serial: unit serial found in the source's metadata
+    chosen: which of its topics were taken by their type
     missing: tells what of the bag is missing, as far as it has been read; None where nothing is
     """
 
@@ -82,4 +83,5 @@ class FitSource:
     blocks: Callable[[], Iterable[SourceBlock]]
     sha256: str | None = None
     serial: str | None = None
+    chosen: str | None = None
     missing: Callable[[], str | None] = _nothing

@@ -37,7 +37,7 @@ class RecordingInfo:
     `topics` have message type and number of messages; two types are joined by `` | ``. `start_ns`
     and `end_ns` are the log times of the first and the last message, or 0. `truncated` says what
     is missing; `metadata` are the pairs that the bag's writer left in it; `input` says which
-    accelerometer topic is read, if there is one.
+    accelerometer topic is read, if there is one; `chosen` which topics were taken by their type.
     """
 
     path: Path
@@ -48,6 +48,7 @@ class RecordingInfo:
     truncated: str | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
     input: Literal['counts', 'imu'] | None = None
+    chosen: str | None = None
 
     @property
     def n_messages(self) -> int:

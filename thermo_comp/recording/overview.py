@@ -80,20 +80,20 @@ class Survey:
         if self.n == 0:
             found.append(
                 'no accelerometer samples: record accel/counts or imu/uncompensated, or name '
-                'yours with --counts-topic or --imu-topic'
+                'yours with --topic counts=TOPIC or --topic imu=TOPIC'
             )
         board = self.thermometers.get('board')
         if board is None:
             found.append(
                 'no board temperature: a thermal fit needs temperature/board, or name yours with '
-                '--board-topic'
+                '--topic board=TOPIC'
             )
         else:
             found += _thermal_findings(board)
         if 'case' not in self.thermometers:
             found.append(
                 'no case temperature: the regime will follow the slower board sensor; name yours '
-                'with --case-topic'
+                'with --topic case=TOPIC'
             )
         if self.n and not self.n_still:
             found.append('it never rests for 3 s: the fit works on positions at rest')

@@ -81,7 +81,7 @@ class RecordingReader:
         self._names = selection.thermometers
         self.topics: Mapping[Role, str] = dict(selection.topics)
         self.definitions = source.definitions
-        self.info = replace(source.info, path=path, input=selection.input)
+        self.info = replace(source.info, path=path, input=selection.input, chosen=selection.chosen)
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +21,6 @@ TEMPERATURE = 'sensor_msgs/msg/Temperature'
 BOOL = 'std_msgs/msg/Bool'
 
 _TYPES = {'counts': VECTOR3_STAMPED, 'imu': IMU, 'board': TEMPERATURE, 'case': TEMPERATURE}
-_OPTIONS = {key: f'--{key}-topic' for key in _TYPES}
 #: What the node gives out is no input of it.
 _OUTPUT = '/imu/data_raw'
 
@@ -42,13 +41,32 @@ class Topics:
     A name matches with or without its leading slash and, where only one topic of the bag fits,
     with any namespace in front: ``accel/counts`` finds ``/imu0/accel/counts``. Where a usual name
     is not there, the bag's only topic of the type is taken. Further thermometers are found by
-    themselves: ``temperature/<name>``, in the namespace of the board's.
+    themselves, ``temperature/<name>`` in the namespace of the board's, or named in `further`.
     """
 
     counts: str = 'accel/counts'
     imu: str = 'imu/uncompensated'
     board: str = 'temperature/board'
     case: str = 'temperature/case'
+    further: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def named(cls, names: Mapping[str, str]) -> Topics:
+        """Take topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``."""
+        roles, further = {}, {}
+        for name, topic in names.items():
+            own = name.removeprefix('temperature/')
+            if not topic.strip('/'):
+                raise ValueError(f'`{name}` needs the name of a topic')
+            if own in _TYPES and (own == name or _TYPES[own] == TEMPERATURE):
+                roles[own] = topic
+            elif own != name and _NAME.fullmatch(own):
+                further[own] = topic
+            else:
+                raise ValueError(
+                    f'`{name}` is no input; expected {", ".join(_TYPES)} or temperature/NAME'
+                )
+        return cls(**roles, further=further)
 
 
 _USUAL = Topics()
@@ -65,12 +83,14 @@ class Selection:
     """
     Which topics of a bag feed which role, as far as they have messages.
 
-    `thermometers` are the names of all of them; `input` says what the accelerometer's topic is.
+    `thermometers` are the names of all of them; `input` says what the accelerometer's topic is,
+    `chosen` what was taken for want of the usual name.
     """
 
     topics: Mapping[Role, str]
     thermometers: tuple[str, ...]
     input: Literal['counts', 'imu'] | None
+    chosen: str | None
 
 
 def select_topics(
@@ -90,43 +110,59 @@ def select_topics(
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages', path)
     found: dict[Role, str] = {}
+    chosen = []
     accel = _accel_key(path, present, topics, input)
     keys: dict[Role, str | None] = {'accel': accel, 'board': 'board', 'case': 'case'}
     for role, key in keys.items():
         name = None if key is None else _find(path, present, topics, key)
         if name is None or key is None:
             if role in require:
-                raise _missing(path, present, topics, key)
+                wanted = [key] if key else ['counts', 'imu']
+                raise _missing(path, present, {one: getattr(topics, one) for one in wanted})
             continue
-        if present[name][0] != _TYPES[key]:
-            raise RecordingError(
-                f'the topic has type {shown(present[name][0])}, expected {_TYPES[key]}',
-                path,
-                shown(name),
-            )
+        _check_type(path, present, name, _TYPES[key])
         if present[name][1]:
             found[role] = name
+            if not _fits(name, getattr(topics, key)):
+                kind = _TYPES[key].rpartition('/')[2]
+                chosen.append(f'{shown(name)}, its only {kind}, is taken for {key}')
         elif role in require:
             raise RecordingError('the topic has no messages', path, shown(name))
-    further = _further(present, found)
-    thermometers = ('board', 'case', *further)
-    return Selection({**found, **further}, thermometers, accel if 'accel' in found else None)
+    further = _further(path, present, topics, found, is_read=bool(require))
+    return Selection(
+        {**found, **further},
+        ('board', 'case', *further),
+        accel if 'accel' in found else None,
+        '; '.join(chosen) or None,
+    )
 
 
-def _further(present: Present, found: Mapping[Role, str]) -> dict[str, str]:
-    """Find the other thermometers: ``temperature/<name>`` beside the board's or the case's."""
+def _further(
+    path: Path, present: Present, topics: Topics, found: Mapping[Role, str], *, is_read: bool
+) -> dict[str, str]:
+    """Find the other thermometers: those named, and any beside the board's or the case's."""
+    named = {}
+    for own, wanted in topics.further.items():
+        name = _match(path, present, wanted, f'temperature/{own}')
+        if name is None and is_read:
+            raise _missing(path, present, {f'temperature/{own}': wanted})
+        if name is not None:
+            _check_type(path, present, name, TEMPERATURE)
+            named[own] = name
     beside = found.get('board') or found.get('case') or ''
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'
-    return {
+    beside_it = {
         name.removeprefix(front): name
         for name, (kind, count) in sorted(present.items())
         if kind == TEMPERATURE
         and count
-        and name not in found.values()
+        and name not in {*found.values(), *named.values()}
         and name.startswith(front)
         and _NAME.fullmatch(name.removeprefix(front))
     }
+    both = {**beside_it, **named}
+    return {own: both[own] for own in sorted(both)}
 
 
 def _accel_key(
@@ -147,8 +183,20 @@ def _accel_key(
     return empty
 
 
-def _find(path: Path, present: Present, topics: Topics, key: str) -> str | None:
-    wanted: str = getattr(topics, key)
+def _check_type(path: Path, present: Present, name: str, expected: str) -> None:
+    kind = present[name][0]
+    if kind != expected:
+        raise RecordingError(
+            f'the topic has type {shown(kind)}, expected {expected}', path, shown(name)
+        )
+
+
+def _fits(name: str, wanted: str) -> bool:
+    return f'/{name.strip("/")}'.endswith(f'/{wanted.strip("/")}')
+
+
+def _match(path: Path, present: Present, wanted: str, key: str) -> str | None:
+    """Find a topic by its name, or the only one that has the name behind a namespace."""
     bare = wanted.strip('/')
     exact = [name for name in present if name.strip('/') == bare]
     if exact:
@@ -157,37 +205,42 @@ def _find(path: Path, present: Present, topics: Topics, key: str) -> str | None:
     if len(spaced) > 1:
         raise RecordingError(
             f'several topics end in it: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
-            f'choose one with {_OPTIONS[key]}',
+            f'choose one with --topic {key}=TOPIC',
             path,
             wanted,
         )
-    if spaced:
-        return spaced[0]
+    return spaced[0] if spaced else None
+
+
+def _find(path: Path, present: Present, topics: Topics, key: str) -> str | None:
+    wanted: str = getattr(topics, key)
+    name = _match(path, present, wanted, key)
+    if name is not None:
+        return name
     # A case is no board, and a bag without a case's thermometer is an ordinary one.
     if key == 'case' or wanted != getattr(_USUAL, key):
         return None
-    taken = {getattr(topics, other).strip('/') for other in _TYPES if other != key}
+    taken = [getattr(topics, other) for other in _TYPES if other != key]
+    taken += topics.further.values()
     only = [
         name
         for name, (kind, count) in present.items()
         if count
         and kind == _TYPES[key]
         and not name.endswith(_OUTPUT)
-        and not any(('/' + name.strip('/')).endswith('/' + other) for other in taken)
+        and not any(_fits(name, other) for other in taken)
     ]
     return only[0] if len(only) == 1 else None
 
 
-def _missing(path: Path, present: Present, topics: Topics, key: str | None) -> RecordingError:
+def _missing(path: Path, present: Present, wanted: Mapping[str, str]) -> RecordingError:
     names = sorted(present)[:_MAX_LISTED]
     listed = ', '.join(f'{shown(name)} ({shown(present[name][0])})' for name in names)
     if len(present) > len(names):
         listed += f' and {len(present) - len(names)} more'
-    if key is None:
-        wanted = f'{topics.counts} or {topics.imu}'
-        option = f'{_OPTIONS["counts"]} or {_OPTIONS["imu"]}'
-    else:
-        wanted, option = getattr(topics, key), _OPTIONS[key]
+    option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
-        f'no such topic; the bag has {listed}; name another with {option}', path, wanted
+        f'no such topic; the bag has {listed}; name another with {option}',
+        path,
+        ' or '.join(wanted.values()),
     )

@@ -15,9 +15,8 @@ from typing import Annotated
 import numpy as np
 
 from ..errors import ThermoCompError
-from ..files import read_bounded
 from ..judging import Verdict
-from ..plain_yaml import load_plain_yaml
+from ..plain_yaml import read_plain_yaml
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
@@ -28,7 +27,6 @@ from .text import number, rounded
 
 #: Coverage factor of an expanded uncertainty: 95 % of a normal distribution.
 COVERAGE = 2.0
-_SIZE_LIMIT = 1 << 16
 _N_SLOPE = 33
 
 Text = Annotated[str, Bounds(longest=500)]
@@ -121,18 +119,14 @@ def load_certificate_info(path: str | Path, serial: str | None = None) -> Certif
     Raises ThermoCompError if it cannot be read, a key is unknown or of another type, or it is
     about another unit; names the file and the key.
     """
+    data = read_plain_yaml(path)
     try:
-        data = load_plain_yaml(read_bounded(path, _SIZE_LIMIT).decode())
         info = build(CertificateInfo, {} if data is None else data)
         if serial and info.unit.serial and info.unit.serial != serial:
             raise SchemaError(
                 'unit.serial', f'must be that of the calibration, {serial}, got {info.unit.serial}'
             )
-    except OSError as error:
-        raise ThermoCompError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except UnicodeDecodeError as error:
-        raise ThermoCompError(f'{path}: not UTF-8 text (byte {error.start})') from error
-    except ValueError as error:  # of YAML, of the schema, of the size
+    except ValueError as error:
         raise ThermoCompError(f'{path}: {error}') from error
     return info
 

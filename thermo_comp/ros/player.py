@@ -66,6 +66,7 @@ class PlayReport:
     lossy: list[str] = field(
         default_factory=list
     )  # topics with a best-effort subscriber, which can lose messages
+    chosen: str | None = None  # which of its topics were taken by their type
     missing: str | None = None  # what of the bag could not be read
 
 
@@ -197,6 +198,7 @@ class _Player:
         for role in self._publishers:
             self._await_acknowledgement(role)
         self._report.duration_s = time.monotonic() - self._started
+        self._report.chosen = self._reader.info.chosen
         self._report.missing = self._reader.info.truncated
         for role, publisher in self._publishers.items():
             self._report.n_messages[publisher.topic_name] = self._n_sent[role]
