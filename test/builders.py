@@ -19,6 +19,7 @@ from thermo_comp.unit.calibration import (
     parameter_layout,
 )
 from thermo_comp.unit.functions import Polynomial
+from thermo_comp.unit.gyroscope import Gyroscope, RateCurve, RateSet, RateTerm
 from thermo_comp.unit.posterior import posterior_of
 
 GRAVITY = 9.80665
@@ -89,7 +90,40 @@ def rich_calibration():
         ),
     )
     n = parameter_layout(value).n_parameters
-    return replace(value, posterior=posterior_of(1e-8 * np.eye(n) + np.full((n, n), 1e-10)))
+    return replace(
+        value,
+        posterior=posterior_of(1e-8 * np.eye(n) + np.full((n, n), 1e-10)),
+        gyroscope=rich_gyroscope(),
+    )
+
+
+def rich_gyroscope():
+    """Make a gyroscope with columns of its own beside some of `rich_calibration`'s."""
+
+    def one(size):
+        curve = RateCurve(Polynomial((0.0, *(size / k for k in (1e4, 1e6)))), delta=size * 1e-5)
+        return RateSet(curve, RateCurve(Polynomial((0.0, 2e-4))), curve)
+
+    def of(kind, bias, **keys):
+        return RateTerm(group=kind, kind=kind, bias=bias, range=(-50.0, 50.0), **keys)
+
+    response = (
+        of('now', (1e-4, -2e-4, 3e-4)),
+        of('board', (3e-4, 1e-4, -1e-4), tau_s=600.0),
+        of('board', (-2e-4, 1e-4, 1e-4), tau_s=120.0),
+        of('neighbour', (1e-4, 0.0, 1e-4), tau_s=240.0, sensor='frame'),
+    )
+    n = 3 * (2 + len(response)) + 2 * (2 + 1 + 2)
+    return Gyroscope(
+        bias_rad_s=(0.02, -0.03, 0.01),
+        static=one(1.0),
+        dynamic=one(-2.0),
+        noise_density_rad_s_sqrt_hz=(1e-4, 2e-4, 1e-4),
+        slow_noise_rad_s_sqrt_h=(1e-6, 1e-6, 1e-6),
+        residual_sd_rad_s=(1e-5, 2e-5, 1e-5),
+        response=response,
+        posterior=posterior_of(1e-10 * np.eye(n) + np.full((n, n), 1e-12)),
+    )
 
 
 @dataclass

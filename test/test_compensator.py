@@ -42,26 +42,46 @@ def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=
 
 
 def stream(compensator, events):
-    """Run events one by one; return the rows and the positions of the published samples."""
+    """
+    Run events one by one; return the rows and the positions of the published samples.
+
+    With a gyroscope a row goes on with the rate, of one unit in a thousand of the sample.
+    """
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:
         if kind == 'accel':
             row = compensator.process(stamp, *map(float, value))
             if row is not None:
+                if compensator.corrects_rate:
+                    rate = (1e-3 * float(component) for component in value)
+                    row = (*row, *compensator.correct_rate(stamp, *rate))
                 rows.append(row)
                 index.append(position)
             position += 1
         else:
             compensator.push(kind, stamp, value)
-    return np.array(rows).reshape(-1, 9), index
+    return np.array(rows).reshape(-1, 15 if compensator.corrects_rate else 9), index
 
 
-def assert_same(block, rows, index):
-    assert block.index.tolist() == index
-    np.testing.assert_array_equal(block.specific_force, rows[:, :3])
-    np.testing.assert_array_equal(block.covariance[:, UNIQUE], rows[:, 3:])
-    matrices = block.covariance.reshape(-1, 3, 3)
+def batch(compensator, events):
+    columns = columns_from_events(events)
+    return process_block(compensator, columns, 1e-3 * columns.accel)
+
+
+def assert_same(blocks, rows, index):
+    if index is not None:
+        assert [k for block in blocks for k in block.index.tolist()] == index
+    parts = [
+        (block.specific_force, block.covariance, block.angular_rate, block.angular_rate_variance)
+        for block in blocks
+    ]
+    force, covariance, rate, variance = map(np.concatenate, zip(*parts, strict=True))
+    np.testing.assert_array_equal(force, rows[:, :3])
+    np.testing.assert_array_equal(covariance[:, UNIQUE], rows[:, 3:9])
+    np.testing.assert_array_equal(rate, rows[:, 9:12])
+    np.testing.assert_array_equal(variance, rows[:, 12:])
+    matrices = covariance.reshape(-1, 3, 3)
     np.testing.assert_array_equal(matrices, matrices.transpose(0, 2, 1))
 
 
@@ -147,17 +167,9 @@ def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, trans
     whole = Compensator(rich_calibration(), config)
     cut = Compensator(rich_calibration(), config)
     rows, index = stream(streamed, events)
-    assert_same(process_block(whole, columns_from_events(events)), rows, index)
-    pieces = [
-        process_block(cut, columns_from_events(events[k : k + chunk]))
-        for k in range(0, len(events), chunk)
-    ]
-    np.testing.assert_array_equal(
-        np.concatenate([piece.specific_force for piece in pieces]), rows[:, :3]
-    )
-    np.testing.assert_array_equal(
-        np.concatenate([piece.covariance for piece in pieces])[:, UNIQUE], rows[:, 3:]
-    )
+    assert_same([batch(whole, events)], rows, index)
+    pieces = [batch(cut, events[k : k + chunk]) for k in range(0, len(events), chunk)]
+    assert_same(pieces, rows, None)
     assert streamed.counters == whole.counters == cut.counters
     assert streamed.take_flags() == whole.take_flags() == cut.take_flags()
 
@@ -166,8 +178,11 @@ def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, trans
 @settings(max_examples=200, deadline=None)
 def test_whatever_comes_in_what_goes_out_is_sound(events):
     compensator = Compensator(rich_calibration(), CompensatorConfig(case_timeout_s=2.0))
-    block = process_block(compensator, columns_from_events(events))
+    block = batch(compensator, events)
     assert np.isfinite(block.specific_force).all()
+    assert np.isfinite(block.angular_rate).all()
+    assert np.isfinite(block.angular_rate_variance).all()
+    assert (block.angular_rate_variance > 0.0).all()
     matrices = block.covariance.reshape(-1, 3, 3)
     assert np.isfinite(matrices).all()
     if len(matrices):
@@ -191,7 +206,7 @@ def test_long_run_batch_equals_stream(rng):
         events.append(('accel', stamp, (rng.normal(0, 900), rng.normal(0, 900), 2900.0)))
     streamed, whole = Compensator(rich_calibration()), Compensator(rich_calibration())
     rows, index = stream(streamed, events)
-    assert_same(process_block(whole, columns_from_events(events)), rows, index)
+    assert_same([batch(whole, events)], rows, index)
     assert len(rows) == 60_000
     assert {value for _, value in whole.take_flags()} == {True, False}
 

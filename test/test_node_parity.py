@@ -58,6 +58,8 @@ def thermal_test(path: Path, imu: bool = False) -> int:
             writer.write_temperature(topic, reading_ns, noisy, reading_ns + late)
         if imu:
             rest = ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
+            # Every tenth message says that it holds no angular rate.
+            rest.angular_velocity_covariance[::10, 0] = -1.0
             covariance = rest.linear_acceleration_covariance
             force = accel / [300.0, -295.0, 310.0]
             writer.write_imu(TOPICS.imu, stamps, force, covariance, 'imu_link', imu=rest)
@@ -125,6 +127,17 @@ def test_imu_in_another_frame(tmp_path: Path) -> None:
     unit = replace(unit, axes=replace(unit.axes, **axes))
     args = ['-p', 'input:=imu', '-p', 'frame_id:=tilted']
     assert run(unit, tmp_path / 'bag.mcap', tmp_path, *args, frame_id='tilted') > 0
+    given = read_recording(tmp_path / 'bag.mcap', input='imu', require=('accel',)).columns
+    found, _, _ = output_of(tmp_path / 'live.mcap')
+    given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, found.accel_stamp_ns)))
+    is_rate = given.angular_velocity_covariance[:, 0] != -1.0
+    # The rate is corrected where there is one; what was no rate goes through as it came.
+    moved = np.abs(found.imu.angular_velocity - given.angular_velocity)
+    assert moved[~is_rate].max() == 0.0
+    # The biases of `rich_gyroscope` at the reference are 10 mrad/s and more.
+    assert moved[is_rate].min() > 1e-3
+    claimed = found.imu.angular_velocity_covariance[is_rate].reshape(-1, 3, 3)
+    assert (np.linalg.eigvalsh(claimed) > 0.0).all()
 
 
 def test_a_node_that_does_not_start_is_reported_in_its_own_words(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from .online.status import CompensatorConfig, Counters
 from .recording import (
     BagWriter,
     Block,
+    ImuColumns,
     Input,
     RawMessages,
     RecordingInfo,
@@ -113,7 +114,8 @@ def corrected_blocks(
 ) -> Iterable[CorrectedBlock]:
     """Run blocks, in file order, through a compensator; its counters go on counting."""
     for block in blocks:
-        corrected = process_block(compensator, block)
+        rate = None if block.imu is None else block.imu.angular_velocity
+        corrected = process_block(compensator, block, rate)
         yield CorrectedBlock(block, corrected, compensator.take_flags())
 
 
@@ -217,7 +219,7 @@ def _messages_of(
                 corrected.specific_force,
                 corrected.covariance,
                 frame_id or block.frame_id,
-                imu=None if block.imu is None else block.imu.take(corrected.index),
+                imu=_imu_of(item),
             )
         if item.flags:
             stamps, values = zip(*item.flags, strict=True)
@@ -253,14 +255,32 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
         after = np.searchsorted(switched, corrected.stamp_ns, 'right')
         columns['regime'] = _REGIMES[np.array(flags)[after]]
         regime = flags[-1]
-        if item.block.imu is not None:
-            rate = item.block.imu.angular_velocity[corrected.index]
+        imu = _imu_of(item)
+        if imu is not None:
             for axis, name in enumerate('xyz'):
-                columns[f'angular_velocity_{name}_rad_s'] = rate[:, axis]
+                columns[f'angular_velocity_{name}_rad_s'] = imu.angular_velocity[:, axis]
         write_rows(columns)
 
     with table as write_rows:
         yield write
+
+
+def _imu_of(item: CorrectedBlock) -> ImuColumns | None:
+    """Give what goes out beside the force; a rate that is none (-1 in its covariance) stays."""
+    if item.block.imu is None:
+        return None
+    imu, corrected = item.block.imu.take(item.corrected.index), item.corrected
+    if corrected.angular_rate is None or corrected.angular_rate_variance is None:
+        return imu
+    before = imu.angular_velocity_covariance
+    is_rate = before[:, :1] != -1.0
+    covariance = np.zeros_like(before)
+    covariance[:, ::4] = corrected.angular_rate_variance
+    return replace(
+        imu,
+        angular_velocity=np.where(is_rate, corrected.angular_rate, imu.angular_velocity),
+        angular_velocity_covariance=np.where(is_rate, covariance, before),
+    )
 
 
 def _others(reader: RecordingReader) -> Iterator[RawMessages]:

@@ -11,15 +11,17 @@ the operations of `Compensator.process` in their order.
 from __future__ import annotations
 
 from array import array
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ..thermal.reading_queue import refused_readings
 from ..typing import Bools, Floats, Ints, Stamps
+from ..unit.correction import Correction
 from .blocks import AccelBlock, CompensatedBlock
 from .compensator import TIME_JUMP_NS, Compensator
-from .kernel import Lines, correct
+from .kernel import Lines, correct, correct_rates
 from .segments import SEGMENT_NS, lay_lines
 
 #: Where xx, xy, xz, yy, yz, zz stand in a row of the covariance.
@@ -67,12 +69,17 @@ class _Segments:
         return list(table.T.copy())
 
 
-def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
+def process_block(
+    compensator: Compensator, block: AccelBlock, angular_rate: Floats | None = None
+) -> CompensatedBlock:
     """
-    Correct a block, e.g. a `recording.Block`, with the bits that `Compensator.process` gives.
+    Correct a block, e.g. a `recording.Block`, with the bits that `Compensator.process` gives, and
+    the angular rate of its samples, shape (n, 3), with those of `correct_rate`.
 
     Flags wait in `Compensator.take_flags`, counts in its `counters`.
     """
+    if not compensator.corrects_rate:
+        angular_rate = None
     counters = compensator.counters
     n_seen = counters.n_in - counters.n_out_of_order
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
@@ -85,7 +92,7 @@ def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlo
     else:
         before = np.maximum.accumulate(np.concatenate(([compensator.last_ns], stamps)))[:-1]
         if np.any(stamps <= before - TIME_JUMP_NS):
-            return _one_by_one(compensator, block)
+            return _one_by_one(compensator, block, angular_rate)
         in_order = stamps > before
         index = np.flatnonzero(in_order)
         counters.n_out_of_order += len(stamps) - len(index)
@@ -94,10 +101,12 @@ def process_block(compensator: Compensator, block: AccelBlock) -> CompensatedBlo
     segments = _run_thermal_side(compensator, block, stamps, kept_before, n_seen)
     if len(stamps):
         compensator.last_ns = int(stamps[-1])
-    return _apply(compensator, segments, index, stamps, samples)
+    return _apply(compensator, segments, index, stamps, samples, angular_rate)
 
 
-def _one_by_one(compensator: Compensator, block: AccelBlock) -> CompensatedBlock:
+def _one_by_one(
+    compensator: Compensator, block: AccelBlock, angular_rate: Floats | None
+) -> CompensatedBlock:
     """Process a block in which time jumps: rare, so the stream's own code serves."""
     events = [
         (int(after), name, int(stamp_ns), float(celsius))
@@ -106,7 +115,7 @@ def _one_by_one(compensator: Compensator, block: AccelBlock) -> CompensatedBlock
         for stamp_ns, celsius, after in zip(*block.temperatures[name], strict=True)
     ]
     events.sort(key=lambda event: event[0])
-    index, rows = [], []
+    index, rows, rates = [], [], []
     k = 0
     stamps = block.accel_stamp_ns.tolist()
     for i, (stamp_ns, sample) in enumerate(zip(stamps, block.accel.tolist(), strict=True)):
@@ -117,16 +126,22 @@ def _one_by_one(compensator: Compensator, block: AccelBlock) -> CompensatedBlock
         if row is not None:
             index.append(i)
             rows.append(row)
+            if angular_rate is not None:
+                rates.append(compensator.correct_rate(stamp_ns, *angular_rate[i].tolist()))
     for _, name, stamp_ns, celsius in events[k:]:
         compensator.push(name, stamp_ns, celsius)
     where = np.array(index, dtype=np.int64)
     table = np.array(rows).reshape(-1, 9)
-    return CompensatedBlock(
+    result = CompensatedBlock(
         where,
         np.asarray(block.accel_stamp_ns)[where],
         table[:, :3],
         table[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]],
     )
+    if angular_rate is None:
+        return result
+    table = np.array(rates).reshape(-1, 6)
+    return replace(result, angular_rate=table[:, :3], angular_rate_variance=table[:, 3:])
 
 
 def _run_thermal_side(
@@ -221,35 +236,49 @@ def _add_segments(
 
 
 def _apply(
-    compensator: Compensator, segments: _Segments, index: Ints, stamps: Stamps, samples: Floats
+    compensator: Compensator,
+    segments: _Segments,
+    index: Ints,
+    stamps: Stamps,
+    samples: Floats,
+    angular_rate: Floats | None,
 ) -> CompensatedBlock:
     if not segments.first:
-        return CompensatedBlock(index[:0], stamps[:0], np.empty((0, 3)), np.empty((0, 9)))
+        none = np.empty((0, 3))
+        rates = () if angular_rate is None else (none, none)
+        return CompensatedBlock(index[:0], stamps[:0], none, np.empty((0, 9)), *rates)
     slow = segments.columns(segments.slow)
+    ends = segments.columns(segments.states), segments.columns(segments.end_states)
+    excess = np.array(segments.noise_excess)
+
+    def lines_of(correction: Correction, first: int) -> list[Floats]:
+        of_axes = [(slow[k], slow[k + 1], slow[k + 2]) for k in (first, first + 3, first + 6)]
+        return lay_lines(correction, *ends, of_axes, excess)
+
     correction = compensator.thermal.correction
-    columns = lay_lines(
-        correction,
-        segments.columns(segments.states),
-        segments.columns(segments.end_states),
-        [(slow[k], slow[k + 1], slow[k + 2]) for k in (0, 3, 6)],
-        np.array(segments.noise_excess),
-    )
+    columns = lines_of(correction, 0)
     counts = np.array(segments.after) - np.array(segments.first)
     if int(counts.sum()) < len(stamps):
         covered = zip(segments.first, segments.after, strict=True)
         source = np.concatenate([np.arange(first, after) for first, after in covered])
         index, stamps, samples = index[source], stamps[source], samples[source]
-    lines = Lines(np.array(segments.start_ns, dtype=np.int64), columns, counts)
+    start_ns = np.array(segments.start_ns, dtype=np.int64)
+    lines = Lines(start_ns, columns, counts)
     force, covariance = correct(lines, correction.misalignment, stamps, samples)
     full_scale = compensator.calibration.unit.full_scale
     keep: Bools = np.asarray((np.abs(samples) < full_scale).all(axis=1))
     is_stuck = _stuck(compensator, stamps, samples)
     _judge(compensator, segments, counts, stamps, samples, force, covariance, keep, is_stuck)
+    rates: tuple[Floats, ...] = ()
+    if angular_rate is not None and compensator.thermal.rate_correction is not None:
+        columns = lines_of(compensator.thermal.rate_correction, 9)
+        rates = correct_rates(Lines(start_ns, columns, counts), stamps, angular_rate[index])
     if not keep.all():
         index, stamps = index[keep], stamps[keep]
         force, covariance = force[keep], covariance[keep]
+        rates = tuple(one[keep] for one in rates)
     compensator.counters.n_out += len(index)
-    return CompensatedBlock(index, stamps, force, covariance)
+    return CompensatedBlock(index, stamps, force, covariance, *rates)
 
 
 def _judge(

@@ -41,3 +41,6 @@ class CompensatedBlock:
     specific_force: Floats
     #: Row-major 3x3 [m^2/s^4], shape (n, 9).
     covariance: Floats
+    #: [rad/s], and variances [rad^2/s^2], shape (n, 3), where a rate is given and corrected.
+    angular_rate: Floats | None = None
+    angular_rate_variance: Floats | None = None

@@ -115,6 +115,23 @@ class Compensator:
             zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy,
         )
 
+    @property
+    def corrects_rate(self) -> bool:
+        """Whether the calibration has a gyroscope."""
+        return self.thermal.rate_correction is not None
+
+    def correct_rate(
+        self, stamp_ns: int, x: float, y: float, z: float
+    ) -> tuple[float, float, float, float, float, float]:
+        """
+        Correct the angular rate [rad/s] that came with the sample which `process` has just given.
+
+        Returns the rate and the variance of each axis [rad^2/s^2]; they have nothing in common.
+        """
+        dt = (stamp_ns - self._segment[0]) * 1e-9
+        bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = self._rate_line
+        return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz
+
     def _count_bad(self, x: float, y: float, z: float) -> None:
         full_scale = self._full_scale
         if self.is_refusing:
@@ -148,8 +165,10 @@ class Compensator:
         self._event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
         start = thermal.tracker.sample(start_ns)
         end = thermal.tracker.sample(start_ns + SEGMENT_NS)
-        slow = thermal.slow_at(start_ns, end)
-        line = lay_lines(thermal.correction, start, end, slow, thermal.noise_excess)
+        slow, excess = thermal.slow_at(start_ns, end), thermal.noise_excess
+        line = lay_lines(thermal.correction, start, end, slow[:3], excess)
+        if thermal.rate_correction is not None:
+            self._rate_line = lay_lines(thermal.rate_correction, start, end, slow[3:], excess)
         self._segment = (start_ns, line[:12], line[12:], thermal.correction.misalignment)
         if not is_new:
             return self.process(stamp_ns, x, y, z)

@@ -25,7 +25,7 @@ class Lines:
 
     def __init__(self, start_ns: Ints, columns: list[Floats], counts: Ints) -> None:
         self._start_ns = start_ns
-        self._columns = columns
+        self.columns = columns
         self._ends = np.cumsum(counts)
         self._begins = self._ends - counts
         self._rows = slice(0, 0)
@@ -51,7 +51,7 @@ class Lines:
 
     def corrected(self, axis: int, raw: Floats, dt: Floats, out: Floats | None = None) -> Floats:
         """Take bias and scale from the samples of one axis."""
-        bias, bias_slope, scale, scale_slope = self._columns[4 * axis : 4 * axis + 4]
+        bias, bias_slope, scale, scale_slope = self.columns[4 * axis : 4 * axis + 4]
         value: Floats = self.spread(bias_slope)
         value *= dt
         value += self.spread(bias)
@@ -65,7 +65,7 @@ class Lines:
 
     def variance(self, axis: int, x: Floats, out: Floats | None = None) -> Floats:
         """Error variance of one axis."""
-        a, b, c = self._columns[12 + 3 * axis : 15 + 3 * axis]
+        a, b, c = self.columns[12 + 3 * axis : 15 + 3 * axis]
         value: Floats = self.spread(c)
         value *= x
         value += self.spread(b)
@@ -95,6 +95,20 @@ def correct(
                 lines, misalignment, stamps[piece], columns, force[:, piece], covariance[:, piece]
             )
     return force.T, covariance.T
+
+
+def correct_rates(lines: Lines, stamps: Stamps, rates: Floats) -> tuple[Floats, Floats]:
+    """Correct angular rates (n, 3), as `Compensator.correct_rate` does; and variances."""
+    lines.select(0, len(stamps))
+    dt = lines.age(stamps)
+    corrected, variance = np.empty((2, len(stamps), 3))
+    for axis in range(3):
+        bias = lines.spread(lines.columns[4 * axis + 1]) * dt
+        bias += lines.spread(lines.columns[4 * axis])
+        with np.errstate(invalid='ignore', over='ignore'):
+            np.subtract(rates[:, axis], bias, out=corrected[:, axis])
+        variance[:, axis] = lines.spread(lines.columns[12 + 3 * axis])
+    return corrected, variance
 
 
 def _correct(

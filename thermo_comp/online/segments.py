@@ -25,6 +25,7 @@ from ..thermal.tracker import ThermalTracker
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction, Variance
 from ..unit.functions import Number
+from ..unit.rate_triad import rate_triad
 from ..unit.uncertainty import SlowUncertainty
 from .sample_checks import RateCheck
 from .status import CompensatorConfig, Counters
@@ -58,7 +59,13 @@ class ThermalSide:
         self._timeout_ns = int(config.temperature_timeout_s * 1e9)
         self.calibration = calibration
         self.correction = Correction(calibration)
-        self._uncertainty = SlowUncertainty(calibration, self.correction)
+        self._uncertainty = [SlowUncertainty(calibration, self.correction)]
+        #: That of the angular rate, over the same thermal state; None where it passes as it is.
+        self.rate_correction: Correction | None = None
+        if calibration.gyroscope is not None:
+            triad = rate_triad(calibration)
+            self.rate_correction = Correction(triad, self.correction.memory)
+            self._uncertainty.append(SlowUncertainty(triad, self.rate_correction))
         self.inputs = (BOARD_INPUT, *calibration.sensors)
         self.rate = RateCheck(calibration.unit.cycle_time_s)
         self._counts_cycles = calibration.unit.input == 'counts'
@@ -189,12 +196,16 @@ class ThermalSide:
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[Variance[float]]:
-        """Give the slow part of the variance of a segment, evaluated at its end or held."""
+        """
+        Give the slow part of the variance of a segment, evaluated at its end or held.
+
+        Of the three axes, and behind these of those of the angular rate, if it is corrected.
+        """
         key = start_ns // SLOW_NS
         if key != self._slow_key:
             self._slow_key = key
             shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
-            self._slow = self._uncertainty.at(end_state, shares)
+            self._slow = [v for one in self._uncertainty for v in one.at(end_state, shares)]
         return self._slow
 
 

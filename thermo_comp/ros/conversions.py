@@ -27,6 +27,8 @@ from sensor_msgs.msg import Imu, Temperature
 
 #: Compensates one sample: stamp and three components in, force and covariance out, None = drop.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
+#: Corrects the angular rate that came with that sample: rate and variances out.
+CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 # An Imu is orientation 4 + 9, angular velocity 3 + 9, linear acceleration 3 + 9 float64 values.
 _PASSED = 25
@@ -45,6 +47,9 @@ _NO_GYRO = Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] 
 _HEADER = Struct('<iII')
 _VALUE = Struct('<d')
 _SHORTEST_READING = 36  # no frame_id: its NUL, padding, temperature and variance
+#: Where the rate stands in what is passed on, and its form with the first of its covariance.
+_RATE_AT = 8 * 13
+_RATE_IN, _RATE_OUT = Struct('<4d'), Struct('<12d')
 _FOREIGN = Struct('>25Q')
 _NATIVE = Struct('<25Q')
 
@@ -64,12 +69,24 @@ class _Layout:
     passed: int
     is_foreign: bool
 
-    def write(self, data: bytes, sec: int, nanosec: int, result: tuple[float, ...]) -> bytes:
+    def write(
+        self,
+        data: bytes,
+        sec: int,
+        nanosec: int,
+        result: tuple[float, ...],
+        correct_rate: CorrectRate | None = None,
+    ) -> bytes:
         block = _NO_GYRO
         if self.passed:
             block = data[self.passed : self.passed + 8 * _PASSED]
             if self.is_foreign:
                 block = _NATIVE.pack(*_FOREIGN.unpack(block))
+            if correct_rate is not None:
+                x, y, z, claimed = _RATE_IN.unpack_from(block, _RATE_AT)
+                if claimed != -1.0:
+                    rate = correct_rate(sec * 1_000_000_000 + nanosec, x, y, z)
+                    block = block[:_RATE_AT] + _RATE_OUT.pack(*_spelt_out(*rate))
         fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
         return self.pack(
             _ENCAPSULATION, sec, nanosec, self.frame, block,
@@ -98,7 +115,9 @@ class SampleConverter:
         #: Messages that took the way through rclpy's deserialization.
         self.n_fallback = 0
 
-    def convert(self, data: bytes, process: Process) -> bytes | None:
+    def convert(
+        self, data: bytes, process: Process, correct_rate: CorrectRate | None = None
+    ) -> bytes | None:
         """Compensate one sample; None if it is not readable or `process` dropped it."""
         layout = self._layout
         try:
@@ -109,14 +128,14 @@ class SampleConverter:
         if not is_known:
             found = self._layout_of(data)
             if found is None:
-                return self._convert_message(data, process)
+                return self._convert_message(data, process, correct_rate)
             self._layout = layout = found
             encapsulation, sec, nanosec, name, x, y, z = layout.unpack(data)
         result = process(sec * 1_000_000_000 + nanosec, x, y, z)
         if result is None:
             return None
         self.last_result = result
-        return layout.write(data, sec, nanosec, result)
+        return layout.write(data, sec, nanosec, result, correct_rate)
 
     def _layout_of(self, data: bytes) -> _Layout | None:
         """Look up, or learn and check, where this message holds its values."""
@@ -164,7 +183,9 @@ class SampleConverter:
         is_written = written[:end] == expected[:end] and written[body:] == expected[body:]
         return layout if is_read and is_written else None
 
-    def _convert_message(self, data: bytes, process: Process) -> bytes | None:
+    def _convert_message(
+        self, data: bytes, process: Process, correct_rate: CorrectRate | None
+    ) -> bytes | None:
         """Take the ordinary way, for what no layout fits."""
         if len(data) > _LONGEST_MESSAGE:
             self.n_malformed += 1
@@ -179,6 +200,8 @@ class SampleConverter:
         if result is None:
             return None
         self.last_result = result
+        if correct_rate is not None and self._message_type is Imu:
+            _set_rate(message, correct_rate)
         return self._write_message(message, result)
 
     def _write_message(self, message: Any, result: tuple[float, ...]) -> bytes:
@@ -226,6 +249,18 @@ def _stamp_ns(message: Any) -> int:
 def _components(message: Any) -> tuple[float, float, float]:
     vector = message.vector if isinstance(message, Vector3Stamped) else message.linear_acceleration
     return vector.x, vector.y, vector.z
+
+
+def _set_rate(message: Any, correct_rate: CorrectRate) -> None:
+    if message.angular_velocity_covariance[0] == -1.0:
+        return
+    rate = message.angular_velocity
+    found = _spelt_out(*correct_rate(_stamp_ns(message), rate.x, rate.y, rate.z))
+    rate.x, rate.y, rate.z, *message.angular_velocity_covariance[:] = found
+
+
+def _spelt_out(x: float, y: float, z: float, xx: float, yy: float, zz: float) -> tuple[float, ...]:
+    return x, y, z, xx, 0.0, 0.0, 0.0, yy, 0.0, 0.0, 0.0, zz
 
 
 def _bits(values: Iterable[float]) -> bytes:

@@ -154,9 +154,11 @@ class Relay:
         return messages[start:]
 
     def _relay(self, messages: list[bytes]) -> None:
-        convert, process = self.converter.convert, self._compensator.process
+        compensator = self._compensator
+        convert, process = self.converter.convert, compensator.process
+        correct_rate = compensator.correct_rate if compensator.corrects_rate else None
         for data in messages:
-            frame = convert(data, process)
+            frame = convert(data, process, correct_rate)
             if frame is not None:
                 try:
                     self._publish(frame)

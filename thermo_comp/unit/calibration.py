@@ -19,16 +19,16 @@ Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import numpy as np
 
 from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings
 from .columns import Column
 from .extremes import extreme_values
-from .functions import TemperatureFunction
+from .functions import TemperatureFunction, check_reference
+from .gyroscope import Gyroscope, RateSet
 from .posterior import Block, ParameterLayout, Posterior
 from .schema import Bounds, NotNegative, Positive
 
@@ -42,8 +42,6 @@ FORMAT_VERSION = 2
 AXES = ('x', 'y', 'z')
 #: A scale function, with every term at its worst, must stay above this fraction of the reference.
 SMALLEST_RELATIVE_SCALE = 0.1
-#: How exactly a function must meet its value at the reference.
-NORMALISATION_TOLERANCE = 1e-9
 
 Celsius = Annotated[float, Bounds(at_least=-273.15, below=1000.0)]
 Vector = tuple[float, float, float]
@@ -104,14 +102,8 @@ class AxisSet:
     ] = 0.0
 
     def __post_init__(self) -> None:
-        for name, function, expected in (
-            ('bias_function', self.bias_function, 0.0),
-            ('scale_function', self.scale_function, 1.0),
-        ):
-            with np.errstate(all='ignore'):
-                value = function.value(0.0)
-            if not abs(value - expected) <= NORMALISATION_TOLERANCE:
-                raise ValueError(f'`{name}` must be {expected:g} at the reference, got {value:g}')
+        check_reference('bias_function', self.bias_function, 0.0)
+        check_reference('scale_function', self.scale_function, 1.0)
 
 
 @dataclass(frozen=True)
@@ -258,6 +250,9 @@ class Calibration:
     posterior: Annotated[
         Posterior | None, 'Covariance of all parameters; null where it is unknown.'
     ] = None
+    gyroscope: Annotated[
+        Gyroscope | None, 'Bias of the angular rate that comes with the samples; null: unknown.'
+    ] = None
 
     def __post_init__(self) -> None:
         if self.format_version != FORMAT_VERSION:
@@ -271,11 +266,12 @@ class Calibration:
                 edge - self.reference_temperature_c for edge in regime_set.temperature_range_c
             )
             for axis, name in enumerate(AXES):
-                extremes = extreme_values(regime_set.axes()[axis].bias_function, lower, upper)
-                if not all(map(math.isfinite, extremes)):
-                    raise ValueError(
-                        f'`{regime}.{name}.bias_function` must be finite over its range'
-                    )
+                for prefix, curves in self._curves(regime):
+                    extremes = extreme_values(curves.axes()[axis].bias_function, lower, upper)
+                    if not all(map(math.isfinite, extremes)):
+                        raise ValueError(
+                            f'`{prefix}.{name}.bias_function` must be finite over its range'
+                        )
                 smallest = self._smallest_scale(regime, regime_set, axis)
                 if not smallest > SMALLEST_RELATIVE_SCALE:
                     raise ValueError(
@@ -288,6 +284,11 @@ class Calibration:
                 f'`posterior.rest` must have one number per parameter ({expected}), '
                 f'got {self.posterior.n_parameters}'
             )
+
+    def _curves(self, regime: str) -> Iterator[tuple[str, RegimeSet | RateSet]]:
+        yield regime, getattr(self, regime)
+        if self.gyroscope is not None:
+            yield f'gyroscope.{regime}', getattr(self.gyroscope, regime)
 
     def _check_misalignment(self) -> None:
         for row in range(3):
@@ -308,12 +309,17 @@ class Calibration:
                 '`sensors` must be different names, at least one, none of them board, '
                 f'got {list(names)}'
             )
-        for k, term in enumerate(self.response):
-            if term.kind in ('now', 'neighbour', 'even') and term.sensor not in names:
-                raise ValueError(
-                    f'`response[{k}].sensor` must be one of sensors {list(names)}, '
-                    f'got {term.sensor!r}'
-                )
+        responses: dict[str, tuple[Column, ...]] = {'response': self.response}
+        if self.gyroscope is not None:
+            responses['gyroscope.response'] = self.gyroscope.response
+        for key, response in responses.items():
+            for k, term in enumerate(response):
+                of_sensor = term.is_of_gradient or term.kind == 'neighbour'
+                if of_sensor and term.sensor not in names:
+                    raise ValueError(
+                        f'`{key}[{k}].sensor` must be one of sensors {list(names)}, '
+                        f'got {term.sensor!r}'
+                    )
 
     def _smallest_scale(self, regime: str, regime_set: RegimeSet, axis: int) -> float:
         """Lower bound of the relative scale over a set's ranges, every term at its worst."""

@@ -16,6 +16,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from ..thermal.memory import MemorySpec
 from ..thermal.state import BOARD, GRADIENT, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
@@ -42,13 +43,13 @@ class Correction:
     Both sets of a calibration, blended by the weight of the thermal state, and its response.
 
     calibration: the unit
-    memory: what the tracker must remember
+    memory: what the tracker must remember, for the angular rate, too; or what it does remember
     noise: variance of the noise of one message per axis, rounding included [m^2/s^4]
     noise_trace: their sum
     misalignment: yx, zx, zy of the misalignment and their variances
     """
 
-    def __init__(self, calibration: Calibration) -> None:
+    def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
         self.static = SetCurves(calibration.static, calibration.dynamic, calibration)
         self.dynamic = SetCurves(calibration.dynamic, calibration.static, calibration)
         self._edges = [one.temperature_range_c for one in calibration.regime_sets()]
@@ -56,7 +57,9 @@ class Correction:
         self._K = tuple(axis.scale_factor for axis in (axes.x, axes.y, axes.z))
         self._gravity = calibration.gravity_m_s2
         response = calibration.response
-        self.memory = memory_of(response, calibration.sensors)
+        gyroscope = calibration.gyroscope
+        columns = (*response, *(gyroscope.response if gyroscope else ()))
+        self.memory = memory or memory_of(columns, calibration.sensors)
         lower, upper = zip(*self._edges, strict=True)
         self.table = ColumnTable(
             response, self.memory, calibration.reference_temperature_c, (min(lower), max(upper))

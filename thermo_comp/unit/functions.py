@@ -26,6 +26,8 @@ from ..typing import Floats
 #: One float, or an array of them: what every evaluation here maps onto itself.
 Number = TypeVar('Number', float, Floats)
 
+#: How exactly a function must meet its value at the reference.
+NORMALISATION_TOLERANCE = 1e-9
 #: Knots of any use [K]; what is closer or farther away overflows.
 _KNOT_STEP = 1e-3
 _FARTHEST_KNOT = 2000.0
@@ -263,6 +265,14 @@ class Exponential:
 
 #: Any of the three families.
 TemperatureFunction = Polynomial | CubicSpline | Exponential
+
+
+def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
+    """Raise ValueError, with the name of the key, if a function misses its value at 0 K."""
+    with np.errstate(all='ignore'):
+        value = function.value(0.0)
+    if not abs(value - expected) <= NORMALISATION_TOLERANCE:
+        raise ValueError(f'`{name}` must be {expected:g} at the reference, got {value:g}')
 
 
 def _check_finite(name: str, values: tuple[float, ...]) -> None:

@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the gyroscope of a unit: the bias of its angular rate over the same columns; its scale is 1.
+
+``w = measured - bias``, with the bias of `calibration`'s measurement model: level and curve of
+each regime, and the response. Ranges, reference temperature and thermometers are the unit's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from .columns import Column
+from .functions import TemperatureFunction, check_reference
+from .posterior import Posterior
+from .schema import NotNegative, Positive
+
+
+@dataclass(frozen=True)
+class RateCurve:
+    """The curve of one axis in one regime."""
+
+    bias_function: Annotated[TemperatureFunction, 'Fs(t) [rad/s]; Fs(0) = 0.']
+    delta: Annotated[float, 'Bias of this regime relative to bias_rad_s [rad/s].'] = 0.0
+
+    def __post_init__(self) -> None:
+        check_reference('bias_function', self.bias_function, 0.0)
+
+
+@dataclass(frozen=True)
+class RateSet:
+    """The curves of one regime."""
+
+    x: RateCurve
+    y: RateCurve
+    z: RateCurve
+
+    def axes(self) -> tuple[RateCurve, RateCurve, RateCurve]:
+        """Return the three axes in order."""
+        return self.x, self.y, self.z
+
+
+@dataclass(frozen=True)
+class RateTerm(Column):
+    """A column of the thermal response with its weights on the three axes."""
+
+    bias: Annotated[tuple[float, float, float], 'rad/s per unit of the column.'] = field(
+        kw_only=True
+    )
+
+
+@dataclass(frozen=True)
+class Gyroscope:
+    """
+    What temperature does to the angular rate.
+
+    Raises ValueError if the posterior has not one variance per parameter: axis by axis the level
+    and the free coefficients of the static set, those of the dynamic one, and the weights.
+    """
+
+    bias_rad_s: Annotated[
+        tuple[float, float, float], 'At the reference temperature, in the mean over positions.'
+    ]
+    static: RateSet
+    dynamic: RateSet
+    noise_density_rad_s_sqrt_hz: Annotated[
+        tuple[Positive, Positive, Positive], 'White noise of each axis.'
+    ]
+    slow_noise_rad_s_sqrt_h: Annotated[
+        tuple[NotNegative, NotNegative, NotNegative],
+        'Random walk of the bias of each axis, per root hour.',
+    ] = (0.0, 0.0, 0.0)
+    residual_sd_rad_s: Annotated[
+        tuple[NotNegative, NotNegative, NotNegative],
+        'What the curves leave unexplained, as a slow error: a turn-on is one.',
+    ] = (0.0, 0.0, 0.0)
+    response: Annotated[tuple[RateTerm, ...], 'The thermal response, common to both sets.'] = ()
+    posterior: Annotated[
+        Posterior | None, 'Covariance of all parameters; null where it is unknown.'
+    ] = None
+
+    def __post_init__(self) -> None:
+        expected = sum(
+            2 + static.bias_function.n_free + dynamic.bias_function.n_free + len(self.response)
+            for static, dynamic in zip(self.static.axes(), self.dynamic.axes(), strict=True)
+        )
+        if self.posterior is not None and self.posterior.n_parameters != expected:
+            raise ValueError(
+                f'`posterior.rest` must have one number per parameter ({expected}), '
+                f'got {self.posterior.n_parameters}'
+            )

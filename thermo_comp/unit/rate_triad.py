@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the gyroscope as a triad: a Calibration of scale 1 in which every m/s^2 reads rad/s.
+
+So whatever corrects, predicts or draws an accelerometer does it for the angular rate as well. Such
+a triad lives in memory alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from .calibration import (
+    Axes,
+    AxisReference,
+    AxisSet,
+    Calibration,
+    Provenance,
+    RegimeSet,
+    ResponseTerm,
+    parameter_layout,
+)
+from .columns import Column
+from .functions import Polynomial
+from .gyroscope import Gyroscope, RateCurve, RateSet, RateTerm
+from .posterior import ParameterLayout, Posterior
+
+_COLUMN = [one.name for one in fields(Column)]
+_NIL = (0.0, 0.0, 0.0)
+
+
+def rate_triad(calibration: Calibration) -> Calibration:
+    """
+    Return the gyroscope of a unit as a triad.
+
+    Raises ValueError if there is none.
+    """
+    own = calibration.gyroscope
+    if own is None:
+        raise ValueError('`calibration` must have a gyroscope')
+    one = Polynomial((1.0,))
+
+    def regime(shared: RegimeSet, curves: RateSet) -> RegimeSet:
+        x, y, z = (
+            AxisSet(curve.bias_function, one, curve.delta, sd)
+            for curve, sd in zip(curves.axes(), own.residual_sd_rad_s, strict=True)
+        )
+        return replace(shared, x=x, y=y, z=z)
+
+    triad = replace(
+        calibration,
+        # No angular rate is out of the range of an accelerometer.
+        unit=replace(calibration.unit, input='m/s^2', full_scale=math.inf),
+        axes=Axes(*(AxisReference(1.0, bias) for bias in own.bias_rad_s)),
+        static=regime(calibration.static, own.static),
+        dynamic=regime(calibration.dynamic, own.dynamic),
+        noise_density_m_s2_sqrt_hz=own.noise_density_rad_s_sqrt_hz,
+        slow_noise_m_s2_sqrt_h=own.slow_noise_rad_s_sqrt_h,
+        misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        misalignment_sd=_NIL,
+        response=tuple(
+            ResponseTerm(**_column(term), bias=term.bias, scale=_NIL) for term in own.response
+        ),
+        provenance=Provenance(),
+        evidence=(),
+        posterior=None,
+        gyroscope=None,
+    )
+    if own.posterior is None:
+        return triad
+    layout = parameter_layout(triad)
+    rows = _bias_rows(layout)
+    matrix = np.zeros((layout.n_parameters, own.posterior.rank))
+    variances = np.zeros(layout.n_parameters)
+    matrix[rows], variances[rows] = own.posterior.matrix, own.posterior.variances
+    return replace(triad, posterior=Posterior.of(matrix, variances))
+
+
+def gyroscope_of(triad: Calibration) -> Gyroscope:
+    """Take the gyroscope out of a triad whose scale is 1."""
+    x, y, z = (axis.bias for axis in (triad.axes.x, triad.axes.y, triad.axes.z))
+    static, dynamic = (
+        RateSet(*(RateCurve(axis.bias_function, axis.delta) for axis in one.axes()))
+        for one in triad.regime_sets()
+    )
+    sx, sy, sz = (axis.residual_sd_m_s2 for axis in triad.static.axes())
+    posterior = triad.posterior
+    if posterior is not None:
+        rows = _bias_rows(parameter_layout(triad))
+        posterior = Posterior.of(posterior.matrix[rows], posterior.variances[rows])
+    return Gyroscope(
+        bias_rad_s=(x, y, z),
+        static=static,
+        dynamic=dynamic,
+        noise_density_rad_s_sqrt_hz=triad.noise_density_m_s2_sqrt_hz,
+        slow_noise_rad_s_sqrt_h=triad.slow_noise_m_s2_sqrt_h,
+        residual_sd_rad_s=(sx, sy, sz),
+        response=tuple(RateTerm(**_column(term), bias=term.bias) for term in triad.response),
+        posterior=posterior,
+    )
+
+
+def _column(term: Column) -> dict[str, Any]:
+    return {name: getattr(term, name) for name in _COLUMN}
+
+
+def _bias_rows(layout: ParameterLayout) -> list[int]:
+    return [row for block in layout.bias for row in range(block.static, block.end)]
