@@ -36,7 +36,7 @@ def processed(folder: Path, **keys: object) -> UnitOutcome:
 @pytest.fixture(scope='module')
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('fleet')
-    write_unit(folder / 'lot-A' / 'unit1', 1)
+    write_unit(folder / 'lot-A' / 'unit1', 1, metadata={'truth': '{}'})
     return folder
 
 
@@ -71,6 +71,7 @@ class TestRow:
         assert row['highest_c'] > 40.0
         assert row['start'] == '2026-01-01T00:00:01Z'
         assert 'mems-0001' in outcome.certificate
+        assert 'class="simulated"' in outcome.certificate
         brief = processed(fleet)
         assert brief.certificate == ''
         assert (brief.row['verdict'], brief.row['reservations']) == (

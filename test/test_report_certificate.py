@@ -212,5 +212,13 @@ def test_command_takes_the_statements(cli, tmp_path):
     given = ('-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'page.html', '--certificate-info')
     cli('report', *given, lab(tmp_path))
     assert 'Inertial Lab' in (tmp_path / 'page.html').read_text(encoding='utf-8')
+    bag = write_bag(tmp_path / '01.mcap')
+    fit = ('fit', bag, '-o', tmp_path / 'fit.yaml', '--gravity', '9.80665', '--certificate-info')
+    cli(*fit, lab(tmp_path), '--report', tmp_path / 'fit.html')
+    page = (tmp_path / 'fit.html').read_text(encoding='utf-8')
+    assert 'Inertial Lab' in page
+    assert 'class="simulated"' in page
+    assert '1 position in bags of its own fit' in page
+    assert '--report' in cli(*fit, lab(tmp_path), '--force', code=2).stderr
     refused = cli('report', *given, lab(tmp_path, 'number: 17'), '--force', code=1)
     assert 'lab.yaml: number: must be a valid text, got 17' in refused.stderr

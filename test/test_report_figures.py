@@ -19,6 +19,8 @@ from matplotlib.patches import StepPatch
 from report_helpers import evidence, fitted
 
 from thermo_comp.judging.history import history_of
+from thermo_comp.report.figures import figures_of
+from thermo_comp.report.figures_position import draw_every_position, draw_positions, equal_area
 from thermo_comp.report.figures_residual import draw_gravity, draw_histograms, draw_residuals
 from thermo_comp.report.figures_thermal import draw_dynamics, draw_temperatures
 from thermo_comp.report.figures_unit import (
@@ -26,14 +28,12 @@ from thermo_comp.report.figures_unit import (
     draw_functions,
     draw_history,
     draw_hysteresis,
-    draw_positions,
     draw_step,
-    equal_area,
     hysteresis_loop,
+    soak_measurements,
     step_answer,
 )
 from thermo_comp.report.page import position_error, schuler_peak
-from thermo_comp.report.plates import PLATES
 from thermo_comp.report.style import NARROW, WIDE, drawing, svg, thin
 from thermo_comp.report.text import label_text, number
 from thermo_comp.report.trace import thermal_trace
@@ -115,6 +115,20 @@ def test_hysteresis_loop_by_hand():
     assert heating[:, 1:] == pytest.approx(cooling[:, 1:])
 
 
+def test_a_soak_measures_what_the_calibration_lacks():
+    # A scale that is wrong by 30 ppm in all soaks, in whatever direction gravity is.
+    windows = evidence().windows
+    up = np.array([one.up for one in evidence().positions])[windows.position]
+    length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
+    wrong = replace(evidence(), windows=replace(windows, force=up * length[:, None]))
+    found = soak_measurements(wrong)
+    assert len(found.temperature) >= len(wrong.positions)
+    known = np.isfinite(found.scale)
+    assert known.any(axis=1).all()  # of three axes one has more than half of gravity
+    assert found.scale[known] == pytest.approx(30.0, rel=1e-4)
+    assert np.linalg.norm(found.bias, axis=1) == pytest.approx(30.0, rel=1e-4)
+
+
 def test_metres_of_a_navigator_by_hand():
     # 1 mg for 60 s: 9.80665e-3 * 1800 m; one micro-g at Schuler's frequency: 2 R 1e-6.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
@@ -175,6 +189,7 @@ def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
         draw_histograms,
         draw_functions,
         draw_positions,
+        draw_every_position,
         draw_step,
         draw_hysteresis,
         draw_history,
@@ -212,9 +227,9 @@ def test_names_of_others_fit_a_figure():
 
 
 def test_every_figure_asks_a_question():
-    for plate in PLATES:
-        assert plate.question.endswith('?')
-        assert plate.reading(evidence()).endswith('.')
+    for one in figures_of(evidence()):
+        assert one.question.endswith('?')
+        assert one.reading.endswith('.')
 
 
 def test_label_of_a_drawing_is_escaped():

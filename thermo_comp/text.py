@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what becomes of text that somebody else chose: serials, topics, metadata, file names."""
+"""Owns how texts are made fit to print: what somebody else chose, and nouns with their number."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ import sys
 
 #: A serial stands in file names, parameter files and tables.
 LONGEST_SERIAL = 64
+
+
+def counted(n: int, noun: str, ending: str = 's') -> str:
+    """Give a number with its noun, as in ``1 window`` and ``2 windows``."""
+    return f'{n} {noun}{ending * (n != 1)}'
 
 
 def one_line(text: str) -> str:

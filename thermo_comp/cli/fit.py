@@ -49,6 +49,7 @@ def fit(
     report: Annotated[
         Path | None, typer.Option(help='Certificate to write (HTML).', metavar='HTML')
     ] = None,
+    certificate_info: options.CertificateInfo = None,
     serial: options.NewSerial = None,
     full_scale: Annotated[
         float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
@@ -99,7 +100,14 @@ def fit(
     check_output(output, CALIBRATION, overwrite=force, others=inputs)
     if report is not None:
         check_output(report, PAGE, overwrite=force, others=[*inputs, output])
+    if certificate_info is not None and report is None:
+        raise options.usage('--certificate-info fills the page of --report: give that, too')
     sources, kind = fit_sources(bags, options.topics_of(topic, topics), input_.value, serial)
+    info = None
+    if certificate_info is not None:
+        from ..report import load_certificate_info
+
+        info = load_certificate_info(certificate_info, serial or sources[0].serial)
     try:
         settings = FitOptions(
             gravity=resolve_gravity(gravity, None, None),
@@ -131,7 +139,7 @@ def fit(
     if report is not None:
         from ..report import write_report
 
-        write_report(result, report, paths=bags, overwrite=force)
+        write_report(result, report, info=info, overwrite=force)
     _say(out, result, output, verbose)
     if report is not None:
         out.line(f'{report}: certificate')
@@ -143,6 +151,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
+    from ..text import counted
     from ..unit.gravity import spoken
 
     calibration = result.calibration
@@ -154,8 +163,7 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
         if finding.level != 'good':
             out.line(f'- {finding.message}')
     left_out = result.residuals[-1].left_out
-    n = len(result.positions)
-    headline = f'{n} position{"s" * (n != 1)}'
+    headline = counted(len(result.positions), 'position')
     if left_out.n:
         headline += f', {spoken(left_out.rms)} RMS of |f| - g on each by the others alone'
     out.line(

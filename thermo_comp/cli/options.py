@@ -105,6 +105,9 @@ NewSerial = Annotated[
 Window = Annotated[
     float, typer.Option('--window', help='Length of a window at rest, in s.', metavar='S')
 ]
+CertificateInfo = Annotated[
+    Path | None, typer.Option(help='What the laboratory states: number, customer, ... (YAML).')
+]
 Tolerance = Annotated[
     str | None,
     typer.Option(

@@ -165,7 +165,8 @@ def text(cell: Cell) -> str:
 
 def micro_g(value: float) -> str:
     """Return a residual in micro-g as the tables show it."""
-    return f'{value:.1f}' if abs(value) < 99.95 else f'{value:.0f}'
+    # Not -0.0.
+    return f'{round(value, 1) + 0.0:.1f}' if abs(value) < 99.95 else f'{value:.0f}'
 
 
 def _is_number(cell: str) -> bool:

@@ -29,9 +29,7 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help='Folder for the figures as PNG files.', metavar='DIR')
     ] = None,
-    certificate_info: Annotated[
-        Path | None, typer.Option(help='What the laboratory states: number, customer, ... (YAML).')
-    ] = None,
+    certificate_info: options.CertificateInfo = None,
     gravity: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,

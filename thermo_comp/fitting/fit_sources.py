@@ -78,6 +78,7 @@ def recording_source(
         serial=info.metadata.get('serial'),
         chosen=info.chosen,
         missing=lambda: latest.truncated,
+        metadata=info.metadata,
     )
     return source, info
 

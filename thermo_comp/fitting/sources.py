@@ -77,6 +77,7 @@ class FitSource:
     serial: unit serial found in the source's metadata
     chosen: which of its topics were taken by their type
     missing: tells what of the bag is missing, as far as it has been read; None where nothing is
+    metadata: what the recording says of itself
     """
 
     name: str
@@ -85,3 +86,4 @@ class FitSource:
     serial: str | None = None
     chosen: str | None = None
     missing: Callable[[], str | None] = _nothing
+    metadata: Mapping[str, str] = field(default_factory=dict)

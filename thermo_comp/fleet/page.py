@@ -12,9 +12,9 @@ from urllib.parse import quote
 import numpy as np
 
 from .. import __version__
+from ..report.figures import DrawnFigure, ReportFigure, drawn_figures
 from ..report.figures_fleet import draw_distances, draw_shares
 from ..report.html import render
-from ..report.plates import Draw, DrawnPlate, draw_plates
 from ..report.text import minus, number
 from .summary import Summary
 from .table import Cell, Row, is_fitted, is_valid
@@ -54,7 +54,7 @@ def render_fleet(
             for one in summary.drifts
         ],
         is_real=[one.is_significant for one in summary.drifts],
-        plates=_figures(fitted, summary),
+        figures=_figures(fitted, summary),
         spreads=[
             _cells(one.quantity.label, one.quantity.unit, float(np.min(one.values)), one.middle)
             + _cells(float(np.max(one.values)), one.sd, len(one.values))
@@ -90,15 +90,15 @@ def _bags(row: Row) -> str:
     return f'{row["n_bags"]} − {n_left_out}' if n_left_out else str(row['n_bags'])
 
 
-def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnPlate]:
+def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnFigure]:
     if not fitted:
         return []
     curves = {
         section: np.array([v for row in fitted if isinstance(v := row[f'{section}_ug'], float)])
         for section in ('raw', 'static', 'dynamic')
     }
-    drawn: list[tuple[str, str, str, Draw]] = [
-        (
+    found = [
+        ReportFigure(
             'residuals',
             'What is left of |g|, unit by unit?',
             'Share of the units whose residual at rest is below the value: raw (constants at the '
@@ -111,13 +111,13 @@ def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnPlate]:
         labels, z, names = zip(
             *((one.quantity.label, one.z, one.names) for one in summary.spreads), strict=True
         )
-        distances: Draw = partial(draw_distances, labels, z, names, summary.limit)
-        plate = (
-            'distances',
-            'Which units stand out, and in what?',
-            'Each stroke is a unit: its distance from the fleet’s median in robust standard '
-            'deviations. Diamonds beyond the dashed lines are the units listed above.',
-            distances,
+        found.append(
+            ReportFigure(
+                'distances',
+                'Which units stand out, and in what?',
+                'Each stroke is a unit: its distance from the fleet’s median in robust standard '
+                'deviations. Diamonds beyond the dashed lines are the units listed above.',
+                partial(draw_distances, labels, z, names, summary.limit),
+            )
         )
-        drawn.append(plate)
-    return draw_plates(drawn)
+    return drawn_figures(found)

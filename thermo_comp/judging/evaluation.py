@@ -86,6 +86,8 @@ def open_bag(
             blocks=lambda: _told(reader.blocks_on_one_clock(), total, progress),
             sha256=digest(path) if is_hashed else None,
             serial=info.metadata.get('serial'),
+            missing=lambda: reader.info.truncated,
+            metadata=info.metadata,
         )
         reduced = reduce_source(
             source,

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ..text import counted
 from ..typing import Bools, Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G, spoken
@@ -256,7 +257,7 @@ def _numbers(section: Section) -> str:
 
 
 def _windows(n: int, windows: Windows) -> str:
-    return f'{n} {"window" if n == 1 else "windows"} of {windows.window_s:g} s'
+    return f'{counted(n, "window")} of {windows.window_s:g} s'
 
 
 def _span(windows: Windows) -> str:

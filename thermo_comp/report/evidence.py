@@ -22,7 +22,7 @@ from ..fitting.reduction import Readings
 from ..judging import Judgement, Verdict, Windows
 from ..judging.history import Epoch
 from ..simulation import Cyclogram
-from ..typing import Floats
+from ..typing import Floats, Ints
 from ..unit.calibration import Calibration, Source
 from ..unit.metrics import norm_residual
 from .trace import ThermalTrace
@@ -197,3 +197,11 @@ class Evidence:
         _, place = np.unique(windows.position, return_inverse=True)
         true = ups[place]
         return {name: force - true for name, force in self.forces.items()}
+
+
+def means_by(labels: Ints, values: Floats) -> Floats:
+    """Average rows that have the same label, in the order of the labels."""
+    _, place = np.unique(labels, return_inverse=True)
+    total = np.zeros((int(place.max(initial=-1)) + 1, *values.shape[1:]))
+    np.add.at(total, place, values)
+    return np.asarray(total / np.bincount(place).reshape(-1, *[1] * (values.ndim - 1)))

@@ -129,7 +129,7 @@ def draw_dynamics(evidence: Evidence, sheet: Sheet) -> Figure:
     line = CASE_LINE if trace.is_case_leading else BOARD_LINE
     plot_thinned(bend, time, trace.case_acceleration * _PER_MINUTE2, sheet, **line)
     bend.set_ylabel('K/min²')
-    bend.set_title(f'     second derivative of T {sensor}')
+    bend.set_title(f'second derivative of T {sensor}')
     few_ticks(bend, 4)
     _draw_flag(flag, shown, unit)
     time_axis(flag, facts)

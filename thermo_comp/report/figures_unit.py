@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of the unit itself: bias, scale, answer to a step, and its positions."""
+"""Owns the figures of the calibration itself: bias and scale, answer to a step, loop, history."""
 
 from __future__ import annotations
 
@@ -17,30 +17,28 @@ from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
-from .evidence import LEFT_OUT, RAW, Evidence, Position
+from .evidence import CHOSEN, Evidence, means_by
 from .style import (
     AXIS_LINES,
+    BLACK,
     DYNAMIC_LINE,
     GREY,
-    RED,
     STATIC_LINE,
     Line,
     Sheet,
     legend_above,
     log_axis,
     new_figure,
+    shared_legend,
 )
-from .text import label_text, number
+from .text import label_text, minus, number
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
 _N_CURVE = 61
 #: From a few readings to where the longest lag of the bank has forgotten.
 _STEP_MINUTES = (0.2, 500.0)
-# Diameter of the ring of the position that the others tell the least of [pt].
-_RING = 22.0
-# Number labels of a dot plot beyond this would overlap.
-_MOST_LABELS = 24
+_POINT: Line = {'color': BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
 
 
 def _calibration(evidence: Evidence) -> Calibration:
@@ -50,43 +48,81 @@ def _calibration(evidence: Evidence) -> Calibration:
 
 
 def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
-    """Draw bias and scale over temperature in a soak and in ramps, with their bands."""
+    """Draw bias and scale over temperature, less a line, with bands and measurements."""
     calibration = _calibration(evidence)
     rows, columns = (6, 1) if sheet.is_narrow else (2, 3)
-    figure = new_figure(sheet, 9.6 if sheet.is_narrow else 4.2)
+    figure = new_figure(sheet, 10.2 if sheet.is_narrow else 4.4)
     panels = np.array(figure.subplots(rows, columns, sharex=True)).reshape(2, 3)
-    widest = np.zeros((2, 3))
-    for curve in curves(calibration):
-        for part, (value, sd) in enumerate(
-            ((curve.bias, curve.sd_bias), (curve.scale, curve.sd_scale))
-        ):
-            for i, axes in enumerate(panels[part]):
+    drawn = curves(calibration)
+    soak = drawn[0]
+    measured = soak_measurements(evidence)
+    reference = calibration.reference_temperature_c
+    for part, (name, unit) in enumerate((('bias', 'µg'), ('scale', 'ppm'))):
+        for i, axes in enumerate(panels[part]):
+            # All curves are 0 in a soak at the reference, and so is the line.
+            slope = float(np.polyfit(soak.temperature, getattr(soak, name)[:, i], 1)[0])
+            title = f'{AXES[i]}: {minus(f"{slope:+.3g}")} {unit}/K'
+            widest = 0.0
+            for curve in drawn:
+                value = getattr(curve, name)[:, i] - slope * (curve.temperature - reference)
                 if calibration.posterior is not None:
-                    _draw_band(axes, curve, value[:, i], BAND_SDS * sd[:, i])
-                    widest[part, i] = max(widest[part, i], BAND_SDS * float(sd[:, i].max()))
+                    half = BAND_SDS * getattr(curve, f'sd_{name}')[:, i]
+                    _draw_band(axes, curve, value, half)
+                    widest = max(widest, float(half.max()))
                 # The ends of the valid range are marked; a range of a few K stays visible so.
                 axes.plot(
                     curve.temperature,
-                    value[:, i],
+                    value,
                     label=curve.name,
                     markersize=3.5,
                     markevery=[0, -1],
                     marker=curve.marker,
                     **curve.line,
                 )
-    for part, (name, unit) in enumerate((('bias', 'µg'), ('scale', 'ppm'))):
-        for i, axes in enumerate(panels[part]):
-            band = f': ±{number(widest[part, i], 2)} {unit} at most' if widest[part, i] else ''
-            axes.set_title(f'{name} {AXES[i]}{band}')
-            axes.axvline(calibration.reference_temperature_c, color=GREY, linewidth=0.8)
+            temperature, error = measured.temperature, getattr(measured, name)[:, i]
+            if np.isfinite(error).any():
+                level = np.interp(temperature, soak.temperature, getattr(soak, name)[:, i])
+                value = level - slope * (temperature - reference) + error
+                axes.plot(temperature, value, 'o', label='measured in a soak', **_POINT)
+            axes.set_title(f'{title}, ±{number(widest, 2)} {unit}' if widest else title)
+            axes.axvline(reference, color=GREY, linewidth=0.8)
             axes.yaxis.set_major_locator(MaxNLocator(5))
             if sheet.is_narrow or not i:
-                axes.set_ylabel(f'change, {unit}')
+                axes.set_ylabel(f'{name} less the line, {unit}')
             if part and (i == 2 or not sheet.is_narrow):
                 axes.set_xlabel('T board, °C')
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper left', ncols=1 if sheet.is_narrow else 3)
+    shared_legend(figure, panels[0, 0], 1 if sheet.is_narrow else 4)
     return figure
+
+
+@dataclass(frozen=True)
+class SoakMeasurements:
+    """
+    What was measured in each soak of each position, against the calibration.
+
+    The mean board temperature, and what bias [micro-g] and scale [ppm] of each axis are larger by,
+    each as if all of the residual were its own, shapes (n, 3); the scale is NaN of an axis that
+    has less than half of gravity.
+    """
+
+    temperature: Floats
+    bias: Floats
+    scale: Floats
+
+
+def soak_measurements(evidence: Evidence) -> SoakMeasurements:
+    """Average what is left over each soak of each position: its windows in the static regime."""
+    windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
+    if windows is None or residual is None:
+        return SoakMeasurements(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    changes = (np.diff(windows.position) != 0) | (np.diff(windows.is_dynamic) != 0)
+    soak = np.concatenate(([0], np.cumsum(changes)))[~windows.is_dynamic]
+    values = np.column_stack((windows.board, residual, windows.force - residual))
+    mean = means_by(soak, values[~windows.is_dynamic])
+    error, force = mean[:, 1:4], mean[:, 4:]
+    known = np.abs(force) >= 0.5 * windows.gravity
+    scale = np.divide(error, force, out=np.full(error.shape, np.nan), where=known)
+    return SoakMeasurements(mean[:, 0], error / MICRO_G, scale * 1e6)
 
 
 @dataclass(frozen=True)
@@ -175,7 +211,7 @@ def draw_step(evidence: Evidence, sheet: Sheet) -> Figure:
             axes.plot(minutes, value[:, i], label=axis, **AXIS_LINES[i])
         axes.axhline(0.0, color='black', linewidth=0.5)
         log_axis(axes, float(minutes[0]), float(minutes[-1]))
-        axes.set_ylabel(f'per K, {unit}')
+        axes.set_ylabel(f'still to come, {unit}/K')
         axes.set_xlabel('time since the step, min')
         title = 'bias' if axes is panels[0] else 'scale'
         legend_above(axes, sheet, share=0.5, title=title, alignment='left')
@@ -217,8 +253,7 @@ def draw_hysteresis(evidence: Evidence, sheet: Sheet) -> Figure:
             axes.set_ylabel('loop, µg')
         if i == 2 or not sheet.is_narrow:
             axes.set_xlabel('T board, °C')
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper left', ncols=2)
+    shared_legend(figure, panels[0], 2)
     return figure
 
 
@@ -267,99 +302,3 @@ def draw_history(evidence: Evidence, sheet: Sheet) -> Figure:
         axes.set_ylabel(f'change, {unit}')
         legend_above(axes, sheet, share=0.5, title=name, alignment='left')
     return figure
-
-
-def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:
-    """Draw where the positions point on the sphere, and what is left on each of them."""
-    positions = evidence.positions
-    if sheet.is_narrow:
-        figure = new_figure(sheet, 4.6 + 0.5)
-        grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.5])
-        places = (grid[0, 0], grid[0, 1], grid[1, :])
-    else:
-        figure = new_figure(sheet, 2.9)
-        grid = figure.add_gridspec(1, 3, width_ratios=[1.0, 1.0, 1.25])
-        places = (grid[0, 0], grid[0, 1], grid[0, 2])
-    for side, place, name in ((1, places[0], 'z up'), (-1, places[1], 'z down')):
-        axes = figure.add_subplot(place)
-        _draw_hemisphere(axes, positions, side)
-        axes.set_title(name, loc='center')
-    dots = figure.add_subplot(places[2])
-    if evidence.residuals:
-        _draw_dots(dots, evidence, sheet)
-    else:
-        dots.set_axis_off()
-    return figure
-
-
-def equal_area(up: tuple[float, float, float], side: int) -> tuple[float, float]:
-    """
-    Map a direction of one hemisphere (side +1 of +z, -1 of -z) into the unit disc, equal areas to
-    equal areas: the pole is its centre, the equator its rim.
-    """
-    x, y, z = up
-    factor = 1.0 / np.sqrt(1.0 + max(side * z, 0.0))
-    return float(x * factor), float(y * factor)
-
-
-def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int) -> None:
-    angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    axes.plot(np.cos(angle), np.sin(angle), color='black', linewidth=0.8)
-    # 45 degrees of elevation, in the same projection.
-    ring = np.sqrt(1.0 - np.sin(np.pi / 4.0))
-    axes.plot(ring * np.cos(angle), ring * np.sin(angle), color='#BBBBBB', linewidth=0.6)
-    axes.plot([-1, 1], [0, 0], color='#BBBBBB', linewidth=0.6)
-    axes.plot([0, 0], [-1, 1], color='#BBBBBB', linewidth=0.6)
-    for label, x, y in (('+x', 1.2, 0), ('−x', -1.2, 0), ('+y', 0, 1.2), ('−y', 0, -1.2)):
-        axes.text(x, y, label, ha='center', va='center', color='#555555', fontsize=7.5)
-    largest = max((p.residual_rms.get(LEFT_OUT, 0.0) for p in positions), default=0.0)
-    for position in positions:
-        if (position.up[2] >= 0.0) == (side > 0):
-            x, y = equal_area(position.up, side)
-            axes.plot(x, y, 'o', markersize=4.5, color='black')
-            if LEFT_OUT in position.residual_rms and largest > 0.0:
-                size = _RING * np.sqrt(position.residual_rms[LEFT_OUT] / largest)
-                axes.plot(x, y, 'o', markersize=size, mfc='none', mec=RED, mew=1.1)
-            axes.annotate(
-                str(position.number),
-                (x, y),
-                xytext=(3.5, 2.5),
-                textcoords='offset points',
-                fontsize=7.5,
-            )
-    axes.set_xlim(-1.32, 1.32)
-    axes.set_ylim(-1.32, 1.32)
-    axes.set_aspect('equal')
-    axes.set_axis_off()
-
-
-def _draw_dots(axes: Axes, evidence: Evidence, sheet: Sheet) -> None:
-    positions = evidence.positions
-    numbers = np.array([position.number for position in positions])
-    rungs = list(evidence.residuals)
-    judged = rungs[-1]
-    after = np.array([p.residual_rms[judged] for p in positions]) / MICRO_G
-    if len(rungs) > 1:
-        before = np.array([p.residual_rms[RAW] for p in positions]) / MICRO_G
-        axes.hlines(numbers, after, before, color='#BBBBBB', linewidth=0.7)
-        axes.plot(before, numbers, 'o', mfc='white', mec='black', ms=4.5, label='raw')
-    axes.plot(after, numbers, 'o', color='black', ms=4.5, label=judged)
-    both = np.concatenate((after, before)) if len(rungs) > 1 else after
-    without = [
-        (p.residual_rms[LEFT_OUT], p.number) for p in positions if LEFT_OUT in p.residual_rms
-    ]
-    if without:
-        left_out = np.array(without)[:, 0] / MICRO_G
-        style: Line = {'mfc': 'none', 'mec': RED, 'ms': 5.5}
-        axes.plot(left_out, np.array(without)[:, 1], 'D', label=LEFT_OUT, **style)
-        both = np.concatenate((both, left_out))
-    both = np.maximum(both, 1e-3)
-    log_axis(axes, float(np.min(both)) / 1.4, float(np.max(both)) * 1.4)
-    axes.set_ylim(len(positions) + 0.7, 0.3)
-    if len(positions) <= _MOST_LABELS:
-        axes.set_yticks(numbers)
-    else:
-        axes.yaxis.set_major_locator(MaxNLocator(12, integer=True))
-    axes.set_xlabel('RMS of |g| − g, µg')
-    axes.set_ylabel('position')
-    legend_above(axes, sheet, share=1.0 if sheet.is_narrow else 0.4)

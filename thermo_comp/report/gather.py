@@ -10,8 +10,7 @@ calibration changes.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from ..fitting.verdict import Finding
 from ..judging import WINDOW_S, OpenedBag, judge_bags
 from ..judging.history import history_of
 from ..judging.windows import raw_windows, usual_window
-from ..recording import inspect_recording
 from ..replay import check_unit
 from ..simulation import CYCLOGRAM_NAMES, Cyclogram, cyclogram_preset, parse_cyclogram
 from ..unit.calibration import Calibration
@@ -62,7 +60,6 @@ def evidence_of_bags(
     bag's samples are too slow for such windows. Raises ValueError if `program` cannot be read.
     """
     reduced = [bag.reduced for bag in bags]
-    metadata = [bag.info.metadata for bag in bags]
     judgement = None
     unit = 'counts'
     if calibration is not None:
@@ -80,42 +77,36 @@ def evidence_of_bags(
         windows = raw_windows(reduced, np.nan if gravity is None else gravity, window_s)
     if calibration is not None:
         serial = calibration.unit.serial
-    said = sorted({one['serial'] for one in metadata if one.get('serial')})
+    said = sorted({bag.source.serial for bag in reduced if bag.source.serial})
     return Evidence(
         serial=serial or ', '.join(said) or 'unknown',
         unit=unit,
         gravity=gravity,
         calibration=calibration,
-        bags=tuple(_facts(bag.reduced, bag.info.truncated) for bag in bags),
-        shown=_shown(reduced, calibration, program, metadata),
+        bags=tuple(map(_facts, reduced)),
+        shown=_shown(reduced, calibration, program),
         windows=windows,
         judgement=judgement,
         findings=() if calibration is None else _against(calibration),
         history=() if calibration is None or not others else history_of([calibration, *others]),
-        is_simulated=any(_SIMULATED in one for one in metadata),
+        is_simulated=_is_simulated(reduced),
     )
 
 
 def evidence_of_fit(
-    result: FitResult,
-    *,
-    paths: Sequence[str | Path] = (),
-    program: str | None = None,
-    is_brief: bool = False,
+    result: FitResult, *, program: str | None = None, is_brief: bool = False
 ) -> Evidence:
     """
     Gather what a fit has to show, on the bags that it was made of.
 
-    Its bags' `paths`, in its order, are looked up for what simulated ones say of themselves;
-    `program` is the chamber's, and a brief evidence lacks what only figures show.
+    `program` is the chamber's, by default what a simulated bag says of itself; a brief evidence
+    lacks what only figures show.
 
-    Raises RecordingError if one of `paths` cannot be opened. Raises ValueError if `program` cannot
-    be read.
+    Raises ValueError if `program` cannot be read.
     """
     calibration = result.calibration
-    metadata = [] if is_brief else [inspect_recording(path).metadata for path in paths]
     # What can be refused comes before the judging, which takes seconds.
-    shown = None if is_brief else _shown(result.bags, calibration, program, metadata)
+    shown = None if is_brief else _shown(result.bags, calibration, program)
     judgement = judge_bags(result.bags, calibration, window_s=usual_window(result.bags))
     rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
@@ -125,7 +116,7 @@ def evidence_of_fit(
         unit=calibration.unit.input,
         gravity=calibration.gravity_m_s2,
         calibration=calibration,
-        bags=tuple(_facts(one) for one in result.bags),
+        bags=tuple(map(_facts, result.bags)),
         shown=shown,
         windows=None if judgement is None else judgement.windows,
         judgement=judgement,
@@ -134,8 +125,12 @@ def evidence_of_fit(
         findings=tuple(dict.fromkeys((*_against(calibration), *against))),
         checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
         is_fit=True,
-        is_simulated=any(_SIMULATED in one for one in metadata),
+        is_simulated=_is_simulated(result.bags),
     )
+
+
+def _is_simulated(bags: Sequence[ReducedBag]) -> bool:
+    return any(_SIMULATED in bag.source.metadata for bag in bags)
 
 
 def _is_reservation(finding: Finding) -> bool:
@@ -171,8 +166,9 @@ def _span_ns(bag: ReducedBag) -> tuple[int, int]:
     return int(bag.board.stamp_ns[0]), int(bag.board.stamp_ns[-1])
 
 
-def _facts(bag: ReducedBag, truncated: str | None = None) -> BagFacts:
+def _facts(bag: ReducedBag) -> BagFacts:
     start_ns, end_ns = _span_ns(bag)
+    truncated = bag.source.missing()
     remarks = [truncated] if truncated else []
     if bag.n_saturated:
         remarks.append(f'{bag.n_saturated} samples saturated, left out')
@@ -200,10 +196,7 @@ def _facts(bag: ReducedBag, truncated: str | None = None) -> BagFacts:
 
 
 def _shown(
-    bags: Sequence[ReducedBag],
-    calibration: Calibration | None,
-    program: str | None,
-    metadata: Sequence[Mapping[str, str]],
+    bags: Sequence[ReducedBag], calibration: Calibration | None, program: str | None
 ) -> ShownBag | None:
     """Prepare the bag of the time figures: the widest in temperature, then the longest."""
     cyclogram = None if program is None else parse_cyclogram(program)
@@ -215,16 +208,16 @@ def _shown(
     index = max(wide, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
     bag = bags[index]
     span_ns = _span_ns(bag)
-    if cyclogram is None and index < len(metadata):
-        cyclogram = _recorded_program(metadata[index])
+    if cyclogram is None:
+        cyclogram = _recorded_program(bag)
     detector = learn_detector(bags) if calibration is None else calibration.detector
     trace = thermal_trace(bag, span_ns, detector)
     return ShownBag(index, span_ns[0], bag.board, bag.case, trace, cyclogram)
 
 
-def _recorded_program(metadata: Mapping[str, str]) -> Cyclogram | None:
+def _recorded_program(bag: ReducedBag) -> Cyclogram | None:
     """Find the chamber's program in a simulated bag's metadata, in which nothing is believed."""
-    text = metadata.get(_SIMULATED, '')
+    text = bag.source.metadata.get(_SIMULATED, '')
     if len(text) > 16 * _LONGEST_PROGRAM:
         return None
     try:

@@ -27,9 +27,9 @@ from ..recording import Input, Topics
 from ..replay import input_for
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence
+from .figures import DrawnFigure, drawn_figures, figures_of
 from .gather import evidence_of_bags
 from .page import render_page
-from .plates import DrawnPlate, drawn_plates
 
 HOST = '127.0.0.1'
 _NAMES = ('127.0.0.1', 'localhost')
@@ -68,7 +68,7 @@ class LiveReport:
         self._lock = threading.Lock()
         self._opened: dict[Path, tuple[str, OpenedBag]] = {}
         self._version = ''
-        self._made: tuple[Evidence, list[DrawnPlate]] | None = None
+        self._made: tuple[Evidence, list[DrawnFigure]] | None = None
         self._notice = ''
 
     def version(self) -> str:
@@ -94,7 +94,7 @@ class LiveReport:
         self._version = version
         try:
             evidence = self._evidence()
-            self._made = (evidence, drawn_plates(evidence))
+            self._made = (evidence, drawn_figures(figures_of(evidence)))
             self._notice = ''
         except (ThermoCompError, OSError, ValueError) as error:
             older = '' if self._made is None else '\nThe page below is older.'

@@ -14,13 +14,14 @@ from .. import __version__
 from ..files import PAGE, PICTURE, write_atomically
 from ..fitting import FitResult
 from ..judging.history import drifts_of
+from ..text import counted
 from ..thermal.regime import Regime
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .certificate import CertificateInfo, budget, combined, conformity_rule, results
 from .evidence import LEFT_OUT, Evidence
+from .figures import DrawnFigure, drawn_figures, figures_of, png_files
 from .gather import evidence_of_fit
 from .html import render, utc
-from .plates import DrawnPlate, drawn_plates, png_files
 
 _EARTH_RADIUS = 6.371e6
 #: Peak of the Schuler oscillation, 2 R b / g, for a bias b of one micro-g [m]: 12.7.
@@ -33,7 +34,6 @@ def write_report(
     *,
     info: CertificateInfo | None = None,
     figures: str | Path | None = None,
-    paths: Sequence[str | Path] = (),
     program: str | None = None,
     overwrite: bool = True,
 ) -> Evidence:
@@ -41,15 +41,15 @@ def write_report(
     Write a certificate as one self-contained HTML page; give what it is made of.
 
     What the laboratory does not state in `info` stays blank. The folder `figures` gets the figures
-    as PNG files. Of a fit, `paths` and `program` are as for `evidence_of_fit`. Page and pictures
-    that are there are replaced if `overwrite`.
+    as PNG files. Of a fit, `program` is as for `evidence_of_fit`. Page and pictures that are there
+    are replaced if `overwrite`.
 
-    Raises OutputError if a file may not or cannot be written. Raises RecordingError if one of
-    `paths` cannot be opened. Raises ValueError if `program` cannot be read.
+    Raises OutputError if a file may not or cannot be written. Raises ValueError if `program`
+    cannot be read.
     """
     evidence = subject
     if isinstance(evidence, FitResult):
-        evidence = evidence_of_fit(evidence, paths=paths, program=program)
+        evidence = evidence_of_fit(evidence, program=program)
     page = render_report(evidence, info)
     if figures is not None:
         for name, content in png_files(evidence).items():
@@ -60,12 +60,12 @@ def write_report(
 
 def render_report(evidence: Evidence, info: CertificateInfo | None = None) -> str:
     """Make a report for whoever writes it: the HTML document."""
-    return render_page(evidence, drawn_plates(evidence), info=info)
+    return render_page(evidence, drawn_figures(figures_of(evidence)), info=info)
 
 
 def render_page(
     evidence: Evidence,
-    plates: Sequence[DrawnPlate],
+    figures: Sequence[DrawnFigure],
     *,
     info: CertificateInfo | None = None,
     script: str = '',
@@ -98,7 +98,7 @@ def render_page(
         rule=conformity_rule(evidence),
         error=position_error,
         schuler=schuler_peak,
-        plates=plates,
+        figures=figures,
         drifts=drifts_of(evidence.history),
         rungs=rungs,
         rung_headings=[f'{rung}, µg RMS' for rung in rungs],
@@ -132,7 +132,7 @@ def _seen(evidence: Evidence) -> list[str]:
         board = evidence.judgement.windows.board
         which = 'bags of its own fit' if evidence.is_seen else 'bags that the fit has not seen'
         said.append(
-            f'{len(evidence.positions)} rests in {which}, '
+            f'{counted(len(evidence.positions), "position")} in {which}, '
             f'{np.min(board):.1f} to {np.max(board):.1f} °C.'
         )
     shown = evidence.shown
@@ -143,8 +143,9 @@ def _seen(evidence: Evidence) -> list[str]:
         dynamic = [s for s in known if s.regime == Regime.DYNAMIC]
         part = sum(s.stop - s.start for s in dynamic) / sum(s.stop - s.start for s in known)
         said.append(
-            f'In bag {evidence.bags[shown.index].name} the flag marked {len(dynamic)} dynamic '
-            f'stretches, {100.0 * part:.0f} % of the time in which the regime was known.'
+            f'In bag {evidence.bags[shown.index].name} the flag marked '
+            f'{counted(len(dynamic), "dynamic stretch", "es")}, {100.0 * part:.0f} % of the time '
+            'in which the regime was known.'
         )
     return said
 

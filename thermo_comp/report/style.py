@@ -72,6 +72,7 @@ _RC: dict[str, Any] = {
     'legend.handlelength': 2.8,
     'legend.columnspacing': 1.4,
     'legend.borderaxespad': 0.0,
+    'legend.borderpad': 0.0,
     'hatch.linewidth': 0.5,
     # Names in figures come from files that others wrote: a dollar sign is a dollar sign.
     'text.parse_math': False,
@@ -211,6 +212,13 @@ def legend_above(axes: Axes, sheet: Sheet, *, share: float = 1.0, **keys: Any) -
     axes.legend(
         loc='lower left', bbox_to_anchor=(0.0, 1.01), ncols=min(columns, len(labels)), **keys
     )
+
+
+def shared_legend(figure: Figure, axes: Axes, n_columns: int) -> None:
+    """Put the legend of panels that have it in common above all of them."""
+    handles, labels = axes.get_legend_handles_labels()
+    place: Any = 'outside upper left'
+    figure.legend(handles, labels, loc=place, borderaxespad=0.5, ncols=n_columns)
 
 
 def few_ticks(axes: Axes, n: int = 5) -> None:

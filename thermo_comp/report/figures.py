@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns the list of figures: what each asks, how its answer is read, and when it can be drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from matplotlib.figure import Figure
+
+from .evidence import Evidence
+from .figures_position import draw_every_position, draw_positions
+from .figures_residual import draw_gravity, draw_histograms, draw_residuals
+from .figures_thermal import draw_dynamics, draw_temperatures
+from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_step
+from .style import NARROW, WIDE, Sheet, drawing, png, svg
+from .text import label_text
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """One figure: its file's name, the question it answers, how that is read, the drawing."""
+
+    name: str
+    question: str
+    reading: str
+    draw: Callable[[Sheet], Figure]
+
+
+@dataclass(frozen=True)
+class DrawnFigure:
+    """A figure ready for the page: as SVG for paper and desk, and narrow for a phone."""
+
+    number: int
+    question: str
+    reading: str
+    wide: str
+    narrow: str
+
+
+def drawn_figures(figures: Sequence[ReportFigure]) -> list[DrawnFigure]:
+    """Draw figures for a page, and number them."""
+    with drawing():
+        return [
+            DrawnFigure(
+                number,
+                one.question,
+                one.reading,
+                wide=svg(one.draw(WIDE), f'f{number}w', one.question),
+                narrow=svg(one.draw(NARROW), f'f{number}n', one.question),
+            )
+            for number, one in enumerate(figures, 1)
+        ]
+
+
+def png_files(evidence: Evidence) -> dict[str, bytes]:
+    """Draw all figures as PNG: their content by file name, like ``1_temperatures.png``."""
+    with drawing():
+        return {
+            f'{number}_{one.name}.png': png(one.draw(WIDE))
+            for number, one in enumerate(figures_of(evidence), 1)
+        }
+
+
+def figures_of(evidence: Evidence) -> list[ReportFigure]:
+    """List the figures that the evidence allows, in order."""
+    found: list[ReportFigure] = []
+
+    def add(
+        name: str, question: str, draw: Callable[[Evidence, Sheet], Figure], *reading: str
+    ) -> None:
+        text = ' '.join(part for part in reading if part)
+        found.append(ReportFigure(name, question, text, partial(draw, evidence)))
+
+    _add_of_time(evidence, add)
+    _add_of_unit(evidence, add)
+    if evidence.residuals and evidence.positions:
+        add(
+            'histograms',
+            'Is what is left noise, or is there something to model?',
+            draw_histograms,
+            '|g| − g over all windows of all positions. Left: bars by regime, with the normal '
+            'distribution of the same mean and spread; where they follow the line, what is left '
+            'is noise. Right: the size of the residual without and with the correction, on a '
+            'logarithmic axis; the further left, the better.',
+        )
+        if len(evidence.positions) > 1:
+            add(
+                'every_position',
+                'Does the correction hold in every position?',
+                draw_every_position,
+                'A row for each position: |g| − g after the correction, over the time since the '
+                'position began; all rows have the scale that is written above. Black and wide in '
+                'the static, red and thin in the dynamic regime. On the right the RMS.',
+            )
+    if evidence.positions:
+        add(
+            'positions',
+            'Are the positions well spread, and does one stand out?',
+            draw_positions,
+            'Direction of the specific force in the output frame, position by position, in an '
+            'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
+            'of elevation. Where gravity is known, what is left in each position stands beside '
+            'it: one that stands out was moved, or is not of this unit.',
+            'Red rings and diamonds: what is left of it by a fit of the other positions alone, '
+            'which is what a new attitude will see; the area of a ring is in proportion.'
+            if evidence.left_out
+            else '',
+        )
+    return found
+
+
+def _add_of_time(evidence: Evidence, add: Callable[..., None]) -> None:
+    """Add the figures of the bag that is shown."""
+    shown, windows = evidence.shown, evidence.windows
+    if shown is None:
+        return
+    bag = f'Bag {label_text(evidence.bags[shown.index].name, 60)}.'
+    read = f'Grey: the time in which the flag says dynamic. {bag} After Fig.'
+    program = ' against the chamber’s program' if shown.cyclogram else ''
+    add(
+        'temperatures',
+        'How did the unit follow the chamber?',
+        draw_temperatures,
+        f'Readings of both thermometers{program}. The board lags behind the case, so the case '
+        f'is the first to tell that a ramp has begun. {read} 3 of the paper.',
+    )
+    sensor = 'case' if shown.trace.is_case_leading else 'board'
+    window_s = 0.0 if windows is None else windows.window_s
+    add(
+        'dynamics',
+        'When do the readings drift, and does the flag mark it?',
+        draw_dynamics,
+        f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
+        f'rates of the temperatures and, below, the second derivative of the {sensor} '
+        'temperature, whose pulses open and close the dynamic state; (c) the state that follows, '
+        'with its direction; before the detector has seen enough it is unknown. '
+        f'{read} 4 of the paper.',
+    )
+    if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
+        return
+    add(
+        'residuals',
+        'What does the correction leave on each axis?',
+        draw_residuals,
+        'Residual of each axis in the output frame. The attitude in a position is not known: '
+        'the mean direction seen there stands for it. Each panel has a scale of its own. '
+        f'{read} 6 of the paper.',
+    )
+    add(
+        'gravity',
+        'Does |g| stay constant over the whole program?',
+        draw_gravity,
+        f'|g| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
+        'a unit at rest must show zero whatever the temperature does. Above: before and after '
+        'the correction; below: after it, in a scale of its own. '
+        f'{read} 7 of the paper.',
+    )
+
+
+def _add_of_unit(evidence: Evidence, add: Callable[..., None]) -> None:
+    """Add the figures of the calibration."""
+    calibration = evidence.calibration
+    if calibration is None:
+        return
+    has_band = calibration.posterior is not None
+    add(
+        'functions',
+        'What is corrected, and how well is it known?',
+        draw_functions,
+        'Bias and scale factor over temperature, in a soak and in ramps through the whole range '
+        'that begin in a soak at its end, less the value at '
+        f'{calibration.reference_temperature_c:g} °C (grey line) and less a straight line, whose '
+        'slope stands above each panel.',
+        'Hatched: 95 % band of all that was fitted, with its largest half width above the panel; '
+        'where it is wider than the curves are apart, the bags do not tell.'
+        if has_band
+        else '',
+        'Circles: what was measured in each soak of each position, all of the residual taken for '
+        'one of bias or of scale; of scale only where the axis has half of gravity or more.'
+        if evidence.windows is not None and evidence.residuals
+        else '',
+    )
+    if any(term.lag for term in calibration.response):
+        add(
+            'step',
+            'For how long does the unit remember a change of temperature?',
+            draw_step,
+            'Board and case jump by 1 K together: how far bias and scale are from where they '
+            'will settle. Where a line meets zero, the unit has settled.',
+        )
+    if any(term.kind == 'play' for term in calibration.response):
+        add(
+            'hysteresis',
+            'Does the bias come back on another way than it went?',
+            draw_hysteresis,
+            'A run through the whole range and back, too slow for any lag: bias of each axis less '
+            'the middle of both ways. No curve over temperature can correct the width of the '
+            'loop.',
+        )
+    if len(evidence.history) > 1:
+        add(
+            'history',
+            'What has drifted between the calibrations of this unit?',
+            draw_history,
+            'Bias and scale in a soak at the reference temperature, by the date of each '
+            'calibration, less those of the first; bars: 95 % of what each leaves open.',
+        )
