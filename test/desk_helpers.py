@@ -21,9 +21,22 @@ from conftest import ROOT, Cli, Once
 #: What is made when an example asks for it; all else an example itself writes, or it lies ready.
 MADE = (
     *('unit.yaml', 'unit42.yaml', 'unit01.yaml', 'unit02.yaml', 'unit03.yaml', 'map.yaml'),
-    *('autopilot.params', 'chamber.mcap', 'unit42_p01', 'freezer.mcap', 'log.csv'),
+    *(
+        'autopilot.params',
+        'xsens_acc.calib',
+        'accel_calib.yaml',
+        'chamber.mcap',
+        'unit42_p01',
+        'freezer.mcap',
+        'log.csv',
+    ),
     *('flight.ulg', 'flight.bin', 'bags/fleet', 'bags/unit42'),
 )
+_EXPORTS = {
+    'autopilot.params': 'px4',
+    'xsens_acc.calib': 'imu_tk',
+    'accel_calib.yaml': 'imu_calib',
+}
 NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
@@ -75,8 +88,9 @@ class Desk:
             path.write_text(
                 re.sub(r'serial: .*?([,}\n])', rf'serial: {path.stem}\1', text, count=1)
             )
-        elif name == 'autopilot.params':
-            self._cli('export', self._make('unit42.yaml'), '--to', 'px4', '-o', path, '-q')
+        elif name in _EXPORTS:
+            to = ('--to', _EXPORTS[name])
+            self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
             # Short: some examples play it as slowly as it was recorded.
             self._cli('simulate', '--profile', '20 4s', '-o', path, '-q')

@@ -16,7 +16,6 @@ import sys
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 import pytest
 import yaml
 from conftest import ROOT, Cli, Once
@@ -130,24 +129,6 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> N
         n_figures += len(drawn)
         plt.close('all')
     assert n_figures == 2
-
-
-def test_imu_calib_s_matrix_is_taken_apart_as_shown() -> None:
-    text = (ROOT / 'docs' / 'integration.md').read_text()
-    (snippet,) = (body for kind, body in FENCE.findall(text) if kind == 'python')
-    names: dict[str, np.ndarray] = {}
-    exec(snippet, names)  # noqa: S102 - our own page
-    matrix = names['misalignment']
-    np.testing.assert_allclose(np.diag(matrix), 1.0)
-    np.testing.assert_array_less(np.abs(np.triu(matrix, 1)), 1e-12)
-    rotation = names['rotation']
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) > 0.0
-    # The same reading through their formula, and through ours with the rotation of tf behind it.
-    raw = np.array([3.0, -4.0, 8.0])
-    theirs = names['SM'] @ raw - names['bias']
-    ours = rotation @ matrix @ ((raw - names['raw_bias']) / names['scale_factor'])
-    np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 
 def test_refusals_are_quoted_as_they_are_said() -> None:

@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Exchange with autopilots: their formulas written out again here, round trips, losses, refusals.
+Exchange with other tools: their formulas written out again here, round trips, losses, refusals.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
+import numpy as np
 import pytest
+import yaml
 from builders import term
 
-from thermo_comp.convert.exchange import export_ardupilot, export_px4, import_parameters
+from thermo_comp.convert.exchange import TOOLS, export_calibration, import_calibration
 from thermo_comp.errors import CalibrationError
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.functions import CubicSpline, Polynomial
@@ -49,14 +49,14 @@ def cubic() -> Calibration:
     )
 
 
-@pytest.mark.parametrize('to', [export_px4, export_ardupilot])
-def test_foreign_text_makes_no_live_line(cubic: Calibration, to: Callable[..., Any]) -> None:
+@pytest.mark.parametrize('to', TOOLS)
+def test_foreign_text_makes_no_live_line(cubic: Calibration, to: str) -> None:
     # WHY: a serial with a line break set a parameter of the vehicle.
-    clean = to(cubic).text
+    clean = export_calibration(cubic, to).text
     unit = replace(cubic.unit)
     forged = '7\nINS_TCAL1_ENABLE,0\r1\t1\tTC_A_ENABLE\t0\t6\x1b[2J\u2028x,1'
     object.__setattr__(unit, 'serial', forged)
-    text = to(replace(cubic, unit=unit)).text
+    text = export_calibration(replace(cubic, unit=unit), to).text
     assert [line for line in text.splitlines() if not line.startswith('#')] == [
         line for line in clean.splitlines() if not line.startswith('#')
     ]
@@ -81,7 +81,7 @@ def bias_at(calibration: Calibration, axis: int, celsius: float) -> float:
 
 
 def test_px4_formula_gives_our_bias(cubic: Calibration) -> None:
-    p = numbers(export_px4(cubic, instance=2, device_id=1376264).text, '\t')
+    p = numbers(export_calibration(cubic, 'px4', number=2, device_id=1376264).text, '\t')
     assert (p['TC_A_ENABLE'], p['TC_A2_ID']) == (1, 1376264)
     assert (p['TC_A2_TMIN'], p['TC_A2_TMAX']) == (5.0, 45.0)
     for axis in range(3):
@@ -93,7 +93,7 @@ def test_px4_formula_gives_our_bias(cubic: Calibration) -> None:
 
 
 def test_ardupilot_formula_gives_our_bias_changes(cubic: Calibration) -> None:
-    p = numbers(export_ardupilot(cubic, imu=3).text, ',')
+    p = numbers(export_calibration(cubic, 'ardupilot', number=3).text, ',')
 
     def polynomial(axis: str, celsius: float) -> float:
         d = celsius - 35.0
@@ -107,7 +107,7 @@ def test_ardupilot_formula_gives_our_bias_changes(cubic: Calibration) -> None:
 
 
 def test_px4_round_trip(cubic: Calibration) -> None:
-    back = import_parameters(export_px4(cubic).text, serial='7')
+    back = import_calibration(export_calibration(cubic, 'px4').text, serial='7')
     assert back.static.temperature_range_c == (5.0, 45.0)
     for axis in range(3):
         for celsius in (5.0, 20.0, 45.0):
@@ -117,8 +117,10 @@ def test_px4_round_trip(cubic: Calibration) -> None:
 
 
 def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic: Calibration) -> None:
-    text = export_ardupilot(cubic).text.replace(',', '=') + 'INS_ACC1_CALTEMP=28.0\n'
-    back = import_parameters(text, serial='7')
+    text = (
+        export_calibration(cubic, 'ardupilot').text.replace(',', '=') + 'INS_ACC1_CALTEMP=28.0\n'
+    )
+    back = import_calibration(text, serial='7')
     for axis in range(3):
         assert bias_at(back, axis, 28.0) == pytest.approx(0.0, abs=1e-12)
         ours = bias_at(cubic, axis, 41.0) - bias_at(cubic, axis, 28.0)
@@ -137,7 +139,7 @@ def test_counts_are_divided_by_the_scale_factor(cubic: Calibration) -> None:
     counts = replace(
         cubic, unit=Unit('7', 'counts', 32767.0, 0.005), axes=axes, static=regime, dynamic=regime
     )
-    ours, expected = export_px4(counts), export_px4(cubic)
+    ours, expected = export_calibration(counts, 'px4'), export_calibration(cubic, 'px4')
     assert any('counts divided by K' in note for note in ours.notes)
     for name, value in numbers(expected.text, '\t').items():
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
@@ -147,7 +149,10 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic: Calibration) -> None:
     drifting = replace(cubic.static.z, scale_function=Polynomial((1.0, 1e-4)))
     regime = replace(cubic.static, z=drifting)
     calibration = replace(cubic, static=regime, dynamic=regime)
-    plain, level = export_px4(calibration), export_px4(calibration, up=(0.0, 0.0, 1.0))
+    plain, level = (
+        export_calibration(calibration, 'px4'),
+        export_calibration(calibration, 'px4', up=(0.0, 0.0, 1.0)),
+    )
     assert any(
         re.search(r'scale over temperature is lost: up to 2.5e\+03 ppm', n) for n in plain.notes
     )
@@ -168,7 +173,7 @@ def test_what_is_lost_is_said(cubic: Calibration) -> None:
         response=(term('now', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (0.0, 0.0, 1.0)),
     )
-    text = export_ardupilot(calibration)
+    text = export_calibration(calibration, 'ardupilot')
     for expected in (
         'replaced by cubics',
         '1e+03 urad',
@@ -192,22 +197,152 @@ def test_what_is_lost_is_said(cubic: Calibration) -> None:
 )
 def test_bad_parameters_are_refused(text: str, message: str) -> None:
     with pytest.raises(CalibrationError, match=message):
-        import_parameters(text, serial='7')
+        import_calibration(text, serial='7')
 
 
 def test_an_absent_set_and_an_empty_range_are_refused(cubic: Calibration) -> None:
-    text = export_px4(cubic).text
+    text = export_calibration(cubic, 'px4').text
     with pytest.raises(CalibrationError, match='no set of parameters 1'):
-        import_parameters(text, serial='7', number=1)
+        import_calibration(text, serial='7', number=1)
     empty = re.sub(r'TMAX\t45', 'TMAX\t5', text)
     with pytest.raises(CalibrationError, match=r'range 5\.\.5 degC is empty'):
-        import_parameters(empty, serial='7')
+        import_calibration(empty, serial='7')
 
 
 def test_impossible_arguments_are_refused(cubic: Calibration) -> None:
-    with pytest.raises(ValueError, match=r'`instance` must be 0\.\.3, got 4'):
-        export_px4(cubic, instance=4)
-    with pytest.raises(ValueError, match=r'`imu` must be 1\.\.3, got 0'):
-        export_ardupilot(cubic, imu=0)
+    with pytest.raises(ValueError, match=r'`number` must be 0\.\.3, got 4'):
+        export_calibration(cubic, 'px4', number=4)
+    with pytest.raises(ValueError, match=r'`number` must be 1\.\.3, got 0'):
+        export_calibration(cubic, 'ardupilot', number=0)
     with pytest.raises(ValueError, match='`up` must be a unit vector'):
-        export_px4(cubic, up=(0.0, 0.0, 9.81))
+        export_calibration(cubic, 'px4', up=(0.0, 0.0, 9.81))
+
+
+@pytest.fixture
+def tumbled() -> Calibration:
+    axes = Axes(
+        AxisReference(373.0, 32800.0), AxisReference(381.0, 32650.0), AxisReference(369.0, 32790.0)
+    )
+    plain = calibration_of([Polynomial((0.0,))] * 3, unit=Unit('7', 'counts', 65536.0, 0.01))
+    return replace(
+        plain, axes=axes, misalignment=((1.0, 0.0, 0.0), (0.02, 1.0, 0.0), (-0.03, 0.05, 1.0))
+    )
+
+
+def ours(calibration: Calibration, raw: np.ndarray) -> np.ndarray:
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    x = (raw - [axis.bias for axis in axes]) / [axis.scale_factor for axis in axes]
+    return x @ np.array(calibration.misalignment).T
+
+
+def turn(notes: tuple[str, ...]) -> np.ndarray:
+    """Make the rotation of a note's roll, pitch and yaw: ours to theirs, one axis at a time."""
+    said = next(note for note in notes if 'roll' in note)
+    roll, pitch, yaw = (float(number) for number in said.split()[-4:-1])
+    x = [[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]]
+    y = [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+    z = [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
+    return np.array(z) @ np.array(y) @ np.array(x)
+
+
+RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 65535.0, 30000.0]])
+
+
+def test_imu_tk_formula_gives_our_correction(tumbled: Calibration) -> None:
+    # X' = T K (X - B), as imu_tk's header has it; its reader takes 9 + 9 + 3 numbers in rows.
+    file = export_calibration(tumbled, 'imu_tk')
+    numbers = [float(cell) for cell in file.text.split()]
+    T, K = np.reshape(numbers[:9], (3, 3)), np.reshape(numbers[9:18], (3, 3))
+    assert np.all(np.diag(T) == 1.0)
+    assert np.all(np.tril(T, -1) == 0.0)
+    assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
+    theirs = (RAW - numbers[18:]) @ (T @ K).T
+    # Six digits of the angles are written: 1e-6 of 90 m/s^2.
+    np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
+    )
+
+
+def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled: Calibration) -> None:
+    data = yaml.safe_load(export_calibration(tumbled, 'imu_calib').text)
+    theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
+    np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)
+    imu = yaml.safe_load(export_calibration(tumbled, 'kalibr', number=1).text)['imu1']
+    # Kalibr predicts the reading: M a + b.
+    part = imu['accelerometers']
+    reading = ours(tumbled, RAW) @ np.array(part['M']).T + part['bias']
+    np.testing.assert_allclose(reading, RAW, rtol=1e-12)
+    assert np.all(np.triu(part['M'], 1) == 0.0)
+    assert (imu['model'], imu['update_rate']) == ('scale-misalignment', 100.0)
+
+
+@pytest.mark.parametrize('to', ['imu_tk', 'imu_calib', 'kalibr'])
+def test_tumble_round_trip(tumbled: Calibration, to: str) -> None:
+    file = export_calibration(tumbled, to)
+    back = import_calibration(file.text, serial='7')
+    assert back.unit.input == 'counts'
+    # The triangle of imu_tk is turned there and back.
+    np.testing.assert_allclose(ours(back, RAW), ours(tumbled, RAW), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(back.misalignment, tumbled.misalignment, atol=1e-12)
+    assert any('holds at 20 degC' in note for note in file.notes)
+
+
+def test_a_file_that_imu_tk_saved_is_read() -> None:
+    # Six digits in columns, as its stream writes them; the formula by hand.
+    text = (
+        '          1 -0.00354989 -0.00890444\n          0           1 -0.0213032\n'
+        '          0           0           1\n\n'
+        '0.00241278          0          0\n         0 0.00242712          0\n'
+        '         0          0 0.00241168\n\n33124.2\n33275.2\n32364.4\n\n'
+    )
+    back = import_calibration(text, serial='7')
+    x = (RAW - [33124.2, 33275.2, 32364.4]) * [0.00241278, 0.00242712, 0.00241168]
+    theirs = np.column_stack(
+        [
+            x[:, 0] - 0.00354989 * x[:, 1] - 0.00890444 * x[:, 2],
+            x[:, 1] - 0.0213032 * x[:, 2],
+            x[:, 2],
+        ]
+    )
+    rotation = turn(back.provenance.notes)
+    np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
+
+
+def test_a_full_matrix_is_taken_apart_into_ours_and_a_turn() -> None:
+    SM = np.array([[1.02, 0.03, -0.01], [-0.02, 0.99, 0.02], [0.01, -0.03, 1.01]])
+    text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
+    back = import_calibration(text, serial='7')
+    raw = np.array([[3.0, -4.0, 8.0], [-9.0, 1.0, 2.0]])
+    rotation = turn(back.provenance.notes)
+    np.testing.assert_allclose(
+        ours(back, raw) @ rotation.T, raw @ SM.T - [0.12, -0.05, 0.2], atol=1e-5
+    )
+    assert not np.triu(back.misalignment, 1).any()
+
+
+def test_kalibr_without_bias_and_with_several_imus() -> None:
+    one = '  accelerometers:\n    M: [[1.01, 0, 0], [0.01, 0.99, 0], [0.02, -0.01, 1.02]]\n'
+    back = import_calibration(f'imu0:\n{one}  update_rate: 200.0\n', serial='7')
+    assert back.unit.input == 'm/s^2'
+    assert 'no bias' in back.provenance.notes[0]
+    # M a by hand, with a = (1, 2, 3).
+    np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
+    with pytest.raises(CalibrationError, match='choose one of the IMUs: there are imu0, imu1'):
+        import_calibration(f'imu0:\n{one}imu1:\n{one}', serial='7')
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('SM: [1, 0, 0]\nbias: [0, 0, 0]', 'SM: must be 9 finite numbers'),
+        ('SM: [1, 0, 0, 0, 1, 0, 0, 0, -1]\nbias: [0, 0, 0]', 'mirrors or flattens'),
+        ('SM: [9.8, 0, 0, 0, 9.8, 0, 0, 0, 9.8]\nbias: [0, 0, 0]', 'neither m/s.2 nor counts'),
+        ('1 0 0 0 1 0 0 0 1  0 0 0 0 0 0 0 0 0  1 2 3', 'mirrors or flattens'),
+        ('imu0: {accelerometers: {M: [[1, 0], [0, 1]]}}', 'M: must be 9 finite numbers'),
+        ('imu0: {rostopic: /imu}', 'nor the matrices of imu_tk'),
+    ],
+)
+def test_matrices_that_are_none_are_refused(text: str, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        import_calibration(text, serial='7')

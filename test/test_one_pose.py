@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pose_helpers import GRAVITY, MG, START_NS, Rest
 
-from thermo_comp.convert.exchange import export_px4
+from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import ArrayBlock, FitSource
 from thermo_comp.simulation import positions
@@ -61,7 +61,7 @@ def test_one_pose_leaves_the_scale_at_its_prior(one_pose):
 
 
 def test_one_pose_becomes_parameters_of_an_autopilot(one_pose):
-    text = export_px4(one_pose.calibration, device_id=1).text
+    text = export_calibration(one_pose.calibration, 'px4', device_id=1).text
     rows = [line.split() for line in text.splitlines() if line.startswith('1')]
     value = {row[2]: float(row[3]) for row in rows}
     d = np.array([17.0, 32.0]) - value['TC_A0_TREF']

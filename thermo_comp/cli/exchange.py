@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns ``thermo_comp export`` and ``import``: a calibration to and from an autopilot's parameters.
+Owns ``thermo_comp export`` and ``import``: a calibration to and from another tool's file.
 """
 
 from __future__ import annotations
@@ -21,20 +21,27 @@ from .output import Output
 _LIMIT = 4 << 20
 
 
-class Autopilot(str, Enum):
-    """Whose parameters."""
+class Tool(str, Enum):
+    """Whose file."""
 
     px4 = 'px4'
     ardupilot = 'ardupilot'
+    imu_tk = 'imu_tk'
+    imu_calib = 'imu_calib'
+    kalibr = 'kalibr'
 
 
 def export(
     path: Annotated[Path, typer.Argument(help='Calibration of the unit.', metavar='YAML')],
-    to: Annotated[Autopilot, typer.Option('--to', help='Whose parameters to write.')],
-    output: Annotated[Path, typer.Option('--output', '-o', help='Parameter file to write.')],
+    to: Annotated[Tool, typer.Option('--to', help='Whose file to write.')],
+    output: Annotated[Path, typer.Option('--output', '-o', help='File to write.')],
     number: Annotated[
         int | None,
-        typer.Option(help='Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1).'),
+        typer.Option(
+            help='Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
+            'Kalibr (0).',
+            min=0,
+        ),
     ] = None,
     device_id: Annotated[
         int, typer.Option(help="PX4's id of the sensor (TC_An_ID), which it matches by.")
@@ -52,30 +59,33 @@ def export(
     quiet: options.Quiet = False,
 ) -> None:
     """
-    Write a calibration as parameters of PX4 or ArduPilot.
+    Write a calibration as a file of another tool.
 
-    Both keep a cubic of temperature per axis' offset and nothing else. What
-    the calibration holds beyond that is lost, and said with what it costs.
+    PX4 and ArduPilot keep a cubic of temperature per axis' offset; imu_tk
+    (.calib), imu_calib and Kalibr (YAML) keep bias, scale and misalignment at
+    one temperature, the reference. What the calibration holds beyond that is
+    lost, and said with what it costs.
 
     Example:
       thermo_comp export unit42.yaml --to px4 -o unit42.params
       thermo_comp export unit42.yaml --to ardupilot --up 0 0 1 -o unit42.parm
+      thermo_comp export unit42.yaml --to imu_tk -o unit42.calib
     """
-    from ..convert.exchange import export_ardupilot, export_px4
+    from ..convert.exchange import export_calibration
     from ..files import PARAMETERS, check_output, write_atomically
     from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
-    if device_id and to is not Autopilot.px4:
+    if device_id and to is not Tool.px4:
         raise options.usage('--device-id is for PX4')
+    if up is not None and to not in (Tool.px4, Tool.ardupilot):
+        raise options.usage('--up is for PX4 and ArduPilot')
     check_output(output, PARAMETERS, overwrite=force, others=[path])
     calibration = load_calibration(path)
     try:
-        if to is Autopilot.px4:
-            instance = 0 if number is None else number
-            result = export_px4(calibration, instance=instance, device_id=device_id, up=up)
-        else:
-            result = export_ardupilot(calibration, imu=1 if number is None else number, up=up)
+        result = export_calibration(
+            calibration, to.value, number=number, device_id=device_id, up=up
+        )
     except ValueError as mistake:
         raise options.usage(str(mistake)) from mistake
     write_atomically(output, result.text.encode(), PARAMETERS, overwrite=force)
@@ -85,7 +95,7 @@ def export(
     out.json(
         {
             'output': output,
-            'autopilot': to.value,
+            'to': to.value,
             'serial': calibration.unit.serial,
             'notes': result.notes,
         }
@@ -96,7 +106,7 @@ def import_(
     path: Annotated[
         Path,
         typer.Argument(
-            help='Parameters as QGroundControl, Mission Planner or MAVProxy save them.',
+            help='Parameters of PX4 or ArduPilot, .calib of imu_tk, YAML of imu_calib or Kalibr.',
             metavar='FILE',
         ),
     ],
@@ -105,7 +115,8 @@ def import_(
         str, typer.Option(help='Serial to give the unit.', callback=options.check_serial)
     ],
     number: Annotated[
-        int | None, typer.Option(help='Which set, where there are several (TC_A0, INS_TCAL1).')
+        int | None,
+        typer.Option(help='Which set, where there are several (TC_A0, INS_TCAL1, imu0).'),
     ] = None,
     gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = STANDARD_GRAVITY,
     rate_hz: Annotated[float, typer.Option(help='Samples per second of the unit.', min=0.1)] = 200,
@@ -118,16 +129,19 @@ def import_(
     quiet: options.Quiet = False,
 ) -> None:
     """
-    Make a calibration of the thermal parameters of PX4 or ArduPilot.
+    Make a calibration of a file of another tool.
 
-    The calibration is for a unit that reports m/s^2 (node: input:=imu), with
-    one set for both regimes: bias over temperature, and nothing else. Fit
-    bags of a thermal test to get the rest.
+    Thermal parameters of PX4 and ArduPilot give the bias over temperature;
+    the files of imu_tk, imu_calib and Kalibr give bias, scale and
+    misalignment. One set stands for both regimes. It is for the readings that
+    the file is for: m/s^2 (node: input:=imu), or counts. Fit bags of a
+    thermal test to get the rest.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml
+      thermo_comp import xsens_acc.calib --serial 42 -o unit42.yaml
     """
-    from ..convert.exchange import import_parameters
+    from ..convert.exchange import import_calibration
     from ..files import CALIBRATION, check_output, read_bounded
     from ..unit.calibration_file import save_calibration
     from ..unit.gravity import MICRO_G
@@ -135,7 +149,7 @@ def import_(
     out = Output(as_json, quiet)
     check_output(output, CALIBRATION, overwrite=force, others=[path])
     try:
-        calibration = import_parameters(
+        calibration = import_calibration(
             read_bounded(path, _LIMIT).decode('utf-8', errors='replace'),
             serial=serial,
             number=number,
