@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pose_helpers import GRAVITY, MG, Rest
+from position_helpers import GRAVITY, MG, Rest
 
 from thermo_comp.fitting.branches import find_branches
 from thermo_comp.fitting.reduction import reduce_source

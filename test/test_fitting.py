@@ -236,7 +236,7 @@ def test_six_faces_leave_misalignment_at_its_prior() -> None:
     assert np.abs(pulls(result, plain)).max() < 4.0
 
 
-def test_one_pose_tells_the_bias_along_gravity_over_temperature() -> None:
+def test_one_position_tells_the_bias_along_gravity_over_temperature() -> None:
     plain = unit_preset('plain', 1)
     result = fitted(plain, np.array([[0.0, 0.0, 1.0]]), 3, allow=('attitude',))
     _, scale_sd, M_sd = claimed(result.calibration)

@@ -378,12 +378,12 @@ class TestShifts:
         found = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
         assert (found.shifts, found.n_positions) == ((), 5)
 
-    def test_wander_is_about_the_mean_of_a_position(self) -> None:
+    def test_rms_of_an_axis_is_about_the_mean_of_a_position(self) -> None:
         windows = made(0.0, 1000.0, 60.0, n=40, dynamic=20)
         force = windows.force.copy()
         force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
         found = judge(dataclasses.replace(windows, force=force), CLAIMING)
-        np.testing.assert_allclose(found.wander, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
+        np.testing.assert_allclose(found.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
 
 
 def test_windows_as_a_table() -> None:

@@ -16,7 +16,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 
 FACTS = (
     *('verdict', 'reason', 'is_valid', 'gravity_m_s2', 'window_s', 'tolerance_m_s2'),
-    *('sections_m_s2', 'n_positions', 'moved', 'shifts', 'wander_m_s2'),
+    *('sections_m_s2', 'n_positions', 'moved', 'shifts', 'axis_rms_m_s2'),
 )
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pose_helpers import GRAVITY, MG, Rest
+from position_helpers import GRAVITY, MG, Rest
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``thermo_comp evaluate``: what a calibration leaves of |g| on bags it has not seen."""
+"""Owns ``thermo_comp evaluate``: what a calibration leaves of |f| on bags it has not seen."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def _say(out: Output, result: Evaluation, drifts: Sequence[Drift]) -> None:
 
 
 def _say_axes(out: Output, judged: Judgement) -> None:
-    """Print what is known axis by axis: wander always, shifts where the positions tell."""
+    """Print what is known axis by axis: its RMS always, shifts where the positions tell."""
     from ..unit.gravity import MICRO_G
 
     columns = ['axis', 'static ug', 'dynamic ug']
@@ -164,7 +164,7 @@ def _say_axes(out: Output, judged: Judgement) -> None:
         columns += ['bias ug', '+-', 'scale ppm', '+-']
     rows: list[tuple[Cell, ...]] = []
     for axis, name in enumerate('xyz'):
-        row: list[Cell] = [name, *(micro_g(one / MICRO_G) for one in judged.wander[:, axis])]
+        row: list[Cell] = [name, *(micro_g(one / MICRO_G) for one in judged.axis_rms[:, axis])]
         if judged.shifts:
             shift = judged.shifts[axis]
             row += [

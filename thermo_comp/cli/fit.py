@@ -188,7 +188,7 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
 
 def _say_positions(out: Output, result: FitResult) -> None:
     """
-    Print every rest: where, when, how long, which way was up, and |f| - g by the fit and without.
+    Print every position: where, when, how long, which way was up; |f| - g by the fit and without.
     """
     from ..unit.gravity import MICRO_G
 

@@ -49,7 +49,7 @@ def report(
     """
     Write the certificate of a unit: one HTML page, no network needed.
 
-    Shows temperatures, regime, |g| before and after, the functions of
+    Shows temperatures, regime, |f| before and after, the functions of
     temperature with their uncertainty, and the verdict of evaluate, with
     its exit code. The report of a fit itself comes from: fit --report.
 

@@ -68,7 +68,7 @@ def render_fleet(
         ],
         links=[quote(certificate_of(row)) if is_fitted(row) else '' for row in rows],
         footer=f'Report made {dt.datetime.now(dt.timezone.utc):%Y-%m-%d %H:%M} UTC by thermo_comp '
-        f'{__version__}. 1 µg = 9.80665·10⁻⁶ m/s². Residuals: |g| − g at rest, on each unit’s own '
+        f'{__version__}. 1 µg = 9.80665·10⁻⁶ m/s². Residuals: |f| − g at rest, on each unit’s own '
         'bags, over windows as long as the column window_s says, 60 s if nothing else.',
     )
 
@@ -100,7 +100,7 @@ def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnFigure]:
     found = [
         ReportFigure(
             'residuals',
-            'What is left of |g|, unit by unit?',
+            'What is left of |f|, unit by unit?',
             'Share of the units whose residual at rest is below the value: raw (constants at the '
             'reference temperature), and with each unit’s calibration. Steep is alike; a tail to '
             'the right is a unit to look at.',

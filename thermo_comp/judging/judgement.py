@@ -21,7 +21,7 @@ from ..typing import Bools, Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G, spoken
 from ..unit.metrics import residual_statistics
-from .shifts import AxisShift, axis_shifts, distinct_positions, wander, what_moved
+from .shifts import AxisShift, axis_shifts, distinct_positions, rms_by_axis, what_moved
 from .windows import Windows
 
 #: A calibration holds while its error is within this many times what it claims.
@@ -81,7 +81,7 @@ class Judgement:
     Sections are ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside``
     them. `left_out_rms` is, of windows that the fit has seen, what it left on positions left out,
     else NaN; `tolerance` the user's limit [m/s^2]. Shifts are per axis, none with fewer than six
-    distinct positions; `moved` says those that are sure. For `wander` see there.
+    distinct positions; `moved` says those that are sure. For `axis_rms` see `rms_by_axis`.
     """
 
     kind: Verdict
@@ -91,7 +91,7 @@ class Judgement:
     tolerance: float | None
     shifts: tuple[AxisShift, ...]
     moved: tuple[str, ...]
-    wander: Floats
+    axis_rms: Floats
     n_positions: int
     windows: Windows
 
@@ -137,7 +137,7 @@ class Judgement:
             'n_positions': self.n_positions,
             'moved': self.moved,
             'shifts': self.shifts,
-            'wander_m_s2': self.wander,
+            'axis_rms_m_s2': self.axis_rms,
         }
 
 
@@ -180,7 +180,7 @@ def judge(
         tolerance=tolerance,
         shifts=shifts,
         moved=moved,
-        wander=wander(windows),
+        axis_rms=rms_by_axis(windows),
         n_positions=distinct_positions(windows),
         windows=windows,
     )

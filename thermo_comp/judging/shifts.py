@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what has moved since a calibration: nine constants fitted once more to the corrected rests.
+Owns what has moved since a calibration: nine constants fitted again to the positions.
 
 In each position ``|f| = g`` whatever the attitude. What bias, scale and misalignment it takes to
 make it so for all positions is what the axes have moved by; a calibration that still holds takes
@@ -105,7 +105,7 @@ def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
     return tuple(said)
 
 
-def wander(windows: Windows) -> Floats:
+def rms_by_axis(windows: Windows) -> Floats:
     """
     Tell what moves each axis at rest, to a constant, whatever the number of positions.
 

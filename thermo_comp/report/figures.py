@@ -81,7 +81,7 @@ def figures_of(evidence: Evidence) -> list[ReportFigure]:
             'histograms',
             'Is what is left noise, or is there something to model?',
             draw_histograms,
-            '|g| − g over all windows of all positions. Left: bars by regime, with the normal '
+            '|f| − g over all windows of all positions. Left: bars by regime, with the normal '
             'distribution of the same mean and spread; where they follow the line, what is left '
             'is noise. Right: the size of the residual without and with the correction, on a '
             'logarithmic axis; the further left, the better.',
@@ -91,7 +91,7 @@ def figures_of(evidence: Evidence) -> list[ReportFigure]:
                 'every_position',
                 'Does the correction hold in every position?',
                 draw_every_position,
-                'A row for each position: |g| − g after the correction, over the time since the '
+                'A row for each position: |f| − g after the correction, over the time since the '
                 'position began; all rows have the scale that is written above. Black and wide in '
                 'the static, red and thin in the dynamic regime. On the right the RMS.',
             )
@@ -151,9 +151,9 @@ def _add_of_time(evidence: Evidence, add: Callable[..., None]) -> None:
     )
     add(
         'gravity',
-        'Does |g| stay constant over the whole program?',
+        'Does |f| stay constant over the whole program?',
         draw_gravity,
-        f'|g| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
+        f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
         'a unit at rest must show zero whatever the temperature does. Above: before and after '
         'the correction; below: after it, in a scale of its own. '
         f'{read} 7 of the paper.',

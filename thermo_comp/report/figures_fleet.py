@@ -47,7 +47,7 @@ def draw_shares(curves: Mapping[str, Floats], sheet: Sheet) -> Figure:
     high = max((float(values[-1]) for values in drawn.values()), default=1.0)
     log_axis(axes, low / 1.3, high * 1.3)
     axes.set_ylim(0.0, 103.0)
-    axes.set_xlabel('|g| − g of a unit, RMS, µg')
+    axes.set_xlabel('|f| − g of a unit, RMS, µg')
     axes.set_ylabel('units, %')
     legend_above(axes, sheet)
     return figure

@@ -21,7 +21,7 @@ _MOST = 24
 
 
 def draw_every_position(evidence: Evidence, sheet: Sheet) -> Figure:
-    """Draw what is left of |g| over the time in every position, or in those with most of it."""
+    """Draw what is left of |f| over the time in every position, or in those with most of it."""
     windows, residuals = evidence.windows, evidence.residuals
     if windows is None or not residuals:
         raise ValueError('`evidence` has no residuals')
@@ -148,6 +148,6 @@ def _draw_dots(axes: Axes, evidence: Evidence, sheet: Sheet) -> None:
         axes.set_yticks(numbers)
     else:
         axes.yaxis.set_major_locator(MaxNLocator(12, integer=True))
-    axes.set_xlabel('RMS of |g| − g, µg')
+    axes.set_xlabel('RMS of |f| − g, µg')
     axes.set_ylabel('position')
     legend_above(axes, sheet, share=1.0 if sheet.is_narrow else 0.4)

@@ -64,13 +64,13 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
 
 
 def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
-    """Draw |g| over time, before and after, and after in detail (the paper's Fig. 7)."""
+    """Draw |f| over time, before and after, and after in detail (the paper's Fig. 7)."""
     shown, facts = shown_bag(evidence)
     unit, _ = time_unit(facts.duration_s)
     windows = evidence.windows
     residuals = evidence.residuals
     if windows is None or evidence.gravity is None or not residuals:
-        raise ValueError('`evidence` has no |g|')
+        raise ValueError('`evidence` has no |f|')
     rows = windows.bag == shown.index
     rungs = list(residuals)
     corrected = [rung for rung in rungs if rung != RAW]
@@ -83,7 +83,7 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
             value = residuals[rung] / MICRO_G
             plot_windows(axes, windows, rows, value, unit, sheet, label=rung, **RUNG_LINES[rung])
         axes.axhline(0.0, color='black', linewidth=0.5)
-        axes.set_ylabel('|g| − g, µg')
+        axes.set_ylabel('|f| − g, µg')
         _absolute_scale(axes, evidence.gravity)
         legend_above(axes, sheet)
     if corrected:
@@ -114,7 +114,7 @@ def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
         axes = figure.add_subplot(place)
         _draw_signed(axes, values, line)
         axes.set_title(f'{judged}, {label}: sd {number(float(values.std()))} µg')
-    axes.set_xlabel('|g| − g, µg')
+    axes.set_xlabel('|f| − g, µg')
     right = figure.add_subplot(places[-1])
     low, high = _size_range(residuals)
     edges = np.logspace(np.log10(low), np.log10(high), 41)
@@ -124,7 +124,7 @@ def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
         right.stairs(share, edges, label=rung, baseline=None, **RUNG_LINES[rung])
     log_axis(right, low, high)
     right.set_ylim(0.0, None)
-    right.set_xlabel('size of |g| − g, µg')
+    right.set_xlabel('size of |f| − g, µg')
     right.set_ylabel('share of windows, %')
     legend_above(right, sheet, share=1.0 if sheet.is_narrow else 0.5)
     return figure
@@ -190,5 +190,5 @@ def _absolute_scale(axes: Axes, gravity: float) -> None:
             lambda value: (np.asarray(value) - gravity) / MICRO_G,
         ),
     )
-    right.set_ylabel('|g|, m/s²')
+    right.set_ylabel('|f|, m/s²')
     right.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))

@@ -50,7 +50,7 @@ def evidence_of_bags(
     """
     Judge bags, with a calibration or without; no bags report on the calibration alone.
 
-    Without a calibration only the thermal side is reported, and ``|g|`` of a unit that speaks
+    Without a calibration only the thermal side is reported, and ``|f|`` of a unit that speaks
     m/s^2. Gravity is the calibration's by default; `window_s` and `tolerance` are as for
     `judging.evaluate`; an empty `serial` accepts any calibration; `program` is the chamber's, as
     `simulation.parse_cyclogram` reads it, by default what a simulated bag says of itself;
@@ -108,7 +108,7 @@ def evidence_of_fit(
     # What can be refused comes before the judging, which takes seconds.
     shown = None if is_brief else _shown(result.bags, calibration, program)
     judgement = judge_bags(result.bags, calibration, window_s=usual_window(result.bags))
-    rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
+    found = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
     against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
     return Evidence(
@@ -121,7 +121,7 @@ def evidence_of_fit(
         windows=None if judgement is None else judgement.windows,
         judgement=judgement,
         steps=result.residuals,
-        left_out={k: left_out[rest] for k, rest in enumerate(rests) if rest in left_out},
+        left_out={k: left_out[one] for k, one in enumerate(found) if one in left_out},
         findings=tuple(dict.fromkeys((*_against(calibration), *against))),
         checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
         is_fit=True,

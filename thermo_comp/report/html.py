@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from ..unit.gravity import MICRO_G
-from .text import label_text, minus, number
+from .text import label_text, minus, number, spelt
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 # What stands in the margin of a printed page has no more letters.
@@ -55,6 +55,7 @@ def _templates() -> Environment:
     )
     made.filters |= {
         'number': number,
+        'spelt': spelt,
         'minus': minus,
         'fixed': lambda value, form: minus(format(value, form)),
         'ug': lambda acceleration, digits=3: number(acceleration / MICRO_G, digits),

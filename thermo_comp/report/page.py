@@ -22,6 +22,7 @@ from .evidence import LEFT_OUT, Evidence
 from .figures import DrawnFigure, drawn_figures, figures_of, png_files
 from .gather import evidence_of_fit
 from .html import render, utc
+from .text import spelt
 
 _EARTH_RADIUS = 6.371e6
 #: Peak of the Schuler oscillation, 2 R b / g, for a bias b of one micro-g [m]: 12.7.
@@ -122,7 +123,7 @@ def _verdict(evidence: Evidence) -> tuple[str, str]:
     words, _, numbers = evidence.headline.partition(': ')
     if evidence.judgement is not None:
         words, numbers = evidence.judgement.verdict, evidence.judgement.reason
-    return words.replace(' ug', ' µg'), numbers.replace(' ug', ' µg')
+    return spelt(words), spelt(numbers)
 
 
 def _seen(evidence: Evidence) -> list[str]:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -25,6 +26,12 @@ def minus(text: str) -> str:
     return text.replace('-', '−')
 
 
+def spelt(text: str) -> str:
+    """Put the signs of print for those that a terminal shows."""
+    text = re.sub(r'\bug\b', 'µg', text.replace('degC', '°C'))
+    return text.replace('|f| - g', '|f| − g').replace('+-', '±')
+
+
 def rounded(value: float, expanded: float) -> tuple[str, str]:
     """
     Round an expanded uncertainty to two significant digits, and its value to the same place.
@@ -36,7 +43,8 @@ def rounded(value: float, expanded: float) -> tuple[str, str]:
     place = 1 - math.floor(math.log10(expanded))
     if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 is 0.10
         place -= 1
-    said = (f'{round(one, place):.{max(place, 0)}f}' for one in (value, expanded))
+    # Not -0.
+    said = (f'{round(one, place) + 0.0:.{max(place, 0)}f}' for one in (value, expanded))
     return minus(next(said)), next(said)
 
 

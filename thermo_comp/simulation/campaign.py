@@ -46,7 +46,7 @@ class Record:
         [degC], shape (m,)
     specific_force: true specific force in the orthogonal frame, m/s^2, shape (3,)
     bias, scale: what the unit's temperatures make of bias [counts/cycle] and relative scale, every
-        second from 0; without the wander of the bias, which no model can know, shape (k, 3)
+        second from 0; without the walk of the bias, which no model can know, shape (k, 3)
     """
 
     name: str

@@ -139,7 +139,7 @@ class Chamber:
             raise ValueError(f'`up` must be a vector other than zero, shape (3,), got {up!r}')
         self._force: Floats = options.gravity * (direction / length)
         self.thermal = thermal or ThermalTruth(unit, cyclogram, options)
-        self.bias = self.thermal.bias + _wander(unit, self.thermal.grid, options.seed)
+        self.bias = self.thermal.bias + _walk(unit, self.thermal.grid, options.seed)
 
         if options.temperature_rate_hz is not None:
             unit = unit.with_thermometers(rate_hz=options.temperature_rate_hz)
@@ -219,7 +219,7 @@ def _switched(
     return fine, np.interp(fine, knots, air), power
 
 
-def _wander(unit: UnitModel, grid: Floats, seed: int) -> Floats:
+def _walk(unit: UnitModel, grid: Floats, seed: int) -> Floats:
     """Return what the bias does of itself: a walk, counts/cycle."""
     result = np.zeros((len(grid), 3))
     step_h = grid[1] / 3600.0

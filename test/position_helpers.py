@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulated rests in one attitude that the tests of the partial fits are built on."""
+"""Owns the simulated positions that the tests of the partial fits are built on."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pose_helpers import GRAVITY, MG, START_NS, Rest
+from position_helpers import GRAVITY, MG, START_NS, Rest
 
 from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
@@ -19,7 +19,7 @@ SLOPE = np.array([1.0, -0.5, 2.0])
 
 
 @pytest.fixture(scope='module')
-def one_pose():
+def one_position():
     """Fit a rest in one attitude whose bias drifts by SLOPE [mg/K] while it cools by 20 K."""
     rest = Rest(np.random.default_rng(20161), level=tuple(GRAVITY * UP))
     rest.accel += (rest.temperature(rest.time)[:, None] - 20.0) * MG * SLOPE
@@ -40,28 +40,28 @@ def turned(rng, ups, rest_s=20.0):
     return FitSource('turned', lambda: [block])
 
 
-def test_one_pose_gives_bias_over_temperature_on_three_axes(one_pose):
+def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
     at = np.array([-3.0, 12.0])
-    for axis, slope in zip(one_pose.calibration.static.axes(), SLOPE, strict=True):
+    for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
         found = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
         # 15000 samples of 3 mg over 16 K: some hundredths of a mg/K.
         assert found == pytest.approx(slope, abs=0.2)
 
 
-def test_one_pose_leaves_the_scale_at_its_prior(one_pose):
-    calibration = one_pose.calibration
+def test_one_position_leaves_the_scale_at_its_prior(one_position):
+    calibration = one_position.calibration
     for axis in calibration.static.axes():
         # Three powers, 1e-4 each where the column has unit RMS.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
     # Scale 5 %, misalignment 1 mrad: what is known of any unit beforehand.
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-3, rtol=0.02)
     assert 'stays at its prior' in next(
-        one.message for one in one_pose.findings if one.name == 'positions'
+        one.message for one in one_position.findings if one.name == 'positions'
     )
 
 
-def test_one_pose_becomes_parameters_of_an_autopilot(one_pose):
-    text = export_calibration(one_pose.calibration, 'px4', device_id=1).text
+def test_one_position_becomes_parameters_of_an_autopilot(one_position):
+    text = export_calibration(one_position.calibration, 'px4', device_id=1).text
     rows = [line.split() for line in text.splitlines() if line.startswith('1')]
     value = {row[2]: float(row[3]) for row in rows}
     d = np.array([17.0, 32.0]) - value['TC_A0_TREF']
