@@ -4,10 +4,11 @@
 Owns still intervals: raw samples -> short cells (count, mean, variance) -> where nothing moved.
 
 Cells of about half a second are accumulated while the samples stream by; a bag of any length
-costs some 50 bytes per cell. Two tests, both relative to the bag's own quiet level: the variance
+costs some 100 bytes per cell. Two tests are relative to the bag's own quiet level: the variance
 inside a cell (vibration, handling) and the step between neighbouring cells (a turn, a knock that
 left another attitude). A step starts a new interval, because a shift of one microradian is
-already one micro-g.
+already one micro-g. Two are absolute, because a flight has a quietest tenth, too: a sensor at rest
+scatters by no more than its noise, and its gyroscope does not turn.
 """
 
 from __future__ import annotations
@@ -18,9 +19,15 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# A cell's variance, of n >= 30 samples, exceeds 4 times its mean by chance with probability
-# below 1e-11; vibration worth cutting out is far above.
-_VARIANCE_RATIO = 4.0
+#: How many times the quiet level a cell's variance, of n >= 30 samples, may be: 4 is exceeded by
+#: chance with probability below 1e-11, and vibration worth cutting out is far above.
+VARIANCE_RATIO = 4.0
+#: The noisiest sensors scatter by less than this at rest [parts of g]; few things that fly do.
+STILL_SD = 0.05
+# What a gyroscope at rest shows: scatter within a cell, and a mean away from its level, which
+# drifts with temperature and is taken over stretches [rad/s, s].
+_STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
+_LEVEL_S = 120.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
 _QUANTUM_SAMPLES = 20000
@@ -42,7 +49,8 @@ class Cells:
     `time` is the mean since `start_ns` [s]; `index` the number of the cell on the bag's time grid,
     so that neighbours differ by 1. Dropped are samples with a component that is not finite or a
     stamp that does not rise. `is_integer` where all are whole numbers (counts); `quantum` is the
-    step of the samples, 0 when they have none to speak of.
+    step of the samples, 0 when they have none to speak of. `rate` and `rate_variance` are those of
+    the gyroscope [rad/s], of zeros where there is none.
     """
 
     start_ns: int
@@ -56,6 +64,8 @@ class Cells:
     n_saturated: int
     is_integer: bool
     quantum: Floats
+    rate: Floats
+    rate_variance: Floats
 
 
 class CellAccumulator:
@@ -86,11 +96,12 @@ class CellAccumulator:
         self._n_saturated = 0
         self._is_integer = True
         self._quantum = np.zeros(3)
-        self._open = np.zeros((0, 8))
+        self._width = 8
+        self._open = np.zeros((0, self._width))
         self._open_id = -1
 
-    def add(self, stamp_ns: Ints, samples: Floats) -> None:
-        """Take the next samples, shape (n, 3), in file order."""
+    def add(self, stamp_ns: Ints, samples: Floats, rate: Floats | None = None) -> None:
+        """Take the next samples, shape (n, 3), in file order, and the gyroscope's rates."""
         stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
         samples = np.asarray(samples, dtype=np.float64)
         if not len(stamp_ns):
@@ -109,10 +120,11 @@ class CellAccumulator:
             return
         if self._last_ns is None:
             self._begin(stamp_ns, samples)
+            self._width = 8 if rate is None else 14
         self._last_ns = int(stamp_ns[-1])
         if self._is_integer:
             self._is_integer = bool((samples == np.rint(samples)).all())
-        self._accumulate(stamp_ns, samples)
+        self._accumulate(stamp_ns, samples, None if rate is None else rate[use])
 
     def finish(self) -> Cells:
         """Return all cells so far, the last one as it is."""
@@ -120,22 +132,26 @@ class CellAccumulator:
         if self._open_id >= 0:
             ids, sums_of = [*ids, np.array([self._open_id])], [*sums_of, self._open]
         index = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)
-        sums = np.concatenate(sums_of) if sums_of else np.zeros((0, 8))
+        sums = np.concatenate(sums_of) if sums_of else np.zeros((0, self._width))
         count = sums[:, 0]
-        mean = sums[:, 2:5] / count[:, None]
-        spread = np.maximum(sums[:, 5:8] - count[:, None] * mean**2, 0.0)
+        mean, variance = _moments(count, sums[:, 2:5], sums[:, 5:8])
+        rate = rate_variance = np.zeros_like(mean)
+        if self._width > 8:
+            rate, rate_variance = _moments(count, sums[:, 8:11], sums[:, 11:14])
         return Cells(
             start_ns=self._start_ns,
             time=sums[:, 1] / count + index * (self._cell_ns * 1e-9),
             count=count.astype(np.int64),
             mean=mean + self._shift,
-            variance=spread / np.maximum(count[:, None] - 1.0, 1.0),
+            variance=variance,
             index=index,
             cell_s=self._cell_ns * 1e-9,
             n_dropped=self._n_dropped,
             n_saturated=self._n_saturated,
             is_integer=self._is_integer,
             quantum=self._quantum,
+            rate=rate,
+            rate_variance=rate_variance,
         )
 
     def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
@@ -146,15 +162,18 @@ class CellAccumulator:
         self._shift = samples[0].copy()
         self._quantum = _quantum_of(samples[:_QUANTUM_SAMPLES])
 
-    def _accumulate(self, stamp_ns: Ints, samples: Floats) -> None:
+    def _accumulate(self, stamp_ns: Ints, samples: Floats, rate: Floats | None) -> None:
         since = stamp_ns - self._start_ns
         ids = since // self._cell_ns
         first = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
-        columns = np.empty((len(since), 8))
+        columns = np.zeros((len(since), self._width))
         columns[:, 0] = 1.0
         columns[:, 1] = (since - ids * self._cell_ns) * 1e-9
         columns[:, 2:5] = samples - self._shift
         columns[:, 5:8] = columns[:, 2:5] ** 2
+        if self._width > 8 and rate is not None:
+            columns[:, 8:11] = np.where(np.abs(rate) < _LARGEST, rate, 0.0)
+            columns[:, 11:14] = columns[:, 8:11] ** 2
         sums = np.add.reduceat(columns, first, axis=0)
         ids = ids[first]
         if self._open_id >= 0:
@@ -168,6 +187,13 @@ class CellAccumulator:
         if len(ids) > 1:
             self._ids.append(ids[:-1])
             self._sums.append(sums[:-1].copy())
+
+
+def _moments(count: Floats, total: Floats, square: Floats) -> tuple[Floats, Floats]:
+    """Mean and variance of each cell's samples, from their sums."""
+    mean = total / count[:, None]
+    spread = np.maximum(square - count[:, None] * mean**2, 0.0)
+    return mean, spread / np.maximum(count[:, None] - 1.0, 1.0)
 
 
 def _part_of(window_s: float, least: float) -> float:
@@ -194,17 +220,25 @@ def _quantum_of(samples: Floats) -> Floats:
     return result
 
 
-def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
+def still_intervals(
+    cells: Cells, min_rest_s: float, still_sd: float = STILL_SD, ratio: float = VARIANCE_RATIO
+) -> list[tuple[int, int]]:
     """
     Find the runs of cells in which nothing moved: half-open ranges of cell numbers, in order.
+
+    `still_sd` is the largest scatter of samples at rest [parts of g], `ratio` that of a variance
+    over the quiet level.
     """
-    n = len(cells.count)
-    if not n:
+    full = _is_full(cells)
+    believable = full & _is_under(cells, still_sd) & ~_is_turning(cells)
+    if not believable.any():
         return []
-    full = cells.count >= max(2.0, 0.5 * float(np.median(cells.count)))
-    if not full.any():
-        return []
-    quiet = full & _is_quiet(cells, full)
+    # A sensor that reads the same number for long is no measure of its noise: toggling between two
+    # neighbours has a variance of a quarter step squared. A tenth-percentile of a chi-square
+    # variance lies a little below its mean; 1.3 covers it for cells of 32 samples.
+    level = np.quantile(cells.variance[believable], 0.1, axis=0)
+    limit = ratio * np.maximum(1.3 * level, 0.25 * cells.quantum**2)
+    quiet = believable & (cells.variance <= limit).all(axis=1)
     broken = ~_is_joined(cells, quiet)
     # A cell beside a moving one, or on either side of a step, holds the edge of the motion.
     moved = ~quiet
@@ -212,7 +246,7 @@ def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
     near[1:] |= moved[:-1] | broken
     near[:-1] |= moved[1:] | broken
     edges = np.flatnonzero(np.diff(np.concatenate(([0], (~near).astype(np.int8), [0]))))
-    min_cells = max(1, int(np.ceil(min_still_s / cells.cell_s - 1e-9)))
+    min_cells = max(1, int(np.ceil(min_rest_s / cells.cell_s - 1e-9)))
     return [
         (int(start), int(stop))
         for start, stop in zip(edges[::2], edges[1::2], strict=True)
@@ -220,16 +254,50 @@ def still_intervals(cells: Cells, min_still_s: float) -> list[tuple[int, int]]:
     ]
 
 
-def _is_quiet(cells: Cells, full: Bools) -> Bools:
-    """Compare each cell's variance with the quietest tenth of the bag."""
-    # A sensor that reads the same number for long is no measure of its noise: toggling between two
-    # neighbours has a variance of a quarter step squared.
-    floor = 0.25 * cells.quantum**2
-    level = np.quantile(cells.variance[full], 0.1, axis=0)
-    # A tenth-percentile of a chi-square variance lies a little below its mean; 1.3 covers it
-    # for cells of 32 samples.
-    limit = _VARIANCE_RATIO * np.maximum(1.3 * level, floor)
-    return np.asarray((cells.variance <= limit).all(axis=1))
+def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
+    """Say what speaks against rests in a bag that has none."""
+    full, under = _is_full(cells), _is_under(cells, still_sd)
+    if full.any() and not (full & under).any():
+        least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
+        return (
+            f'its samples scatter by {1e3 * least:.3g} mg where they are quietest, and by less '
+            f'than {1e3 * still_sd:.3g} mg at rest (--still-sd)'
+        )
+    if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():
+        return 'its gyroscope turns all the time'
+    return 'the unit must rest in each position'
+
+
+def _is_full(cells: Cells) -> Bools:
+    if not len(cells.count):
+        return np.zeros(0, dtype=bool)
+    return np.asarray(cells.count >= max(2.0, 0.5 * float(np.median(cells.count))))
+
+
+def _one_g(cells: Cells) -> float:
+    """Typical reading: gravity, on average, of whatever does not fall."""
+    return float(np.median(np.linalg.norm(cells.mean, axis=1)))
+
+
+def _is_under(cells: Cells, still_sd: float) -> Bools:
+    """Whether a cell scatters by no more than a sensor at rest, or its own rounding."""
+    ceiling = np.maximum((still_sd * _one_g(cells)) ** 2, cells.quantum**2)
+    return np.asarray((cells.variance <= ceiling).all(axis=1))
+
+
+def _is_turning(cells: Cells) -> Bools:
+    """Whether the gyroscope saw a cell shake or turn; it has a level that drifts, and is found."""
+    shakes = (cells.rate_variance > _STILL_RATE_SD**2).any(axis=1)
+    calm = np.flatnonzero(~shakes)
+    if not len(calm) or not cells.rate.any():
+        return np.asarray(shakes)
+    stretch = (cells.time[calm] // _LEVEL_S).astype(np.int64)
+    first = np.flatnonzero(np.r_[True, np.diff(stretch) != 0])
+    runs = np.split(calm, first[1:])
+    middle = [float(np.median(cells.time[run])) for run in runs]
+    levels = np.array([np.median(cells.rate[run], axis=0) for run in runs])
+    level = np.column_stack([np.interp(cells.time, middle, axis) for axis in levels.T])
+    return np.asarray(shakes | (np.abs(cells.rate - level) > _STILL_RATE).any(axis=1))
 
 
 def _is_joined(cells: Cells, quiet: Bools) -> Bools:
