@@ -21,7 +21,7 @@ def ratio(path: Path) -> float:
     nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
     block = ArrayBlock(stamps, accel, nothing_ns, nothing, nothing_ns, nothing)
     options = FitOptions(
-        gravity=STANDARD_GRAVITY, input='m/s^2', window_s=1.0, cell_s=0.2, min_still_s=1.0
+        gravity=STANDARD_GRAVITY, input='m/s^2', window_s=1.0, cell_s=0.2, min_rest_s=1.0
     )
     bags = [reduce_bag(FitSource(path.stem, lambda: [block]), 0, options)]
     result = fit_bags(bags, options)

@@ -48,7 +48,7 @@ def split(whole: ArrayBlock, n_parts: int) -> list[ArrayBlock]:
 
 def reduced(blocks: Iterable[ArrayBlock], **options: float | None) -> ReducedBag:
     kept = list(blocks)
-    settings = {'window_s': 10.0, 'cell_s': 0.5, 'min_still_s': 3.0, 'full_scale': 32767.0}
+    settings = {'window_s': 10.0, 'cell_s': 0.5, 'min_rest_s': 3.0, 'full_scale': 32767.0}
     return reduce_source(FitSource('bag', lambda: kept), 0, **{**settings, **options})
 
 

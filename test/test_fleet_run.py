@@ -296,7 +296,7 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(
 def test_options_are_part_of_a_result(client: Any, fleet: Path, tmp_path: Path) -> None:
     refused = fleet / 'B'
     fit_fleet(str(refused), tmp_path / 'out', OPTIONS, client=client)
-    other = replace(OPTIONS, fit=replace(OPTIONS.fit, min_still_s=4.0))
+    other = replace(OPTIONS, fit=replace(OPTIONS.fit, min_rest_s=4.0))
     assert fit_fleet(str(refused), tmp_path / 'out', other, client=client).n_done == 1
 
 

@@ -22,7 +22,7 @@ OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 
 def reduced(source):
-    return reduce_source(source, 0, window_s=10.0, cell_s=2.0, min_still_s=5.0, full_scale=None)
+    return reduce_source(source, 0, window_s=10.0, cell_s=2.0, min_rest_s=5.0, full_scale=None)
 
 
 def bags(rng, n=9, jump_in=None, size=20.0):

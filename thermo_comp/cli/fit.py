@@ -57,7 +57,8 @@ def fit(
     reference_temperature: Annotated[
         float, typer.Option(help='Reference temperature in degC.', min=-273.15, max=1000.0)
     ] = 20.0,
-    min_still: Annotated[float, typer.Option(help='Shortest still interval used, in s.')] = 3.0,
+    min_rest: options.MinRest = None,
+    still_sd: options.StillSd = '50mg',
     allow: Annotated[
         list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
     ] = None,
@@ -117,12 +118,15 @@ def fit(
             groups=None if groups is None else _names(groups),
             forced=_names(force_groups),
             prior=None if prior is None else load_calibration(prior),
-            ageing=Ageing(options.acceleration(ageing_bias) or 0.0, ageing_scale * 1e-6),
+            ageing=Ageing(
+                options.acceleration(ageing_bias, '--ageing-bias') or 0.0, ageing_scale * 1e-6
+            ),
             serial=serial,
             input='counts' if kind == 'counts' else 'm/s^2',
             full_scale=full_scale,
             reference_temperature=reference_temperature,
-            min_still_s=min_still,
+            min_rest_s=min_rest,
+            still_sd=options.acceleration(still_sd, '--still-sd') or 0.0,
             allow=tuple(allow or ()),
         )
     except ValueError as mistake:

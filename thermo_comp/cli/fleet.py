@@ -64,7 +64,8 @@ def fit(
     reference_temperature: Annotated[
         float, typer.Option(help='Reference temperature [degC].')
     ] = 20.0,
-    min_still: Annotated[float, typer.Option(help='Shortest still interval used [s].')] = 3.0,
+    min_rest: options.MinRest = None,
+    still_sd: options.StillSd = '50mg',
     allow: Annotated[
         list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
     ] = None,
@@ -101,7 +102,8 @@ def fit(
                 model=model.value,
                 full_scale=full_scale,
                 reference_temperature=reference_temperature,
-                min_still_s=min_still,
+                min_rest_s=min_rest,
+                still_sd=options.acceleration(still_sd, '--still-sd') or 0.0,
                 allow=tuple(allow or ()),
             ),
             topics=options.topics_of(topic, topics),

@@ -120,15 +120,27 @@ AgeingBias = Annotated[
     typer.Option(help="What the biases may have changed by since the prior's: 50ug, 0.1mg."),
 ]
 
+MinRest = Annotated[
+    float | None,
+    typer.Option(
+        help='Shortest rest used, in s; else 3, or less where short ones tell more.',
+        metavar='S',
+        show_default=False,
+    ),
+]
+StillSd = Annotated[
+    str, typer.Option(help="Largest scatter of samples at rest: a few times the sensor's noise.")
+]
 
-def acceleration(text: str | None) -> float | None:
+
+def acceleration(text: str | None, name: str = '--tolerance') -> float | None:
     """Read an acceleration with its unit [m/s^2]; None where none is given."""
     from ..unit.gravity import parse_acceleration
 
     try:
         return None if text is None else parse_acceleration(text)
     except ValueError as mistake:
-        raise usage(f'--tolerance: {mistake}') from mistake
+        raise usage(f'{name}: {mistake}') from mistake
 
 
 def positive(value: float, name: str) -> float:

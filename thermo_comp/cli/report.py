@@ -81,7 +81,6 @@ def report(
             certificate_info, None if loaded is None else loaded.unit.serial
         )
     kind = input_.value if loaded is None else input_for(loaded, input_.value)
-    full_scale = None if loaded is None else loaded.unit.full_scale
     opened = []
     with out.progress('reading', total=max(len(paths), 1)) as done:
         for number, path in enumerate(paths):
@@ -92,7 +91,7 @@ def report(
                     kind,
                     number=number,
                     window_s=window,
-                    full_scale=full_scale,
+                    calibration=loaded,
                     progress=partial(_tell, done, number),
                 )
             )

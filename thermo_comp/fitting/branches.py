@@ -21,7 +21,7 @@ import numpy as np
 
 from ..typing import Floats, Ints
 from .reduction import ReducedBag
-from .sources import FitSource
+from .sources import FitSource, angular_velocity
 
 # Still intervals further apart than this are not looked at for a step: too much can have happened.
 _LONGEST_GAP_S = 30.0
@@ -133,7 +133,7 @@ def _near(
     if gaps:
         for block in source.blocks():
             time = _seconds(block.accel_stamp_ns, start_ns)
-            rate = _angular_velocity(block)
+            rate = angular_velocity(block)
             for part, (begin, end) in zip(parts, gaps, strict=True):
                 use = (time >= begin - _MARGIN_S) & (time <= end + _MARGIN_S)
                 use &= np.isfinite(block.accel).all(axis=1)
@@ -156,14 +156,6 @@ def _near(
 def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
     since: Floats = (stamp_ns - start_ns).astype(np.float64) * 1e-9
     return since
-
-
-def _angular_velocity(block: object) -> Floats | None:
-    """Angular rate of a block that has one: a recording's, when its input is an Imu."""
-    rate = getattr(getattr(block, 'imu', None), 'angular_velocity', None)
-    if rate is None or not np.asarray(rate).any():
-        return None
-    return np.asarray(rate, dtype=np.float64)
 
 
 def _examine(

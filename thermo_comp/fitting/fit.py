@@ -17,6 +17,7 @@ from ..unit.calibration import Calibration, Unit
 from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
 from .assembly import UnitFacts, build_calibration
+from .attitudes import distinct_directions
 from .curves import sets_of
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .learning import Learnt, learn
@@ -29,15 +30,7 @@ from .sensors import learn_detector
 from .sources import FitSource
 from .start import ConstantCalibration, constant_calibration, position_means
 from .unknowns import Prior, initial_state
-from .verdict import (
-    POSITIONS_NEEDED,
-    Finding,
-    distinct_directions,
-    enforce,
-    judge_bags,
-    judge_result,
-    judge_windows,
-)
+from .verdict import POSITIONS_NEEDED, Finding, enforce, judge_bags, judge_result, judge_windows
 from .windows import CURVE, FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
 
 Progress = Callable[[str, float], None]
@@ -121,17 +114,15 @@ def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBa
         number,
         window_s=options.window_s,
         cell_s=options.cell_s,
-        min_still_s=options.min_still_s,
+        min_rest_s=options.min_rest_s,
+        still_sd=options.still_sd / STANDARD_GRAVITY,
         full_scale=full_scale,
         fewest_windows=FEWEST_WINDOWS,
     )
     if not bag.n_samples:
         raise FitError(f'{source.name}: no accelerometer samples')
     if not bag.intervals:
-        raise FitError(
-            f'{source.name}: no still interval of {options.min_still_s:g} s; the unit must '
-            'rest in each position'
-        )
+        raise FitError(f'{source.name}: no still interval: {bag.restless}')
     return bag
 
 

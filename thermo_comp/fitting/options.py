@@ -8,8 +8,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from ..recording.stillness import STILL_SD
 from ..thermal.settings import DetectorSettings
 from ..unit.calibration import Calibration
+from ..unit.gravity import STANDARD_GRAVITY
 
 #: The converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
@@ -61,8 +63,9 @@ class FitOptions:
     reference_temperature: T_ref; the paper uses 20
     detector: thermometer and detector settings; None learns them from the bags
     transition_time_s: cross-over time of the sets, as the node will use
-    window_s, cell_s, min_still_s: lengths of a window, of a cell and of the shortest still
-        interval
+    window_s, cell_s: lengths of a window and of a cell
+    min_rest_s: length of the shortest rest; None chooses, see `reduction`
+    still_sd: largest scatter of the samples at rest [m/s^2]
     regression_window_s: length up to which neighbouring windows of a position are merged for the
         regression
     allow: names of refusals that the user overrides, see `verdict`
@@ -86,14 +89,17 @@ class FitOptions:
     transition_time_s: float = 30.0
     window_s: float = 10.0
     cell_s: float = 0.5
-    min_still_s: float = 3.0
+    min_rest_s: float | None = None
+    still_sd: float = STILL_SD * STANDARD_GRAVITY
     regression_window_s: float = 60.0
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ('gravity', 'window_s', 'cell_s', 'min_still_s', 'regression_window_s'):
+        for name in (
+            'gravity', 'window_s', 'cell_s', 'min_rest_s', 'still_sd', 'regression_window_s',
+        ):  # fmt: skip
             value = getattr(self, name)
-            if not 0.0 < value < math.inf:
+            if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {value}')
         if self.full_scale is not None and not 0.0 < self.full_scale < math.inf:
             raise ValueError(f'`full_scale` must be positive, got {self.full_scale}')

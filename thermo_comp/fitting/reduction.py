@@ -17,14 +17,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..recording.stillness import CellAccumulator, Cells, still_intervals
+from ..recording.stillness import (
+    STILL_SD,
+    VARIANCE_RATIO,
+    CellAccumulator,
+    Cells,
+    still_intervals,
+    why_restless,
+)
 from ..typing import Floats, Ints
-from .sources import FitSource
+from .attitudes import best_rests
+from .sources import FitSource, angular_velocity
 
 # Faster readings are averaged to this interval: no thermometer of this kind is that fast, and the
 # thermometers' recursion runs in Python.
 _SHORTEST_READING_INTERVAL_S = 0.2
 _LEAST_FILLED = 0.9
+# What is tried, the strictest first: lengths of the shortest rest [s], ratios of variances.
+_MIN_RESTS_S = (3.0, 2.0, 1.0)
+_RATIOS = tuple(VARIANCE_RATIO * 2.0**power for power in range(6))
 # Nothing that is read outside these is a temperature of a part [degC].
 _COLDEST, _HOTTEST = -273.15, 1e4
 
@@ -87,6 +98,7 @@ class ReducedBag:
     window_s: length of a window: as asked, or a multiple of it where the samples are slow [s]
     cycle_s: typical interval between samples
     is_integer: whether all samples were whole numbers
+    restless: what speaks against rests, where there is none
     """
 
     source: FitSource
@@ -102,6 +114,7 @@ class ReducedBag:
     window_s: float
     cycle_s: float
     is_integer: bool
+    restless: str = ''
 
     @property
     def board(self) -> Readings:
@@ -120,21 +133,28 @@ def reduce_source(
     *,
     window_s: float,
     cell_s: float,
-    min_still_s: float,
+    min_rest_s: float | None = None,
+    still_sd: float = STILL_SD,
     full_scale: float | None,
     fewest_windows: int = 1,
 ) -> ReducedBag:
-    """Stream one source and keep its sufficient statistics."""
+    """
+    Stream one source and keep its sufficient statistics.
+
+    `still_sd` is the largest scatter at rest [parts of g]. Without `min_rest_s` rests last 3 s;
+    where a recording has so many short ones that they tell bias and scale, how short, and how
+    quiet beside the quietest, is what tells these best.
+    """
     cells = CellAccumulator(cell_s, full_scale, window_s)
     collectors: dict[str, _ReadingCollector] = {}
     n_samples = 0
     for block in source.blocks():
-        cells.add(block.accel_stamp_ns, block.accel)
+        cells.add(block.accel_stamp_ns, block.accel, angular_velocity(block))
         for name, (reading_ns, celsius, _) in block.temperatures.items():
             collectors.setdefault(name, _ReadingCollector()).add(reading_ns, celsius)
         n_samples += len(block.accel_stamp_ns)
     found = cells.finish()
-    ranges = still_intervals(found, min_still_s)
+    ranges = _rests(found, min_rest_s, still_sd)
     per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
     return ReducedBag(
         source=source,
@@ -160,7 +180,24 @@ def reduce_source(
         window_s=round(per_window * found.cell_s, 6) or window_s,
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
         is_integer=found.is_integer,
+        restless='' if ranges else why_restless(found, still_sd),
     )
+
+
+def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
+    """Find the rests, by the thresholds under which they tell the triad best."""
+    found: list[list[tuple[int, int]]] = []
+    for shortest in _MIN_RESTS_S if min_rest_s is None else (min_rest_s,):
+        for ratio in _RATIOS:
+            ranges = still_intervals(cells, shortest, still_sd, ratio)
+            if ranges not in found:
+                found.append(ranges)
+    weighted = cells.mean * cells.count[:, None]
+    means = [
+        np.array([weighted[a:b].sum(axis=0) / cells.count[a:b].sum() for a, b in ranges])
+        for ranges in found
+    ]
+    return found[best_rests([one.reshape(-1, 3) for one in means])]
 
 
 def _windows(cells: Cells, bag: int, lower: int, upper: int, per_window: int) -> StillInterval:

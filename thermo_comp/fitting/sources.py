@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
+
 from ..typing import Floats, Ints
 
 
@@ -60,6 +62,12 @@ class ArrayBlock:
             'case': (self.case_stamp_ns, self.case, None),
             **{name: (stamps, value, None) for name, (stamps, value) in self.others.items()},
         }
+
+
+def angular_velocity(block: object) -> Floats | None:
+    """Angular rate of a block that has one: a recording's, when its input is an Imu."""
+    rate = getattr(getattr(block, 'imu', None), 'angular_velocity', None)
+    return np.asarray(rate, dtype=np.float64) if rate is not None and np.any(rate) else None
 
 
 def _nothing() -> str | None:

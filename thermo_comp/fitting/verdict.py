@@ -18,6 +18,7 @@ import numpy as np
 from ..errors import FitError
 from ..typing import Floats
 from ..unit.gravity import MICRO_G
+from .attitudes import distinct_directions, geometry
 from .options import FitOptions
 from .reduction import ReducedBag
 from .windows import ThermalWindows
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 SPAN_ADVISED = 25.0
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_ADVISED = 6, 9, 18
-# Directions closer than this are one position measured twice.
-_SAME_DIRECTION_DEG = 5.0
 # Largest standard deviation, in units of the noise of one position, that a parameter may have: 18
 # spread positions give 1, nine 3, the six faces each done three times by hand 4.5 to 8.
 _WORST_GEOMETRY = 6.0
@@ -231,38 +230,6 @@ def can_tell_misalignment(up: Floats) -> bool:
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
         return False
     return geometry(distinct, with_misalignment=True) <= _WORST_GEOMETRY
-
-
-def distinct_directions(up: Floats) -> Floats:
-    """
-    Drop directions that repeat another.
-
-    `up`: unit vectors, shape (n, 3).
-    """
-    kept: list[Floats] = []
-    limit = np.cos(np.radians(_SAME_DIRECTION_DEG))
-    for direction in up:
-        if all(float(direction @ other) < limit for other in kept):
-            kept.append(direction)
-    return np.array(kept).reshape(-1, 3)
-
-
-def geometry(up: Floats, with_misalignment: bool) -> float:
-    """
-    Worst standard deviation of bias, scale and misalignment per unit of norm noise.
-
-    `up`: directions, shape (n, 3).
-    """
-    x, y, z = up.T
-    # d|f| by the biases, relative scales and the three elements of M.
-    columns = [x, y, z, x * x, y * y, z * z]
-    if with_misalignment:
-        columns += [x * y, x * z, y * z]
-    jacobian = np.column_stack(columns)
-    values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
-    if values[0] < 1e-9 * values[-1]:
-        return float('inf')
-    return float(np.sqrt(np.max((vectors**2) @ (1.0 / values))))
 
 
 def judge_result(

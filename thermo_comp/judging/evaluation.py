@@ -13,6 +13,8 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import RecordingError
 from ..files import shown_name
 from ..fitting.fit_sources import digest
@@ -21,12 +23,16 @@ from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import FitSource
 from ..online.status import CompensatorConfig
 from ..recording import Block, Input, RecordingInfo, Role, Topics, open_recording
+from ..recording.stillness import STILL_SD
 from ..replay import check_unit, input_for
 from ..unit.calibration import Calibration
+from ..unit.gravity import STANDARD_GRAVITY
 from .judgement import Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 
-_CELL_S, _MIN_STILL_S = 0.5, 3.0
+_CELL_S = 0.5
+# A unit at rest scatters by no more than this many times what its calibration says of its noise.
+_NOISES = 4.0
 _BOARD: tuple[Role, ...] = ('board',)
 Progress = Callable[[float], None]
 
@@ -59,7 +65,7 @@ def open_bag(
     *,
     number: int = 0,
     window_s: float = WINDOW_S,
-    full_scale: float | None = None,
+    calibration: Calibration | None = None,
     require: Collection[Role] = _BOARD,
     is_hashed: bool = True,
     progress: Progress | None = None,
@@ -67,8 +73,9 @@ def open_bag(
     """
     Read one bag, in bounded memory, for windows of `window_s` seconds.
 
-    `number` is its place among several; a saturated sample has the magnitude `full_scale`, of
-    counts 32767 by default; its hash takes reading it once more; `progress` is told the fraction.
+    `number` is its place among several; what is saturated, and what a rest scatters by, is the
+    unit's as its `calibration` says, else the usual; its hash takes reading it once more;
+    `progress` is told the fraction.
 
     Raises RecordingError if it cannot be read or has no board temperature. Raises ValueError if
     `window_s` is not positive.
@@ -77,8 +84,12 @@ def open_bag(
     sum_s = sum_length(window_s)
     with open_recording(path, topics, input, require=require) as reader:
         info = reader.info
-        if full_scale is None and info.input != 'imu':
-            full_scale = COUNTS_FULL_SCALE
+        full_scale = COUNTS_FULL_SCALE if info.input != 'imu' else None
+        still_sd = STILL_SD
+        if calibration is not None:
+            full_scale = calibration.unit.full_scale
+            density = max(calibration.noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
+            still_sd = max(still_sd, _NOISES / np.sqrt(calibration.unit.cycle_time_s) * density)
         name = reader.topics.get('accel')
         total = info.topics[name][1] if name else 0
         source = FitSource(
@@ -90,12 +101,7 @@ def open_bag(
             metadata=info.metadata,
         )
         reduced = reduce_source(
-            source,
-            number,
-            window_s=sum_s,
-            cell_s=min(_CELL_S, sum_s),
-            min_still_s=_MIN_STILL_S,
-            full_scale=full_scale,
+            source, number, window_s=sum_s, cell_s=min(_CELL_S, sum_s), full_scale=full_scale
         )
         info = reader.info
     if not len(reduced.board.value):
@@ -164,7 +170,7 @@ def evaluate(
             input_for(first, input),
             number=number,
             window_s=window_s,
-            full_scale=first.unit.full_scale,
+            calibration=first,
             require=('accel', 'board'),
             is_hashed=False,
             progress=_part_of(tell, number, len(paths)),

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..fitting.verdict import POSITIONS_NEEDED, distinct_directions
+from ..fitting.attitudes import distinct_directions
+from ..fitting.verdict import POSITIONS_NEEDED
 from ..typing import Floats
 from ..unit.gravity import MICRO_G
 from .windows import Windows

@@ -23,7 +23,7 @@ ADVISED_SPAN_K = 25.0
 # Rate of the board over two minutes that counts as a ramp: well above a soak's slow drift.
 _RAMP_K_MIN = 0.1
 _RAMP_WINDOW_S = 120.0
-_CELL_S, _MIN_STILL_S = 0.5, 3.0
+_CELL_S, _MIN_REST_S = 0.5, 3.0
 # A pause of this many usual intervals is a gap.
 _GAP_INTERVALS = 5.0
 
@@ -136,7 +136,8 @@ def survey_recording(
         for block in reader.blocks():
             stamps.add(block.accel_stamp_ns)
             n_not_finite += int((~np.isfinite(block.accel).all(axis=1)).sum())
-            cells.add(block.accel_stamp_ns, block.accel)
+            rate = None if block.imu is None else block.imu.angular_velocity
+            cells.add(block.accel_stamp_ns, block.accel, rate)
             for name, one in block.temperatures.items():
                 readings.setdefault(name, []).append(one)
             if progress is not None and total:
@@ -146,7 +147,7 @@ def survey_recording(
     still_s = 0.0
     if stamps.n > 1:
         reduced = cells.finish()
-        still = still_intervals(reduced, _MIN_STILL_S)
+        still = still_intervals(reduced, _MIN_REST_S)
         # whole cells: the first and the last may reach beyond the samples
         still_s = sum((upper - lower) * reduced.cell_s for lower, upper in still)
         still_s = min(still_s, stamps.duration_s)

@@ -276,7 +276,8 @@ def _is_full(cells: Cells) -> Bools:
 
 def _one_g(cells: Cells) -> float:
     """Typical reading: gravity, on average, of whatever does not fall."""
-    return float(np.median(np.linalg.norm(cells.mean, axis=1)))
+    norms = np.linalg.norm(cells.mean, axis=1)
+    return float(np.median(norms)) if len(norms) else 0.0
 
 
 def _is_under(cells: Cells, still_sd: float) -> Bools:
@@ -307,7 +308,8 @@ def _is_joined(cells: Cells, quiet: Bools) -> Bools:
     if not both.any():
         return np.zeros(len(step), dtype=bool)
     spread = 1.4826 * np.median(np.abs(step[both]), axis=0)
-    noise = np.sqrt(2.0 * np.median(cells.variance[quiet] / cells.count[quiet, None], axis=0))
+    square = cells.variance / cells.count[:, None]
+    noise = np.sqrt(np.maximum(2.0 * np.median(square[quiet], axis=0), square[1:] + square[:-1]))
     # One that mostly reads the same number goes from one to the next in a step that is no knock.
     is_stuck = np.median(cells.variance[quiet], axis=0) < (_STUCK * cells.quantum) ** 2
     limit = np.maximum(

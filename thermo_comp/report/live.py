@@ -112,7 +112,7 @@ class LiveReport:
                     self._topics,
                     input_for(calibration, self._input),
                     number=number,
-                    full_scale=calibration.unit.full_scale,
+                    calibration=calibration,
                 )
                 known = (signature, bag)
                 self._opened[path] = known

@@ -1,0 +1,141 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is a rest: not a flight, with or without a gyroscope; short rests by hand, each of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from position_helpers import START_NS, Imu, ImuBlock
+
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import FitOptions, FitSource, fit, reduce_bag
+from thermo_comp.simulation import positions
+
+GRAVITY = 9.80665
+MG = GRAVITY * 1e-3
+RATE_HZ = 100.0
+OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
+
+
+def source(accel, gyro=None) -> FitSource:
+    """Make a bag of samples, without a thermometer."""
+    stamps = START_NS + np.rint(np.arange(len(accel)) * 1e9 / RATE_HZ).astype(np.int64)
+    nothing = np.zeros(0)
+    imu = None if gyro is None else Imu(gyro)
+    block = ImuBlock(stamps, accel, nothing.astype(np.int64), nothing,
+                     nothing.astype(np.int64), nothing, imu=imu)  # fmt: skip
+    return FitSource('log', lambda: [block])
+
+
+def time_of(seconds: float) -> np.ndarray:
+    return np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+
+
+def ground(rng, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    n = len(time_of(seconds))
+    level = np.array((0.0, 0.0, GRAVITY)) + 3.0 * MG * rng.standard_normal((n, 3))
+    return level, np.radians(2.0) + np.radians(0.05) * rng.standard_normal((n, 3))
+
+
+def hover(rng, seconds: float, vibration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Thrust about g, a slow sway of some degrees at some deg/s, and what the propellers shake."""
+    time = time_of(seconds)
+    tilt = np.radians(3.0) * np.sin(2.0 * np.pi * time[:, None] / np.array((5.0, 7.0)))
+    thrust = GRAVITY * (1.0 + 0.03 * np.sin(2.0 * np.pi * time / 11.0))
+    accel = thrust[:, None] * np.column_stack((tilt, np.ones(len(time))))
+    accel += vibration * rng.standard_normal(accel.shape)
+    gyro = np.column_stack((np.gradient(tilt, 1.0 / RATE_HZ, axis=0), np.zeros(len(time))))
+    return accel, gyro + np.radians(2.0) + np.radians(0.5) * rng.standard_normal(gyro.shape)
+
+
+@pytest.mark.parametrize('with_gyro', [True, False])
+def test_a_flight_is_no_rest(rng, with_gyro):
+    accel, gyro = hover(rng, 120.0, vibration=1.0)
+    with pytest.raises(FitError, match=r'log: no still interval: its samples scatter by 9\d mg'):
+        reduce_bag(source(accel, gyro if with_gyro else None), 0, OPTIONS)
+
+
+def test_a_smooth_flight_is_told_by_its_gyroscope(rng):
+    # Vibration of 15 mg is within what a noisy sensor shows; 4 deg/s is what none does.
+    accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
+    with pytest.raises(FitError, match='its gyroscope turns all the time'):
+        reduce_bag(source(accel, gyro), 0, OPTIONS)
+
+
+def test_of_a_log_only_the_ground_is_a_rest(rng):
+    parts = [ground(rng, 12.0), hover(rng, 240.0, 15.0 * MG), ground(rng, 12.0)]
+    accel, gyro = (np.concatenate(each) for each in zip(*parts, strict=True))
+    bag = reduce_bag(source(accel, gyro), 0, OPTIONS)
+    ends = [((i.start_ns - START_NS) * 1e-9, (i.end_ns - START_NS) * 1e-9) for i in bag.intervals]
+    assert len(ends) == 2
+    assert ends[0][1] < 12.0
+    assert ends[1][0] > 252.0
+
+
+def test_what_the_user_says_of_the_noise_decides(rng):
+    accel, _ = hover(rng, 120.0, vibration=15.0 * MG)
+    quiet, _ = ground(rng, 30.0)
+    options = FitOptions(gravity=GRAVITY, input='m/s^2', still_sd=10.0 * MG)
+    with pytest.raises(FitError, match=r'by less than 10 mg at rest \(--still-sd\)'):
+        reduce_bag(source(accel), 0, options)
+    assert len(reduce_bag(source(quiet), 0, options).intervals) == 1
+
+
+def test_a_gyroscope_that_drifts_with_temperature_rests(rng):
+    accel, gyro = ground(rng, 1200.0)
+    gyro[:, 0] += np.radians(10.0) * np.linspace(0.0, 1.0, len(gyro)) ** 2
+    bag = reduce_bag(source(accel, gyro), 0, OPTIONS)
+    assert len(bag.intervals) == 1
+    assert bag.n_still_cells == bag.n_cells
+
+
+def by_hand(rng, n_rests: int, rest_s: float, shaky: tuple[int, ...], misalignment: float = 0.0):
+    """Make rests by hand with turns between them; the shaky ones scatter four times as much."""
+    ups = positions(n_rests, 4)
+    matrix = np.eye(3)
+    matrix[1, 0] = matrix[2, 1] = misalignment
+    parts = []
+    for k in range(n_rests):
+        n = len(time_of(rest_s))
+        sd = 3.0 * MG * (4.0 if k in shaky else 1.0)
+        parts.append(GRAVITY * ups[k] + sd * rng.standard_normal((n, 3)))
+        way = np.linspace(0.0, 1.0, len(time_of(3.0)))[:, None]
+        turn = ups[k] + way * (ups[(k + 1) % n_rests] - ups[k])
+        turn /= np.linalg.norm(turn, axis=1, keepdims=True) + 1e-9
+        parts.append(GRAVITY * turn + 60.0 * MG * rng.standard_normal(turn.shape))
+    force = np.concatenate(parts)
+    return force @ np.linalg.inv(matrix).T * (1.01, 0.99, 1.02) + (0.3, -0.2, 0.1)
+
+
+@pytest.mark.parametrize(('rest_s', 'shaky'), [(6.0, (2, 5, 9)), (3.5, ()), (3.5, (0, 3, 7))])
+def test_each_short_rest_is_found(rng, rest_s, shaky):
+    accel = by_hand(rng, 10, rest_s, shaky)
+    result = fit([source(accel)], OPTIONS)
+    assert len(result.positions) == 10
+    axes = result.calibration.axes
+    # 350 samples of 3 to 12 mg in each rest: 0.2 to 0.6 mg, over ten of them.
+    np.testing.assert_allclose([axes.x.bias, axes.y.bias, axes.z.bias], (0.3, -0.2, 0.1),
+                               atol=1.5 * MG)  # fmt: skip
+    assert result.residuals[-1].fitted.rms < 2.0 * MG
+
+
+def test_motion_does_not_pass_for_a_rest_in_the_scan(rng):
+    # Two more stretches, as quiet as the shaky rests, in which the unit is pushed about.
+    accel = by_hand(rng, 14, 6.0, (3,), misalignment=5e-3)
+    time = time_of(10.0)
+    push = GRAVITY * np.array((0.0, 0.6, 0.8)) * 1.04 + 0.0 * time[:, None]
+    accel = np.concatenate((accel, push + 12.0 * MG * rng.standard_normal(push.shape)))
+    result = fit([source(accel)], OPTIONS)
+    assert 13 <= len(result.positions) <= 14
+    assert result.residuals[-1].fitted.rms < 2.0 * MG
+
+
+def test_the_shortest_rest_is_yours_to_say(rng):
+    accel = by_hand(rng, 10, 3.5, ())
+    bag = reduce_bag(source(accel), 0, FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=2.0))
+    assert len(bag.intervals) == 10
+    with pytest.raises(FitError, match='must rest in each position'):
+        reduce_bag(source(accel), 0, FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=60.0))
+    with pytest.raises(ValueError, match='`min_rest_s` must be positive'):
+        FitOptions(gravity=GRAVITY, min_rest_s=0.0)
