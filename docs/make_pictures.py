@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the drawings of the pages: the chamber test with its cyclogram, and the viewer's layout.
+
+    python docs/make_pictures.py
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, FancyBboxPatch, Polygon, Rectangle
+
+import thermo_comp as tc
+from thermo_comp.simulation import cyclogram_preset, positions, simulate, unit_preset
+
+ROOT = Path(__file__).parent.parent
+IMAGES = ROOT / 'docs' / 'images'
+LAYOUT = ROOT / 'config' / 'thermo_comp.foxglove.json'
+BLUE, RED, GREY = '#0072B2', '#D55E00', '#5A5A5A'
+
+
+def draw_chamber(axes: Axes) -> None:
+    """Draw what stands where, without a scale."""
+    axes.set_xlim(0, 10)
+    axes.set_ylim(0, 6)
+    axes.set_axis_off()
+    axes.add_patch(
+        FancyBboxPatch((0.3, 0.6), 5.6, 4.9, 'round,pad=0.1', fc='#F2F6F9', ec='black', lw=2)
+    )
+    axes.text(0.5, 5.15, 'chamber: its air follows the cyclogram', fontsize=8)
+    axes.add_patch(Rectangle((0.9, 0.85), 4.4, 0.25, fc='#BBBBBB'))
+    axes.add_patch(Polygon([(2.0, 1.1), (4.2, 1.1), (3.9, 1.75), (2.3, 1.75)], fc='#DDDDDD'))
+    axes.text(1.1, 1.3, 'holder', fontsize=8, color=GREY)
+    corners = np.array([(2.15, 2.2), (3.75, 1.75), (4.25, 3.45), (2.65, 3.9)])
+    axes.add_patch(Polygon(corners, fc='white', ec='black', lw=1.6))
+    axes.add_patch(Polygon(corners * 0.5 + (1.6, 1.42), fc='#E3EFE3', ec='black', lw=1.0))
+    axes.text(3.2, 2.82, 'board', fontsize=7, ha='center', va='center', rotation=-15)
+    axes.add_patch(Circle((3.62, 2.98), 0.09, color=BLUE))
+    axes.add_patch(Circle((4.02, 2.66), 0.09, color=RED))
+    axes.annotate(
+        'T case: leads',
+        (4.08, 2.68),
+        (3.95, 1.5),
+        fontsize=8,
+        color=RED,
+        arrowprops={'arrowstyle': '-', 'color': RED},
+    )
+    axes.annotate(
+        'T board: lags',
+        (3.66, 3.04),
+        (3.9, 4.3),
+        fontsize=8,
+        color=BLUE,
+        arrowprops={'arrowstyle': '-', 'color': BLUE},
+    )
+    axes.text(0.6, 3.2, 'unit, at rest\nin any attitude', fontsize=8)
+    axes.annotate(
+        'g', (1.2, 1.5), (1.2, 2.6), ha='center', arrowprops={'arrowstyle': '-|>', 'lw': 1.5}
+    )
+    axes.plot([4.25, 6.9], [3.4, 3.4], color='black', lw=1.2)
+    axes.add_patch(FancyBboxPatch((7.0, 2.5), 2.6, 1.7, 'round,pad=0.1', fc='white', lw=1.6))
+    axes.text(8.3, 3.35, 'ros2 bag record\ncounts, T board,\nT case', ha='center', va='center')
+    axes.text(8.3, 1.7, 'one bag\nper position', ha='center', va='center', color=GREY)
+
+
+def draw_cyclogram(axes: Axes) -> None:
+    """Draw the paper's program, and what two thermometers see of it."""
+    program = cyclogram_preset('chamber')
+    run = simulate(unit_preset('thermostatted', 1), program, positions(1, 0)[0], rate_hz=0.2)
+    hours = np.array(program.time_s) / 3600.0
+    axes.plot(hours, program.temperature_c, color='black', lw=1.0, ls=':', label='chamber')
+    for name, stamps, value, color in (
+        ('T case', run.case_stamp_ns, run.case, RED),
+        ('T board', run.board_stamp_ns, run.board, BLUE),
+    ):
+        axes.plot((stamps - stamps[0]) / 3.6e12, value, color=color, lw=1.2, label=name)
+    for start, stop, *pair in zip(
+        hours, hours[1:], program.temperature_c, program.temperature_c[1:], strict=False
+    ):
+        word = 'soak' if pair[0] == pair[1] else 'ramp'
+        if word == 'ramp':
+            axes.axvspan(start, stop, color='#E9E9E9', lw=0)
+        axes.text((start + stop) / 2, 39.2, word, ha='center', fontsize=7, color=GREY)
+    axes.set(xlabel='time, h', ylabel='°C', ylim=(2, 41), xlim=(0, hours[-1]))
+    axes.legend(loc='lower left', fontsize=7, frameon=False)
+
+
+def series() -> dict[str, tuple[Any, Any]]:
+    """Return what the layout's paths hold, of the held-out sample bag."""
+    recording = tc.read(ROOT / 'bags' / 'held_out.mcap')
+    calibration = tc.fit(sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), gravity=9.80665)
+    out = calibration.correct(recording.time_s, recording.counts, **recording.temperatures)
+    minutes = recording.time_s / 60.0
+    found: dict[str, tuple[Any, Any]] = {'/regime/dynamic.data': (minutes, out.dynamic)}
+    for i, axis in enumerate('xyz'):
+        found[f'/accel/counts.vector.{axis}'] = minutes, recording.counts[:, i]
+        found[f'/imu/data_raw.linear_acceleration.{axis}'] = minutes, out.specific_force[:, i]
+        sd = np.sqrt(out.covariance[:, i, i])
+        found[f'/imu/data_raw.linear_acceleration_covariance[{4 * i}].@sqrt'] = minutes, sd
+    script = '/studio_script/temperature_rates.'
+    for name, (time, value) in recording.temperatures.items():
+        found[f'/temperature/{name}.temperature'] = time / 60.0, value
+        smooth = np.convolve(value, np.ones(25) / 25, 'valid')
+        inner = time[12:-12] / 60.0
+        found[f'{script}{name}_k_min'] = inner, np.gradient(smooth, inner)
+    return found
+
+
+def draw_layout(figure: Figure) -> None:
+    """Draw the panels where the layout has them, with the data that it asks for."""
+    saved = json.loads(LAYOUT.read_text(encoding='utf-8'))
+    data = series()
+
+    def place(node: Any, x: float, y: float, width: float, height: float) -> None:
+        if isinstance(node, dict):
+            share = node.get('splitPercentage', 50) / 100.0
+            if node['direction'] == 'row':
+                place(node['first'], x, y, width * share, height)
+                place(node['second'], x + width * share, y, width * (1 - share), height)
+            else:
+                place(node['first'], x, y, width, height * share)
+                place(node['second'], x, y + height * share, width, height * (1 - share))
+            return
+        panel = saved['configById'][node]
+        title = panel.get('title') or panel.get('foxglovePanelTitle') or node.split('!')[1]
+        margin = 0.028
+        axes = figure.add_axes(
+            (
+                x + margin + 0.012,
+                1.0 - y - height + margin,
+                width - 2 * margin,
+                height - 2 * margin,
+            )
+        )
+        axes.set_title(title, fontsize=7, loc='left', pad=2)
+        axes.tick_params(labelsize=5.5, length=2)
+        drawn = [p['value'] for p in panel.get('paths', []) if p['value'] in data]
+        axes.ticklabel_format(axis='y', useMathText=True, scilimits=(-2, 5))
+        axes.yaxis.get_offset_text().set_fontsize(5.5)
+        for path in drawn:
+            axes.plot(*data[path], lw=0.7)
+        if not drawn:
+            axes.set(xticks=[], yticks=[])
+            axes.text(0.5, 0.5, '/diagnostics of the live node', ha='center', fontsize=6)
+
+    place(saved['layout'], 0.0, 0.0, 1.0, 1.0)
+
+
+def main() -> None:
+    """Write the drawings."""
+    plt.rcParams.update({'svg.hashsalt': 'thermo_comp', 'font.size': 8, 'svg.fonttype': 'none'})
+    figure = plt.figure(figsize=(9, 3.3), layout='constrained')
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1))
+    draw_chamber(left)
+    draw_cyclogram(right)
+    figure.savefig(IMAGES / 'chamber_test.png', dpi=130, metadata={'Software': None})
+    figure = plt.figure(figsize=(9, 5))
+    draw_layout(figure)
+    figure.savefig(IMAGES / 'viewer.png', dpi=110, metadata={'Software': None})
+
+
+if __name__ == '__main__':
+    main()

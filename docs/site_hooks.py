@@ -1,0 +1,21 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns what the site adds to its pages while it is built: the options of all commands."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+from typer.cli import get_docs_for_click
+
+from thermo_comp.cli.app import app
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Write what every command takes at the end of the page of the command line."""
+    if page.file.src_uri != 'cli.md':
+        return markdown
+    command = typer.main.get_command(app)
+    said = get_docs_for_click(obj=command, ctx=typer.Context(command), name='thermo_comp')
+    return f'{markdown}\n{said.replace(chr(10) + "#", chr(10) + "##").removeprefix("# ")}'
