@@ -51,6 +51,11 @@ def calibration(**keys):
     return Calibration(**values)
 
 
+def thermal_calibration():
+    """Make such a unit that needs a temperature all the same: ramps change a last digit."""
+    return calibration(dynamic=regime_set(z=axis_set((0.0, 1e-12))))
+
+
 def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
     """Make a term of the response; its group is its kind, its range wide."""
     values = {'group': kind, 'range': (-50.0, 50.0), **keys}

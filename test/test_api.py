@@ -148,25 +148,25 @@ def test_data_are_no_exceptions_but_rows_of_nan(arrays: dict[str, np.ndarray]) -
     counts = arrays['counts'].copy()
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
-    out = calibration().correct(arrays['time_s'], counts, board=board, case=arrays['case'])
+    out = thermal_calibration().correct(arrays['time_s'], counts, board=board, case=arrays['case'])
     # The first reading of the board is that beside the sample at 1 s.
     assert np.isnan(out.specific_force[:10]).all()
     assert np.isnan(out.covariance[:10]).all()
     assert np.isfinite(out.specific_force[10:]).all()
     assert (out.counters.n_no_temperature, out.counters.n_out) == (10, 1190)
-    late = calibration().correct(arrays['time_s'], counts, board=arrays['board'])
+    late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
     assert not late.dynamic.any()
 
 
 def test_nothing_in_is_nothing_out() -> None:
-    out = calibration().correct([], np.empty((0, 3)), board=[])
+    out = thermal_calibration().correct([], np.empty((0, 3)), board=[])
     assert out.specific_force.shape == (0, 3)
     assert out.covariance.shape == (0, 3, 3)
     assert out.dynamic.shape == (0,)
     dates = np.array(['2026-01-01', '2026-01-02'], 'M8[ns]')
-    unread = calibration().correct(dates, np.ones((2, 3)), board=([], []))
+    unread = thermal_calibration().correct(dates, np.ones((2, 3)), board=([], []))
     assert np.isnan(unread.specific_force).all()
     assert unread.counters.n_no_temperature == 2
 

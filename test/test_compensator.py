@@ -262,7 +262,7 @@ def test_unknown_regime_is_paid_for_in_the_covariance():
 
 
 def test_nothing_goes_out_before_a_temperature_or_long_after_one():
-    compensator = Compensator(calibration(), CompensatorConfig(temperature_timeout_s=20.0))
+    compensator = Compensator(thermal_calibration(), CompensatorConfig(temperature_timeout_s=20.0))
     assert compensator.process(1, 0.0, 0.0, 1.0) is None
     compensator.push('board', 2, 20.0)
     assert compensator.process(3, 0.0, 0.0, 1.0) is not None

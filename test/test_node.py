@@ -16,7 +16,7 @@ from conftest import ROOT
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-from builders import calibration, rich_calibration
+from builders import calibration, rich_calibration, thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -217,7 +217,7 @@ def test_flag_is_latched_and_not_there_while_unknown(
 
 def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[str]]) -> None:
     wait = diagnosis(peer)
-    with node_in_thread(*saved(calibration())) as node:
+    with node_in_thread(*saved(thermal_calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         begin_ns = time.time_ns()
         array, status, values = wait(lambda s, _: 'no board temperature' in s.message)
@@ -281,7 +281,7 @@ def test_diagnostics_tell_noise_and_bias_apart(
 def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]) -> None:
     wait = diagnosis(peer)
     with node_in_thread(
-        *saved(calibration(), 'temperature_timeout:=20', 'case_timeout:=10')
+        *saved(thermal_calibration(), 'temperature_timeout:=20', 'case_timeout:=10')
     ) as node:
         driver = drive(peer, node)
         # 50 degC: 15 K above the calibrated range.
@@ -303,6 +303,21 @@ def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]
         _, status, values = wait(lambda s, _: '25.0 s old, nothing is published' in s.message)
         assert status.level == DiagnosticStatus.ERROR
         assert values['stale'] == '1'
+
+
+def test_constants_need_no_thermometer(peer: Peer, saved: Callable[..., list[str]]) -> None:
+    wait = diagnosis(peer)
+    with node_in_thread(*saved(calibration())) as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        driver = drive(peer, node)
+        for k in range(20):
+            driver.counts(START_NS + k * CYCLE_NS, *standing(k))
+        _, status, values = wait(lambda _, values: values['samples out'] == '20')
+    assert len(heard) == 20
+    # 100 samples a second as calibrated, but in a hurry: DDS says how many came in a report.
+    assert 'what temperature does is not known' in status.message or 'samples/s' in status.message
+    assert status.level != DiagnosticStatus.ERROR
+    assert (values['board age [s]'], values['board temperature sd [K]']) == ('inf', '10.0000')
 
 
 def test_sample_rate_is_held_against_the_calibrated_one(

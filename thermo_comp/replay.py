@@ -36,6 +36,7 @@ from .recording import (
     RawMessages,
     RecordingInfo,
     RecordingReader,
+    Role,
     Topics,
     open_recording,
 )
@@ -109,6 +110,11 @@ def input_for(calibration: Calibration, asked: Input) -> Input:
     return 'counts' if calibration.unit.input == 'counts' else 'imu'
 
 
+def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
+    """Say what a recording must hold to be corrected: constants need no thermometer."""
+    return ('accel', 'board') if any(one.needs_temperature for one in calibrations) else ('accel',)
+
+
 def corrected_blocks(
     compensator: Compensator, blocks: Iterable[Block]
 ) -> Iterable[CorrectedBlock]:
@@ -148,7 +154,7 @@ def replay(
     """
     compensator = Compensator(calibration, config)
     wanted = input_for(calibration, input)
-    with open_recording(path, topics, wanted, require=('accel', 'board')) as reader:
+    with open_recording(path, topics, wanted, require=needed_roles(calibration)) as reader:
         check_unit(calibration, reader.info, serial)
         metadata = {
             'serial': calibration.unit.serial,

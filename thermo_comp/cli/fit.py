@@ -218,20 +218,21 @@ def _say_groups(out: Output, result: FitResult) -> None:
     from ..unit.gravity import MICRO_G
 
     calibration = result.calibration
-    out.table(
-        ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
-        [
-            (
-                one.group,
-                one.part,
-                micro_g(one.explains_m_s2 / MICRO_G),
-                f'{one.effective_parameters:.1f}',
-                f'{one.log_evidence_change:.1f}',
-            )
-            for one in calibration.evidence
-        ],
-        title='what the data need; log evidence: how much it falls without the group',
-    )
+    if calibration.evidence:
+        out.table(
+            ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
+            [
+                (
+                    one.group,
+                    one.part,
+                    micro_g(one.explains_m_s2 / MICRO_G),
+                    f'{one.effective_parameters:.1f}',
+                    f'{one.log_evidence_change:.1f}',
+                )
+                for one in calibration.evidence
+            ],
+            title='what the data need; log evidence: how much it falls without the group',
+        )
     white, walk = (
         ' '.join(micro_g(value / MICRO_G) for value in values)
         for values in (calibration.noise_density_m_s2_sqrt_hz, calibration.slow_noise_m_s2_sqrt_h)

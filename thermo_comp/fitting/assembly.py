@@ -47,8 +47,10 @@ _EDGE_MARGIN = 0.02
 # chamber's has twice the terms. A curve over temperature has no such law: it ends where the data
 # end.
 _LINEAR_REACH = 2.0
-# Bags without any temperature say nothing of a range: the curve is flat, its prior wide.
-_UNSEEN_RANGE_C = 0.5
+# A test at one temperature holds about it [K], within such rates [K/min].
+_MARGIN_C, _RATE_MARGIN = 0.5, 0.01
+# Without any thermometer the curve is flat, and what it leaves open grows from the reference on.
+_UNSEEN_MARGIN_C, _UNSEEN_RATE = 50.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -117,10 +119,13 @@ def build_calibration(
         for k in used
     )
     slow = _slow_error(windows, learnt)
+    is_seen = windows.was_measured
     regimes = {
         name: RegimeSet(
-            _range(windows.temperature, _UNSEEN_RANGE_C),
-            _widened(windows.rate * 60.0, _LINEAR_REACH, 0.01),
+            _range(windows.temperature, _MARGIN_C if is_seen else _UNSEEN_MARGIN_C),
+            _widened(
+                windows.rate * 60.0, _LINEAR_REACH, _RATE_MARGIN if is_seen else _UNSEEN_RATE
+            ),
             *(_axis_set(sets, weights, axis, is_dynamic, float(slow[axis])) for axis in range(3)),
         )
         for name, is_dynamic in (('static', False), ('dynamic', True))
@@ -190,7 +195,7 @@ def build_calibration(
                 log_evidence_change=float(worth.evidence),
                 prior_sd=worth.sd,
             )
-            for worth in learnt.worth
+            for worth in (learnt.worth if is_seen else ())
         ),
         posterior=posterior_of(covariance),
     )

@@ -24,11 +24,10 @@ _E_FOLDS_K = (15.0, 30.0)
 def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
     """Choose the curves of the two sets."""
     readings = [bag.board.value for bag in bags if len(bag.board.value)]
-    span = (
-        (min(float(r.min()) for r in readings), max(float(r.max()) for r in readings))
-        if readings
-        else (0.0, 0.0)
-    )
+    if not readings:
+        line = _family('linear', 0.0, 0.0)
+        return Sets(line, line)
+    span = (min(float(r.min()) for r in readings), max(float(r.max()) for r in readings))
     lower, upper = (edge - options.reference_temperature for edge in span)
     is_paper = options.model == 'golovach'
     static = options.static_curve or ('linear' if is_paper else 'cubic')

@@ -43,6 +43,8 @@ _USUAL_BOARD_LAG_S = 900.0
 BIAS_SD, SCALE_SD, SKEW_SD = 1.0, 0.05, 1e-3
 # Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
 _COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
+# What temperature does to a unit that no thermometer has seen, per K: a cheap sensor's data sheet.
+_UNSEEN_BIAS_SLOPE, _UNSEEN_SCALE_SLOPE = 5e-3, 2e-4
 # A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
 _OFFSET_SD, _SIGMA = 1e-6, 1e-5
 
@@ -292,13 +294,17 @@ def _wide_prior(
     if options.model == 'golovach':
         # The paper's sets stay whatever they earn: their prior says nothing.
         wide, scale_wide = 50.0 * wide, 50.0 * scale_wide
+    on_bias = np.where(allowed, wide * _COLUMN_BIAS_SD, 0.0)
+    on_scale = np.where(in_scale, scale_wide * _COLUMN_SCALE_SD, 0.0)
+    if not windows.was_measured:
+        on_bias[0], on_scale[0] = _UNSEEN_BIAS_SLOPE, _UNSEEN_SCALE_SLOPE
     return Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
         skew_sd=SKEW_SD,
-        on_bias=np.where(allowed, wide * _COLUMN_BIAS_SD, 0.0),
-        on_scale=np.where(in_scale, scale_wide * _COLUMN_SCALE_SD, 0.0),
+        on_bias=on_bias,
+        on_scale=on_scale,
         offset_sd=_OFFSET_SD,
         sigma=np.full(3, _SIGMA),
         rho=np.zeros(3),

@@ -81,8 +81,13 @@ class ThermalWindows:
     typical_count: float
 
     @property
+    def was_measured(self) -> bool:
+        """Whether any temperature was recorded: else the first curve's column, t, is 0."""
+        return bool(self.data.columns[:, 0].any())
+
+    @property
     def has_temperature(self) -> bool:
-        """Whether any temperature was recorded."""
+        """Whether any change of temperature was recorded."""
         return bool(np.ptp(self.temperature) > 0.0)
 
 

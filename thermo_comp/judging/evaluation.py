@@ -24,7 +24,7 @@ from ..fitting.sources import FitSource
 from ..online.status import CompensatorConfig
 from ..recording import Block, Input, RecordingInfo, Role, Topics, open_recording
 from ..recording.stillness import STILL_SD
-from ..replay import check_unit, input_for
+from ..replay import check_unit, input_for, needed_roles
 from ..unit.calibration import Calibration
 from ..unit.gravity import STANDARD_GRAVITY
 from .judgement import Judgement, judge
@@ -104,7 +104,7 @@ def open_bag(
             source, number, window_s=sum_s, cell_s=min(_CELL_S, sum_s), full_scale=full_scale
         )
         info = reader.info
-    if not len(reduced.board.value):
+    if 'board' in require and not len(reduced.board.value):
         raise RecordingError('no board temperature in it', path=str(path))
     return OpenedBag(info, reduced)
 
@@ -171,7 +171,7 @@ def evaluate(
             number=number,
             window_s=window_s,
             calibration=first,
-            require=('accel', 'board'),
+            require=needed_roles(*(one for _, one in calibrations)),
             is_hashed=False,
             progress=_part_of(tell, number, len(paths)),
         )

@@ -171,7 +171,8 @@ def judge(
     left_out = calibration.provenance.left_out_rms if is_seen else np.nan
     shifts = axis_shifts(windows.select(inside), calibration.misalignment_sd)
     moved = what_moved(shifts) if claims else ()
-    kind, reason = _verdict(windows, sections, left_out, tolerance, moved, claims)
+    is_thermal = calibration.needs_temperature
+    kind, reason = _verdict(windows, sections, left_out, tolerance, moved, claims, is_thermal)
     return Judgement(
         kind=kind,
         reason=reason,
@@ -202,6 +203,7 @@ def _verdict(
     tolerance: float | None,
     moved: tuple[str, ...],
     claims: bool,
+    is_thermal: bool,
 ) -> tuple[Verdict, str]:
     one, outside = sections['all'], sections['outside']
     if not one.n:
@@ -215,7 +217,7 @@ def _verdict(
     ratio = max(s.ratio for s in (*judged, one))
     # A NaN of no claim compares false.
     is_wide = one.claimed_rms > (tolerance or min(_WIDE_PART * one.raw_rms, _WIDE_CLAIM))
-    if one.rms >= one.raw_rms:
+    if one.rms >= one.raw_rms and is_thermal:
         kind = Verdict.NO_BETTER
     elif tolerance is not None and worst > tolerance:
         kind = Verdict.RECALIBRATE

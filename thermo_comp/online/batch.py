@@ -204,7 +204,6 @@ def _add_segments(
 ) -> None:
     """Add the segments of samples first..after, over which no reading takes effect."""
     thermal = compensator.thermal
-    tracker = thermal.tracker
     last_ns = stamps.item(after - 1)
     fresh_ns = thermal.fresh_until_ns
     if last_ns > fresh_ns:
@@ -227,10 +226,10 @@ def _add_segments(
         segments.is_new.append(is_new)
         segments.is_too_fast.append(is_too_fast)
         segments.noise_excess.append(thermal.noise_excess)
-        end = tracker.sample(end_ns)
+        end = thermal.sample(end_ns)
         for of_axis in thermal.slow_at(start_ns, end):
             segments.slow.extend(of_axis)
-        segments.states.extend(tracker.sample(start_ns))
+        segments.states.extend(thermal.sample(start_ns))
         segments.end_states.extend(end)
         first = stop
 

@@ -163,8 +163,7 @@ class Compensator:
         start_ns = thermal.start_of(stamp_ns)
         is_new = thermal.open(start_ns, counters.n_in - counters.n_out_of_order, stamp_ns)
         self._event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
-        start = thermal.tracker.sample(start_ns)
-        end = thermal.tracker.sample(start_ns + SEGMENT_NS)
+        start, end = thermal.sample(start_ns), thermal.sample(start_ns + SEGMENT_NS)
         slow, excess = thermal.slow_at(start_ns, end), thermal.noise_excess
         line = lay_lines(thermal.correction, start, end, slow[:3], excess)
         if thermal.rate_correction is not None:

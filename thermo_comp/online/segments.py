@@ -21,6 +21,7 @@ from ..thermal.memory import BOARD_INPUT
 from ..thermal.reading_queue import ReadingQueue
 from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig
+from ..thermal.state import BOARD, ThermalState
 from ..thermal.tracker import ThermalTracker
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction, Variance
@@ -36,8 +37,11 @@ SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000
 #: Samples this much faster than calibrated, relative, still have the calibrated noise.
 RATE_TOLERANCE: Final = 0.1
-#: Earlier than any stamp.
+#: Earlier and later than any stamp.
 EVER_NS: Final = -(1 << 62)
+FOREVER_NS: Final = 1 << 62
+#: A unit that no thermometer watches is taken to be at the reference, within this sd [K].
+UNMEASURED_SD_K: Final = 10.0
 
 
 class ThermalSide:
@@ -58,6 +62,7 @@ class ThermalSide:
         #: Age of the board temperature beyond which nothing is published.
         self._timeout_ns = int(config.temperature_timeout_s * 1e9)
         self.calibration = calibration
+        self._needs_temperature = calibration.needs_temperature
         self.correction = Correction(calibration)
         self._uncertainty = [SlowUncertainty(calibration, self.correction)]
         #: That of the angular rate, over the same thermal state; None where it passes as it is.
@@ -155,8 +160,34 @@ class ThermalSide:
             self.apply(reading_ns, kind, celsius)
 
     @property
+    def is_unmeasured(self) -> bool:
+        """Whether constants are applied to a unit whose temperature nobody has measured."""
+        return not self._needs_temperature and self.tracker.board.stamp_ns is None
+
+    def sample(self, stamp_ns: int) -> tuple[float, ...]:
+        """Thermal state at a stamp, as `ThermalTracker.sample` gives it."""
+        if self.is_unmeasured:
+            gradients = (0.0, 0.0) * len(self.calibration.sensors)
+            reference = self.calibration.reference_temperature_c
+            return (reference, UNMEASURED_SD_K**2, 0.0, 0.0, 0.0, *gradients)
+        return self.tracker.sample(stamp_ns)
+
+    def state_at(self, stamp_ns: int) -> ThermalState:
+        """Thermal state at a stamp, with names; ValueError before it is known."""
+        if not self.is_unmeasured:
+            return self.tracker.state_at(stamp_ns)
+        nil = dict.fromkeys(self.calibration.sensors, 0.0)
+        board, variance, *_ = self.sample(stamp_ns)
+        regime = self.tracker.detector
+        return ThermalState(
+            board, variance, 0.0, nil, nil, 0.0, regime.regime, regime.direction, (), (), ()
+        )
+
+    @property
     def fresh_until_ns(self) -> int:
         """The last stamp at which the board temperature is not too old; before any without one."""
+        if not self._needs_temperature:
+            return FOREVER_NS
         board_ns = self.tracker.board.stamp_ns
         return EVER_NS if board_ns is None else board_ns + self._timeout_ns
 
@@ -205,6 +236,9 @@ class ThermalSide:
         if key != self._slow_key:
             self._slow_key = key
             shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
+            if self.is_unmeasured:
+                # What the weights leave open counts as at the usual distance.
+                end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             self._slow = [v for one in self._uncertainty for v in one.at(end_state, shares)]
         return self._slow
 

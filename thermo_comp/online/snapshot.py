@@ -27,15 +27,15 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     counters = replace(compensator.counters)
     ahead_s = 0.0 if stamp_ns is None else thermal.queue.ahead(stamp_ns)
     board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
-    if stamp_ns is None or board_ns is None:
+    if stamp_ns is None or (board_ns is None and not thermal.is_unmeasured):
         return CompensatorStatus(counters, stamp_ns, pending_ahead_s=ahead_s)
-    board_age = (stamp_ns - board_ns) * 1e-9
+    board_age = math.inf if board_ns is None else (stamp_ns - board_ns) * 1e-9
     # Half the time-out at the latest, so that a warning always comes before the error.
     stale_after = compensator.config.temperature_timeout_s / 2.0
     usual = STALE_INTERVALS * tracker.board.interval_s
     if usual < stale_after:
         stale_after = max(usual, SHORTEST_STALE_S)
-    state = tracker.sample(stamp_ns)
+    state = thermal.sample(stamp_ns)
     correction = thermal.correction
     board, case = (tracker.checks[name] for name in thermal.inputs[:2])
     is_dynamic = tracker.detector.regime == Regime.DYNAMIC
@@ -43,7 +43,7 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     return CompensatorStatus(
         counters,
         stamp_ns,
-        tracker.state_at(stamp_ns),
+        thermal.state_at(stamp_ns),
         board_age,
         math.inf if case_ns is None else (stamp_ns - case_ns) * 1e-9,
         board_age > stale_after,

@@ -109,7 +109,7 @@ def build(
     return DiagnosticStatus(
         level=bytes([findings[0][0] if findings else 0]),
         name=f'{name}: compensation',
-        message=one_line('; '.join(text for _, text in findings) or _all_well(now)),
+        message=one_line('; '.join(text for _, text in findings) or _all_well(loaded, now)),
         hardware_id=loaded.calibration.unit.serial,
         values=[
             KeyValue(key=key, value=one_line(value)) for key, value in _values(loaded, now, before)
@@ -140,11 +140,14 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> Ite
     new = _since(status.counters, before.status.counters)
     if new.n_in == 0 and now.silence_s > max(SILENT_S, SILENT_CYCLES * unit.cycle_time_s):
         yield _ERROR, 'no samples are coming in'
+    needs_board = loaded.calibration.needs_temperature
+    is_seen = math.isfinite(status.board_age_s)
     if status.state is None:
-        yield _ERROR, 'no board temperature yet, nothing is published'
-    elif status.is_board_lost:
+        if needs_board:
+            yield _ERROR, 'no board temperature yet, nothing is published'
+    elif status.is_board_lost and needs_board:
         yield _ERROR, f'board temperature {status.board_age_s:.1f} s old, nothing is published'
-    elif status.is_board_stale:
+    elif status.is_board_stale and is_seen:
         yield _WARN, f'board temperature {status.board_age_s:.1f} s old, held'
     yield from _sensor_findings(status)
     if new.n_stuck:
@@ -161,7 +164,7 @@ def _findings(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> Ite
             yield _WARN, f'{missed}: has the unit aged?'
     if new.n_saturated:
         yield _ERROR, f'{new.n_saturated} samples saturated (+-{unit.full_scale:g}), dropped'
-    if status.state is not None and status.is_case_lost:
+    if status.state is not None and status.is_case_lost and needs_board:
         yield _WARN, 'case temperature lost, the board sensor decides the regime'
     for excess, what in (
         (status.temperature_excess_k, 'board temperature {:+.2f} K'),
@@ -207,8 +210,11 @@ def _sensor_findings(status: CompensatorStatus) -> Iterator[Finding]:
         yield _ERROR, f'the board leads the case in ramps: {text}'
 
 
-def _all_well(now: Snapshot) -> str:
+def _all_well(loaded: LoadedCalibration, now: Snapshot) -> str:
     state = now.status.state
+    if not loaded.calibration.needs_temperature:
+        reference = loaded.calibration.reference_temperature_c
+        return f'constants of {reference:g} degC, what temperature does is not known'
     if state is None or state.regime == Regime.UNKNOWN:
         return 'regime not known yet, the static set applies'
     return f'{_REGIMES[state.regime]} regime'

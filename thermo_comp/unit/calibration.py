@@ -353,6 +353,22 @@ class Calibration:
         return self.static, self.dynamic
 
     @property
+    def needs_temperature(self) -> bool:
+        """
+        Whether temperature changes what it says; else it is constants, of the reference.
+        """
+        curves = [axis for one in self.regime_sets() for axis in one.axes()]
+        weights = [axis.delta for axis in curves]
+        for axis in curves:
+            weights += axis.bias_function.free_coefficients
+            weights += axis.scale_function.free_coefficients
+        if self.gyroscope is not None:
+            for rate in (*self.gyroscope.static.axes(), *self.gyroscope.dynamic.axes()):
+                weights += (rate.delta, *rate.bias_function.free_coefficients)
+        columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
+        return bool(columns) or any(weights)
+
+    @property
     def has_uncertainty(self) -> bool:
         """
         Whether the calibration says anything of how well it is known; else it claims nothing.
