@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import GRAVITY, SECOND_NS, calibration, rich_calibration
+from builders import GRAVITY, SECOND_NS, calibration, rich_calibration, thermal_calibration
 from readme_helpers import FENCES
 from test_layers import loaded_after
 

@@ -19,6 +19,7 @@ from builders import (
     regime_set,
     rich_calibration,
     term,
+    thermal_calibration,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -12,6 +12,7 @@ from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import ArrayBlock, FitSource
 from thermo_comp.simulation import positions
+from thermo_comp.unit.calibration import parameter_layout
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 UP = np.array([0.48, -0.6, 0.64])
@@ -78,9 +79,22 @@ def test_positions_without_temperature(rng):
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.005)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.001)
     assert calibration.response == ()
-    lower, upper = calibration.static.temperature_range_c
-    assert upper - lower == pytest.approx(1.0)
     assert 'temperature' in {finding.name for finding in result.findings}
+    # What temperature does stays at its prior: no slope, 5 mm/s^2 and 200 ppm per K as its sd.
+    assert not calibration.needs_temperature
+    sd = np.sqrt(np.diag(calibration.posterior.covariance()))
+    layout = parameter_layout(calibration)
+    for bias, scale in zip(layout.bias, layout.scale, strict=True):
+        assert sd[bias.static + 1] == pytest.approx(5e-3, rel=0.02)
+        assert sd[scale.static + 1] == pytest.approx(2e-4, rel=0.02)
+    # Without a thermometer the unit is taken to be within 10 K of the reference.
+    out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
+    np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
+    left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
+    # Noise of a sample, 0.02, and what the tumble leaves.
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
+    )
 
 
 def test_six_faces_leave_the_misalignment_at_its_prior(rng):

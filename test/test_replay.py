@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import rich_calibration
+from builders import calibration, rich_calibration
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -29,7 +29,7 @@ from thermo_comp.recording import (
     read_recording,
 )
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, ReplayResult, replay, switches
-from thermo_comp.unit.calibration import Calibration, Unit
+from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000
@@ -151,6 +151,27 @@ def test_equals_the_stream_bit_for_bit(tmp_path: Path) -> None:
     assert result.switches == switches(flags)
     assert result.counters.n_in == len(read_recording(bag).columns)
     assert result.counters.n_out == len(block)
+
+
+def test_constants_need_no_thermometer(tmp_path: Path) -> None:
+    bag = tmp_path / 'bag'
+    rng = np.random.default_rng(3)
+    n = 3000
+    stamps = START_NS + np.arange(n) * 10_000_000
+    with BagWriter(bag) as writer:
+        writer.write_counts(TOPICS.counts, stamps, 2940.0 + rng.standard_normal((n, 3)), 'imu')
+    constants = calibration(axes=Axes(*[AxisReference(510.0, 5.0)] * 3))
+    replay(bag, constants, tmp_path / 'out')
+    source = read_recording(bag, require=('accel',)).columns
+    published, _ = one_by_one(source, constants)
+    block, flags = output_of(tmp_path / 'out')
+    expected = np.array([row[1:] for row in published])
+    assert block.accel.tobytes() == np.ascontiguousarray(expected[:, :3]).tobytes()
+    np.testing.assert_allclose(block.accel, (source.accel - 5.0) / 510.0, rtol=1e-14)
+    assert flags == []
+    # One that has learnt what temperature does is not applied without any.
+    with pytest.raises(RecordingError, match='temperature/board'):
+        replay(bag, rich_calibration(), tmp_path / 'other')
 
 
 def test_imu_input_passes_everything_else_through(tmp_path: Path) -> None:

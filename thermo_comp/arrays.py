@@ -110,7 +110,7 @@ def correct(
     time_s: npt.ArrayLike,
     counts: npt.ArrayLike,
     *,
-    board: Temperature,
+    board: Temperature = ([], []),
     config: CompensatorConfig | None = None,
     **sensors: Temperature,
 ) -> Corrected:
@@ -125,9 +125,10 @@ def correct(
         Time of each sample, rising: seconds since any origin, or datetime64.
     counts : array_like, shape (n, 3)
         The raw samples, in the calibration's input unit.
-    board : array_like, shape (n,), or (array_like, array_like)
+    board : array_like, shape (n,), or (array_like, array_like), optional
         Board temperature [degC]: beside the samples (NaN where it was not read), or as
         (time_s, value) at times of its own. A reading counts from the first sample not before it.
+        Constants alone need none.
     config : CompensatorConfig or None, optional
         The node's settings.
     **sensors : as `board`

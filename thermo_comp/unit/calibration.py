@@ -339,7 +339,7 @@ class Calibration:
         return result if math.isfinite(result) else -math.inf
 
     def correct(
-        self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature, **others: Any
+        self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
     ) -> Corrected:
         """
         Correct arrays of samples: `thermo_comp.correct` says what it takes, and gives.
