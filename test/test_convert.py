@@ -121,9 +121,30 @@ def test_counts_become_an_imu_with_a_sensitivity(tmp_path: Path) -> None:
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
     # The sensitivity is checked as a unit is.
     wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
-    with pytest.raises(RecordingError, match='16384 per g are stated'):
+    with pytest.raises(RecordingError, match=r'16384 per g are stated$'):
         write_log(wrong, tmp_path / 'other')
     assert not (tmp_path / 'other').exists()
+
+
+def test_an_offset_is_taken_away(tmp_path: Path) -> None:
+    path, columns = table(tmp_path / 'log.csv', scale=2048.0)
+    rows = path.read_text().splitlines()
+    at = [rows[0].split(',').index(name) for name in ('ax', 'ay', 'az')]
+    for i, row in enumerate(rows[1:], 1):
+        cells = row.split(',')
+        for k in at:
+            cells[k] = repr(float(cells[k]) + 32768.0)
+        rows[i] = ','.join(cells)
+    path.write_text('\n'.join(rows) + '\n')
+    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'counts'}
+    accel |= {'counts_per_g': 2048.0, 'clip': [0, 65535]}
+    with pytest.raises(RecordingError, match='is there an `offset`'):
+        write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag.mcap')
+    log = table_log(path, column_map(accel={**accel, 'offset': 32768.0}))
+    assert log.clip == (-32768.0, 32767.0)
+    write_log(log, tmp_path / 'bag.mcap')
+    found = read_recording(tmp_path / 'bag.mcap').columns.accel
+    np.testing.assert_allclose(found[:, 0], columns['ax'], atol=1e-9)
 
 
 def test_every_odd_row_is_accounted_for(tmp_path: Path) -> None:

@@ -54,6 +54,13 @@ def fit(
     full_scale: Annotated[
         float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
     ] = None,
+    offset: Annotated[
+        float | None,
+        typer.Option(
+            help='What raw words read without a force, as 32768; found out by itself if it can.',
+            metavar='WORD',
+        ),
+    ] = None,
     reference_temperature: Annotated[
         float, typer.Option(help='Reference temperature in degC.', min=-273.15, max=1000.0)
     ] = 20.0,
@@ -124,6 +131,7 @@ def fit(
             serial=serial,
             input='counts' if kind == 'counts' else 'm/s^2',
             full_scale=full_scale,
+            offset=offset,
             reference_temperature=reference_temperature,
             min_rest_s=min_rest,
             still_sd=options.acceleration(still_sd, '--still-sd') or 0.0,

@@ -74,7 +74,8 @@ class Accel:
 
     `output` is what becomes of them: ``counts`` (geometry_msgs/Vector3Stamped) or ``imu``
     (sensor_msgs/Imu, m/s^2). `clip` are the readings, in the table's unit, at and beyond which
-    the sensor saturates.
+    the sensor saturates; `offset` is what it reads without a force, as 32768 in offset binary,
+    which is taken away.
     """
 
     columns: tuple[Column, Column, Column]
@@ -82,6 +83,7 @@ class Accel:
     output: Literal['counts', 'imu']
     counts_per_g: Positive | None = None
     clip: tuple[float, float] | None = None
+    offset: float = 0.0
 
     def __post_init__(self) -> None:
         if self.unit == 'counts' and self.output == 'imu' and self.counts_per_g is None:
@@ -192,7 +194,7 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
         table = read_text(
             path, wanted, stamp.column, stamp.exponent, separated.character, separated.header
         )
-    stamp_ns = _stamps(table, columns)
+    stamp_ns, clip = _stamps(table, columns), columns.accel.clip
     gyro = None
     if columns.gyro is not None:
         gyro = _stack(table, columns.gyro.columns)
@@ -204,13 +206,13 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
         unit=columns.accel.unit,
         factor=columns.accel.factor,
         stamp_ns=stamp_ns,
-        accel=_stack(table, columns.accel.columns),
+        accel=_stack(table, columns.accel.columns) - columns.accel.offset,
         gyro=gyro,
         board=_readings(table, stamp_ns, columns.board),
         case=_readings(table, stamp_ns, columns.case),
         line=table.line,
         counts_per_g=columns.accel.counts_per_g,
-        clip=columns.accel.clip,
+        clip=clip and (clip[0] - columns.accel.offset, clip[1] - columns.accel.offset),
         frame_id=columns.frame_id,
         serial=columns.serial or '',
         n_short=table.n_short,

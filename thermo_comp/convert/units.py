@@ -113,7 +113,8 @@ def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> 
     if stated != 'counts':
         return None if believed == stated else f'{reason}: that looks like {believed}'
     if counts_per_g is not None and abs(magnitude / counts_per_g - 1.0) > _TOLERANCE:
-        return f'|a| at rest is {magnitude:.4g} counts, {counts_per_g:g} per g are stated'
+        text = f'|a| at rest is {magnitude:.4g} counts, {counts_per_g:g} per g are stated'
+        return f'{text}: is there an `offset`?' if magnitude > 2.0 * counts_per_g else text
     if magnitude < 50.0:
         return f'{reason}: that looks like {believed}'
     return None

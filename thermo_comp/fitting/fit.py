@@ -21,6 +21,7 @@ from .attitudes import distinct_directions
 from .curves import sets_of
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .learning import Learnt, learn
+from .offset import about, centred, find_offset
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .posterior import Regression
 from .priors import constants_of, known_of, prior_columns, prior_sets, state_of
@@ -137,6 +138,22 @@ def fit_bags(
     Raises FitError if the data contradict themselves.
     """
     tell = progress or _no_progress
+    offset = find_offset(bags, options)
+    if not offset.any():
+        return _fit(bags, options, tell)
+    note = f'no force reads {" ".join(f"{word:g}" for word in offset)}: words with an offset'
+    known = options.prior and about(options.prior, -offset)
+    found = _fit([centred(bag, offset) for bag in bags], replace(options, prior=known), tell)
+    return replace(
+        found,
+        calibration=about(found.calibration, offset, note),
+        findings=(Finding('offset', 'advice', note), *found.findings),
+        bags=tuple(bags),
+    )
+
+
+def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
+    """Fit a calibration to bags in which no force is about zero."""
     _check_temperatures(bags)
     findings = list(enforce(judge_bags(bags, options), options))
     findings += enforce(judge_rests(bags, options), options)

@@ -60,6 +60,7 @@ class FitOptions:
     input: unit of the samples
     full_scale: magnitude of a saturated sample; None takes 32767 for counts, and for m/s^2 the
         smallest usual range that holds the data
+    offset: what raw words read without a force, as 32768; None finds it out
     reference_temperature: T_ref; the paper uses 20
     detector: thermometer and detector settings; None learns them from the bags
     transition_time_s: cross-over time of the sets, as the node will use
@@ -84,6 +85,7 @@ class FitOptions:
     serial: str | None = None
     input: Literal['counts', 'm/s^2'] = 'counts'
     full_scale: float | None = None
+    offset: float | None = None
     reference_temperature: float = 20.0
     detector: DetectorSettings | None = None
     transition_time_s: float = 30.0
@@ -103,6 +105,8 @@ class FitOptions:
                 raise ValueError(f'`{name}` must be positive, got {value}')
         if self.full_scale is not None and not 0.0 < self.full_scale < math.inf:
             raise ValueError(f'`full_scale` must be positive, got {self.full_scale}')
+        if self.offset is not None and not math.isfinite(self.offset):
+            raise ValueError(f'`offset` must be finite, got {self.offset}')
         if self.input not in ('counts', 'm/s^2'):
             raise ValueError(f"`input` must be 'counts' or 'm/s^2', got {self.input!r}")
         if self.model not in ('response', 'golovach'):

@@ -98,6 +98,7 @@ class ReducedBag:
     window_s: length of a window: as asked, or a multiple of it where the samples are slow [s]
     cycle_s: typical interval between samples
     is_integer: whether all samples were whole numbers
+    middle: the word of no force where the words have no sign, else 0
     restless: what speaks against rests, where there is none
     """
 
@@ -114,6 +115,7 @@ class ReducedBag:
     window_s: float
     cycle_s: float
     is_integer: bool
+    middle: float = 0.0
     restless: str = ''
 
     @property
@@ -180,6 +182,7 @@ def reduce_source(
         window_s=round(per_window * found.cell_s, 6) or window_s,
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
         is_integer=found.is_integer,
+        middle=found.middle,
         restless='' if ranges else why_restless(found, still_sd),
     )
 

@@ -37,6 +37,8 @@ STRETCHES = (1, 2, 3, 6, 12, 30, 60)
 _LONGEST_CELL_NS = 86400e9
 # A sample beyond has a square that is no number; it is none itself.
 _LARGEST = 1e100
+# The middle of words of 16 bits.
+_WORD = 32768.0
 # Noise below this many quanta leaves a sensor on one number for long.
 _STUCK = 0.3
 
@@ -49,8 +51,9 @@ class Cells:
     `time` is the mean since `start_ns` [s]; `index` the number of the cell on the bag's time grid,
     so that neighbours differ by 1. Dropped are samples with a component that is not finite or a
     stamp that does not rise. `is_integer` where all are whole numbers (counts); `quantum` is the
-    step of the samples, 0 when they have none to speak of. `rate` and `rate_variance` are those of
-    the gyroscope [rad/s], of zeros where there is none.
+    step of the samples, 0 when they have none to speak of. `middle` is that of words of 16 bits
+    without a sign (offset binary), where the samples can be nothing else, or 0. `rate` and
+    `rate_variance` are those of the gyroscope [rad/s], of zeros where there is none.
     """
 
     start_ns: int
@@ -64,6 +67,7 @@ class Cells:
     n_saturated: int
     is_integer: bool
     quantum: Floats
+    middle: float
     rate: Floats
     rate_variance: Floats
 
@@ -95,6 +99,8 @@ class CellAccumulator:
         self._n_dropped = 0
         self._n_saturated = 0
         self._is_integer = True
+        self._is_negative = False
+        self._middle = 0.0
         self._quantum = np.zeros(3)
         self._width = 8
         self._open = np.zeros((0, self._width))
@@ -110,7 +116,9 @@ class CellAccumulator:
         before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
         if self._full_scale is not None:
-            saturated = use & (np.abs(samples) >= self._full_scale).any(axis=1)
+            if self._full_scale == _WORD - 1.0 and not self._middle:
+                self._look_for_sign(samples[use])
+            saturated = use & (np.abs(samples - self._middle) >= self._full_scale).any(axis=1)
             self._n_saturated += int(saturated.sum())
             use &= ~saturated
             self._n_dropped -= int(saturated.sum())
@@ -150,9 +158,17 @@ class CellAccumulator:
             n_saturated=self._n_saturated,
             is_integer=self._is_integer,
             quantum=self._quantum,
+            middle=self._middle,
             rate=rate,
             rate_variance=rate_variance,
         )
+
+    def _look_for_sign(self, samples: Floats) -> None:
+        """See whether words of 16 bits have none: whole, never negative, beyond what is signed."""
+        self._is_negative |= bool((samples < 0.0).any())
+        if not self._is_negative and np.max(samples, initial=0.0) > _WORD:
+            is_word = (samples == np.rint(samples)) & (samples < 2.0 * _WORD)
+            self._middle = _WORD if is_word.all() else 0.0
 
     def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
         step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
@@ -276,7 +292,7 @@ def _is_full(cells: Cells) -> Bools:
 
 def _one_g(cells: Cells) -> float:
     """Typical reading: gravity, on average, of whatever does not fall."""
-    norms = np.linalg.norm(cells.mean, axis=1)
+    norms = np.linalg.norm(cells.mean - cells.middle, axis=1)
     return float(np.median(norms)) if len(norms) else 0.0
 
 

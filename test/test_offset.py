@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Raw words whose zero is far away: the same calibration, the word of no force in its bias."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from position_helpers import START_NS
+
+from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit
+from thermo_comp.fitting.attitudes import rough_centre
+from thermo_comp.simulation import positions
+
+GRAVITY = 9.80665
+OPTIONS = FitOptions(gravity=GRAVITY)
+K = np.array((4130.0, 4080.0, 4200.0)) / GRAVITY
+BIAS = np.array((120.0, -340.0, 55.0))
+M = np.array(((1.0, 0.0, 0.0), (0.004, 1.0, 0.0), (-0.006, 0.003, 1.0)))
+
+
+def source(words, name='words') -> FitSource:
+    stamps = START_NS + np.arange(len(words)) * 10_000_000
+    none_ns, none = np.zeros(0, dtype=np.int64), np.zeros(0)
+    block = ArrayBlock(stamps, words, none_ns, none, none_ns, none)
+    return FitSource(name, lambda: [block])
+
+
+def words_of(ups, rng, seconds=20.0):
+    """Read each attitude for some seconds, after a second of handling; whole numbers."""
+    parts = []
+    for up in ups:
+        n = round(100 * seconds)
+        force = np.linalg.solve(M, GRAVITY * up)
+        rest = force * K + BIAS + 12.0 * rng.standard_normal((n, 3))
+        parts += [BIAS + 3000.0 * rng.standard_normal((100, 3)), rest]
+    return np.rint(np.concatenate(parts))
+
+
+def constants(result):
+    axes = result.calibration.axes
+    triad = (axes.x, axes.y, axes.z)
+    return np.array([one.bias for one in triad]), np.array([one.scale_factor for one in triad])
+
+
+@pytest.mark.parametrize(
+    ('offset', 'declared'), [(32768.0, False), (32768.0, True), (8192.0, False), (20000.0, False)]
+)
+def test_the_nine_numbers_are_those_of_signed_words(rng, offset, declared):
+    words = words_of(positions(14, 3), rng)
+    plain = fit([source(words)], OPTIONS)
+    found = fit([source(words + offset)], replace(OPTIONS, offset=offset if declared else None))
+    bias, scale = constants(found)
+    np.testing.assert_allclose(bias - offset, constants(plain)[0], atol=0.02)
+    np.testing.assert_allclose(scale, constants(plain)[1], rtol=1e-6)
+    # And these are the truth: means of 2000 samples of 12 counts, 14 of them.
+    np.testing.assert_allclose(bias - offset, BIAS, atol=1.0)
+    np.testing.assert_allclose(scale, K, rtol=3e-4)
+    np.testing.assert_allclose(found.calibration.misalignment, M, atol=3e-4)
+    assert any(one.name == 'offset' for one in found.findings)
+    assert 'no force reads' in found.calibration.provenance.notes[0]
+    assert not any(one.name == 'offset' for one in plain.findings)
+
+
+def test_a_bag_for_each_position_needs_none_of_the_others(rng):
+    # All axes down, all up, some of both: only some words of 16 bits show that they have no sign.
+    ups = positions(10, 3)
+    ups[0] = -np.full(3, 3.0**-0.5)
+    bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]
+    found = fit(bags, OPTIONS)
+    bias, scale = constants(found)
+    np.testing.assert_allclose(bias - 32768.0, BIAS, atol=2.0)
+    np.testing.assert_allclose(scale, K, rtol=6e-4)
+    assert found.bags[0].n_saturated == found.bags[1].n_saturated == 0
+
+
+def test_one_attitude_of_16_bits_has_the_right_scale(rng):
+    found = fit([source(words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0)], OPTIONS)
+    bias, scale = constants(found)
+    # The norm of one reading, and bias at its prior: 1 m/s^2, some 400 counts.
+    np.testing.assert_allclose(scale, 4200.0 / GRAVITY, rtol=0.05)
+    np.testing.assert_allclose(bias, 32768.0, atol=400.0)
+    assert found.calibration.unit.full_scale == 65535.0
+
+
+def test_rails_of_words_without_a_sign_are_saturated(rng):
+    words = words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0
+    words[500, 0], words[600, 2] = 65535.0, 0.0
+    (bag,) = fit([source(words)], OPTIONS).bags
+    assert bag.n_saturated == 2
+
+
+def test_a_prior_knows_the_offset(rng):
+    known = fit([source(words_of(positions(14, 3), rng) + 32768.0)], OPTIONS).calibration
+    up = np.array((0.6, 0.0, 0.8))
+    found = fit([source(words_of([up], rng) + 32768.0)], replace(OPTIONS, prior=known))
+    np.testing.assert_allclose(constants(found)[0], 32768.0 + BIAS, atol=2.0)
+
+
+def test_a_centre_is_found_only_where_there_is_one(rng):
+    ups = positions(12, 5)
+    assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()
+    np.testing.assert_allclose(rough_centre(100.0 * ups + 338.0), 338.0, atol=1e-6)
+    # In a plane, or too few: what is across is not seen.
+    flat = ups * (1.0, 1.0, 0.0)
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    assert not rough_centre(100.0 * flat + 338.0).any()
+    assert not rough_centre(100.0 * ups[:3] + 338.0).any()
