@@ -55,6 +55,20 @@ def test_headings_are_optional(tmp_path: Path) -> None:
     assert read_text(path, [0], has_header=True).values[0].tolist() == [1.0]
 
 
+@pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
+def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path: Path, separator: str) -> None:
+    # A title, comments of three kinds, a key with its value, a blank line; a row of units, which
+    # counts as one without numbers; a comment and a torn last row in the table itself.
+    head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
+    rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
+    text = '\n'.join([*head, *(row.replace('|', separator) for row in rows)])
+    table = read_text(write(tmp_path / 'log.csv', text), ['t', 'az'])
+    assert np.isnan(table.values['t'][0])
+    np.testing.assert_array_equal(table.values['az'][1:], np.arange(60.0))
+    assert table.line[1] == 9
+    assert table.n_short == 1
+
+
 def test_line_numbers_are_those_of_an_editor(tmp_path: Path) -> None:
     path = write(tmp_path / 'log.csv', '# made by hand\na,b\n\n1,2\nx,3\n4\n5,6\n')
     table = read_text(path, ['a', 'b'])

@@ -157,7 +157,7 @@ def test_torn_log_is_read_up_to_the_tear(flight):
     path, truth = flight
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    read = read_ulog(path)
+    read, _ = read_ulog(path)
     n = len(read.imus[0].stamp_ns)
     assert 250 < n < 350
     np.testing.assert_array_equal(read.imus[0].accel, truth['force'][0][:n])
@@ -172,6 +172,73 @@ def test_simulator_is_refused(tmp_path):
     path.write_bytes(log.body)
     with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
         ulog_log(path)
+
+
+COMBINED = 'sensor_combined:uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;'
+COMBINED += 'int32_t accelerometer_timestamp_relative;float[3] accelerometer_m_s2;'
+COMBINED += 'uint32_t accelerometer_integral_dt;'
+AIR = 'vehicle_air_data:uint64_t timestamp;uint64_t timestamp_sample;float baro_temp_celcius;'
+
+
+def write_combined(path: Path, rng, **parameters: int) -> np.ndarray:
+    """Write a log of PX4's default profile before it logged each sensor."""
+    log = UlogWriter(COMBINED, AIR)
+    for name, value in parameters.items():
+        key = f'int32_t {name}'.encode()
+        log.message('P', bytes([len(key)]) + key + struct.pack('<i', value))
+    number, air = log.subscribe('sensor_combined', 0), log.subscribe('vehicle_air_data', 0)
+    force = still(rng)
+    for k, vector in enumerate(force):
+        now = 7_000_000 + k * STEP_US
+        rows = [(-200, vector)]
+        if k == 3:
+            # No accelerometer in it; and one whose reading has been logged already.
+            rows += [(2**31 - 1, vector), (-200 - 50, vector)]
+        for j, (relative, (x, y, z)) in enumerate(rows):
+            at = now + (50 if j == 2 else 0)
+            log.data(
+                number,
+                struct.pack('<QfffIifffI', at, 0.1, 0.2, 0.3, 5000, relative, x, y, z, 5000),
+            )
+        if k % 100 == 0:
+            log.data(air, struct.pack('<QQf', now, now, 40.0 + k))
+    path.write_bytes(log.body)
+    return force
+
+
+def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
+    path = tmp_path / 'default.ulg'
+    force = write_combined(path, rng)
+    read = ulog_log(path)
+    np.testing.assert_array_equal(read.accel, force)
+    np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
+    np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
+    # The barometer's is the only thermometer: it is what a fit and the node must have.
+    np.testing.assert_array_equal(read.board.celsius, 40.0 + 100.0 * np.arange(6))
+    assert not len(read.case.celsius)
+    said = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
+    assert 'sensor_accel is missing' in said
+    assert 'add 4 to SDLOG_PROFILE' in said
+
+
+def test_a_combined_sensor_that_px4_compensated_is_refused(tmp_path, rng):
+    path = tmp_path / 'corrected.ulg'
+    write_combined(path, rng, TC_A_ENABLE=1)
+    with pytest.raises(RecordingError, match=r'TC_A_ENABLE was 1.*SDLOG_PROFILE'):
+        ulog_log(path)
+    assert len(ulog_log(path, allow_compensated=True).stamp_ns) == N
+
+
+def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):
+    log = UlogWriter(OLD_ACCEL)
+    number = log.subscribe('sensor_accel', 0)
+    for k, force in enumerate(still(rng)):
+        log.data(number, struct.pack('<Qffff', (1 + k) * 1_000_000, *force, 31.5 + 0.01 * k))
+    path = tmp_path / 'slow.ulg'
+    path.write_bytes(log.body)
+    said = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
+    assert '1 Hz: good for soaks of minutes' in said
+    assert 'sensor_accel at 10 Hz' in said
 
 
 def test_absent_instances_are_named(flight):

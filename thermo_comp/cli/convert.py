@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ..convert.log import Finding
 
 _BAGS = {'.mcap', '.db3', '.bag'}
+#: Slower logs tell of soaks alone.
+_SLOW_HZ = 5.0
 
 
 class UnitChoice(str, Enum):
@@ -50,7 +52,7 @@ def convert(
         int | None, typer.Option(help='Barometer of a log, for the case temperature.')
     ] = None,
     allow_compensated: Annotated[
-        bool, typer.Option(help='Take an ArduPilot log corrected by INS_TCAL.')
+        bool, typer.Option(help='Take a log that INS_TCAL or TC_A has corrected.')
     ] = False,
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
@@ -115,10 +117,10 @@ def _reader(
     is_log = suffix in ('.ulg', '.bin')
     if is_log and columns is not None:
         raise options.usage(f'a {suffix} log needs no --columns')
-    if allow_compensated and suffix != '.bin':
-        raise options.usage('--allow-compensated is for ArduPilot logs (.bin)')
+    if allow_compensated and not is_log:
+        raise options.usage('--allow-compensated is for PX4 and ArduPilot logs (.ulg, .bin)')
     if suffix == '.ulg':
-        return partial(ulog_log, log, imu, baro)
+        return partial(ulog_log, log, imu, baro, allow_compensated)
     if suffix == '.bin':
         return partial(dataflash_log, log, imu, baro, allow_compensated)
     if imu is not None or baro is not None:
@@ -140,6 +142,13 @@ def say(out: Output, report: ConversionReport) -> None:
     out.line(f'  {report.board_messages:8} temperature/board')
     out.line(f'  {report.case_messages:8} temperature/case')
     out.line(f'unit: {report.unit}; {report.believed}')
+    if report.rate_hz < _SLOW_HZ:
+        out.line(
+            f'{report.rate_hz:.3g} Hz: good for soaks of minutes; rests by hand are too short for '
+            'it, and it sees neither vibration nor a knock between two samples'
+        )
+    if report.hint and (report.rate_hz < _SLOW_HZ or not report.case_messages):
+        out.line(report.hint)
     _say_finding(out, 'rows left out, too short', report.short_rows)
     _say_finding(out, 'rows left out, no number', report.non_numeric)
     _say_finding(out, 'rows left out, stamp before 1970 or after 2038', report.out_of_range)

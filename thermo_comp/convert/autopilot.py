@@ -5,7 +5,8 @@ Owns what the logs of autopilots have in common: numbered IMUs, their thermomete
 
 The thermometer inside the IMU sits with the converter and lags: it becomes the board temperature.
 The barometer beside it hardly heats itself and follows the surroundings: it becomes the case
-temperature. A simulator's log is refused: it has no noise, so nothing can be weighed by it.
+temperature, and the board's where the IMU has none. A simulator's log is refused: it has no noise,
+so nothing can be weighed by it.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ class AutopilotLog:
     imus: dict[int, ImuRows]
     baros: dict[int, Readings]
     metadata: dict[str, str] = field(default_factory=dict)
+    #: How a log would hold more.
+    hint: str = ''
 
 
 def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = None) -> ForeignLog:
@@ -71,6 +74,8 @@ def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = No
     if baros or baro is not None:
         case = _choose(baros, baro, 'barometer', log.path)
     board = _reported(Readings(rows.stamp_ns, rows.celsius))
+    if not len(board.celsius):
+        board, case = case, NO_READINGS
     return ForeignLog(
         path=log.path,
         input='imu',
@@ -84,6 +89,7 @@ def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = No
         line=np.arange(1, len(rows.stamp_ns) + 1),
         serial=rows.serial,
         n_short=rows.n_short,
+        hint=log.hint,
         metadata={**log.metadata, **origin(log.path, rows.serial)},
     )
 

@@ -58,6 +58,7 @@ class ForeignLog:
     counts_per_g, clip: the stated sensitivity; readings at and beyond which the sensor saturates
     n_short: rows that were left out because they are too short
     missing: what of the log could not be read
+    hint: how its recorder would have logged more
     """
 
     path: str
@@ -77,6 +78,7 @@ class ForeignLog:
     n_short: int = 0
     metadata: dict[str, str] = field(default_factory=dict)
     missing: str | None = None
+    hint: str = ''
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,7 @@ class ConversionReport:
     stillness: Stillness
     start_ns: int
     missing: str | None
+    hint: str
 
 
 NO_READINGS = Readings(np.empty(0, dtype=np.int64), np.empty(0))
@@ -210,6 +213,7 @@ def write_log(
         stillness=stillness,
         start_ns=int(stamp_ns[0]),
         missing=log.missing,
+        hint=log.hint,
     )
 
 

@@ -31,6 +31,8 @@ Column = str | int
 # A row is parsed in one go with this many others: bounded memory for text, one array each.
 _CHUNK_ROWS = 65536
 _SNIFF_BYTES = 65536
+# A logger's preamble is no longer than this.
+_PREAMBLE_ROWS = 1000
 #: What packs numbers more tightly holds no measurement.
 _MOST_ROWS_PER_BYTE = 4
 _STAMP_UNITS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
@@ -84,8 +86,9 @@ def read_text(
             if '\0' in head:
                 raise RecordingError('not a table of text: it holds zero bytes', path=path)
             file.seek(0)
-            rows = _rows(file, delimiter if delimiter is not None else sniff(head))
-            return _collect(path, rows, columns, stamp, stamp_exponent, has_header)
+            delimiter = delimiter or sniff(head)
+            heading, rows = _begin(_rows(file, delimiter), _width(head, delimiter), has_header)
+            return _collect(path, heading, rows, columns, stamp, stamp_exponent)
     except UnicodeError as failure:
         raise RecordingError(f'not a table of text ({failure})', path=path) from failure
     except csv.Error as failure:
@@ -100,7 +103,7 @@ def sniff(head: str) -> str:
 
     One of comma, semicolon, tab, bar, or a blank for any run of white space.
     """
-    lines = [line for line in head.splitlines()[:50] if line.strip() and line.lstrip()[0] != '#']
+    lines = _sample(head)
     best, best_score = ' ', 0
     for delimiter in (',', ';', '\t', '|'):
         counts = [line.count(delimiter) for line in lines]
@@ -111,16 +114,67 @@ def sniff(head: str) -> str:
     return best
 
 
+def _sample(head: str) -> list[str]:
+    """Take lines from the end of a head, where the preamble of a logger is over."""
+    lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
+    # The last one may be cut.
+    return (lines[:-1] if len(lines) > 2 else lines)[-50:]
+
+
+def _is_comment(cell: str) -> bool:
+    return cell.lstrip().startswith(('#', '%', '//'))
+
+
+def _width(head: str, delimiter: str) -> int:
+    """Count the cells of most lines."""
+    widths = [_n_cells(row) for _, row in _rows(_sample(head), delimiter)]
+    return max(set(widths), key=widths.count, default=0)
+
+
+def _n_cells(row: Sequence[str]) -> int:
+    return len(row) - (not row[-1].strip())
+
+
+def _begin(
+    rows: Iterator[tuple[int, list[str]]], width: int, has_header: bool | None
+) -> tuple[list[str] | None, Iterator[tuple[int, list[str]]]]:
+    """
+    Skip what stands before a table; return its headings, if it has any, and its rows.
+
+    Its rows are as wide as most, but for a blank last cell. The first of numbers, or a run of such
+    rows right before it, begins the table: then the first of these has the headings.
+    """
+    first = list(islice(rows, _PREAMBLE_ROWS))
+    is_row = [_n_cells(row) == width for _, row in first]
+    begin = next(
+        (
+            k
+            for k, (_, row) in enumerate(first)
+            if is_row[k] and 2 * sum(map(is_number, row)) > width
+        ),
+        None,
+    )
+    if begin is None:
+        begin = is_row.index(True) if any(is_row) else 0
+        has_header = has_header is not False
+    while begin and is_row[begin - 1]:
+        begin -= 1
+    if has_header is None:
+        has_header = not any(map(is_number, first[begin][1]))
+    heading = first[begin][1] if has_header and first else None
+    return heading, chain(first[begin + (heading is not None) :], rows)
+
+
 def _rows(file: Iterable[str], delimiter: str) -> Iterator[tuple[int, list[str]]]:
     """
-    Yield (line number, cells) of every line that holds something; ``#`` starts a comment line.
+    Yield (line number, cells) of every line that holds something but a comment.
     """
     if delimiter == ' ':
         cells: Iterable[list[str]] = (line.split() for line in file)
     else:
         cells = csv.reader(file, delimiter=delimiter)
     for number, row in enumerate(cells, 1):
-        if row and not row[0].lstrip().startswith('#') and any(cell.strip() for cell in row):
+        if row and not _is_comment(row[0]) and any(cell.strip() for cell in row):
             yield number, row
 
 
@@ -135,21 +189,18 @@ def is_number(cell: str) -> bool:
 
 def _collect(
     path: Path,
+    heading: list[str] | None,
     rows: Iterator[tuple[int, list[str]]],
     columns: Sequence[Column],
     stamp: Column | None,
     stamp_exponent: int,
-    has_header: bool | None,
 ) -> Table:
+    headings = [cell.strip() for cell in heading or ()]
     first = next(rows, None)
-    if first is None:
+    if first is None and not headings:
         raise RecordingError('the table is empty', path=path)
-    if has_header is None:
-        has_header = not any(is_number(cell) for cell in first[1])
-    headings = [cell.strip() for cell in first[1]] if has_header else []
-    if not has_header:
-        rows = chain([first], rows)
-    width = len(first[1])
+    rows = rows if first is None else chain([first], rows)
+    width = len(headings) if first is None else len(first[1])
     places = {name: place(path, name, headings, width) for name in columns}
     stamp_place = None if stamp is None else place(path, stamp, headings, width)
     needed = 1 + max([*places.values(), -1 if stamp_place is None else stamp_place])

@@ -5,7 +5,8 @@ Owns PX4's ULog files (``.ulg``), behind the extra ``px4``.
 
 ``sensor_accel`` holds what the driver read, before PX4's own thermal correction and calibration,
 with the temperature of the same chip; ``sensor_baro`` holds a second temperature. PX4 logs them at
-1 Hz unless the logger's profile asks for more (``SDLOG_PROFILE``: thermal calibration).
+1 Hz unless the logger's profile asks for more (``SDLOG_PROFILE``: thermal calibration). Where it
+is missing, ``sensor_combined`` stands in: after PX4's calibration, and without a temperature.
 
 References
 ----------
@@ -29,22 +30,42 @@ from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
 from .log import ForeignLog, Readings
 from .table import NO_STAMP
 
-_TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_baro')
+_TOPICS = (
+    *('sensor_accel', 'sensor_gyro', 'sensor_baro'),
+    *('sensor_combined', 'vehicle_air_data'),
+)
 _AXES = ('x', 'y', 'z')
+_PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
+#: `accelerometer_timestamp_relative` of a message without an accelerometer.
+_NOT_THERE = 2**31 - 1
 
 
-def ulog_log(path: str | Path, imu: int | None = None, baro: int | None = None) -> ForeignLog:
+def ulog_log(
+    path: str | Path,
+    imu: int | None = None,
+    baro: int | None = None,
+    allow_compensated: bool = False,
+) -> ForeignLog:
     """
     Read one IMU and one barometer of a PX4 log; None takes the lowest instance.
 
+    `allow_compensated` takes ``sensor_combined`` though PX4 has corrected its thermal drift.
+
     Raises RecordingError if pyulog is not installed, the file is no ULog, it holds no such
-    instance, or its accelerometer has no noise.
+    instance, its drift is already corrected, or its accelerometer has no noise.
     """
-    return foreign_log(read_ulog(path), imu, baro)
+    log, is_compensated = read_ulog(path)
+    if is_compensated and not allow_compensated:
+        raise RecordingError(
+            'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
+            f'thermal drift out of these readings; {_PROFILE}',
+            path=path,
+        )
+    return foreign_log(log, imu, baro)
 
 
-def read_ulog(path: str | Path) -> AutopilotLog:
-    """Read the inertial sensors of a PX4 log."""
+def read_ulog(path: str | Path) -> tuple[AutopilotLog, bool]:
+    """Read the inertial sensors of a PX4 log, and whether PX4 has corrected their drift."""
     try:
         from pyulog import ULog
     except ImportError as failure:
@@ -64,18 +85,26 @@ def read_ulog(path: str | Path) -> AutopilotLog:
         if len(data.data.get('timestamp', ())):
             by_topic[data.name][int(data.multi_id)] = data.data
     gyros = by_topic['sensor_gyro']
-    return AutopilotLog(
-        path=str(path),
-        imus={
-            number: _imu(columns, gyros.get(number))
-            for number, columns in by_topic['sensor_accel'].items()
-        },
-        baros={
-            number: Readings(_stamps(columns), _column(columns, 'temperature'))
-            for number, columns in by_topic['sensor_baro'].items()
-        },
-        metadata=_metadata(log),
-    )
+    imus = {
+        number: _imu(columns, gyros.get(number))
+        for number, columns in by_topic['sensor_accel'].items()
+    }
+    baros = {
+        number: Readings(_stamps(columns), _column(columns, name))
+        for topic, name in (
+            ('vehicle_air_data', 'baro_temp_celcius'),
+            ('sensor_baro', 'temperature'),
+        )
+        for number, columns in by_topic[topic].items()
+    }
+    metadata, hint = _metadata(log), _PROFILE
+    is_combined = not imus and bool(by_topic['sensor_combined'])
+    if is_combined:
+        imus = {n: _combined(columns) for n, columns in by_topic['sensor_combined'].items()}
+        metadata['px4_topic'] = 'sensor_combined'
+        hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
+    is_compensated = is_combined and log.initial_parameters.get('TC_A_ENABLE') == 1
+    return AutopilotLog(str(path), imus, baros, metadata, hint), is_compensated
 
 
 def _imu(columns: dict[str, Any], gyro: dict[str, Any] | None) -> ImuRows:
@@ -88,6 +117,23 @@ def _imu(columns: dict[str, Any], gyro: dict[str, Any] | None) -> ImuRows:
         celsius=_column(columns, 'temperature'),
         serial='' if device is None else f'px4-accel-{int(device[0])}',
     )
+
+
+def _combined(columns: dict[str, Any]) -> ImuRows:
+    relative = _column(columns, 'accelerometer_timestamp_relative')
+    is_there = np.isfinite(relative) & (relative != _NOT_THERE)
+    published = columns['timestamp'][is_there].astype(np.int64)
+    stamp_ns = stamps_ns(published + relative[is_there].astype(np.int64))
+    # A message with news of the gyroscope alone repeats what the accelerometer said last.
+    is_new = np.concatenate((np.ones(len(stamp_ns[:1]), bool), np.diff(stamp_ns) != 0))
+    accel, gyro = (
+        np.column_stack([_column(columns, f'{name}[{axis}]') for axis in range(3)])[is_there][
+            is_new
+        ]
+        for name in ('accelerometer_m_s2', 'gyro_rad')
+    )
+    rate = gyro if np.isfinite(gyro).all() else None
+    return ImuRows(stamp_ns[is_new], accel, rate, np.full(len(accel), np.nan))
 
 
 def _stamps(columns: dict[str, Any]) -> Ints:
