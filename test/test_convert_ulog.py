@@ -201,7 +201,7 @@ def write_combined(path: Path, rng, **parameters: int) -> np.ndarray:
                 struct.pack('<QfffIifffI', at, 0.1, 0.2, 0.3, 5000, relative, x, y, z, 5000),
             )
         if k % 100 == 0:
-            log.data(air, struct.pack('<QQf', now, now, 40.0 + k))
+            log.data(air, struct.pack('<QQf', now, now, 40.0 + 0.01 * k))
     path.write_bytes(log.body)
     return force
 
@@ -214,7 +214,7 @@ def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
     # The barometer's is the only thermometer: it is what a fit and the node must have.
-    np.testing.assert_array_equal(read.board.celsius, 40.0 + 100.0 * np.arange(6))
+    np.testing.assert_array_equal(read.board.celsius, 40.0 + np.arange(6))
     assert not len(read.case.celsius)
     said = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
     assert 'sensor_accel is missing' in said
