@@ -18,9 +18,13 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass
 class Imu:
-    """The one column of a recording's Imu that a jump is checked against."""
+    """The columns of a recording's Imu that a jump is checked against."""
 
     angular_velocity: np.ndarray
+
+    @property
+    def angular_velocity_covariance(self) -> np.ndarray:
+        return np.zeros((len(self.angular_velocity), 9))
 
 
 @dataclass(frozen=True)

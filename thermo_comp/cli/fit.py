@@ -171,6 +171,7 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
         _say_positions(out, result)
     _say_groups(out, result)
     _say_residuals(out, result)
+    _say_gyroscope(out, result)
     for finding in result.findings:
         if finding.level != 'good':
             out.line(f'- {finding.message}')
@@ -192,6 +193,7 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
             'evidence': calibration.evidence,
             'noise_density_m_s2_sqrt_hz': calibration.noise_density_m_s2_sqrt_hz,
             'slow_noise_m_s2_sqrt_h': calibration.slow_noise_m_s2_sqrt_h,
+            'gyroscope': _facts_of_gyroscope(result),
             'positions': result.positions,
             'findings': result.findings,
         }
@@ -267,6 +269,56 @@ def _say_residuals(out: Output, result: FitResult) -> None:
         ],
         title='|f| - g at rest, RMS in ug; left out: each position by the others',
     )
+
+
+def _say_gyroscope(out: Output, result: FitResult) -> None:
+    """Print what the angular rate does within the positions, and its constants."""
+    from ..unit.gyroscope import MILLIDEGREE
+
+    found = result.gyroscope
+    if found is None:
+        return
+    out.table(
+        ('section', 'windows', 'raw', 'fitted', 'left out'),
+        [
+            (
+                row.section,
+                row.fitted.n // 3,
+                *(
+                    f'{one.rms / MILLIDEGREE:.3g}' if one.n else None
+                    for one in (row.raw, row.fitted, row.left_out)
+                ),
+            )
+            for row in found.residuals
+            if row.fitted.n
+        ],
+        title='angular rate at rest less the mean of each position, RMS of an axis in mdeg/s',
+    )
+    unit = found.gyroscope
+    white, walk, bias = (
+        ' '.join(f'{value / MILLIDEGREE:.3g}' for value in values)
+        for values in (
+            unit.noise_density_rad_s_sqrt_hz,
+            unit.slow_noise_rad_s_sqrt_h,
+            unit.bias_rad_s,
+        )
+    )
+    out.line(
+        f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
+        f'walk {walk} mdeg/s/sqrt(h)'
+    )
+
+
+def _facts_of_gyroscope(result: FitResult) -> dict[str, object] | None:
+    if result.gyroscope is None:
+        return None
+    unit = result.gyroscope.gyroscope
+    return {
+        'bias_rad_s': unit.bias_rad_s,
+        'noise_density_rad_s_sqrt_hz': unit.noise_density_rad_s_sqrt_hz,
+        'slow_noise_rad_s_sqrt_h': unit.slow_noise_rad_s_sqrt_h,
+        'residuals_rad_s': result.gyroscope.residuals,
+    }
 
 
 def _ug(value: float) -> str | None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from ..unit.gravity import STANDARD_GRAVITY
@@ -16,7 +17,9 @@ from . import options
 from .output import Output
 
 if TYPE_CHECKING:
+    from ..recording import ImuColumns
     from ..simulation import Cyclogram, SimulatedRun, UnitModel
+    from ..typing import Bools
 
 _BLOCK = 65536
 
@@ -62,6 +65,12 @@ def simulate(
     gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = STANDARD_GRAVITY,
     cold_start: Annotated[
         bool, typer.Option('--cold-start', help='Switch the unit on when the recording starts.')
+    ] = False,
+    imu: Annotated[
+        bool,
+        typer.Option(
+            '--imu', help='Write sensor_msgs/Imu, with the angular rate of a unit that has one.'
+        ),
     ] = False,
     level: Annotated[int, typer.Option(help='zstd level, 1 fast to 19 small.', min=1, max=19)] = 3,
     force: options.Force = False,
@@ -126,7 +135,7 @@ def simulate(
                 warm=not cold_start,
             )
             count = _write(
-                name, runs, specimen, facts, level, force, _part(done, i, cyclogram, rate_hz)
+                name, runs, specimen, facts, imu, level, force, _part(done, i, cyclogram, rate_hz)
             )
             written.append({'bag': str(name), **count})
     out.table(
@@ -149,6 +158,7 @@ def _write(
     runs: Any,
     unit: UnitModel,
     facts: dict[str, Any],
+    is_imu: bool,
     level: int,
     force: bool,
     tell: Callable[[int], None],
@@ -179,15 +189,32 @@ def _write(
             # Temperatures first: of equal stamps the reading comes before the sample.
             writer.write_temperature(topics.board, run.board_stamp_ns, run.board)
             writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
-            writer.write_counts(
-                topics.counts, run.accel_stamp_ns[keep], run.counts[keep], 'imu_link'
-            )
+            stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]
+            if is_imu:
+                # As a driver reports it: scaled by what the data sheet says.
+                force, rest = counts / np.mean(unit.scale_factor), _beside(run, keep)
+                writer.write_imu(topics.imu, stamp_ns, force, np.zeros(9), 'imu_link', rest)
+            else:
+                writer.write_counts(topics.counts, stamp_ns, counts, 'imu_link')
             writer.flush()
             count['counts'] += int(keep.sum())
             count['board'] += len(run.board)
             count['case'] += len(run.case)
             tell(count['counts'])
     return count
+
+
+def _beside(run: SimulatedRun, keep: Bools) -> ImuColumns | None:
+    """Give what an Imu holds beside the force: no orientation, a rate of unknown covariance."""
+    from ..recording import ImuColumns
+
+    if run.angular_rate is None:
+        return None
+    n = int(keep.sum())
+    nothing, unknown = np.zeros((n, 9)), np.zeros((n, 9))
+    unknown[:, 0] = -1.0
+    level = np.tile((0.0, 0.0, 0.0, 1.0), (n, 1))
+    return ImuColumns(level, unknown, run.angular_rate[keep], nothing, nothing)
 
 
 def _first_stamp(run: SimulatedRun) -> int:

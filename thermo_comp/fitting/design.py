@@ -32,7 +32,7 @@ class Design:
     The data of a fit as combinations of base columns: one, the columns, and their start states.
 
     windows: the data
-    gravity: local gravity
+    gravity: local gravity; 0 for an angular rate
     nominal_scale: K0 [input units per m/s^2], shape (3,)
     """
 
@@ -151,6 +151,9 @@ class Design:
         if prior.known is not None:
             result[: layout.n_unit] = 0.0
         result[layout.offset] = prior.offset_sd**-2
+        if not self.gravity:
+            # Attitudes are nothing to an angular rate: they stay as they are.
+            result[layout.up] = 1.0
         return result[:-1]
 
     def _inform(self, prior: Prior, layout: Layout) -> list[tuple[slice, Floats]]:

@@ -20,6 +20,7 @@ from .assembly import UnitFacts, build_calibration
 from .attitudes import distinct_directions
 from .curves import sets_of
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
+from .gyroscope import GyroscopeFit, fit_gyroscope
 from .learning import Learnt, learn
 from .offset import about, centred, find_offset
 from .options import COUNTS_FULL_SCALE, FitOptions
@@ -62,6 +63,7 @@ class FitResult:
     findings: what the data lacked, or not
     windows: the windows of the regression
     bags: the reduced bags
+    gyroscope: that of the angular rate; None where the bags have none, or there is a prior
     """
 
     calibration: Calibration
@@ -71,6 +73,7 @@ class FitResult:
     findings: tuple[Finding, ...]
     windows: ThermalWindows
     bags: tuple[ReducedBag, ...]
+    gyroscope: GyroscopeFit | None = None
 
 
 def fit(
@@ -237,6 +240,18 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         calibration = build_calibration(
             windows, regression, learnt, columns, sets, nominal, bags, facts, residuals, findings
         )
+        gyroscope = None
+        if known is not None:
+            calibration = replace(calibration, gyroscope=known.gyroscope, sensors=sensors)
+        else:
+            gyroscope = fit_gyroscope(windows, columns, sets, bags, facts, options.groups)
+        if gyroscope is not None:
+            needed = {*calibration.sensors, *gyroscope.sensors}
+            calibration = replace(
+                calibration,
+                gyroscope=gyroscope.gyroscope,
+                sensors=tuple(name for name in sensors if name in needed),
+            )
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     return FitResult(
@@ -247,6 +262,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         findings=tuple(findings),
         windows=windows,
         bags=tuple(bags),
+        gyroscope=gyroscope,
     )
 
 

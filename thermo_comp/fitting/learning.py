@@ -148,7 +148,7 @@ def _left_open(
     """
     told = regression.told_of_absent(posterior.state, prior, allowed)
     widths = {}
-    for part, unit in (('bias', 1.0), ('scale', 1.0 / regression.gravity)):
+    for part, unit in (('bias', 1.0), ('scale', 1.0 / (regression.gravity or 1.0))):
         wide, S = widths_of(allowed, part), told[part]
         sd = np.minimum(1.0 / np.sqrt(np.maximum(S, 1e-300)), wide)
         matters = (widths_of(prior, part) == 0.0) & (wide > 0.0)
@@ -211,7 +211,8 @@ def _settle(
         offset_sd, skew_sd = prior.offset_sd, prior.skew_sd
         told_offset, power = _told_of(posterior, vector, posterior.layout.offset)
         if told_offset > 0.3:
-            offset_sd = max(np.sqrt(power / told_offset), 0.03 * _position_sd(regression, prior))
+            least = max(0.03 * _position_sd(regression, prior), prior.least_offset_sd)
+            offset_sd = max(np.sqrt(power / told_offset), least)
             if told_offset > 1.0:
                 change = max(change, float(np.abs(np.log(offset_sd / prior.offset_sd))))
         told_skew, power = _told_of(posterior, vector, posterior.layout.skew)
@@ -238,7 +239,7 @@ def _smallest(regression: Regression, prior: Prior, part: str) -> float:
     Return a width that the data cannot tell from 0; a column that stays all the same keeps it.
     """
     sd = 1e-2 * float(np.mean(prior.sigma) / np.sqrt(len(regression.windows.time)))
-    return sd if part == 'bias' else sd / regression.gravity
+    return sd if part == 'bias' else sd / (regression.gravity or 1.0)
 
 
 def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float, float]:
@@ -259,7 +260,7 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
     told, layout = posterior.told, posterior.layout
     own = told[layout.axis].sum(axis=1) + told[layout.offset].sum(axis=0)
     # Attitudes, misalignment and start states are told by all three.
-    shared = told[layout.skew].sum() + layout.up.size + told[layout.start].sum()
+    shared = told[layout.skew].sum() + told[layout.up].sum() + told[layout.start].sum()
     spent = own + shared / 3.0
     sigma = prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n))
     return np.asarray(np.maximum(sigma, _LEAST_SIGMA))

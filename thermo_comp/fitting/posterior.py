@@ -7,6 +7,8 @@ Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
 
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + walk + white,   a = (A u_p)_i g,  A = M^-1
 
+With g = 0 this is the regression of an angular rate: what is left is b, B beta and o_p.
+
 B and S are columns of one table (`unit.columns`), each in units of its RMS over the windows. All
 unknowns have Gaussian priors (attitudes: flat on the sphere); Gauss-Newton finds the mode, the
 inverse of the Hessian is the covariance. The windows enter only through the whitened columns of

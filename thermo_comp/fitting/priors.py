@@ -321,6 +321,7 @@ def _calibration(
         ),
         evidence=(),
         posterior=posterior_of(scatter),
+        gyroscope=None,
     )
 
 

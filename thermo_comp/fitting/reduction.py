@@ -71,6 +71,7 @@ class StillInterval:
     count: samples per window, shape (n,)
     mean: window means of the raw samples, shape (n, 3)
     sample_sd: scatter of single samples, shape (3,)
+    angular_rate: window means of it [rad/s], shape (n, 3); None where the bag has none throughout
     """
 
     bag: int
@@ -82,6 +83,7 @@ class StillInterval:
     count: Floats
     mean: Floats
     sample_sd: Floats
+    angular_rate: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -150,8 +152,12 @@ def reduce_source(
     cells = CellAccumulator(cell_s, full_scale, window_s)
     collectors: dict[str, _ReadingCollector] = {}
     n_samples = 0
+    has_rate = True
     for block in source.blocks():
-        cells.add(block.accel_stamp_ns, block.accel, angular_velocity(block))
+        rate = angular_velocity(block)
+        if len(block.accel_stamp_ns):
+            has_rate &= rate is not None and bool(np.isfinite(rate).all())
+        cells.add(block.accel_stamp_ns, block.accel, rate)
         for name, (reading_ns, celsius, _) in block.temperatures.items():
             collectors.setdefault(name, _ReadingCollector()).add(reading_ns, celsius)
         n_samples += len(block.accel_stamp_ns)
@@ -169,6 +175,7 @@ def reduce_source(
                 lower,
                 upper,
                 min(per_window, max(1, (upper - lower) // fewest_windows)),
+                has_rate,
             )
             for lower, upper in ranges
         ),
@@ -203,7 +210,9 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
     return found[best_rests([one.reshape(-1, 3) for one in means])]
 
 
-def _windows(cells: Cells, bag: int, lower: int, upper: int, per_window: int) -> StillInterval:
+def _windows(
+    cells: Cells, bag: int, lower: int, upper: int, per_window: int, has_rate: bool
+) -> StillInterval:
     n_whole, rest = divmod(upper - lower, per_window)
     # Less than half a window weighs too little to be one.
     end = upper - rest if n_whole and 2 * rest < per_window else upper
@@ -214,7 +223,11 @@ def _windows(cells: Cells, bag: int, lower: int, upper: int, per_window: int) ->
     # Where the bag ends within a cell, its window does not last as long.
     if n_whole and total[n_whole - 1] < _LEAST_FILLED * np.median(total):
         n_whole -= 1
-    mean = np.add.reduceat(cells.mean[rows] * count[:, None], offsets, axis=0) / total[:, None]
+
+    def means(of_cells: Floats) -> Floats:
+        summed = np.add.reduceat(of_cells[rows] * count[:, None], offsets, axis=0)
+        return np.asarray(summed / total[:, None])
+
     return StillInterval(
         bag=bag,
         start_ns=cells.start_ns + round(cells.time[lower] * 1e9),
@@ -223,8 +236,9 @@ def _windows(cells: Cells, bag: int, lower: int, upper: int, per_window: int) ->
         n_whole=n_whole,
         time=np.add.reduceat(cells.time[rows] * count, offsets) / total,
         count=total,
-        mean=mean,
+        mean=means(cells.mean),
         sample_sd=np.sqrt(np.median(cells.variance[rows], axis=0)),
+        angular_rate=means(cells.rate) if has_rate else None,
     )
 
 

@@ -13,8 +13,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-import numpy as np
-
 from ..typing import Floats, Ints
 
 
@@ -66,8 +64,11 @@ class ArrayBlock:
 
 def angular_velocity(block: object) -> Floats | None:
     """Angular rate of a block that has one: a recording's, when its input is an Imu."""
-    rate = getattr(getattr(block, 'imu', None), 'angular_velocity', None)
-    return np.asarray(rate, dtype=np.float64) if rate is not None and np.any(rate) else None
+    imu = getattr(block, 'imu', None)
+    if imu is None or (imu.angular_velocity_covariance[:, 0] == -1.0).any():
+        return None
+    rate: Floats = imu.angular_velocity
+    return rate if rate.any() else None
 
 
 def _nothing() -> str | None:

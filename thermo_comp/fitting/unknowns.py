@@ -80,6 +80,7 @@ class Prior:
     offset_sd: of the offset of each position and axis [m/s^2]
     sigma: white noise of a typical window [m/s^2], shape (3,)
     rho: variance per second of the walk over that of the white noise, shape (3,)
+    least_offset_sd: what offset_sd is at least, whatever the data say [m/s^2]
     known: takes the place of all widths of the unit's own parameters; these say only which columns
         take part
     """
@@ -93,6 +94,7 @@ class Prior:
     offset_sd: float
     sigma: Floats
     rho: Floats
+    least_offset_sd: float = 0.0
     known: Known | None = None
 
 

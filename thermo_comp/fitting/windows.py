@@ -68,6 +68,7 @@ class ThermalWindows:
     temperature, rate, weight: board temperature, its rate, weight of the dynamic set, shape (n,)
     gradient: T - T_board of the sensor that leads, shape (n,)
     raw: the response's columns before powers of t and ranges, shape (n, k)
+    angular_rate: mean of it [rad/s], shape (n, 3); (n, 0) where a bag lacks it
     typical_count: samples in a typical window
     """
 
@@ -78,6 +79,7 @@ class ThermalWindows:
     weight: Floats
     gradient: Floats
     raw: Floats
+    angular_rate: Floats
     typical_count: float
 
     @property
@@ -116,6 +118,7 @@ def thermal_windows(
     numbers: list[tuple[Ints, Ints]] = []
     groups: list[str] = []
     n_positions = 0
+    has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
     for bag, reduced in enumerate(bags):
         begin, grid, states, shares = _states(
             reduced, spec, detector, config, reference_temperature
@@ -131,6 +134,8 @@ def thermal_windows(
                 continue
             time, count = interval.time[use], interval.count[use]
             rows = np.column_stack([np.interp(time, grid, column) for column in whole.T])
+            if has_rate and interval.angular_rate is not None:
+                rows = np.hstack((rows, interval.angular_rate[use]))
             merged = _merged(time, count, interval.mean[use], rows, window_s)
             n = len(merged[0])
             parts.append(merged)
@@ -139,6 +144,7 @@ def thermal_windows(
     time, count, mean, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
     k, m = len(columns), len(groups) + len(columns)
+    moved_at, end = 4 + k + m, 4 + k + m + len(columns)
     lag = [-1] * len(groups)
     lag += [
         spec.lags.index(column.lag)
@@ -152,10 +158,10 @@ def thermal_windows(
         time=time,
         weight=count / float(np.median(count)),
         mean=mean,
-        columns=rows[:, 4 + k : 4 + k + m],
+        columns=rows[:, 4 + k : moved_at],
         groups=(*groups, *(column.group for column in columns)),
         lag=np.array(lag, dtype=np.int64),
-        start=np.hstack((np.zeros((len(time), len(groups))), rows[:, 4 + k + m :])),
+        start=np.hstack((np.zeros((len(time), len(groups))), rows[:, moved_at:end])),
         start_covariance=start_covariance(spec.lags),
         # Fc is 1 at the reference in either regime, so the scale has no level of its own there;
         # a play in the scale has never been seen.
@@ -172,6 +178,7 @@ def thermal_windows(
         weight=rows[:, 2],
         gradient=rows[:, 3],
         raw=rows[:, 4 : 4 + k],
+        angular_rate=rows[:, end:],
         typical_count=float(np.median(count)),
     )
 

@@ -244,8 +244,10 @@ def _apply(
 ) -> CompensatedBlock:
     if not segments.first:
         none = np.empty((0, 3))
-        rates = () if angular_rate is None else (none, none)
-        return CompensatedBlock(index[:0], stamps[:0], none, np.empty((0, 9)), *rates)
+        found = CompensatedBlock(index[:0], stamps[:0], none, np.empty((0, 9)))
+        if angular_rate is None:
+            return found
+        return replace(found, angular_rate=none, angular_rate_variance=none)
     slow = segments.columns(segments.slow)
     ends = segments.columns(segments.states), segments.columns(segments.end_states)
     excess = np.array(segments.noise_excess)

@@ -45,6 +45,8 @@ class Record:
     board_time_s, board, case_time_s, case: readings of the thermometers: instants [s] and values
         [degC], shape (m,)
     specific_force: true specific force in the orthogonal frame, m/s^2, shape (3,)
+    angular_rate: of a unit with a gyroscope, mean of each cycle, rad/s, shape (n, 3)
+    rate_bias: the bias of that every second, without the Earth's rate and the turn-on, rad/s
     bias, scale: what the unit's temperatures make of bias [counts/cycle] and relative scale, every
         second from 0; without the walk of the bias, which no model can know, shape (k, 3)
     """
@@ -59,6 +61,8 @@ class Record:
     specific_force: Floats
     bias: Floats
     scale: Floats
+    angular_rate: Floats | None = None
+    rate_bias: Floats | None = None
 
     def means(self, window_s: float = 60.0) -> Floats:
         """Return the means of the counts over whole windows, shape (w, 3)."""
@@ -147,6 +151,8 @@ def arrays(
                 gravity * station.up,
                 chamber.thermal.bias,
                 chamber.thermal.scale,
+                run.angular_rate,
+                chamber.thermal.rate_bias,
             )
         )
     return records

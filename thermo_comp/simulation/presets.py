@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -30,6 +31,7 @@ from .drift import (
     SlipEffect,
     Triple,
 )
+from .gyro import GyroModel
 from .network import AIR, Link, ThermalNetwork, Thermostat
 from .streams import Stream, generator
 from .thermometers import ThermometerModel
@@ -200,7 +202,7 @@ def _mems(seed: int) -> UnitModel:
             CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),
         )
     )
-    return draw.unit(
+    unit = draw.unit(
         network,
         drift,
         full_scale_g=16.0,
@@ -212,6 +214,15 @@ def _mems(seed: int) -> UnitModel:
         noise_density=(120.0, 120.0, 150.0),
         converter=Converter(carries_remainder=False),
     )
+    rate = DriftModel(
+        (
+            PartEffect('die', bias=draw.signed(5.0, 20.0), bias_curvature=draw.normal(0.1)),
+            DifferenceEffect('board', 'package', bias=draw.normal(30.0)),
+            CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(0.1)),
+        )
+    )
+    gyro = GyroModel(rate, draw.normal(500.0), (5.0, 5.0, 5.0), turn_on=2.0)
+    return replace(unit, gyro=gyro)
 
 
 _AXES = ('x', 'y', 'z')

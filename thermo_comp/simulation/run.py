@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike
 
 from ..typing import Floats, Ints
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
+from ..unit.gyroscope import MILLIDEGREE
 from .cyclogram import Cyclogram
 from .drift import PartHistory
 from .response import ThermalResponse
 from .streams import Stream, generator
-from .truth import SimulatedRun, Truth
+from .truth import SimulatedRun, Truth, on_cycles
 from .unit import UnitModel
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
@@ -108,9 +109,9 @@ class ThermalTruth:
         self.air = np.interp(self.grid, knots, air)
         self.temperatures = self.response.temperatures(self.grid)
         origin = unit.origin
-        bias_ug, scale = unit.drift.evaluate(
-            PartHistory(unit.network.nodes, self.temperatures - origin, origin, _GRID_S)
-        )
+        history = PartHistory(unit.network.nodes, self.temperatures - origin, origin, _GRID_S)
+        bias_ug, scale = unit.drift.evaluate(history)
+        self.rate_bias = None if unit.gyro is None else unit.gyro.bias(history)
         self.bias = np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g
         self.scale = 1.0 + scale
 
@@ -157,6 +158,7 @@ class Chamber:
         # A mean over one cycle of white noise: density times the root of the cycle rate.
         noise_sd = np.array(unit.noise_density) * MICRO_G * K * math.sqrt(rate)
         noise = [generator(seed, Stream.ACCEL_NOISE, i) for i in range(3)]
+        rate_noise = [generator(seed, Stream.GYRO_NOISE, i) for i in range(3)]
         remainder = unit.converter.start(seed)
         passed = -1
         for first in range(0, self.n_cycles, block_size):
@@ -182,7 +184,18 @@ class Chamber:
                 case_stamp_ns=case_ns + start,
                 case=case,
                 truth=truth,
+                angular_rate=self._angular_rate(truth.cycle_s, rate_noise),
             )
+
+    def _angular_rate(self, cycle_s: Floats, noise: list[np.random.Generator]) -> Floats | None:
+        gyro, bias = self._unit.gyro, self.thermal.rate_bias
+        if gyro is None or bias is None:
+            return None
+        rate = on_cycles(bias, self.thermal.grid, cycle_s) + gyro.constant(self._options.seed)
+        sd = np.array(gyro.noise_density) * MILLIDEGREE * math.sqrt(self._options.rate_hz)
+        for i in range(3):
+            rate[:, i] += sd[i] * noise[i].standard_normal(len(cycle_s))
+        return rate
 
     def _truth(self, cycle_s: Floats) -> Truth:
         thermal = self.thermal

@@ -26,6 +26,8 @@ class Stream(IntEnum):
     BIAS_WALK = 11
     LOAD = 13
     SIBLING = 14
+    GYRO_NOISE = 15
+    GYRO_OFFSET = 16
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:

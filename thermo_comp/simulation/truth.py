@@ -46,12 +46,12 @@ class Truth:
     @property
     def bias(self) -> Floats:
         """Bias of each cycle, shape (n, 3), counts/cycle."""
-        return _on_cycles(self.bias_grid, self.grid_s, self.cycle_s)
+        return on_cycles(self.bias_grid, self.grid_s, self.cycle_s)
 
     @property
     def scale(self) -> Floats:
         """Scale of each cycle relative to the one at the reference temperature, shape (n, 3)."""
-        return _on_cycles(self.scale_grid, self.grid_s, self.cycle_s)
+        return on_cycles(self.scale_grid, self.grid_s, self.cycle_s)
 
     def temperature(self, node: str) -> Floats:
         """
@@ -66,7 +66,8 @@ class SimulatedRun:
     What a recorder would have stored, and the truth.
 
     Ends of the conversion cycles [ns], shape (n,), and their counts, shape (n, 3); instants and
-    values [degC] of the thermometers' readings, shape (m,).
+    values [degC] of the thermometers' readings, shape (m,). Of a unit with a gyroscope also the
+    mean angular rate of each cycle [rad/s], shape (n, 3).
     """
 
     accel_stamp_ns: Ints
@@ -76,9 +77,11 @@ class SimulatedRun:
     case_stamp_ns: Ints
     case: Floats
     truth: Truth
+    angular_rate: Floats | None = None
 
 
-def _on_cycles(grid: Floats, grid_s: Floats, cycle_s: Floats) -> Floats:
+def on_cycles(grid: Floats, grid_s: Floats, cycle_s: Floats) -> Floats:
+    """Give what is straight between the points of the grid, at each cycle."""
     # One arithmetic per cycle, whatever the block: not np.interp, which prepares slopes or not.
     place = cycle_s / grid_s[1]
     left = np.minimum(place.astype(np.int64), len(grid_s) - 2)

@@ -13,6 +13,7 @@ from ..typing import Floats
 from ..unit.gravity import MICRO_G
 from .converter import Converter
 from .drift import ZERO, DriftModel, Effect, Triple
+from .gyro import GyroModel
 from .network import ThermalNetwork
 from .streams import Stream, generator
 from .thermometers import ThermometerModel
@@ -44,6 +45,7 @@ class UnitModel:
     reference_temperature: reading of the board's part at which K and bias hold in still air, degC
     bias_walk: random walk of the bias per axis within a run, ug per square root of an hour
     loads: loads beside the constant powers
+    gyro: the gyroscope beside it, if there is one
     """
 
     name: str
@@ -60,6 +62,7 @@ class UnitModel:
     reference_temperature: float = 20.0
     bias_walk: Triple = ZERO
     loads: tuple[SwitchedLoad, ...] = ()
+    gyro: GyroModel | None = None
 
     @property
     def counts_per_micro_g(self) -> Floats:

@@ -9,6 +9,7 @@ each regime, and the response. Ranges, reference temperature and thermometers ar
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -16,6 +17,9 @@ from .columns import Column
 from .functions import TemperatureFunction, check_reference
 from .posterior import Posterior
 from .schema import NotNegative, Positive
+
+#: A unit of angular rates [rad/s].
+MILLIDEGREE = math.radians(1e-3)
 
 
 @dataclass(frozen=True)

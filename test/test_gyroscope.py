@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The gyroscope: its fit against simulated truth and closed forms, its file, its triad."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders import calibration, rich_calibration
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermo_comp.errors import CalibrationError
+from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting.gyroscope import within_positions
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.recording import Block, ImuColumns
+from thermo_comp.recording.columns import Readings
+from thermo_comp.simulation import arrays, plan, unit_preset
+from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
+from thermo_comp.unit.functions import Polynomial
+from thermo_comp.unit.gravity import EARTH_RATE, STANDARD_GRAVITY
+from thermo_comp.unit.gyroscope import MILLIDEGREE, RateCurve
+from thermo_comp.unit.prediction import bias_and_scale, predicted_sd, ramp_states
+from thermo_comp.unit.rate_triad import gyroscope_of, rate_triad
+
+OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
+START_NS = 1_767_225_600_000_000_000
+#: White noise of a mean over 60 s of the simulated gyroscope.
+FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
+
+
+def block_of(record, K, rate=None):
+    """Make the block that a recording of Imu messages would be."""
+    stamps, board_ns, case_ns = (
+        START_NS + np.rint(time * 1e9).astype(np.int64)
+        for time in (record.time_s, record.board_time_s, record.case_time_s)
+    )
+    n, nothing = len(stamps), np.zeros((len(stamps), 9))
+    rate = record.angular_rate if rate is None else rate
+    imu = ImuColumns(np.zeros((n, 4)), nothing, rate, nothing, nothing)
+    temperatures = {
+        name: Readings(at, value, np.searchsorted(stamps, at))
+        for name, at, value in (('board', board_ns, record.board), ('case', case_ns, record.case))
+    }
+    return Block(stamps, record.counts / K, 'imu', imu, temperatures, {})
+
+
+def source_of(record, K, rate=None):
+    return FitSource(record.name, lambda: [block_of(record, K, rate)])
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.fixture(scope='module')
+def unit():
+    return unit_preset('mems', 2)
+
+
+@pytest.fixture(scope='module')
+def fitted(unit):
+    """Fit a MEMS unit, whose gyroscope drifts with parts that no column is, to nine positions."""
+    records = arrays(unit, plan('chamber-9', 2), 2)
+    return fit([source_of(one, unit.scale_factor) for one in records], OPTIONS)
+
+
+def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted):
+    calibration = fitted.calibration
+    own = calibration.gyroscope
+    for record in arrays(unit, plan('held-out', 2), 99):
+        block = block_of(record, unit.scale_factor)
+        out = process_block(Compensator(calibration), block, block.imu.angular_velocity)
+        n = len(out.index) // 240
+        means, raw = (
+            rate[: 240 * n].reshape(n, 240, 3).mean(axis=1)
+            for rate in (out.angular_rate, block.imu.angular_velocity[out.index])
+        )
+        changes = means - means.mean(axis=0)
+        assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
+        assert rms(changes) < 1.15 * FLOOR
+        assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
+        # The level holds a turn-on of 2 mdeg/s and the Earth's rate, which are told apart from
+        # nothing: so it stands within what is claimed for the bias and the Earth's rate.
+        message = own.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
+        claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
+        assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
+    np.testing.assert_allclose(own.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
+    # Of 9 positions with a turn-on of 2 mdeg/s, and of the Earth's rate as the prior has it.
+    assert np.mean(own.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
+
+
+def test_the_fit_tells_what_other_positions_see(fitted):
+    row = fitted.gyroscope.residuals[-1]
+    assert row.section == 'all'
+    assert row.raw.rms > 100.0 * FLOOR
+    assert row.fitted.rms <= row.left_out.rms < 1.05 * FLOOR
+
+
+def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
+    records = arrays(unit, plan('tumble-1', 2), 2)
+    with_rate = fit([source_of(one, unit.scale_factor) for one in records], OPTIONS)
+    silent = [np.zeros((len(one.time_s), 3)) for one in records]
+    sources = [
+        source_of(o, unit.scale_factor, rate) for o, rate in zip(records, silent, strict=True)
+    ]
+    without = fit(sources, OPTIONS)
+    assert with_rate.calibration.gyroscope is not None
+    assert without.calibration.gyroscope is None
+    same = replace(
+        with_rate.calibration, gyroscope=None, provenance=without.calibration.provenance
+    )
+    assert same == without.calibration
+    # A bag whose rate is not a number somewhere at rest has none.
+    broken = [np.array(one.angular_rate) for one in records]
+    broken[0][len(broken[0]) // 2 :] = np.nan
+    sources = [
+        source_of(o, unit.scale_factor, rate) for o, rate in zip(records, broken, strict=True)
+    ]
+    assert fit(sources, OPTIONS).calibration.gyroscope is None
+
+
+@given(st.lists(st.integers(0, 4), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_within_positions_is_blind_to_levels(places, seed):
+    position = np.sort(np.array(places))
+    rng = np.random.default_rng(seed)
+    rate, level = rng.standard_normal((len(places), 3)), rng.standard_normal((5, 3))
+    within = within_positions(rate, position)
+    np.testing.assert_allclose(
+        within_positions(rate + level[position], position), within, atol=1e-12
+    )
+    for p in np.unique(position):
+        np.testing.assert_allclose(within[position == p].sum(axis=0), 0.0, atol=1e-12)
+
+
+def test_file_and_triad_round_trip():
+    whole = rich_calibration()
+    assert parse_calibration(dump_calibration(whole).encode()) == whole
+    triad = rate_triad(whole)
+    assert gyroscope_of(triad) == whole.gyroscope
+    assert triad.gyroscope is None
+    # Its scale is 1, and the posterior says nothing of it.
+    states = ramp_states(triad, np.array([10.0, 20.0, 30.0]), 0.0, 0.0)
+    bias, scale = bias_and_scale(triad, states)
+    np.testing.assert_array_equal(scale, 1.0)
+    sd = predicted_sd(triad, np.array([20.0]), 0.0)
+    np.testing.assert_array_equal(sd.scale, 0.0)
+    # At the reference: the bias as it stands there; its level's variance and the turn-on's.
+    np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
+    np.testing.assert_allclose(
+        sd.bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5
+    )
+    with pytest.raises(ValueError, match='`calibration` must have a gyroscope'):
+        rate_triad(calibration())
+
+
+def test_a_file_is_refused_by_key():
+    text = dump_calibration(rich_calibration())
+    for old, new, said in (
+        ('bias_rad_s: [0.02', 'bias_rad_s: [.nan', r'gyroscope\.bias_rad_s\[0\]'),
+        (
+            'noise_density_rad_s_sqrt_hz: [0.0001',
+            'noise_density_rad_s_sqrt_hz: [0.0',
+            r'gyroscope\.noise_density_rad_s_sqrt_hz\[0\]: .*greater than 0',
+        ),
+        ('residual_sd_rad_s', 'residual_sd', r'gyroscope'),
+    ):
+        assert old in text
+        with pytest.raises(CalibrationError, match=said):
+            parse_calibration(text.replace(old, new).encode())
+    own = rich_calibration().gyroscope
+    with pytest.raises(ValueError, match=r'`posterior\.rest` must have one number per parameter'):
+        replace(own, response=own.response[1:])
+    with pytest.raises(ValueError, match='`bias_function` must be 0 at the reference, got 1'):
+        RateCurve(Polynomial((1.0, 2.0)))
+    foreign = replace(own, response=(replace(own.response[0], sensor='magnet'),), posterior=None)
+    with pytest.raises(ValueError, match=r'`gyroscope.response\[0\].sensor` must be one of'):
+        replace(rich_calibration(), gyroscope=foreign)
+
+
+def test_the_rate_is_corrected_by_hand_numbers():
+    # No response, at the reference: what is left is the constant; the force takes no notice.
+    own = replace(rich_calibration().gyroscope, response=(), posterior=None)
+    for gyroscope in (own, None):
+        compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
+        for second in range(2000):
+            compensator.push('board', second * 10**9, 20.0)
+            compensator.push('case', second * 10**9, 20.0)
+        row = compensator.process(2000 * 10**9, 300.0, 600.0, 2900.0)
+        assert row[:2] == pytest.approx((1.0, 2.0))
+        assert compensator.corrects_rate is (gyroscope is not None)
+    compensator = Compensator(replace(calibration(), gyroscope=own))
+    compensator.push('board', 0, 20.0)
+    compensator.push('case', 0, 20.0)
+    assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
+    x, y, z, *variances = compensator.correct_rate(0, 1.0, 1.0, 1.0)
+    assert (x, y, z) == pytest.approx((0.98 - 1e-5, 1.03, 0.99 - 1e-5), abs=1e-12)
+    # While the regime is unknown: noise of a message, slow error, what the sets differ by.
+    least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
+    assert (np.array(variances) >= least).all()
+    assert variances == pytest.approx(least, rel=0.05)
