@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from ..unit.gravity import STANDARD_GRAVITY
@@ -164,6 +163,8 @@ def _write(
     tell: Callable[[int], None],
 ) -> dict[str, int]:
     """Write one run; the recording starts with the first temperatures, as a recorder would."""
+    import numpy as np
+
     from .. import __version__
     from ..recording import BagWriter, Topics
 
@@ -206,6 +207,8 @@ def _write(
 
 def _beside(run: SimulatedRun, keep: Bools) -> ImuColumns | None:
     """Give what an Imu holds beside the force: no orientation, a rate of unknown covariance."""
+    import numpy as np
+
     from ..recording import ImuColumns
 
     if run.angular_rate is None:
