@@ -21,7 +21,7 @@ from builders import (
     term,
     thermal_calibration,
 )
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from thermo_comp.online.batch import process_block
@@ -160,7 +160,21 @@ def event_lists(draw):
     return events
 
 
+def at_seconds(*events):
+    """Make events of letters and seconds: samples, or readings of the board, of the case."""
+    kinds = {'A': ('accel', (0.0, 0.0, 1.0)), 'B': ('board', 0.0), 'C': ('case', 0.0)}
+    return [
+        (kinds[kind][0], int(seconds * SECOND_NS), kinds[kind][1])
+        for kind, seconds in zip(events[::2], events[1::2], strict=True)
+    ]
+
+
+# Which of the readings that wait are of another clock is told by the order in which they came,
+# across the cuts, too: behind one from tomorrow, and behind one that took effect in between.
 @given(event_lists(), st.integers(1, 30), st.sampled_from([0.0, 5.0]))
+@example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
+@example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
+@example(at_seconds('B', 12, 'B', 7.1, 'A', 7.1, 'B', 6.1), 1, 0.0)
 @settings(max_examples=300, deadline=None)
 def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, transition_s):
     config = CompensatorConfig(transition_time_s=transition_s, case_timeout_s=2.0)

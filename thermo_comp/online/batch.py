@@ -170,27 +170,34 @@ def _run_thermal_side(
     values = np.concatenate([np.asarray(part[3], dtype=np.float64) for part in parts])
     effect = np.maximum(np.searchsorted(stamps, reading_ns, side='left'), arrival)
     order = np.lexsort((orders, kinds, reading_ns, effect))
-    refused = refused_readings(reading_ns, kinds, arrival, effect)
+    queue = compensator.thermal.queue
+    refused = refused_readings(reading_ns, kinds, arrival, effect, len(pending), queue.last_ns)
     if refused is not None:
         for kind, n_refused in enumerate(np.bincount(kinds[refused]).tolist()):
             compensator.thermal.count_rejected(kind, n_refused)
         order = order[~refused[order]]
+    n_due = int(np.searchsorted(effect[order], n_samples))
+    due, waiting = order[:n_due], np.sort(order[n_due:])
     events = zip(
-        *(column[order].tolist() for column in (effect, reading_ns, kinds, values)), strict=True
+        *(column[due].tolist() for column in (effect, reading_ns, kinds, values)), strict=True
     )
     thermal = compensator.thermal
     position = 0
     for at, stamp_ns, kind, celsius in events:
         if at > position:
-            stop = min(at, n_samples)
-            _add_segments(compensator, segments, stamps, position, stop, n_seen)
+            _add_segments(compensator, segments, stamps, position, at, n_seen)
             position = at
-        if at >= n_samples:
-            compensator.push(thermal.inputs[kind], stamp_ns, celsius)
-        else:
-            thermal.apply(stamp_ns, kind, celsius)
+        thermal.apply(stamp_ns, kind, celsius)
     if position < n_samples:
         _add_segments(compensator, segments, stamps, position, n_samples, n_seen)
+    for i in waiting.tolist():
+        kind = int(kinds[i])
+        if not queue.put(int(reading_ns[i]), kind, float(values[i])):
+            thermal.count_rejected(kind, 1)
+    for kind in range(len(thermal.inputs)):
+        own_ns = reading_ns[len(pending) :][kinds[len(pending) :] == kind]
+        if len(own_ns):
+            queue.last_ns[kind] = int(own_ns[-1])
     return segments
 
 

@@ -101,7 +101,7 @@ class ThermalSide:
         self._use(calibration, self.config)
         if self.inputs != sensors:
             waiting, self.queue = self.queue.take(), ReadingQueue()
-            for stamp_ns, kind, _, celsius in sorted(waiting, key=lambda entry: entry[2]):
+            for stamp_ns, kind, _, celsius in waiting:
                 self.push(sensors[kind], stamp_ns, celsius)
         if calibration.detector == detector and self.correction.memory == old.spec:
             old.reconfigure(self._thermal_config(), now_ns)
