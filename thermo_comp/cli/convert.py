@@ -5,10 +5,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -22,14 +21,6 @@ if TYPE_CHECKING:
 _BAGS = {'.mcap', '.db3', '.bag'}
 #: Slower logs tell of soaks alone.
 _SLOW_HZ = 5.0
-
-
-class UnitChoice(str, Enum):
-    """What a driver may publish as linear acceleration."""
-
-    m_s2 = 'm/s^2'
-    g = 'g'
-    mg = 'mg'
 
 
 def convert(
@@ -57,8 +48,8 @@ def convert(
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
     unit: Annotated[
-        UnitChoice, typer.Option(help='What the Imu topic of a bag is in.')
-    ] = UnitChoice.m_s2,
+        Literal['m/s^2', 'g', 'mg'], typer.Option(help='What the Imu topic of a bag is in.')
+    ] = 'm/s^2',
     force: options.Force = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -93,10 +84,10 @@ def convert(
                 'has --topic'
             )
         read: Callable[[], ForeignLog] = partial(
-            bag_log, log, names.get('imu'), names.get('board'), names.get('case'), unit.value
+            bag_log, log, names.get('imu'), names.get('board'), names.get('case'), unit
         )
     else:
-        if names or unit is not UnitChoice.m_s2:
+        if names or unit != 'm/s^2':
             raise options.usage('--topic and --unit are for bags')
         read = _reader(log, columns, imu, baro, allow_compensated)
     with out.progress('converting', total=1.0) as done:

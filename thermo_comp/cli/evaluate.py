@@ -38,7 +38,7 @@ def evaluate(
         Path | None, typer.Option(help='File for the windows, one a line.', metavar='FILE')
     ] = None,
     serial: options.Serial = None,
-    input_: options.InputOption = options.InputChoice.auto,
+    input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
     force: options.Force = False,
@@ -82,7 +82,7 @@ def evaluate(
             window_s=window_s,
             tolerance=limit,
             topics=options.topics_of(topic, topics),
-            input=input_.value,
+            input=input_,
             serial=serial,
             progress=done,
         )

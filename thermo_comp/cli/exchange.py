@@ -6,9 +6,8 @@ Owns ``thermo_comp export`` and ``import``: a calibration to and from another to
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -21,14 +20,7 @@ from .output import Output
 _LIMIT = 4 << 20
 
 
-class Tool(str, Enum):
-    """Whose file."""
-
-    px4 = 'px4'
-    ardupilot = 'ardupilot'
-    imu_tk = 'imu_tk'
-    imu_calib = 'imu_calib'
-    kalibr = 'kalibr'
+Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
 
 def export(
@@ -76,29 +68,20 @@ def export(
     from ..unit.calibration_file import load_calibration
 
     out = Output(as_json, quiet)
-    if device_id and to is not Tool.px4:
+    if device_id and to != 'px4':
         raise options.usage('--device-id is for PX4')
-    if up is not None and to not in (Tool.px4, Tool.ardupilot):
+    if up is not None and to not in ('px4', 'ardupilot'):
         raise options.usage('--up is for PX4 and ArduPilot')
     check_output(output, PARAMETERS, overwrite=force, others=[path])
     calibration = load_calibration(path)
-    try:
-        result = export_calibration(
-            calibration, to.value, number=number, device_id=device_id, up=up
-        )
-    except ValueError as mistake:
-        raise options.usage(str(mistake)) from mistake
+    with options.usage_of():
+        result = export_calibration(calibration, to, number=number, device_id=device_id, up=up)
     write_atomically(output, result.text.encode(), PARAMETERS, overwrite=force)
-    out.line(f'{output}: parameters of {to.value} for unit {calibration.unit.serial}')
+    out.line(f'{output}: parameters of {to} for unit {calibration.unit.serial}')
     for note in result.notes:
         out.line(f'- {note}')
     out.json(
-        {
-            'output': output,
-            'to': to.value,
-            'serial': calibration.unit.serial,
-            'notes': result.notes,
-        }
+        {'output': output, 'to': to, 'serial': calibration.unit.serial, 'notes': result.notes}
     )
 
 

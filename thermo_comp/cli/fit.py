@@ -26,7 +26,7 @@ def fit(
     gravity: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
-    model: options.Model = options.ModelChoice.response,
+    model: options.Model = 'response',
     static_curve: options.StaticCurve = None,
     dynamic_curve: options.DynamicCurve = None,
     groups: Annotated[
@@ -51,9 +51,7 @@ def fit(
     ] = None,
     certificate_info: options.CertificateInfo = None,
     serial: options.NewSerial = None,
-    full_scale: Annotated[
-        float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
-    ] = None,
+    full_scale: options.FullScale = None,
     offset: Annotated[
         float | None,
         typer.Option(
@@ -61,15 +59,11 @@ def fit(
             metavar='WORD',
         ),
     ] = None,
-    reference_temperature: Annotated[
-        float, typer.Option(help='Reference temperature in degC.', min=-273.15, max=1000.0)
-    ] = 20.0,
+    reference_temperature: options.ReferenceTemperature = 20.0,
     min_rest: options.MinRest = None,
     still_sd: options.StillSd = '50mg',
-    allow: Annotated[
-        list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
-    ] = None,
-    input_: options.InputOption = options.InputChoice.auto,
+    allow: options.Allow = None,
+    input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
     force: options.Force = False,
@@ -94,34 +88,32 @@ def fit(
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
     """
     from ..files import CALIBRATION, PAGE, check_output
-    from ..fitting import FitOptions, resolve_gravity
+    from ..fitting import FitOptions
     from ..fitting import fit as run
     from ..fitting.fit_sources import fit_sources
     from ..fitting.options import Ageing
     from ..unit.calibration_file import load_calibration, save_calibration
 
     out = Output(as_json, quiet)
-    gravity = options.place(gravity, latitude, height)
-    if gravity is None:
-        raise options.usage('give --gravity, or --latitude and --height')
+    gravity = options.needed_place(gravity, latitude, height)
     inputs = bags if prior is None else [*bags, prior]
     check_output(output, CALIBRATION, overwrite=force, others=inputs)
     if report is not None:
         check_output(report, PAGE, overwrite=force, others=[*inputs, output])
     if certificate_info is not None and report is None:
         raise options.usage('--certificate-info fills the page of --report: give that, too')
-    sources, kind = fit_sources(bags, options.topics_of(topic, topics), input_.value, serial)
+    sources, kind = fit_sources(bags, options.topics_of(topic, topics), input_, serial)
     info = None
     if certificate_info is not None:
         from ..report import load_certificate_info
 
         info = load_certificate_info(certificate_info, serial or sources[0].serial)
-    try:
+    with options.usage_of():
         settings = FitOptions(
-            gravity=resolve_gravity(gravity, None, None),
-            model=model.value,
-            static_curve=static_curve.value if static_curve else None,
-            dynamic_curve=dynamic_curve.value if dynamic_curve else None,
+            gravity=gravity,
+            model=model,
+            static_curve=static_curve,
+            dynamic_curve=dynamic_curve,
             groups=None if groups is None else _names(groups),
             forced=_names(force_groups),
             prior=None if prior is None else load_calibration(prior),
@@ -137,8 +129,6 @@ def fit(
             still_sd=options.acceleration(still_sd, '--still-sd') or 0.0,
             allow=tuple(allow or ()),
         )
-    except ValueError as mistake:
-        raise options.usage(str(mistake)) from mistake
     with out.progress('fitting', total=1.0) as done:
         result = run(sources, settings, lambda _stage, part: done(part))
     for source in sources:

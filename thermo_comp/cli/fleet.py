@@ -57,19 +57,13 @@ def fit(
         list[Path] | None,
         typer.Option(help='fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
     ] = None,
-    model: options.Model = options.ModelChoice.response,
-    full_scale: Annotated[
-        float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
-    ] = None,
-    reference_temperature: Annotated[
-        float, typer.Option(help='Reference temperature [degC].')
-    ] = 20.0,
+    model: options.Model = 'response',
+    full_scale: options.FullScale = None,
+    reference_temperature: options.ReferenceTemperature = 20.0,
     min_rest: options.MinRest = None,
     still_sd: options.StillSd = '50mg',
-    allow: Annotated[
-        list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
-    ] = None,
-    input_: options.InputOption = options.InputChoice.auto,
+    allow: options.Allow = None,
+    input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
     as_json: options.Json = False,
@@ -92,14 +86,12 @@ def fit(
     from ..fleet import FleetOptions, fit_fleet, read_parquet
 
     out = Output(as_json, quiet)
-    gravity = options.place(gravity, latitude, height)
-    if gravity is None:
-        raise options.usage('give --gravity, or --latitude and --height')
-    try:
+    gravity = options.needed_place(gravity, latitude, height)
+    with options.usage_of():
         settings = FleetOptions(
             fit=FitOptions(
                 gravity=gravity,
-                model=model.value,
+                model=model,
                 full_scale=full_scale,
                 reference_temperature=reference_temperature,
                 min_rest_s=min_rest,
@@ -107,11 +99,9 @@ def fit(
                 allow=tuple(allow or ()),
             ),
             topics=options.topics_of(topic, topics),
-            input=input_.value,
+            input=input_,
             certificates=certificates,
         )
-    except ValueError as mistake:
-        raise options.usage(str(mistake)) from mistake
     before = [row for path in earlier or () for row in read_parquet(path)]
     with out.progress('fitting', total=1.0) as done:
         result = fit_fleet(

@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,38 +18,16 @@ if TYPE_CHECKING:
     from ..recording import Topics
 
 
-class InputChoice(str, Enum):
-    """What the accelerometer's messages are."""
-
-    auto = 'auto'
-    counts = 'counts'
-    imu = 'imu'
-
-
-class ModelChoice(str, Enum):
-    """The models of a fit."""
-
-    response = 'response'
-    golovach = 'golovach'
-
-
-class CurveChoice(str, Enum):
-    """The families of curves over temperature."""
-
-    linear = 'linear'
-    quadratic = 'quadratic'
-    cubic = 'cubic'
-    spline = 'spline'
-    exponential = 'exponential'
+InputChoice = Literal['auto', 'counts', 'imu']
+ModelChoice = Literal['response', 'golovach']
+CurveChoice = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
 
 def check_serial(serial: str | None) -> str | None:
     """Refuse what can be no serial; an empty one is for the command to judge."""
     if serial:
-        try:
+        with usage_of():
             valid_serial(serial)
-        except ValueError as mistake:
-            raise usage(str(mistake)) from mistake
     return serial
 
 
@@ -102,6 +81,21 @@ NewSerial = Annotated[
     str | None,
     typer.Option('--serial', help="Serial, instead of the bags'.", callback=check_serial),
 ]
+FullScale = Annotated[
+    float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
+]
+ReferenceTemperature = Annotated[
+    float, typer.Option(help='Reference temperature in degC.', min=-273.15, max=1000.0)
+]
+Allow = Annotated[
+    list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
+]
+Program = Annotated[
+    str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
+]
+JudgedBags = Annotated[
+    list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
+]
 Window = Annotated[
     float, typer.Option('--window', help='Length of a window at rest, in s.', metavar='S')
 ]
@@ -114,7 +108,6 @@ Tolerance = Annotated[
         '--tolerance', help='Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'
     ),
 ]
-
 AgeingBias = Annotated[
     str | None,
     typer.Option(help="What the biases may have changed by since the prior's: 50ug, 0.1mg."),
@@ -137,10 +130,8 @@ def acceleration(text: str | None, name: str = '--tolerance') -> float | None:
     """Read an acceleration with its unit [m/s^2]; None where none is given."""
     from ..unit.gravity import parse_acceleration
 
-    try:
+    with usage_of(f'{name}: '):
         return None if text is None else parse_acceleration(text)
-    except ValueError as mistake:
-        raise usage(f'{name}: {mistake}') from mistake
 
 
 def positive(value: float, name: str) -> float:
@@ -174,31 +165,41 @@ def topics_of(given: list[str] | None, profile: Path | None) -> Topics:
     """Read where the inputs stand in a bag."""
     from ..recording import Topics
 
-    try:
+    with usage_of('--topic: '):
         return Topics.named(named_topics(given, profile))
-    except ValueError as mistake:
-        raise usage(f'--topic: {mistake}') from mistake
 
 
 def place(gravity: float | None, latitude: float | None, height: float | None) -> float | None:
-    """
-    Return local gravity from what the user gave of it, None where that is nothing; a usage mistake
-    where latitude or height stands alone.
-    """
-    if gravity is not None:
+    """Return local gravity, None where nothing was given; latitude and height go together."""
+    if gravity is not None or (latitude is None and height is None):
         return gravity
-    if (latitude is None) != (height is None):
-        raise usage('give --gravity, or --latitude and --height')
     if latitude is None or height is None:
-        return None
+        raise usage('give --gravity, or --latitude and --height')
     from ..fitting import normal_gravity
 
-    try:
+    with usage_of():
         return normal_gravity(latitude, height)
-    except ValueError as mistake:
-        raise usage(str(mistake)) from mistake
+
+
+def needed_place(gravity: float | None, latitude: float | None, height: float | None) -> float:
+    """Return local gravity where a command cannot do without; FitError where it is none."""
+    from ..fitting import resolve_gravity
+
+    known = place(gravity, latitude, height)
+    if known is None:
+        raise usage('give --gravity, or --latitude and --height')
+    return resolve_gravity(known, None, None)
 
 
 def usage(message: str, **context: Any) -> typer.BadParameter:
     """Return a mistake in the command line, to be raised: exit code 2."""
     return typer.BadParameter(message, **context)
+
+
+@contextmanager
+def usage_of(what: str = '') -> Iterator[None]:
+    """Take a ValueError of the block for a mistake in the command line."""
+    try:
+        yield
+    except ValueError as mistake:
+        raise usage(f'{what}{mistake}') from mistake

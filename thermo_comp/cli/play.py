@@ -29,7 +29,7 @@ def play(
     wait: Annotated[
         float, typer.Option(help='Longest wait for a subscriber on every topic, in s.', min=0.0)
     ] = 10.0,
-    input_: options.InputOption = options.InputChoice.auto,
+    input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
     as_json: options.Json = False,
@@ -61,7 +61,7 @@ def play(
             clock=clock,
             wait_s=wait,
             topics=options.topics_of(topic, topics),
-            input=input_.value,
+            input=input_,
             ros_args=context.obj or (),
             progress=done,
         )

@@ -42,7 +42,7 @@ def replay(
     case_timeout: Annotated[
         float | None, typer.Option(help='As the parameter of the node, in s.')
     ] = None,
-    input_: options.InputOption = options.InputChoice.auto,
+    input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
     force: options.Force = False,
@@ -72,10 +72,8 @@ def replay(
         'temperature_timeout_s': temperature_timeout,
         'case_timeout_s': case_timeout,
     }
-    try:
+    with options.usage_of():
         config = CompensatorConfig(**{k: v for k, v in given.items() if v is not None})
-    except ValueError as mistake:
-        raise options.usage(str(mistake)) from mistake
     kind = TABLES.get(output.suffix) or bag_kind(output, ', *.csv, *.parquet')
     if output.suffix in TABLES and (keep_inputs or all_topics):
         raise options.usage('--keep-inputs and --all-topics are for bags')
@@ -87,7 +85,7 @@ def replay(
             output,
             config=config,
             topics=options.topics_of(topic, topics),
-            input=input_.value,
+            input=input_,
             serial=serial,
             frame_id=frame_id,
             keep_inputs=keep_inputs,

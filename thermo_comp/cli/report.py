@@ -17,9 +17,7 @@ from .output import Output
 
 def report(
     output: Annotated[Path, typer.Option('--output', '-o', help='Page to write (HTML).')],
-    bags: Annotated[
-        list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
-    ] = None,
+    bags: options.JudgedBags = None,
     calibration: Annotated[
         list[Path] | None,
         typer.Option(
@@ -36,10 +34,8 @@ def report(
     window: options.Window = 60.0,
     tolerance: options.Tolerance = None,
     serial: options.Serial = None,
-    program: Annotated[
-        str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
-    ] = None,
-    input_: options.InputOption = options.InputChoice.auto,
+    program: options.Program = None,
+    input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
     force: options.Force = False,
@@ -80,7 +76,7 @@ def report(
         info = load_certificate_info(
             certificate_info, None if loaded is None else loaded.unit.serial
         )
-    kind = input_.value if loaded is None else input_for(loaded, input_.value)
+    kind = input_ if loaded is None else input_for(loaded, input_)
     opened = []
     with out.progress('reading', total=max(len(paths), 1)) as done:
         for number, path in enumerate(paths):
@@ -95,7 +91,7 @@ def report(
                     progress=partial(_tell, done, number),
                 )
             )
-    try:
+    with options.usage_of():
         evidence = evidence_of_bags(
             opened,
             loaded,
@@ -106,8 +102,6 @@ def report(
             program=program,
             others=known[1:],
         )
-    except ValueError as mistake:
-        raise options.usage(str(mistake)) from mistake
     is_torn = out.told(bag.info for bag in opened)
     write_report(evidence, output, info=info, figures=figures, overwrite=force)
     for finding in evidence.findings:

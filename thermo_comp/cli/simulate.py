@@ -90,7 +90,7 @@ def simulate(
     from ..files import bag_kind, check_output
 
     out = Output(as_json, quiet)
-    try:
+    with options.usage_of():
         specimen = simulation.unit_preset(unit, unit_seed)
         if plan is None:
             program = simulation.parse_cyclogram(profile)
@@ -98,8 +98,6 @@ def simulate(
             stations = tuple(simulation.Position(profile, program, up) for up in ups)
         else:
             stations = simulation.plan(plan, position_seed)
-    except ValueError as mistake:
-        raise options.usage(str(mistake)) from mistake
     if sibling is not None:
         specimen = specimen.sibling(sibling)
     n = len(stations)

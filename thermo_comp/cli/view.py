@@ -20,9 +20,7 @@ def view(
     calibration: Annotated[
         Path, typer.Argument(help='Calibration of the unit (YAML).', metavar='YAML')
     ],
-    bags: Annotated[
-        list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
-    ] = None,
+    bags: options.JudgedBags = None,
     port: Annotated[
         int, typer.Option(help='Port on this machine; 0 takes any free one.', min=0, max=65535)
     ] = 8042,
@@ -33,10 +31,8 @@ def view(
     latitude: options.Latitude = None,
     height: options.Height = None,
     serial: options.Serial = None,
-    program: Annotated[
-        str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
-    ] = None,
-    input_: options.InputOption = options.InputChoice.auto,
+    program: options.Program = None,
+    input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
     quiet: options.Quiet = False,
@@ -61,7 +57,7 @@ def view(
         calibration,
         bags or [],
         options.topics_of(topic, topics),
-        input_.value,
+        input_,
         gravity=options.place(gravity, latitude, height),
         serial=serial,
         program=program,
