@@ -10,8 +10,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set, term
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
 from matplotlib.container import ErrorbarContainer
@@ -34,43 +32,12 @@ from thermo_comp.report.figures_unit import (
     step_answer,
 )
 from thermo_comp.report.page import position_error, schuler_peak
-from thermo_comp.report.style import NARROW, WIDE, drawing, svg, thin
+from thermo_comp.report.style import NARROW, WIDE, drawing, svg
 from thermo_comp.report.text import label_text, number
 from thermo_comp.report.trace import thermal_trace
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.gravity import MICRO_G
-
-
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(1, 20))
-@settings(max_examples=60, deadline=None)
-def test_thinning_loses_no_extreme(values, n_bins):
-    time = np.arange(len(values), dtype=float)
-    value = np.array(values)
-    thin_time, thin_value = thin(time, value, n_bins)
-    assert len(thin_time) <= max(3 * n_bins, 2 * n_bins + 1, 1)
-    assert np.all(np.diff(thin_time) >= 0.0)
-    # Every kept point is one of the series, and the extremes of each stretch are kept.
-    assert np.array_equal(thin_value, value[thin_time.astype(int)])
-    edges = np.linspace(0.0, max(time[-1], 1e-9), n_bins + 1)
-    stretch = np.clip(np.searchsorted(edges, time, side='right') - 1, 0, n_bins - 1)
-    kept = np.clip(np.searchsorted(edges, thin_time, side='right') - 1, 0, n_bins - 1)
-    for one in np.unique(stretch):
-        inside, left = value[stretch == one], thin_value[kept == one]
-        # A point on an edge may fall to either side of it by rounding.
-        if len(left):
-            assert left.max() >= np.sort(inside)[-2:].min() or len(inside) < 3
-    assert thin_value.max() == value.max()
-    assert thin_value.min() == value.min()
-
-
-def test_thinning_keeps_gaps():
-    time = np.arange(1000.0)
-    value = np.where((time > 300) & (time < 600), np.nan, time)
-    thin_time, thin_value = thin(time, value, 20)
-    (gap,) = np.flatnonzero(np.isnan(thin_value))
-    assert thin_time[gap - 1] == 300
-    assert thin_time[gap + 1] == 600
 
 
 def test_bias_and_scale_curves_by_hand():

@@ -107,7 +107,8 @@ def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnFigure]:
             partial(draw_shares, curves),
         )
     ]
-    if len(fitted) > 2:
+    # Of few units nobody knows what is usual.
+    if np.isfinite(summary.limit):
         labels, z, names = zip(
             *((one.quantity.label, one.z, one.names) for one in summary.spreads), strict=True
         )

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,8 @@ from ..typing import Floats, Ints
 from ..unit.calibration import Calibration, Source
 from ..unit.metrics import norm_residual
 from .trace import ThermalTrace
+
+_T = TypeVar('_T')
 
 #: What is set side by side: the constants at the reference temperature, and the calibration.
 RAW = 'raw'
@@ -197,6 +199,13 @@ class Evidence:
         _, place = np.unique(windows.position, return_inverse=True)
         true = ups[place]
         return {name: force - true for name, force in self.forces.items()}
+
+
+def given(value: _T | None) -> _T:
+    """Return what a figure draws, which is drawn only where it is there."""
+    if value is None:
+        raise ValueError('`evidence` lacks what is to be drawn')
+    return value
 
 
 def means_by(labels: Ints, values: Floats) -> Floats:

@@ -81,10 +81,8 @@ def figures_of(evidence: Evidence) -> list[ReportFigure]:
             'histograms',
             'Is what is left noise, or is there something to model?',
             draw_histograms,
-            '|f| − g over all windows of all positions. Left: bars by regime, with the normal '
-            'distribution of the same mean and spread; where they follow the line, what is left '
-            'is noise. Right: the size of the residual without and with the correction, on a '
-            'logarithmic axis; the further left, the better.',
+            '|f| − g over all windows of all positions, by regime, with the normal distribution '
+            'of the same mean and spread. Where the bars follow the line, what is left is noise.',
         )
         if len(evidence.positions) > 1:
             add(

@@ -67,8 +67,7 @@ def draw_distances(
     """
     figure = new_figure(sheet, 0.6 + 0.19 * len(labels))
     axes = figure.subplots()
-    far = max((float(np.max(np.abs(z), initial=0.0)) for z in distances), default=0.0)
-    shown = min(max(1.15 * limit, 4.0), 12.0) if np.isfinite(limit) else max(4.0, far)
+    shown = min(max(1.15 * limit, 4.0), 12.0)
     n_named = 0
     for row, (z, units) in enumerate(zip(distances, names, strict=True)):
         at = np.clip(z, -1.04 * shown, 1.04 * shown)
@@ -87,8 +86,7 @@ def draw_distances(
                 fontsize=7,
             )
     for edge in (-limit, limit):
-        if np.isfinite(edge):
-            axes.axvline(edge, color=BLACK, linewidth=0.8, linestyle=(0, (5, 2)))
+        axes.axvline(edge, color=BLACK, linewidth=0.8, linestyle=(0, (5, 2)))
     axes.set_xlim(-1.1 * shown, 1.1 * shown)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_yticks(range(len(labels)), labels)

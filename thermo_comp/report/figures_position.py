@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..unit.gravity import MICRO_G
-from .evidence import LEFT_OUT, RAW, Evidence, Position
+from .evidence import LEFT_OUT, RAW, Evidence, Position, given
 from .style import BLACK, RED, Line, Sheet, legend_above, log_axis, new_figure, time_unit
 from .text import number
 
@@ -22,10 +22,8 @@ _MOST = 24
 
 def draw_every_position(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw what is left of |f| over the time in every position, or in those with most of it."""
-    windows, residuals = evidence.windows, evidence.residuals
-    if windows is None or not residuals:
-        raise ValueError('`evidence` has no residuals')
-    judged, residual = list(residuals.items())[-1]
+    windows = given(evidence.windows)
+    judged, residual = list(evidence.residuals.items())[-1]
     worst = sorted(evidence.positions, key=lambda one: -one.residual_rms[judged])[:_MOST]
     shown = sorted(worst, key=lambda one: one.number)
     numbers = np.unique(windows.position)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of the residuals: the paper's Fig. 6 and Fig. 7, and the histograms."""
+"""Owns the figures of the residuals: the paper's Fig. 6 and Fig. 7, and how they scatter."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from ..typing import Bools, Floats
 from ..unit.gravity import MICRO_G
-from .evidence import RAW, Evidence
+from .evidence import RAW, Evidence, given
 from .figures_thermal import plot_windows, shade_dynamic, shown_bag, time_axis
 from .style import (
     AXIS_LINES,
@@ -22,7 +22,6 @@ from .style import (
     Sheet,
     few_ticks,
     legend_above,
-    log_axis,
     new_figure,
     time_unit,
 )
@@ -33,10 +32,8 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw the residual of each axis, without and with the calibration (the paper's Fig. 6)."""
     shown, facts = shown_bag(evidence)
     unit, _ = time_unit(facts.duration_s)
-    windows = evidence.windows
+    windows = given(evidence.windows)
     residuals = evidence.axis_residuals()
-    if windows is None or not residuals:
-        raise ValueError('`evidence` has no residuals')
     rows = windows.bag == shown.index
     height = 1.25 if sheet.is_narrow else 1.05
     figure = new_figure(sheet, 0.5 + height * len(residuals))
@@ -46,7 +43,7 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
         shade_dynamic(axes, shown, unit)
         for i, axis in enumerate('xyz'):
             value = residual[:, i] / MICRO_G
-            plot_windows(axes, windows, rows, value, unit, sheet, label=axis, **AXIS_LINES[i])
+            plot_windows(axes, windows, rows, value, unit, label=axis, **AXIS_LINES[i])
         axes.set_ylabel('µg')
         axes.axhline(0.0, color='black', linewidth=0.5)
         few_ticks(axes, 5)
@@ -67,10 +64,8 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw |f| over time, before and after, and after in detail (the paper's Fig. 7)."""
     shown, facts = shown_bag(evidence)
     unit, _ = time_unit(facts.duration_s)
-    windows = evidence.windows
+    windows, gravity = given(evidence.windows), given(evidence.gravity)
     residuals = evidence.residuals
-    if windows is None or evidence.gravity is None or not residuals:
-        raise ValueError('`evidence` has no |f|')
     rows = windows.bag == shown.index
     rungs = list(residuals)
     corrected = [rung for rung in rungs if rung != RAW]
@@ -81,10 +76,10 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
         shade_dynamic(axes, shown, unit)
         for rung in drawn:
             value = residuals[rung] / MICRO_G
-            plot_windows(axes, windows, rows, value, unit, sheet, label=rung, **RUNG_LINES[rung])
+            plot_windows(axes, windows, rows, value, unit, label=rung, **RUNG_LINES[rung])
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_ylabel('|f| − g, µg')
-        _absolute_scale(axes, evidence.gravity)
+        _absolute_scale(axes, gravity)
         legend_above(axes, sheet)
     if corrected:
         limit = _shared_limit([residuals[rung][rows][:, None] for rung in corrected])
@@ -94,48 +89,26 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
 
 
 def draw_histograms(evidence: Evidence, sheet: Sheet) -> Figure:
-    """Draw how the residuals are distributed: the calibration's by regime, and all by size."""
-    windows = evidence.windows
-    residuals = evidence.residuals
-    if windows is None or not residuals:
-        raise ValueError('`evidence` has no residuals')
-    judged = next(reversed(residuals))
-    parts = _by_regime(residuals[judged] / MICRO_G, windows.is_dynamic)
-    height = 1.5 * len(parts)
-    if sheet.is_narrow:
-        figure = new_figure(sheet, height + 2.6)
-        grid = figure.add_gridspec(len(parts) + 1, 1, height_ratios=[*[1.0] * len(parts), 1.5])
-        places = [grid[i, 0] for i in range(len(parts) + 1)]
-    else:
-        figure = new_figure(sheet, max(height, 2.6))
-        grid = figure.add_gridspec(len(parts), 2)
-        places = [*(grid[i, 0] for i in range(len(parts))), grid[:, 1]]
-    for place, (label, values, line) in zip(places, parts, strict=False):
-        axes = figure.add_subplot(place)
-        _draw_signed(axes, values, line)
-        axes.set_title(f'{judged}, {label}: sd {number(float(values.std()))} µg')
-    axes.set_xlabel('|f| − g, µg')
-    right = figure.add_subplot(places[-1])
-    low, high = _size_range(residuals)
-    edges = np.logspace(np.log10(low), np.log10(high), 41)
-    for rung, residual in residuals.items():
-        size = np.abs(residual) / MICRO_G
-        share = np.histogram(size, edges)[0] / max(len(size), 1) * 100.0
-        right.stairs(share, edges, label=rung, baseline=None, **RUNG_LINES[rung])
-    log_axis(right, low, high)
-    right.set_ylim(0.0, None)
-    right.set_xlabel('size of |f| − g, µg')
-    right.set_ylabel('share of windows, %')
-    legend_above(right, sheet, share=1.0 if sheet.is_narrow else 0.5)
-    return figure
-
-
-def _by_regime(residual: Floats, is_dynamic: Bools) -> list[tuple[str, Floats, Line]]:
-    found = [
-        ('static', residual[~is_dynamic], STATIC_LINE),
-        ('dynamic', residual[is_dynamic], DYNAMIC_LINE),
+    """Draw how what is left is distributed, by regime."""
+    name, residual = list(evidence.residuals.items())[-1]
+    dynamic = given(evidence.windows).is_dynamic
+    parts = [
+        (label, residual[rows] / MICRO_G, line)
+        for label, rows, line in (
+            ('static', ~dynamic, STATIC_LINE),
+            ('dynamic', dynamic, DYNAMIC_LINE),
+        )
+        if rows.any()
     ]
-    return [part for part in found if len(part[1])]
+    figure = new_figure(sheet, 2.0 * len(parts) if sheet.is_narrow else 2.0)
+    shape = (len(parts), 1) if sheet.is_narrow else (1, len(parts))
+    for axes, (label, values, line) in zip(
+        np.atleast_1d(figure.subplots(*shape)), parts, strict=True
+    ):
+        _draw_signed(axes, values, line)
+        axes.set_title(f'{name}, {label}: sd {number(float(values.std()))} µg')
+        axes.set_xlabel('|f| − g, µg')
+    return figure
 
 
 def _draw_signed(axes: Axes, values: Floats, line: Line) -> None:
@@ -156,16 +129,6 @@ def _draw_signed(axes: Axes, values: Floats, line: Line) -> None:
     axes.set_ylabel('windows, %')
     axes.xaxis.set_major_locator(MaxNLocator(6))
     few_ticks(axes, 4)
-
-
-def _size_range(residuals: dict[str, Floats]) -> tuple[float, float]:
-    """
-    Range of sizes worth showing [micro-g]: all that is large, and the small without its tail.
-    """
-    sizes = [np.abs(residual) / MICRO_G for residual in residuals.values()]
-    low = max(min(float(np.quantile(size, 0.02)) for size in sizes), 1e-2)
-    high = max(float(np.max(size)) for size in sizes)
-    return low, max(high, 2.0 * low)
 
 
 def _shared_limit(residuals: list[Floats]) -> float:

@@ -14,7 +14,7 @@ from ..judging import Windows
 from ..thermal.regime import Regime
 from ..typing import Bools, Floats
 from ..unit.gravity import MICRO_G
-from .evidence import BagFacts, Evidence, ShownBag
+from .evidence import BagFacts, Evidence, ShownBag, given
 from .style import (
     AXIS_LINES,
     BOARD_LINE,
@@ -25,7 +25,6 @@ from .style import (
     few_ticks,
     legend_above,
     new_figure,
-    plot_thinned,
     time_unit,
 )
 
@@ -38,9 +37,8 @@ _SHADE = '#E9E9E9'
 
 def shown_bag(evidence: Evidence) -> tuple[ShownBag, BagFacts]:
     """Return the bag of the time figures and its facts."""
-    if evidence.shown is None:
-        raise ValueError('`evidence` has no bag to show')
-    return evidence.shown, evidence.bags[evidence.shown.index]
+    shown = given(evidence.shown)
+    return shown, evidence.bags[shown.index]
 
 
 def shade_dynamic(axes: Axes, shown: ShownBag, unit: float) -> None:
@@ -56,17 +54,11 @@ def shade_dynamic(axes: Axes, shown: ShownBag, unit: float) -> None:
 
 
 def plot_windows(
-    axes: Axes,
-    windows: Windows,
-    rows: Bools,
-    value: Floats,
-    unit: float,
-    sheet: Sheet,
-    **line: Any,
+    axes: Axes, windows: Windows, rows: Bools, value: Floats, unit: float, **line: Any
 ) -> None:
     """Draw a value of some windows over time, with a gap between positions."""
     time, value = broken(windows.time[rows], value[rows], windows.position[rows])
-    plot_thinned(axes, time / unit, value, sheet, **line)
+    axes.plot(time / unit, value, **line)
 
 
 def time_axis(axes: Axes, facts: BagFacts) -> None:
@@ -93,7 +85,7 @@ def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
     ):
         if len(readings.value):
             seconds: Floats = np.asarray((readings.stamp_ns - shown.start_ns) * 1e-9, np.float64)
-            plot_thinned(axes, seconds / unit, readings.value, sheet, label=label, **line)
+            axes.plot(seconds / unit, readings.value, label=label, **line)
     time_axis(axes, facts)
     axes.set_ylabel('temperature, °C')
     legend_above(axes, sheet)
@@ -122,12 +114,12 @@ def draw_dynamics(evidence: Evidence, sheet: Sheet) -> Figure:
         ('dT board/dt', trace.board_rate, BOARD_LINE),
     ):
         if np.isfinite(rate).any():
-            plot_thinned(rates, time, rate * _PER_MINUTE, sheet, label=label, **line)
+            rates.plot(time, rate * _PER_MINUTE, label=label, **line)
     rates.set_ylabel('K/min')
     legend_above(rates, sheet, title='b  first derivatives', alignment='left')
     sensor = 'case' if trace.is_case_leading else 'board'
     line = CASE_LINE if trace.is_case_leading else BOARD_LINE
-    plot_thinned(bend, time, trace.case_acceleration * _PER_MINUTE2, sheet, **line)
+    bend.plot(time, trace.case_acceleration * _PER_MINUTE2, **line)
     bend.set_ylabel('K/min²')
     bend.set_title(f'second derivative of T {sensor}')
     few_ticks(bend, 4)
@@ -141,12 +133,10 @@ def _draw_drift(
     axes: Axes, evidence: Evidence, shown: ShownBag, sheet: Sheet, unit: float
 ) -> None:
     drift, unit_name = reading_drift(evidence)
-    windows = evidence.windows
-    if windows is None:
-        return
+    windows = given(evidence.windows)
     rows = windows.bag == shown.index
     for i, axis in enumerate('xyz'):
-        plot_windows(axes, windows, rows, drift[:, i], unit, sheet, label=axis, **AXIS_LINES[i])
+        plot_windows(axes, windows, rows, drift[:, i], unit, label=axis, **AXIS_LINES[i])
     axes.set_ylabel(unit_name)
     legend_above(axes, sheet, title='a  drift of the readings since the start', alignment='left')
 
@@ -156,9 +146,7 @@ def reading_drift(evidence: Evidence) -> tuple[Floats, str]:
     Give the change of the raw readings within each position since it began, shape (n, 3), and its
     unit: micro-g where the scale factor is known, otherwise raw units.
     """
-    windows = evidence.windows
-    if windows is None:
-        return np.zeros((0, 3)), ''
+    windows = given(evidence.windows)
     drift = windows.mean.copy()
     for p in np.unique(windows.position):
         rows = windows.position == p

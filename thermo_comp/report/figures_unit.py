@@ -17,7 +17,7 @@ from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
-from .evidence import CHOSEN, Evidence, means_by
+from .evidence import CHOSEN, Evidence, given, means_by
 from .style import (
     AXIS_LINES,
     BLACK,
@@ -41,15 +41,9 @@ _STEP_MINUTES = (0.2, 500.0)
 _POINT: Line = {'color': BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
 
 
-def _calibration(evidence: Evidence) -> Calibration:
-    if evidence.calibration is None:
-        raise ValueError('`evidence` has no calibration')
-    return evidence.calibration
-
-
 def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw bias and scale over temperature, less a line, with bands and measurements."""
-    calibration = _calibration(evidence)
+    calibration = given(evidence.calibration)
     rows, columns = (6, 1) if sheet.is_narrow else (2, 3)
     figure = new_figure(sheet, 10.2 if sheet.is_narrow else 4.4)
     panels = np.array(figure.subplots(rows, columns, sharex=True)).reshape(2, 3)
@@ -202,7 +196,7 @@ def _draw_band(axes: Axes, curve: Curve, value: Floats, half: Floats) -> None:
 
 def draw_step(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw what a step of the temperature does to each axis over time."""
-    calibration = _calibration(evidence)
+    calibration = given(evidence.calibration)
     minutes, bias, scale = step_answer(calibration)
     figure = new_figure(sheet, 4.4 if sheet.is_narrow else 2.5)
     panels = figure.subplots(*((2, 1) if sheet.is_narrow else (1, 2)))
@@ -234,7 +228,7 @@ def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 
 def draw_hysteresis(evidence: Evidence, sheet: Sheet) -> Figure:
     """Draw the loop of each axis' bias in a slow run through the range and back."""
-    temperature, heating, cooling = hysteresis_loop(_calibration(evidence))
+    temperature, heating, cooling = hysteresis_loop(given(evidence.calibration))
     figure = new_figure(sheet, 5.6 if sheet.is_narrow else 2.5)
     panels = figure.subplots(*((3, 1) if sheet.is_narrow else (1, 3)), sharex=True, sharey=True)
     for i, axes in enumerate(panels):

@@ -79,22 +79,23 @@ _RC: dict[str, Any] = {
     'text.usetex': False,
     'svg.fonttype': 'none',
     'svg.hashsalt': 'thermo_comp',
+    # Of many points in one pixel those at its ends are drawn.
     'path.simplify': True,
+    'path.simplify_threshold': 0.5,
 }
 _PNG_DPI = 160
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """The paper of a figure: its width in inches, and how many pixels a line may use across."""
+    """The paper of a figure: its width in inches."""
 
     width: float
-    n_bins: int
     is_narrow: bool  # a phone's screen: panels stand below each other
 
 
-WIDE = Sheet(7.1, 420, False)
-NARROW = Sheet(3.75, 220, True)
+WIDE = Sheet(7.1, False)
+NARROW = Sheet(3.75, True)
 
 
 @contextmanager
@@ -154,39 +155,6 @@ def time_unit(duration_s: float) -> tuple[float, str]:
     if duration_s >= 300.0:
         return 60.0, 'time, min'
     return 1.0, 'time, s'
-
-
-def thin(time: Floats, value: Floats, n_bins: int) -> tuple[Floats, Floats]:
-    """
-    Keep, of each of `n_bins` equal stretches of time, the lowest and the highest point.
-
-    So a line through the result covers the same pixels as a line through all points, and no
-    spike is lost. Where values are missing a NaN stays, so that the line breaks there.
-    """
-    use = np.isfinite(value)
-    if len(time) <= 2 * n_bins or not use.any():
-        return time, np.where(use, value, np.nan)
-    width = (float(time[-1]) - float(time[0])) / n_bins
-    bins = np.minimum(((time - time[0]) / width).astype(np.int64), n_bins - 1)
-    kept, at, found = bins[use], time[use], value[use]
-    order = np.lexsort((found, kept))
-    first = np.flatnonzero(np.concatenate(([True], np.diff(kept[order]) > 0)))
-    last = np.concatenate((first[1:], [len(order)])) - 1
-    rows = np.unique(np.concatenate((order[first], order[last])))
-    times, values = at[rows], found[rows]
-    # A missing stretch: not thinned away, because a line must not cross it.
-    broken = np.flatnonzero(~use & np.concatenate(([True], use[:-1])))
-    if len(broken):
-        times = np.concatenate((times, time[broken]))
-        values = np.concatenate((values, np.full(len(broken), np.nan)))
-        by_time = np.argsort(times, kind='stable')
-        times, values = times[by_time], values[by_time]
-    return times, values
-
-
-def plot_thinned(axes: Axes, time: Floats, value: Floats, sheet: Sheet, **line: Any) -> None:
-    """Draw a long series with no more points than the sheet has pixels."""
-    axes.plot(*thin(time, value, sheet.n_bins), **line)
 
 
 def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]:
