@@ -179,7 +179,7 @@ class TestPage:
     def test_a_fleet_without_a_calibration(self) -> None:
         rows = [empty_row(name='u', serial='u', verdict='failed', problem='x: damaged')]
         page = render_fleet(rows, summarise(rows), lambda _: '')
-        assert '0 of 1 tests gave a calibration.' in page
+        assert '0 of 1 test gave a calibration.' in page
         assert '<figure' not in page
 
 

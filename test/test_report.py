@@ -26,6 +26,7 @@ from thermo_comp.report import Evidence, evidence_of_bags, evidence_of_fit, writ
 from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.figures import figures_of, png_files
 from thermo_comp.report.page import render_page
+from thermo_comp.report.text import spelt
 from thermo_comp.simulation import STANDARD_GRAVITY, parse_cyclogram
 from thermo_comp.thermal.regime import Regime
 
@@ -148,11 +149,11 @@ def test_bag_says_whether_its_fit_has_seen_it(bag):
     calibration = fitted().calibration
     assert 'positions in bags of its own fit' in Page(certificate()).text
     unseen = evidence_of_bags([open_bag(bag)], calibration)
-    assert 'positions in bags that the fit has not seen' in words_of(unseen).text
+    assert '1 position in bags that the fit has not seen' in words_of(unseen).text
     sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].sha256),)
     provenance = replace(calibration.provenance, sources=sources)
     seen = evidence_of_bags([open_bag(bag)], replace(calibration, provenance=provenance))
-    assert 'positions in bags of its own fit' in words_of(seen).text
+    assert '1 position in bags of its own fit' in words_of(seen).text
 
 
 def test_bag_alone_shows_temperatures_derivatives_and_flag(bag, tmp_path):
@@ -299,7 +300,7 @@ def test_verdict_and_its_colour(bag):
     assert (strict.level, strict.judgement.verdict) == ('poor', 'recalibrate')
     page = words_of(strict)
     assert '<section class="verdict poor"' in page.source
-    assert strict.judgement.reason.replace(' ug', ' µg') in page.text
+    assert spelt(strict.judgement.reason) in page.text
 
 
 def test_another_units_calibration_is_refused(bag):

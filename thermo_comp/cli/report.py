@@ -55,7 +55,6 @@ def report(
     from ..files import PAGE, check_output
     from ..judging import open_bag
     from ..judging.history import drifts_of
-    from ..replay import input_for
     from ..report import evidence_of_bags, load_certificate_info, write_report
     from ..unit.calibration_file import load_calibration
 
@@ -76,7 +75,6 @@ def report(
         info = load_certificate_info(
             certificate_info, None if loaded is None else loaded.unit.serial
         )
-    kind = input_ if loaded is None else input_for(loaded, input_)
     opened = []
     with out.progress('reading', total=max(len(paths), 1)) as done:
         for number, path in enumerate(paths):
@@ -84,7 +82,7 @@ def report(
                 open_bag(
                     path,
                     where,
-                    kind,
+                    input_,
                     number=number,
                     window_s=window,
                     calibration=loaded,

@@ -82,6 +82,8 @@ def open_bag(
     """
     path = Path(path)
     sum_s = sum_length(window_s)
+    if calibration is not None:
+        input = input_for(calibration, input)  # noqa: A001 - as above
     with open_recording(path, topics, input, require=require) as reader:
         info = reader.info
         full_scale = COUNTS_FULL_SCALE if info.input != 'imu' else None
@@ -167,7 +169,7 @@ def evaluate(
         bag = open_bag(
             path,
             topics,
-            input_for(first, input),
+            input,
             number=number,
             window_s=window_s,
             calibration=first,

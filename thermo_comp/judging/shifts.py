@@ -18,7 +18,7 @@ from ..fitting.attitudes import distinct_directions
 from ..fitting.verdict import POSITIONS_NEEDED
 from ..typing import Floats
 from ..unit.gravity import MICRO_G
-from .windows import Windows
+from .windows import Windows, means_by
 
 # A shift must be this sure to be called one.
 _SURE_SDS = 3.0
@@ -44,7 +44,7 @@ class AxisShift:
 
 def distinct_positions(windows: Windows) -> int:
     """Count the directions that differ by more than five degrees."""
-    means = _means(windows, windows.force)
+    means = means_by(windows.position, windows.force)
     return len(distinct_directions(means / np.linalg.norm(means, axis=1, keepdims=True)))
 
 
@@ -62,11 +62,12 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     gravity = windows.gravity
     # Where a calibration claims little, as while its lags are unknown, it is asked little.
     weight = 1.0 / np.maximum(windows.claimed_sd, _SMALLEST_MISS) ** 2
-    known = _means(windows, weight)
-    force = _means(windows, windows.force * weight[:, None]) / known[:, None] / gravity
+    known = means_by(windows.position, weight)
+    force = means_by(windows.position, windows.force * weight[:, None]) / known[:, None] / gravity
     residual = windows.residual
-    scatter = _means(windows, residual**2) - _means(windows, residual) ** 2
-    variance = 1.0 / known + scatter / np.maximum(_counts(windows) / _ALIKE, 1.0)
+    scatter = means_by(windows.position, residual**2) - means_by(windows.position, residual) ** 2
+    count = np.unique(windows.position, return_counts=True)[1]
+    variance = 1.0 / known + scatter / np.maximum(count / _ALIKE, 1.0)
     sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_MISS)
     skew_sd = np.maximum(misalignment_sd, _SMALLEST_SKEW)
 
@@ -114,22 +115,10 @@ def rms_by_axis(windows: Windows) -> Floats:
     without windows.
     """
     _, place = np.unique(windows.position, return_inverse=True)
-    about = windows.force - _means(windows, windows.force)[place]
+    about = windows.force - means_by(windows.position, windows.force)[place]
     return np.array(
         [
             np.sqrt(np.mean(about[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)
             for rows in (~windows.is_dynamic, windows.is_dynamic)
         ]
     )
-
-
-def _counts(windows: Windows) -> Floats:
-    return np.unique(windows.position, return_counts=True)[1].astype(np.float64)
-
-
-def _means(windows: Windows, values: Floats) -> Floats:
-    """Average by position."""
-    found, place = np.unique(windows.position, return_inverse=True)
-    total = np.zeros((len(found), *values.shape[1:]))
-    np.add.at(total, place, values)
-    return np.asarray(total / _counts(windows).reshape(-1, *[1] * (values.ndim - 1)))

@@ -211,6 +211,14 @@ def csv_of(windows: Windows, bags: Sequence[str]) -> str:
     return text.getvalue()
 
 
+def means_by(labels: Ints, values: Floats) -> Floats:
+    """Average rows that have the same label, in the order of the labels."""
+    _, place = np.unique(labels, return_inverse=True)
+    total = np.zeros((int(place.max(initial=-1)) + 1, *values.shape[1:]))
+    np.add.at(total, place, values)
+    return np.asarray(total / np.bincount(place).reshape(-1, *[1] * (values.ndim - 1)))
+
+
 # Columns of a sum and of a window. Averaged over a window's sums are all from the time on.
 _BAG, _POSITION, _START, _COUNT, _EXCESS, _TIME, _BOARD, _RATE, _WEIGHT, _VARIANCE = range(10)
 _MEAN, _FORCE, _WIDTH = slice(10, 13), slice(13, 16), 16

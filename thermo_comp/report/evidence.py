@@ -22,7 +22,7 @@ from ..fitting.reduction import Readings
 from ..judging import Judgement, Verdict, Windows
 from ..judging.history import Epoch
 from ..simulation import Cyclogram
-from ..typing import Floats, Ints
+from ..typing import Floats
 from ..unit.calibration import Calibration, Source
 from ..unit.metrics import norm_residual
 from .trace import ThermalTrace
@@ -206,11 +206,3 @@ def given(value: _T | None) -> _T:
     if value is None:
         raise ValueError('`evidence` lacks what is to be drawn')
     return value
-
-
-def means_by(labels: Ints, values: Floats) -> Floats:
-    """Average rows that have the same label, in the order of the labels."""
-    _, place = np.unique(labels, return_inverse=True)
-    total = np.zeros((int(place.max(initial=-1)) + 1, *values.shape[1:]))
-    np.add.at(total, place, values)
-    return np.asarray(total / np.bincount(place).reshape(-1, *[1] * (values.ndim - 1)))

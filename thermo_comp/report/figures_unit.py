@@ -11,13 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ..judging.windows import means_by
 from ..thermal.state import Layout as StateLayout
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
-from .evidence import CHOSEN, Evidence, given, means_by
+from .evidence import CHOSEN, Evidence, given
 from .style import (
     AXIS_LINES,
     BLACK,

@@ -18,6 +18,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from ..text import counted
 from ..unit.gravity import MICRO_G
 from .text import label_text, minus, number, spelt
 
@@ -55,6 +56,8 @@ def _templates() -> Environment:
     )
     made.filters |= {
         'number': number,
+        'cell': _cell,
+        'counted': counted,
         'spelt': spelt,
         'minus': minus,
         'fixed': lambda value, form: minus(format(value, form)),
@@ -64,6 +67,12 @@ def _templates() -> Environment:
         'css': _css_text,
     }
     return made
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return '–'
+    return number(value) if isinstance(value, float) else str(value)
 
 
 def utc(stamp_ns: int) -> dt.datetime:

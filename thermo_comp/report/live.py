@@ -24,7 +24,6 @@ from typing import Any
 from ..errors import ThermoCompError
 from ..judging import OpenedBag, open_bag
 from ..recording import Input, Topics
-from ..replay import input_for
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence
 from .figures import DrawnFigure, drawn_figures, figures_of
@@ -108,11 +107,7 @@ class LiveReport:
             known = self._opened.get(path)
             if known is None or known[0] != signature:
                 bag = open_bag(
-                    path,
-                    self._topics,
-                    input_for(calibration, self._input),
-                    number=number,
-                    calibration=calibration,
+                    path, self._topics, self._input, number=number, calibration=calibration
                 )
                 known = (signature, bag)
                 self._opened[path] = known
