@@ -18,6 +18,9 @@ from thermo_comp.convert.exchange import TOOLS, export_calibration, import_calib
 from thermo_comp.errors import CalibrationError
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.functions import CubicSpline, Polynomial
+from thermo_comp.unit.gyroscope import Gyroscope, RateCurve, RateSet
+from thermo_comp.unit.prediction import bias_and_scale, ramp_states
+from thermo_comp.unit.rate_triad import rate_triad
 
 ONE = Polynomial((1.0,))
 
@@ -125,6 +128,52 @@ def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic: Calibration
         assert bias_at(back, axis, 28.0) == pytest.approx(0.0, abs=1e-12)
         ours = bias_at(cubic, axis, 41.0) - bias_at(cubic, axis, 28.0)
         assert bias_at(back, axis, 41.0) == pytest.approx(ours, rel=1e-7, abs=1e-9)
+
+
+def test_the_angular_rate_goes_both_ways(cubic: Calibration) -> None:
+    curves = [(0.0, 2e-4, -3e-6, 1e-8), (0.0, -1e-4, 2e-6, 0.0), (0.0, 5e-5, 0.0, -2e-8)]
+    own = RateSet(*(RateCurve(Polynomial(curve)) for curve in curves))
+    gyroscope = Gyroscope((0.02, -0.01, 0.03), own, own, (1e-4,) * 3)
+    unit = replace(cubic, gyroscope=gyroscope)
+    celsius = np.linspace(*unit.static.temperature_range_c, 7)
+    true = np.array(gyroscope.bias_rad_s) + np.column_stack(
+        [Polynomial(curve).value(celsius - unit.reference_temperature_c) for curve in curves]
+    )
+
+    def again(text: str) -> np.ndarray:
+        found = import_calibration(text, serial='7')
+        triad = rate_triad(found)
+        return bias_and_scale(triad, ramp_states(triad, celsius, 0.0, 0.0))[0]
+
+    px4 = export_calibration(unit, 'px4')
+    value = numbers(px4.text, '\t')
+    assert value['TC_G_ENABLE'] == 1.0
+    # PX4's formula: X0 + X1 d + X2 d^2 + X3 d^3 is what it takes from the rate, in rad/s.
+    d = celsius[2] - value['TC_G0_TREF']
+    for axis in range(3):
+        bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))
+        assert bias == pytest.approx(true[2, axis], rel=1e-6)
+    # 9 digits of each coefficient.
+    np.testing.assert_allclose(again(px4.text), true, atol=1e-9)
+    # A gyroscope that was calibrated about another temperature than the accelerometer.
+    shifted = Polynomial((0.02, *curves[0][1:]))
+    moved = px4.text.replace('TC_G0_TREF\t20\t', 'TC_G0_TREF\t30\t')
+    assert moved != px4.text
+    np.testing.assert_allclose(again(moved)[:, 0], shifted.value(celsius - 30.0), atol=1e-9)
+    assert 'angular rate' not in ' '.join(px4.notes)
+
+    ardupilot = export_calibration(unit, 'ardupilot', number=2).text
+    assert 'INS_TCAL2_GYR1_X' in ardupilot
+    # The offset is ArduPilot's own: none at the temperature of its calibration.
+    found = again(f'{ardupilot}INS_GYR2_CALTEMP,{celsius[3]}\n')
+    np.testing.assert_allclose(found, true - true[3], atol=1e-9)
+    zeros = re.sub(r'(GYR\d_.),.*', r'\1,0', ardupilot)
+    assert import_calibration(zeros, serial='7').gyroscope is None
+    off = px4.text.replace('TC_G_ENABLE\t1', 'TC_G_ENABLE\t0')
+    assert import_calibration(off, serial='7').gyroscope is None
+    assert 'angular rate: is lost' in export_calibration(unit, 'kalibr').notes
+    with pytest.raises(CalibrationError, match='TC_G0_X3_1: is missing'):
+        import_calibration(px4.text.replace('TC_G0_X3_1', 'TC_G0_Y3_1'), serial='7')
 
 
 def test_counts_are_divided_by_the_scale_factor(cubic: Calibration) -> None:

@@ -21,6 +21,7 @@ class Content:
     reference_c, range_c: the temperature that the cubics count from, and where they hold
     notes: what is lost, or lacks
     source: the tool and the set that was read
+    rate_bias: as `bias`, of the angular rate [rad/s], where it is known and can be said
     noise: white [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second, on the way out
     """
 
@@ -31,3 +32,4 @@ class Content:
     notes: list[str]
     source: str = ''
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rate_bias: Floats | None = None

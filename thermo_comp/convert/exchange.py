@@ -17,6 +17,7 @@ import numpy as np
 
 from ..errors import CalibrationError
 from ..text import one_line
+from ..typing import Floats
 from ..unit.calibration import (
     FORMAT_VERSION,
     Axes,
@@ -29,10 +30,15 @@ from ..unit.calibration import (
 )
 from ..unit.functions import Polynomial
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
+from ..unit.gyroscope import MILLIDEGREE, Gyroscope, RateCurve, RateSet
+from ..unit.prediction import bias_and_scale, ramp_states
+from ..unit.rate_triad import rate_triad
 from . import parameters, triads
 from .content import Content
 
 _GRID = 257
+#: White noise of an imported gyroscope, of which nothing is said [rad/s/sqrt(Hz)].
+_RATE_NOISE = 1e-4
 #: Readings in m/s^2 have scale factors near 1; beyond this factor they are something else.
 _NEAR_ONE = 2.0
 
@@ -124,10 +130,7 @@ def _content(
         d = temperature - reference_c
         loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
         offset = (level / K)[:, None] + bias + loads[:, None] * scale
-        for axis, values in enumerate(offset):
-            fitted = np.polynomial.Polynomial.fit(d, values, 3).convert().coef
-            cubics[axis, : len(fitted)] = fitted
-        misfit = float(np.max(np.abs(np.polynomial.polynomial.polyval(d, cubics.T) - offset)))
+        cubics, misfit = _cubics(d, offset)
         if misfit > 0.01 * MICRO_G:
             notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
         if scale_drift > 1e-8:
@@ -146,6 +149,13 @@ def _content(
             f'{drift}, the scale by {1e6 * scale_drift:.2g} ppm'
         )
     notes += _losses(calibration)
+    rate_bias = None
+    if calibration.gyroscope is not None:
+        if tool.is_thermal:
+            rate_bias, said = _rate_cubics(calibration, temperature, reference_c)
+        else:
+            said = ['is lost']
+        notes += [f'angular rate: {one}' for one in said]
     if calibration.unit.input == 'counts':
         notes.append(
             'offsets are counts divided by K: the driver must scale by these K'
@@ -157,7 +167,29 @@ def _content(
         max(calibration.slow_noise_m_s2_sqrt_h),
         1.0 / calibration.unit.cycle_time_s,
     )
-    return Content(matrix, cubics, reference_c, range_c, notes, noise=noise)
+    return Content(matrix, cubics, reference_c, range_c, notes, noise=noise, rate_bias=rate_bias)
+
+
+def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
+    """Fit a cubic to the offset of each axis, and say by how much it is off at most."""
+    cubics = np.zeros((3, 4))
+    for axis, values in enumerate(offset):
+        fitted = np.polynomial.Polynomial.fit(d, values, 3).convert().coef
+        cubics[axis, : len(fitted)] = fitted
+    return cubics, float(np.max(np.abs(np.polynomial.polynomial.polyval(d, cubics.T) - offset)))
+
+
+def _rate_cubics(
+    calibration: Calibration, temperature: Floats, reference_c: float
+) -> tuple[Floats, list[str]]:
+    """Give the bias of the angular rate as cubics, and what that loses."""
+    triad = rate_triad(calibration)
+    bias, _ = bias_and_scale(triad, ramp_states(triad, temperature, 0.0, 0.0))
+    cubics, misfit = _cubics(temperature - reference_c, bias.T)
+    notes = []
+    if misfit > 1e-3 * MILLIDEGREE:
+        notes.append(f'replaced by cubics, off by {misfit / MILLIDEGREE:.2g} mdeg/s')
+    return cubics, notes + _losses(triad)
 
 
 def _losses(calibration: Calibration) -> list[str]:
@@ -233,4 +265,11 @@ def import_calibration(
         noise_density_m_s2_sqrt_hz=(noise_density,) * 3,
         misalignment=((1.0, 0.0, 0.0), (yx, 1.0, 0.0), (zx, zy, 1.0)),
         provenance=Provenance(model=content.source, notes=notes),
+        gyroscope=None if content.rate_bias is None else _gyroscope(content.rate_bias),
     )
+
+
+def _gyroscope(rate_bias: Floats) -> Gyroscope:
+    x, y, z = rate_bias.tolist()
+    curves = RateSet(*(RateCurve(Polynomial((0.0, *row[1:]))) for row in (x, y, z)))
+    return Gyroscope((x[0], y[0], z[0]), curves, curves, (_RATE_NOISE,) * 3)
