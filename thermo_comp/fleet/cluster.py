@@ -22,21 +22,13 @@ _WAIT_S = 30.0
 
 
 def dask_setup(_worker: object) -> None:
-    """
-    Leave Ctrl-C, which a terminal sends to all processes, to the one that was started in it.
-
-    Dask calls it in each worker process that it starts with this module as its preload.
-    """
+    """Leave Ctrl-C, which a terminal sends to all, to the first process: a preload of Dask."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
 
 
 def require_libraries() -> None:
-    """
-    Say at once what is missing.
-
-    Raises FleetError if a library of the extra `fleet` is not installed.
-    """
+    """Raise FleetError at once if a library of the extra `fleet` is not installed."""
     try:
         import distributed
         import fsspec
@@ -51,12 +43,9 @@ def connected(
     scheduler: str | None = None, n_workers: int | None = None, most: int = 1 << 30
 ) -> Iterator[Any]:
     """
-    Give a client of a cluster with at least one worker.
+    Give a client of a cluster with at least one worker: of one that runs, or of one of its own.
 
-    `scheduler`: address of a running one, e.g. ``tcp://host:8786``; None makes one on this
-    machine, and ends it at the end. `n_workers`: processes of the own cluster; None takes one per
-    processor. Raises FleetError if nobody answers, there is no worker, or they run another
-    version.
+    Raises FleetError if nobody answers, there is no worker, or they run another version.
     """
     import dask
     from distributed import Client, LocalCluster

@@ -35,12 +35,7 @@ class FoundBag:
 
 @dataclass(frozen=True)
 class FoundUnit:
-    """
-    The bags of one thermal test of one unit.
-
-    `name` is its folder below the fleet's, or its serial, and `lot` the folder above it or empty;
-    both are fit to be shown.
-    """
+    """The bags of one thermal test; the name is a folder or serial, the lot the folder above."""
 
     name: str
     lot: str
@@ -48,11 +43,7 @@ class FoundUnit:
 
 
 def find_units(storage: Storage) -> list[FoundUnit]:
-    """
-    Find the units of a fleet, in the order of their names.
-
-    Raises FleetError if the folder cannot be listed, or holds no bag.
-    """
+    """Find the units by name; raises FleetError where nothing can be listed or there is no bag."""
     bags = group_files(storage.files())
     if not bags:
         raise FleetError(

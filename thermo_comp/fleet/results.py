@@ -29,11 +29,7 @@ CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'resu
 
 
 class Results:
-    """
-    The folder of a fleet's results; made if it is not there.
-
-    Raises FleetError if it cannot be made.
-    """
+    """The folder of results, made if it is not there; raises FleetError if it cannot be."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -53,12 +49,7 @@ class Results:
         return folder / CALIBRATION, folder / CERTIFICATE
 
     def look_up(self, unit: FoundUnit, options: FleetOptions) -> Row | None:
-        """
-        Find the row of an earlier run.
-
-        None where the unit must be done anew: it was never finished, its files look otherwise,
-        other options, another version, a file of the result is missing or was changed.
-        """
+        """Find the row of an earlier run; None where something changed, or was never finished."""
         folder = self.folder_of(unit.name, options.fit.prior)
         try:
             said = json.loads((folder / RESULT).read_bytes())
@@ -81,10 +72,7 @@ class Results:
         """
         Write what came out of a unit, and return its row.
 
-        An outcome without a calibration, or from a file system that failed, takes no earlier
-        calibration away.
-
-        Raises OutputError if it cannot be written.
+        A failure takes no earlier calibration away. Raises OutputError if it cannot be written.
         """
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row

@@ -31,14 +31,9 @@ Tell = Callable[[int, int, Row], None]
 @dataclass(frozen=True)
 class FleetResult:
     """
-    A fleet, done.
+    A fleet, done: its rows by name, what they tell, the files.
 
-    rows: the fleet table, in the order of names
-    summary: what it tells
-    n_done: fits of this run; the others were there
-    parquet, csv, page: the files
-    prior: what the units that hold have in common; None where that cannot be said
-    no_prior: why not
+    `n_done` counts the fits of this run; `no_prior` says why there is no `prior`.
     """
 
     rows: tuple[Row, ...]
@@ -76,10 +71,10 @@ def fit_fleet(
     tell: Tell | None = None,
 ) -> FleetResult:
     """
-    Fit all units of a fleet whose results are not there yet.
+    Fit all units whose results are not there yet.
 
-    Raises FleetError if a library is missing, there is no bag or no scheduler. Raises OutputError
-    if results cannot be written.
+    Raises FleetError without a library, bags or a scheduler; OutputError where nothing can be
+    written.
     """
     require_libraries()
     storage = Storage(url)

@@ -32,11 +32,7 @@ class StoredFile:
 
 
 class Storage:
-    """
-    A folder: a path of this machine, or a URL such as ``s3://bucket/bags``.
-
-    Raises FleetError if no library knows the protocol.
-    """
+    """A folder here or at a URL like ``s3://bucket/bags``; FleetError for a strange protocol."""
 
     def __init__(self, url: str) -> None:
         import fsspec
@@ -98,11 +94,7 @@ class Storage:
 
     @contextmanager
     def here(self, name: str, files: Sequence[StoredFile]) -> Iterator[Path]:
-        """
-        Give the path of a bag on this machine; one from elsewhere is a copy while it is read.
-
-        Raises OSError if it cannot be brought here.
-        """
+        """Give the path of a bag on this machine, a copy if it lies elsewhere; raises OSError."""
         if self.is_local:
             yield Path(self._root) / name
             return

@@ -31,12 +31,7 @@ _MAD_EFFICIENCY = 0.37
 
 @dataclass(frozen=True)
 class Quantity:
-    """
-    What units are compared in: columns of the fleet table with their standard deviations.
-
-    `is_relative`: as the deviation from the fleet's median in ppm. `is_size`: positive by nature,
-    compared by its logarithm.
-    """
+    """What units are compared in: relative in ppm of the median, sizes by their logarithm."""
 
     column: str
     label: str
@@ -70,11 +65,9 @@ QUANTITIES: tuple[Quantity, ...] = (
 @dataclass(frozen=True)
 class Spread:
     """
-    How a quantity is spread over the units that have it.
+    How a quantity is spread: `z`, shape (n,), is the distance from the median `middle` in `sd`.
 
-    `sd` is 1.4826 times the median absolute deviation from `middle`, the median (of a size: that
-    of its logarithm, times the median); `z`, shape (n,), the distances from the middle in it, 0
-    where there is no spread.
+    `sd` is 1.4826 times the median absolute deviation; of a size, of its logarithm.
     """
 
     quantity: Quantity
@@ -115,11 +108,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Drift:
-    """
-    What changed between two tests of one unit; significant where that is more than chance.
-
-    `days` is NaN where a start is not known.
-    """
+    """What changed between two tests of a unit, and whether by more than chance."""
 
     serial: str
     earlier: str
@@ -137,11 +126,9 @@ class Drift:
 @dataclass(frozen=True)
 class Summary:
     """
-    What a fleet table tells.
+    What a fleet table tells: units by verdict, spreads, outliers and drifts, the surest first.
 
-    Units by verdict; spreads by quantity; the `limit` in standard deviations beyond which a unit
-    stands out, infinite in a fleet too small to tell; outliers, the farthest first; drifts, the
-    surest first.
+    Beyond `limit` standard deviations a unit stands out; infinite where too few units tell.
     """
 
     verdicts: dict[str, int]
@@ -197,11 +184,7 @@ def spread_of(quantity: Quantity, rows: Sequence[Row]) -> Spread | None:
 
 
 def outlier_limit(n_units: int, n_quantities: int) -> float:
-    """
-    Return the distance, in standard deviations, beyond which a unit stands out.
-
-    Of Student's t, because the spread is itself estimated; infinite for fewer than eight units.
-    """
+    """Give the distance of Student's t beyond which a unit stands out; infinite below eight."""
     from scipy.stats import t
 
     if n_units < _UNITS_NEEDED or not n_quantities:

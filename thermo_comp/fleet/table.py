@@ -240,11 +240,7 @@ def _text(cell: Cell) -> str:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """
-    Read a fleet.parquet of an earlier run; columns that it lacks are empty.
-
-    Raises FleetError if it is no such table.
-    """
+    """Read a table of an earlier run; what it lacks is empty. Raises FleetError if it is none."""
     from pyarrow import ArrowException, parquet
 
     try:

@@ -32,11 +32,7 @@ _LACKS = frozenset({'temperature', 'ramps', 'directions', 'misfit'})
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """
-    What the user says of a fleet; the same for all units, whose serial and input are their bags'.
-
-    `certificates` is whether each unit gets one.
-    """
+    """What the user says of all units alike; serial and input are those of the bags."""
 
     fit: FitOptions
     topics: Topics | None = None
@@ -62,12 +58,10 @@ class FleetOptions:
 @dataclass(frozen=True)
 class UnitOutcome:
     """
-    What came out of one unit; small enough to travel.
+    What came out of one unit, small enough to travel.
 
-    row: its row of the fleet table
-    hashes: SHA-256 of its bags by name; empty where one could not be read
-    is_final: whether the same bags would give the same again; a failed file system may not
-    calibration, certificate: the files; empty where there are none
+    `is_final`: the same bags would give the same again; a failed file system may not. Files and
+    hashes that there are not are empty.
     """
 
     row: dict[str, Cell]

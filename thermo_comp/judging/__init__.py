@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the judgement of a calibration against recordings: one judge, for every command.
-
-- `evaluate` reads recordings and judges calibrations on them; `open_bag` and `judge_bags` are its
-  two halves.
-- `judge` says what windows at rest tell of a calibration: a `Judgement`.
-"""
+"""Owns the judgement of a calibration against recordings: one judge, for every command."""
 
 from .evaluation import Evaluation, OpenedBag, evaluate, judge_bags, open_bag
 from .judgement import SECTIONS, Judgement, Section, Verdict, judge

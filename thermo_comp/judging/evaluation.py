@@ -47,11 +47,7 @@ class OpenedBag:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """
-    What recordings tell of one or more calibrations, by their names in the order given.
-
-    The notes say what of the recordings was not judged.
-    """
+    """What recordings tell of calibrations, by name; the notes say what was not judged."""
 
     bags: tuple[OpenedBag, ...]
     judgements: dict[str, Judgement]
@@ -73,11 +69,10 @@ def open_bag(
     """
     Read one bag, in bounded memory, for windows of `window_s` seconds.
 
-    `number` is its place among several; what is saturated, and what a rest scatters by, is the
-    unit's as its `calibration` says, else the usual; its hash takes reading it once more;
-    `progress` is told the fraction.
+    `number` is its place among several. What is read, what is saturated and what a rest scatters
+    by is as the `calibration` says, else the usual; the hash takes reading it once more.
 
-    Raises RecordingError if it cannot be read or has no board temperature. Raises ValueError if
+    Raises RecordingError if it cannot be read or has no board temperature; ValueError if
     `window_s` is not positive.
     """
     path = Path(path)
@@ -120,11 +115,7 @@ def judge_bags(
     tolerance: float | None = None,
     config: CompensatorConfig | None = None,
 ) -> Judgement | None:
-    """
-    Judge a calibration on bags that have been reduced, as `evaluate` does.
-
-    None where no window rests with a temperature.
-    """
+    """Judge a calibration on reduced bags; None where no window was corrected."""
     windows = corrected_windows(
         bags, calibration, gravity=gravity, window_s=window_s, config=config
     )
@@ -150,12 +141,11 @@ def evaluate(
     Judge one or more calibrations of a unit, given with their names, on its recordings.
 
     Local gravity and what is read are those of the first calibration by default; `tolerance` is
-    the largest RMS that is accepted [m/s^2], `config` the node's settings, and of `serial` see
-    `replay.check_unit`.
+    the largest RMS that is accepted [m/s^2]; of `serial` see `replay.check_unit`.
 
-    Raises ValueError if there is no recording or no calibration, or `window_s` or `tolerance` is
-    not positive. Raises RecordingError if a recording cannot be read, or none of them rests for a
-    window. Raises CalibrationError if a calibration is for another unit.
+    Raises ValueError without a recording or calibration, or if `window_s` or `tolerance` is not
+    positive; RecordingError if a recording cannot be read, or none of them rests for a window;
+    CalibrationError if a calibration is for another unit.
     """
     if not paths or not calibrations:
         raise ValueError('`paths` and `calibrations` must hold at least one each')

@@ -22,10 +22,9 @@ _SURE_SDS = 3.0
 @dataclass(frozen=True)
 class Epoch:
     """
-    One calibration of a history: bias [ug] and scale [ppm of the first one], shapes (3,).
+    One calibration of a history, in a soak at the reference temperature of the first.
 
-    In a soak at the first one's reference temperature, with standard deviations, which are NaN of
-    a calibration that says nothing of them.
+    Bias [ug], scale [ppm of the first one], shapes (3,); an sd that nobody claims is NaN.
     """
 
     created: str
@@ -54,7 +53,7 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Put calibrations in the order of their dates: those of the first one's unit.
+    Put calibrations of the first one's unit in the order of their dates.
 
     Of those that were fitted on the same bags the first counts: two models are no history.
     """

@@ -149,12 +149,10 @@ def judge(
     is_seen: bool = False,
 ) -> Judgement:
     """
-    Judge a calibration by its windows, at least one.
+    Judge a calibration by its windows; a `tolerance` on the RMS [m/s^2] decides where given.
 
-    A `tolerance`, the largest RMS that the user accepts in either regime [m/s^2], decides where
-    given. Of windows that the fit has seen, what it left on positions left out stands for them.
-
-    Raises ValueError if there is no window, or `tolerance` is not positive.
+    Of windows that the fit has seen, what it left on positions left out stands for them. Raises
+    ValueError if there is no window, or `tolerance` is not positive.
     """
     if not len(windows):
         raise ValueError('`windows` must hold at least one')

@@ -30,11 +30,7 @@ _ALIKE = 6.0
 
 @dataclass(frozen=True)
 class AxisShift:
-    """
-    What one axis differs by from the calibration: bias [m/s^2] and relative scale.
-
-    The standard deviations include what the calibration claims.
-    """
+    """What an axis has moved by: bias [m/s^2], relative scale; the sds hold what was claimed."""
 
     bias: float
     bias_sd: float
@@ -50,10 +46,9 @@ def distinct_positions(windows: Windows) -> int:
 
 def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:
     """
-    Fit nine constants to the positions' means of the corrected force.
+    Fit nine constants to the positions' means; none with fewer than six distinct positions.
 
-    `misalignment_sd` is how well the calibration knows the three elements of M. Empty with fewer
-    than six distinct positions.
+    `misalignment_sd` is how well the calibration knows the three elements of M.
     """
     from scipy.optimize import least_squares
 
@@ -108,12 +103,7 @@ def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
 
 
 def rms_by_axis(windows: Windows) -> Floats:
-    """
-    Tell what moves each axis at rest, to a constant, whatever the number of positions.
-
-    RMS of each axis about its mean in a position [m/s^2], shape (2, 3): static and dynamic, NaN
-    without windows.
-    """
+    """Give the RMS of each axis about its mean in a position, static and dynamic, shape (2, 3)."""
     _, place = np.unique(windows.position, return_inverse=True)
     about = windows.force - means_by(windows.position, windows.force)[place]
     return np.array(

@@ -102,21 +102,14 @@ class Windows:
 
 
 def sum_length(window_s: float) -> float:
-    """
-    Choose the longest part of a window up to ten seconds, for the sums of `fitting.reduction`.
-
-    Raises ValueError if `window_s` is not positive.
-    """
+    """Choose the longest part of a window up to ten seconds; raises ValueError if not positive."""
     if not 0.0 < window_s < np.inf:
         raise ValueError(f'`window_s` must be positive, got {window_s:g}')
     return window_s / float(np.ceil(window_s / _LONGEST_SUM_S))
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """
-    Choose the length of the windows of bags that were not read for a length in particular [s]:
-    60 s, or what is next to it where the bags' sums do not fill that.
-    """
+    """Choose the length [s] of the windows of a fit's bags: 60 s, or what next their sums fill."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 
@@ -130,10 +123,7 @@ def corrected_windows(
     config: CompensatorConfig | None = None,
 ) -> Windows:
     """
-    Correct the windows of bags of the calibration's unit.
-
-    Local gravity is the calibration's by default. Empty where nothing rests for as long with a
-    temperature.
+    Correct the windows of bags of the calibration's unit; local gravity is its own by default.
 
     Raises RecordingError if the samples of a bag are too slow for such windows.
     """
@@ -167,10 +157,9 @@ def corrected_windows(
 
 def raw_windows(bags: Sequence[ReducedBag], gravity: float, window_s: float) -> Windows:
     """
-    Take the windows of bags as they are: static all of them, inside any range, without a claim.
+    Take the windows as they are: static, inside any range, without a claim.
 
-    Their forces are the means of the samples; gravity is NaN where nobody knows it. Raises a
-    RecordingError as `corrected_windows` does.
+    Raises RecordingError as `corrected_windows` does; unknown gravity is NaN.
     """
 
     def keep(bag: ReducedBag, sums: Floats) -> None:

@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the report: a unit's certificate as one HTML page, its figures, and its live view.
-
-- `evidence_of_bags` gathers what bags tell, with or without a calibration,
-  `evidence_of_fit` takes what a fit has to show; `write_report` writes the page.
-- The only place with matplotlib and Jinja2.
-"""
+"""Owns the report: a unit's certificate, its figures, its live view; has matplotlib and Jinja2."""
 
 from .certificate import CertificateInfo, load_certificate_info
 from .evidence import Evidence

@@ -116,8 +116,7 @@ def load_certificate_info(path: str | Path, serial: str | None = None) -> Certif
     """
     Read a laboratory's statements on the unit with a serial from a YAML file.
 
-    Raises ThermoCompError if it cannot be read, a key is unknown or of another type, or it is
-    about another unit; names the file and the key.
+    Raises ThermoCompError, naming file and key, if one is wrong or of another unit.
     """
     data = read_plain_yaml(path)
     try:

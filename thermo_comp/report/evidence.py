@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a report is made of: facts, series and statistics, gathered before anything is drawn.
-
-Figures and page read one value, `Evidence`, whether it came from a fit, from bags with or without
-a calibration, or from a calibration alone; what is missing is None or empty, and its part of the
-page is left out.
+Owns what a report is made of, gathered before anything is drawn: from a fit, from bags, or from a
+calibration alone; what is missing is None or empty, and its part of the page is left out.
 """
 
 from __future__ import annotations
@@ -187,10 +184,9 @@ class Evidence:
 
     def axis_residuals(self) -> dict[str, Floats]:
         """
-        Residual of each axis over the windows, per rung, shape (n, 3) [m/s^2].
+        Give the residual of each axis over the windows, by rung, shape (n, 3) [m/s^2].
 
-        The attitude of a position is not known, so the mean direction that the judged rung sees
-        there stands for it, with the length of gravity. Empty without gravity.
+        The mean direction that the judged rung sees in a position stands for its attitude.
         """
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:

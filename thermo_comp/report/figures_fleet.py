@@ -60,11 +60,7 @@ def draw_distances(
     limit: float,
     sheet: Sheet,
 ) -> Figure:
-    """
-    Draw every unit's distance from the fleet's middle in standard deviations, by quantity.
-
-    `names` are the units, as in `distances`; beyond `limit` they are written beside it.
-    """
+    """Draw each unit's distance from the middle, by quantity; beyond `limit` with its name."""
     figure = new_figure(sheet, 0.6 + 0.19 * len(labels))
     axes = figure.subplots()
     shown = min(max(1.15 * limit, 4.0), 12.0)

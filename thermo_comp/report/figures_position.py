@@ -79,10 +79,7 @@ def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:
 
 
 def equal_area(up: tuple[float, float, float], side: int) -> tuple[float, float]:
-    """
-    Map a direction of one hemisphere (side +1 of +z, -1 of -z) into the unit disc, equal areas to
-    equal areas: the pole is its centre, the equator its rim.
-    """
+    """Map a direction of one hemisphere into the unit disc, the pole its centre, areas kept."""
     x, y, z = up
     factor = 1.0 / np.sqrt(1.0 + max(side * z, 0.0))
     return float(x * factor), float(y * factor)

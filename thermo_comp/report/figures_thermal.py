@@ -93,9 +93,7 @@ def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
 
 
 def draw_dynamics(evidence: Evidence, sheet: Sheet) -> Figure:
-    """
-    Draw the drift of the readings, the temperatures' derivatives and the flag (Fig. 4 a, b, c).
-    """
+    """Draw the readings' drift, the temperatures' derivatives and the flag (Fig. 4 a, b, c)."""
     shown, facts = shown_bag(evidence)
     unit, _ = time_unit(facts.duration_s)
     has_drift = evidence.windows is not None and bool(np.any(evidence.windows.bag == shown.index))
@@ -142,10 +140,7 @@ def _draw_drift(
 
 
 def reading_drift(evidence: Evidence) -> tuple[Floats, str]:
-    """
-    Give the change of the raw readings within each position since it began, shape (n, 3), and its
-    unit: micro-g where the scale factor is known, otherwise raw units.
-    """
+    """Give what the readings change by in each position, shape (n, 3), and its unit."""
     windows = given(evidence.windows)
     drift = windows.mean.copy()
     for p in np.unique(windows.position):

@@ -93,11 +93,10 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
 @dataclass(frozen=True)
 class SoakMeasurements:
     """
-    What was measured in each soak of each position, against the calibration.
+    What each soak of each position measured against the calibration, shapes (n,) and (n, 3).
 
-    The mean board temperature, and what bias [micro-g] and scale [ppm] of each axis are larger by,
-    each as if all of the residual were its own, shapes (n, 3); the scale is NaN of an axis that
-    has less than half of gravity.
+    Bias [micro-g] and scale [ppm] as if all of the residual were one of them; the scale is NaN of
+    an axis that has less than half of gravity.
     """
 
     temperature: Floats
@@ -139,11 +138,7 @@ class Curve:
 
 
 def curves(calibration: Calibration) -> list[Curve]:
-    """
-    Evaluate a calibration in a soak, and in ramps through its range at half of the fastest rate.
-
-    The soak alone where ramps make no difference.
-    """
+    """Evaluate a soak and, where they differ, ramps at half of the fastest rate."""
     static, dynamic = calibration.regime_sets()
     looks = [('soak', static, 0.0, STATIC_LINE, '////', 'o')]
     cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
@@ -215,10 +210,9 @@ def draw_step(evidence: Evidence, sheet: Sheet) -> Figure:
 
 def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     """
-    Evaluate what a step of board and case by 1 K, up to the reference, leaves to come.
+    Evaluate what is still to come of bias and scale after a step by 1 K up to the reference.
 
-    Returns the minutes since the step, and bias [micro-g] and scale [ppm] less those of the soak
-    at the end, shapes (n, 3).
+    Returns the minutes since the step, bias [micro-g] and scale [ppm], shapes (n, 3).
     """
     minutes = np.geomspace(*_STEP_MINUTES, _N_CURVE)
     since_s = np.append(minutes * 60.0, np.inf)
@@ -254,10 +248,9 @@ def draw_hysteresis(evidence: Evidence, sheet: Sheet) -> Figure:
 
 def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     """
-    Evaluate the bias in a run through the static range and back that is too slow for any lag.
+    Evaluate the bias in a run through the range and back that is too slow for any lag.
 
-    Returns the temperatures, and the bias on the way up and down [micro-g], shapes (n, 3). Each
-    play begins at the end that the way before has pushed it to.
+    Returns the temperatures, and the bias on the way up and down [micro-g], shapes (n, 3).
     """
     lower, upper = calibration.static.temperature_range_c
     temperature = np.linspace(lower, upper, _N_CURVE)

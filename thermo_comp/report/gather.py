@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the way to a report's evidence: from bags, with or without a calibration, or from a fit.
-
-Reading and judging are apart, so that a viewer reads a bag once and judges it anew whenever the
-calibration changes.
-"""
+"""Owns the way to a report's evidence: from bags, with or without a calibration, or from a fit."""
 
 from __future__ import annotations
 
@@ -50,14 +45,12 @@ def evidence_of_bags(
     """
     Judge bags, with a calibration or without; no bags report on the calibration alone.
 
-    Without a calibration only the thermal side is reported, and ``|f|`` of a unit that speaks
-    m/s^2. Gravity is the calibration's by default; `window_s` and `tolerance` are as for
-    `judging.evaluate`; an empty `serial` accepts any calibration; `program` is the chamber's, as
-    `simulation.parse_cyclogram` reads it, by default what a simulated bag says of itself;
-    `others` are further calibrations of the unit, for its history.
+    Gravity is the calibration's by default; `window_s` and `tolerance` are as for `evaluate`; an
+    empty `serial` accepts any calibration; `program` is the chamber's, by default what a simulated
+    bag says of itself; `others` are further calibrations of the unit, for its history.
 
-    Raises CalibrationError if the calibration is for another unit. Raises RecordingError if a
-    bag's samples are too slow for such windows. Raises ValueError if `program` cannot be read.
+    Raises CalibrationError for a calibration of another unit; RecordingError if samples are too
+    slow for such windows; ValueError if `program` cannot be read.
     """
     reduced = [bag.reduced for bag in bags]
     judgement = None
@@ -97,10 +90,7 @@ def evidence_of_fit(
     result: FitResult, *, program: str | None = None, is_brief: bool = False
 ) -> Evidence:
     """
-    Gather what a fit has to show, on the bags that it was made of.
-
-    `program` is the chamber's, by default what a simulated bag says of itself; a brief evidence
-    lacks what only figures show.
+    Gather what a fit has to show, on its own bags; a brief one lacks what only figures show.
 
     Raises ValueError if `program` cannot be read.
     """

@@ -1,10 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way into HTML: the templates, in which every text is escaped, and the page's policy.
-
-What comes from a bag or a calibration is text that somebody else wrote; the page's own policy
-forbids it to run or load anything.
+Owns the way into HTML: templates that escape every text, because others wrote it, and the policy
+by which the page can neither run nor load anything.
 """
 
 from __future__ import annotations
@@ -29,10 +27,9 @@ _LONGEST_MARGIN = 90
 
 def render(template: str, *, script: str = '', nonce: str = '', **context: Any) -> str:
     """
-    Fill a template that extends ``page.html`` with what it names; at least `title`.
+    Fill a template that extends ``page.html``; `title` at least.
 
-    A viewer that serves the page has a script, and a nonce by which the page's policy lets this
-    one script run and talk to its server; a page in a file has none.
+    A viewer's page has a script, and a nonce by which the policy lets this one run.
     """
     policy = _POLICY
     if script:

@@ -116,11 +116,7 @@ class LiveReport:
 
 
 class LiveServer(ThreadingHTTPServer):
-    """
-    Serves one live report on the loopback interface; port 0 takes any that is free.
-
-    Raises OSError if the port is taken.
-    """
+    """Serves one live report on the loopback interface; port 0 is any. OSError if it is taken."""
 
     daemon_threads = True
 

@@ -41,12 +41,9 @@ def write_report(
     """
     Write a certificate as one self-contained HTML page; give what it is made of.
 
-    What the laboratory does not state in `info` stays blank. The folder `figures` gets the figures
-    as PNG files. Of a fit, `program` is as for `evidence_of_fit`. Page and pictures that are there
-    are replaced if `overwrite`.
-
-    Raises OutputError if a file may not or cannot be written. Raises ValueError if `program`
-    cannot be read.
+    What the laboratory does not state in `info` stays blank. The folder `figures` gets PNG files.
+    Raises OutputError if a file may not or cannot be written; ValueError if `program` cannot be
+    read.
     """
     evidence = subject
     if isinstance(evidence, FitResult):

@@ -115,10 +115,9 @@ def new_figure(sheet: Sheet, height: float) -> Figure:
 
 def svg(figure: Figure, name: str, label: str) -> str:
     """
-    Write a figure as an SVG element for a page, without a header.
+    Write a figure as an SVG element of a page; `label` is for readers who do not see it.
 
-    The letters and digits of `name` make its ids unique in the page; `label` says what it shows
-    to readers who do not see it. The page's style sheet gives its lines round joints.
+    The letters and digits of `name` make its ids unique. Round joints are the style sheet's.
     """
     buffer = io.StringIO()
     nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}
@@ -168,11 +167,7 @@ def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]
 
 
 def legend_above(axes: Axes, sheet: Sheet, *, share: float = 1.0, **keys: Any) -> None:
-    """
-    Put the legend above the axes, where it hides nothing, in as many columns as fit.
-
-    The axes have a `share` of the sheet's width.
-    """
+    """Put the legend above axes with a `share` of the width, in as many columns as fit."""
     labels = axes.get_legend_handles_labels()[1]
     # An entry takes its label and a handle as wide as some eight letters.
     letters = 8 + max((len(label) for label in labels), default=0)

@@ -33,11 +33,7 @@ def spelt(text: str) -> str:
 
 
 def rounded(value: float, expanded: float) -> tuple[str, str]:
-    """
-    Round an expanded uncertainty to two significant digits, and its value to the same place.
-
-    An unknown uncertainty is a dash, and its value has six digits.
-    """
+    """Round an uncertainty to two digits, its value to that place; an unknown one is a dash."""
     if not 0.0 < expanded < math.inf:
         return number(value, 6), '–'
     place = 1 - math.floor(math.log10(expanded))

@@ -36,10 +36,9 @@ class Stretch:
 @dataclass(frozen=True)
 class ThermalTrace:
     """
-    Thermal state of one bag on a uniform grid of times since its start, NaN where not known yet.
+    Thermal state on a uniform grid of times since the start, NaN where not known yet.
 
-    Rates are in K/s, the acceleration is that of the leading sensor [K/s^2]: the board where the
-    bag has no case sensor. The stretches cover the bag without a gap.
+    Rates in K/s; the acceleration is that of the leading sensor [K/s^2].
     """
 
     time: Floats
@@ -53,11 +52,7 @@ class ThermalTrace:
 def thermal_trace(
     bag: ReducedBag, span_ns: tuple[int, int], detector: DetectorSettings
 ) -> ThermalTrace:
-    """
-    Run the thermometers and the detector over a bag's readings, as the node would.
-
-    Times count from the first of the two stamps of `span_ns`.
-    """
+    """Run thermometers and detector over a bag's readings from `span_ns` on, as the node would."""
     tracker = ThermalTracker(detector)
     start_ns, end_ns = span_ns
     step_ns = max(round(_SHORTEST_STEP_S * 1e9), (end_ns - start_ns) // _N_GRID)
