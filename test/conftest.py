@@ -53,6 +53,24 @@ settings.load_profile('usual')
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
+#: Files that take longest, the longest first: whoever works in parallel begins with them, so that
+#: no worker is left alone with one at the end (`make test` keeps this order).
+_LONG = (
+    *('test_cli_help', 'test_report', 'test_faults', 'test_priors', 'test_fault_process'),
+    *('test_fleet_run', 'test_fitting', 'test_docs', 'test_cli_demo', 'test_degenerate'),
+    *('test_third_thermometer', 'test_fault_files', 'test_report_live', 'test_plausibility'),
+    *('test_regime', 'test_player', 'test_one_judge', 'test_judging_history', 'test_correction'),
+    *('test_node_defence', 'test_node_parity', 'test_recording_write', 'test_replay'),
+    *('test_compensator', 'test_cli', 'test_fitting_learning', 'test_fitting_posterior'),
+)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {name: place for place, name in enumerate(_LONG)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(_LONG)))
+
+
 class Cli(Protocol):
     """Run ``thermo_comp`` as a user does."""
 

@@ -132,7 +132,8 @@ class Desk:
 
     def run(self, command: str, cli: Cli | None = None) -> subprocess.CompletedProcess[str]:
         """
-        Run one example in a fresh folder, as it is written but for a wait; it must succeed.
+        Run one example as it is written but for a wait; it must succeed. Each has a fresh folder,
+        but a fleet goes on in its own.
 
         Parameters
         ----------
@@ -151,15 +152,17 @@ class Desk:
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}
         self._n += 1
-        here = self._folder / f'run{self._n}'
-        (here / 'bags').mkdir(parents=True)
+        # A fleet goes on where it was: asked again, it tells what is there.
+        here = self._folder / ('fleet' if words[0] == 'fleet' else f'run{self._n}')
+        (here / 'bags').mkdir(parents=True, exist_ok=True)
         for word in words:
             made = word.partition('/*')[0]
             if made in MADE and made not in outputs:
                 self._make(made)
         for path in [*self._ready.iterdir(), *(self._ready / 'bags').iterdir()]:
             name = path.relative_to(self._ready)
-            if path.name != 'bags' and str(name) not in outputs:
+            is_there = (here / name).is_symlink()
+            if path.name != 'bags' and str(name) not in outputs and not is_there:
                 (here / name).symlink_to(path)
         arguments = [
             one
