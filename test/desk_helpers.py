@@ -177,7 +177,7 @@ class Desk:
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
             # Nobody listens here, whom it would wait for.
             arguments[1:1] = ['--wait', '0.5']
-        if arguments[0] == 'view':
+        if arguments[0] == 'view' or arguments[:2] == ['record', '--positions']:
             return self._view(arguments, here)
         return (cli or self._cli)(*arguments, cwd=here)
 

@@ -40,8 +40,12 @@ OF_ITS_OWN = {
     for name in COMMANDS
     if name != 'demo'
 }
-# What prints figures: all that only serves a page or plays a bag does not.
-WITH_JSON = [one for one in EXAMPLES if one.split()[1] not in ('view', 'play')]
+# What prints figures and ends by itself: what serves a page, listens or plays a bag does not.
+WITH_JSON = [
+    one
+    for one in EXAMPLES
+    if one.split()[1] not in ('view', 'play') and 'record --positions' not in one
+]
 
 QUICK = [one for one in EXAMPLES if one.split()[1] in ('info', 'convert', 'export', 'import')]
 

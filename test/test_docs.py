@@ -25,9 +25,13 @@ from matplotlib import pyplot as plt
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# README's console blocks run with their output in test_readme; a bag that plays for minutes, and
-# the demo, have tests of their own (test_player, test_cli_demo).
-ELSEWHERE = ('thermo_comp demo', 'thermo_comp play bags/held_out.mcap --rate 20')
+# README's console blocks run with their output in test_readme; a bag that plays for minutes, one
+# that grows, and the demo, have tests of their own (test_player, test_record, test_cli_demo).
+ELSEWHERE = (
+    'thermo_comp demo',
+    'thermo_comp play bags/held_out.mcap --rate 20',
+    'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',
+)
 
 
 def commands() -> list[tuple[str, str, str]]:

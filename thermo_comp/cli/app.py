@@ -29,6 +29,7 @@ from . import (
     output,
     play,
     prior,
+    record,
     replay,
     report,
     simulate,
@@ -71,6 +72,7 @@ def _top(
     """Thermal-drift compensation of a three-axis accelerometer."""
 
 
+app.command()(record.record)
 app.command()(fit.fit)
 app.command()(prior.prior)
 app.add_typer(fleet.app)

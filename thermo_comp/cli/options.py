@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -139,6 +140,14 @@ def positive(value: float, name: str) -> float:
     if not 0.0 < value < float('inf'):
         raise usage(f'{name} must be positive, got {value:g}')
     return value
+
+
+def duration(text: str, name: str) -> float:
+    """Read a duration with its unit, like ``45min``, ``1.5h`` or ``30s`` [s]."""
+    found = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
+    if found is None:
+        raise usage(f'{name}: expected a duration like 45min, 1.5h or 30s, got {text!r}')
+    return positive(float(found[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[found[2]], name)
 
 
 def named_topics(given: list[str] | None, profile: Path | None) -> dict[str, str]:

@@ -82,21 +82,41 @@ class Output:
         cells = [[_shown(text(cell), sys.stdout) for cell in row] for row in rows]
         right = [all(_is_number(row[i]) for row in cells) for i in range(len(columns))]
         if sys.stdout.isatty():
-            from rich import box
             from rich.console import Console
-            from rich.table import Table
 
-            table = Table(
-                title=title or None, title_justify='left', box=box.SIMPLE_HEAD, pad_edge=False
-            )
-            for heading, is_right in zip(columns, right, strict=True):
-                table.add_column(heading, justify='right' if is_right else 'left')
-            for row in cells:
-                table.add_row(*row)
+            table = _rich_table(columns, cells, right, title)
             Console(highlight=False, markup=False).print(table)
             return
         for text_line in aligned(columns, cells, right, title):
             _print(text_line)
+
+    @contextmanager
+    def live(self) -> Iterator[Callable[..., None] | None]:
+        """
+        Show a table with lines below it, anew with each call of what is yielded; None where stderr
+        is no terminal or nothing is to be shown.
+        """
+        if self.quiet or not sys.stderr.isatty():
+            yield None
+            return
+        from rich.console import Console, Group
+        from rich.live import Live
+        from rich.text import Text
+
+        console = Console(stderr=True)
+        with Live(console=console, transient=True, auto_refresh=False) as view:
+
+            def show(
+                columns: Sequence[str], rows: Sequence[Sequence[Cell]], lines: Sequence[str]
+            ) -> None:
+                # The lines are what it is looked at for, and then the newest rows.
+                newest = rows[-max(1, console.height - len(lines) - 5) :]
+                cells = [[_shown(text(cell), sys.stderr) for cell in row] for row in newest]
+                table = _rich_table(columns, cells, [False] * len(columns), '')
+                below = [Text(_shown(line, sys.stderr)) for line in lines]
+                view.update(Group(table, *below), refresh=True)
+
+            yield show
 
     @contextmanager
     def progress(self, what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
@@ -128,6 +148,21 @@ class Output:
         ) as bar:
             task = bar.add_task(_shown(what, sys.stderr), total=total)
             yield lambda done: bar.update(task, completed=done)
+
+
+def _rich_table(
+    columns: Sequence[str], cells: Sequence[Sequence[str]], right: Sequence[bool], title: str
+) -> Any:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title or None, title_justify='left', box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading, is_right in zip(columns, right, strict=True):
+        table.add_column(heading, justify='right' if is_right else 'left')
+    for row in cells:
+        table.add_row(*map(Text, row))
+    return table
 
 
 def _ignore(_done: float) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 
 from ..errors import FitError
 from ..typing import Floats
+from .coverage import norm_columns
 from .start import constant_calibration
 
-# Directions closer than this are one position measured twice.
-_SAME_DIRECTION_DEG = 5.0
+#: Directions closer than this are one position measured twice.
+SAME_DIRECTION_DEG = 5.0
 # About their centre readings have one norm: elsewhere it differs by this part of their spread, and
 # about a good centre by less than this part of its own.
 _OFF_CENTRE, _ON_CENTRE = 0.3, 0.1
@@ -26,7 +27,7 @@ _FEWEST, _FEWEST_FOR_MISALIGNMENT = 6, 12
 def distinct_directions(up: Floats) -> Floats:
     """Drop unit vectors, shape (n, 3), that repeat another."""
     kept: list[Floats] = []
-    limit = np.cos(np.radians(_SAME_DIRECTION_DEG))
+    limit = np.cos(np.radians(SAME_DIRECTION_DEG))
     for direction in up:
         if all(float(direction @ other) < limit for other in kept):
             kept.append(direction)
@@ -71,12 +72,7 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
     `up`: directions, shape (n, 3).
     """
-    x, y, z = up.T
-    # d|f| by the biases, relative scales and the three elements of M.
-    columns = [x, y, z, x * x, y * y, z * z]
-    if with_misalignment:
-        columns += [x * y, x * z, y * z]
-    jacobian = np.column_stack(columns)
+    jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
         return float('inf')

@@ -31,7 +31,7 @@ from .rests import judge_rests
 from .sensors import learn_detector
 from .sources import FitSource
 from .start import ConstantCalibration, constant_calibration, position_means
-from .unknowns import Prior, initial_state
+from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD, Prior, initial_state
 from .verdict import POSITIONS_NEEDED, Finding, enforce, judge_bags, judge_result, judge_windows
 from .windows import CURVE, FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
 
@@ -41,8 +41,6 @@ Progress = Callable[[str, float], None]
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 # Stands in where the bags do not tell how far the board lags behind the case.
 _USUAL_BOARD_LAG_S = 900.0
-#: Built-in prior, wide for any triad: bias [m/s^2], relative scale, elements of M [rad].
-BIAS_SD, SCALE_SD, SKEW_SD = 1.0, 0.05, 1e-3
 # Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
 _COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
 # What temperature does to a unit that no thermometer has seen, per K: a cheap sensor's data sheet.

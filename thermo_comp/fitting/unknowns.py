@@ -11,6 +11,9 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
+#: Built-in prior, wide for any triad: bias [m/s^2], relative scale, elements of M [rad].
+BIAS_SD, SCALE_SD, SKEW_SD = 1.0, 0.05, 1e-3
+
 
 @dataclass(frozen=True)
 class Windows:

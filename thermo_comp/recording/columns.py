@@ -82,7 +82,7 @@ class ImuColumns:
     angular_velocity_covariance: Floats
     linear_acceleration_covariance: Floats
 
-    def take(self, rows: Ints) -> ImuColumns:
+    def take(self, rows: Ints | slice) -> ImuColumns:
         """Choose some messages."""
         return ImuColumns(*(getattr(self, one.name)[rows] for one in fields(self)))
 
@@ -100,6 +100,13 @@ class RawMessages:
     log_ns: Ints
     data: Bytes
     ends: Ints
+
+    def part(self, begin: int, end: int | None = None) -> RawMessages:
+        """Choose a run of them."""
+        ends = self.ends[begin:end]
+        start = int(self.ends[begin - 1]) if begin else 0
+        data = self.data[start : int(ends[-1]) if len(ends) else start]
+        return RawMessages(self.topic, self.type, self.log_ns[begin:end], data, ends - start)
 
 
 class Readings(NamedTuple):

@@ -89,7 +89,7 @@ class Survey:
                 '--topic board=TOPIC'
             )
         else:
-            found += _thermal_findings(board)
+            found += thermal_findings(board)
         if 'case' not in self.thermometers:
             found.append(
                 'no case temperature: the regime will follow the slower board sensor; name yours '
@@ -104,7 +104,8 @@ class Survey:
         return found
 
 
-def _thermal_findings(board: ThermometerSurvey) -> list[str]:
+def thermal_findings(board: ThermometerSurvey) -> list[str]:
+    """Say what of span and ramps is missing."""
     found = []
     if board.span < ADVISED_SPAN_K:
         found.append(f'board temperature spans {board.span:.1f} K: {ADVISED_SPAN_K:g} are advised')
@@ -163,7 +164,7 @@ def survey_recording(
         n_still=len(still),
         still_s=still_s,
         thermometers={
-            name: survey for name, own in readings.items() if (survey := _survey_of(own))
+            name: survey for name, own in readings.items() if (survey := survey_thermometer(own))
         },
     )
 
@@ -205,7 +206,10 @@ class _Stamps:
         return 0.0 if self._first_ns is None else (self._last_ns - self._first_ns) * 1e-9
 
 
-def _survey_of(readings: Sequence[Readings]) -> ThermometerSurvey | None:
+def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
+    """Describe one thermometer by its readings, in pieces; None where there is no number."""
+    if not readings:
+        return None
     stamp_ns = np.concatenate([one.stamp_ns for one in readings])
     celsius = np.concatenate([one.celsius for one in readings])
     use = np.isfinite(celsius)

@@ -13,7 +13,7 @@ scatters by no more than its noise, and its gyroscope does not turn.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +30,7 @@ _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
-_QUANTUM_SAMPLES = 20000
+_QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 #: How many windows a cell lasts where the samples are slow.
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)
 # Stamps may lie anywhere; no unit rests in one cell for a day.
@@ -71,6 +71,11 @@ class Cells:
     rate: Floats
     rate_variance: Floats
 
+    def part(self, which: slice) -> Cells:
+        """Choose a run of them."""
+        names = ('time', 'count', 'mean', 'variance', 'index', 'rate', 'rate_variance')
+        return replace(self, **{name: getattr(self, name)[which] for name in names})
+
 
 class CellAccumulator:
     """
@@ -102,6 +107,7 @@ class CellAccumulator:
         self._is_negative = False
         self._middle = 0.0
         self._quantum = np.zeros(3)
+        self._n_looked_at = 0
         self._width = 8
         self._open = np.zeros((0, self._width))
         self._open_id = -1
@@ -130,6 +136,10 @@ class CellAccumulator:
             self._begin(stamp_ns, samples)
             self._width = 8 if rate is None else 14
         self._last_ns = int(stamp_ns[-1])
+        if self._n_looked_at < _QUANTUM_SAMPLES:
+            found = _quantum_of(samples[: _QUANTUM_SAMPLES - self._n_looked_at])
+            self._quantum = np.where(self._quantum > 0.0, self._quantum, found)
+            self._n_looked_at += len(samples)
         if self._is_integer:
             self._is_integer = bool((samples == np.rint(samples)).all())
         self._accumulate(stamp_ns, samples, None if rate is None else rate[use])
@@ -176,7 +186,6 @@ class CellAccumulator:
         self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
-        self._quantum = _quantum_of(samples[:_QUANTUM_SAMPLES])
 
     def _accumulate(self, stamp_ns: Ints, samples: Floats, rate: Floats | None) -> None:
         since = stamp_ns - self._start_ns
@@ -231,7 +240,10 @@ def _quantum_of(samples: Floats) -> Floats:
             continue
         # Changes of one step differ by rounding only; without a step no two are alike.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
-        if n_levels < 0.2 * len(changes) or n_levels == 1:
+        # Nor are larger ones whole numbers of the smallest; those of hands are, of many levels.
+        steps = changes / changes[0]
+        is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()
+        if n_levels < 0.2 * len(changes) or n_levels == 1 or is_whole:
             result[axis] = changes[0]
     return result
 

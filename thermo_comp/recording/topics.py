@@ -60,7 +60,7 @@ class Topics:
                 raise ValueError(f'`{name}` needs the name of a topic')
             if own in _TYPES and (own == name or _TYPES[own] == TEMPERATURE):
                 roles[own] = topic
-            elif own != name and _NAME.fullmatch(own):
+            elif own != name and is_thermometer(own):
                 further[own] = topic
             else:
                 raise ValueError(
@@ -70,6 +70,11 @@ class Topics:
 
 
 _USUAL = Topics()
+
+
+def is_thermometer(name: str) -> bool:
+    """Tell whether a further thermometer may be called so."""
+    return _NAME.fullmatch(name) is not None
 
 
 def shown(name: str) -> str:
@@ -159,7 +164,7 @@ def _further(
         and count
         and name not in {*found.values(), *named.values()}
         and name.startswith(front)
-        and _NAME.fullmatch(name.removeprefix(front))
+        and is_thermometer(name.removeprefix(front))
     }
     both = {**beside_it, **named}
     return {own: both[own] for own in sorted(both)}

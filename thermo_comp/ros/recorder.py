@@ -18,9 +18,7 @@ from struct import Struct
 from typing import Any
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.context import Context
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu
@@ -29,7 +27,7 @@ from std_msgs.msg import Bool
 from ..errors import ThermoCompError
 from ..online.stamped_flag import STAMPED_TOPIC
 from ..recording import BagWriter
-from .waitloop import WaitLoop
+from .listener import Listener
 
 NODE_NAME = 'thermo_comp_recorder'
 
@@ -69,25 +67,17 @@ class Recorder:
     def __enter__(self) -> Recorder:
         """Start recording."""
         self._writer = BagWriter(self._path, overwrite=self._overwrite)
-        self._context = Context()
-        rclpy.init(args=['--ros-args', *self._ros_args], context=self._context)
-        self._node = rclpy.create_node(NODE_NAME, context=self._context)
-        self._loop = WaitLoop(self._node)
+        self._listener = Listener(NODE_NAME, self._ros_args)
         self._subscriptions = {
-            name: self._loop.subscribe(message_type, name, _QOS)
+            name: self._listener.loop.subscribe(message_type, name, _QOS)
             for name, message_type in self._topics.items()
         }
-        self._thread = threading.Thread(target=self._run, name='recorder')
-        self._thread.start()
+        self._listener.start(self._take)
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
         """Stop; finish the bag, or drop it after an error."""
-        self._loop.stop()
-        self._thread.join()
-        self._loop.close()
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        self._listener.close()
         if kind is not None or self._failure is not None:
             self._writer.abort()
         else:
@@ -127,10 +117,6 @@ class Recorder:
                 if self._failure is not None or not self._changed.wait(timeout_s):
                     return False
         return True
-
-    def _run(self) -> None:
-        self._loop.run(self._take)
-        self._take()
 
     def _take(self) -> None:
         """Write what has arrived, until that fails."""

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The account of a test while it is recorded: known positions, in blocks of any length."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pytest
+
+from thermo_comp.fitting.acquisition import Acquisition
+from thermo_comp.recording.columns import Block, Readings
+
+START_NS = 10**18
+RATE = 50.0
+UPS = [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, 1, 0), (0.8, 0.6, 0), (0, -1, 0)]
+
+
+class Stream:
+    """Samples of a unit of 300 counts per m/s^2, as somebody turns it."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._pieces: list[np.ndarray] = []
+        self.celsius: list[np.ndarray] = []
+
+    @property
+    def seconds(self) -> float:
+        return sum(map(len, self._pieces)) / RATE
+
+    def rest(
+        self, up: Sequence[float], seconds: float, ramp: float = 0.0, noise: float = 3.0
+    ) -> None:
+        n = round(seconds * RATE)
+        force = 2942.0 * np.array(up) / np.linalg.norm(up) + (60.0, -90.0, 30.0)
+        self._pieces.append(np.rint(force + self._rng.normal(0.0, noise, (n, 3))))
+        last = self.celsius[-1][-1] if self.celsius else 20.0
+        self.celsius.append(last + ramp / 60.0 / RATE * np.arange(n))
+
+    def turn(self, seconds: float = 6.0) -> None:
+        self.rest((0, 0, 1), seconds, noise=900.0)
+
+    def blocks(self, seconds: float, start_ns: int = START_NS) -> Iterator[Block]:
+        accel = np.concatenate(self._pieces)
+        celsius = np.concatenate(self.celsius)
+        stamp_ns = start_ns + (np.arange(len(accel)) * 1e9 / RATE).astype(np.int64)
+        size = round(seconds * RATE)
+        for begin in range(0, len(accel), size):
+            own = slice(begin, begin + size)
+            # A reading a second.
+            places = np.arange(begin, min(begin + size, len(accel)))
+            at = places[places % round(RATE) == 0]
+            board = Readings(stamp_ns[at], celsius[at], at - begin)
+            log_ns = {'accel': stamp_ns[own], 'board': stamp_ns[at]}
+            yield Block(stamp_ns[own], accel[own], '', None, {'board': board}, log_ns)
+
+
+@pytest.fixture
+def stream(rng: np.random.Generator) -> Stream:
+    return Stream(rng)
+
+
+def reasons(test: Acquisition) -> list[str]:
+    return [one.reason for one in test.account().positions]
+
+
+@pytest.mark.parametrize('seconds', [0.1, 0.7, 25.0, 1e4])
+def test_positions_are_found_however_the_blocks_fall(stream: Stream, seconds: float) -> None:
+    begins = []
+    for up in UPS:
+        begins.append(stream.seconds)
+        stream.rest(up, 60.0, ramp=1.0)
+        stream.turn()
+    test = Acquisition(6, 50.0)
+    found = [begin for block in stream.blocks(seconds) for begin in test.add(block)]
+    # A position begins within two cells of half a second after the turn.
+    assert np.array(found) * 1e-9 - START_NS * 1e-9 == pytest.approx(
+        np.array(begins[1:]) + 0.5, abs=0.6
+    )
+    account = test.account()
+    assert account.is_complete
+    for position, up in zip(account.positions, UPS, strict=True):
+        # A bias of 0.04 g turns what is read by up to 2 degrees.
+        assert position.up @ up > np.cos(np.radians(2.5))
+        assert position.still_s == pytest.approx(60.0, abs=2.0)
+        assert position.thermometers['board'].span == pytest.approx(1.0, abs=0.15)
+        assert (position.n_rests, position.reason) == (1, '')
+    board = account.thermometers['board']
+    assert (board.lowest, board.n) == (
+        20.0,
+        sum(one.thermometers['board'].n for one in account.positions),
+    )
+    assert board.highest == pytest.approx(26.0, abs=0.1)
+
+
+def test_a_position_grows_until_it_is_good(stream: Stream) -> None:
+    stream.rest((0, 0, 1), 40.0)
+    test = Acquisition(2, 30.0)
+    told = []
+    for block in stream.blocks(1.0):
+        test.add(block)
+        account = test.account()
+        told.append((account.positions[-1].reason, account.is_still))
+    words = list(dict.fromkeys(reason for reason, _ in told))
+    assert words == ['not at rest yet', 'rests until 30 s', '']
+    assert told[-1] == ('', True)
+    assert 'positions are missing' in account.findings[0]
+    assert not account.is_complete
+    # Turned upside down from here.
+    assert account.next_deg == pytest.approx(np.degrees(np.arccos(account.next_up @ account.now)))
+
+
+def test_what_is_wrong_with_a_position_is_said(stream: Stream) -> None:
+    stream.rest((0, 0, 1), 60.0)
+    stream.turn()
+    stream.rest((1, 0, 0), 20.0)
+    stream.turn()
+    stream.rest((0, 0.03, 1), 60.0)
+    stream.turn()
+    stream.rest((0, 1, 0), 60.0, noise=15.0)
+    stream.turn()
+    stream.rest((0, -1, 0), 30.0)
+    stream.turn()
+    # Knocked, and back in its place.
+    stream.rest((0, -1, 0), 30.0)
+    test = Acquisition(5, 50.0)
+    for block in stream.blocks(0.5):
+        test.add(block)
+    account = test.account()
+    assert [one.reason for one in account.positions] == [
+        '',
+        'left before 50 s',
+        'as position 1',
+        'restless',
+        '',
+    ]
+    assert account.positions[-1].n_rests == 2
+
+
+def test_the_same_direction_does_not_count_twice(stream: Stream) -> None:
+    for up in ((0, 0, 1), (1, 0, 0), (0, 0.03, 1)):
+        stream.rest(up, 40.0)
+        stream.turn()
+    test = Acquisition(3, 30.0)
+    for block in stream.blocks(0.5):
+        test.add(block)
+    assert reasons(test) == ['', '', 'as position 1']
+
+
+def test_a_clock_that_goes_back_begins_a_position(stream: Stream) -> None:
+    stream.rest((0, 0, 1), 40.0)
+    test = Acquisition(1, 30.0)
+    for start_ns in (START_NS, 10**15):
+        begins = [begin for block in stream.blocks(0.5, start_ns) for begin in test.add(block)]
+    assert begins == [10**15]
+    assert [one.still_s for one in test.account().positions] == pytest.approx([40.0] * 2, abs=1.0)
+
+
+def test_nothing_has_come() -> None:
+    account = Acquisition(18, 60.0).account()
+    assert not account.is_still
+    assert np.isnan(account.now).all()
+    assert account.findings[0] == '18 of 18 positions are missing'
+    assert [one.n_rests for one in account.positions] == [0]

@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What directions are worth: against closed forms, a second route and the scatter of estimates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermo_comp.fitting.coverage import (
+    PRIOR_SD,
+    constants_covariance,
+    farthest,
+    force_columns,
+    next_direction,
+    norm_columns,
+    spoken_direction,
+    worst_sd,
+)
+from thermo_comp.simulation import positions
+
+FACES = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
+NOTHING = np.empty((0, 3))
+SD = 2e-5
+
+
+def units(rng: np.random.Generator, n: int) -> np.ndarray:
+    vectors = rng.standard_normal((n, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def mean_variance(ups: np.ndarray, at: np.ndarray) -> float:
+    covariance = constants_covariance(ups, np.full(len(ups), SD))
+    columns = force_columns(at)
+    return float(np.mean(np.trace(columns @ covariance @ columns.transpose(0, 2, 1), 0, 1, 2)))
+
+
+def test_columns_are_the_derivatives_of_the_measured_force(rng: np.random.Generator) -> None:
+    up, step = units(rng, 20), 1e-6
+
+    def force(constants: np.ndarray) -> np.ndarray:
+        bias, scale, skew = constants.reshape(3, 3)
+        inverse = np.eye(3)
+        inverse[1, 0], inverse[2, 0], inverse[2, 1] = skew
+        return (up @ inverse.T) * (1.0 + scale) + bias
+
+    for k, step_of in enumerate(step * np.eye(9)):
+        slope = (force(step_of) - force(-step_of)) / (2.0 * step)
+        np.testing.assert_allclose(force_columns(up)[:, :, k], slope, atol=1e-9)
+        norm = [np.linalg.norm(force(one), axis=1) for one in (step_of, -step_of)]
+        np.testing.assert_allclose(
+            norm_columns(up)[:, k], (norm[0] - norm[1]) / (2.0 * step), atol=1e-9
+        )
+
+
+def test_without_positions_the_prior_is_left() -> None:
+    covariance = constants_covariance(NOTHING, np.empty(0))
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
+    # Bias and scale of one axis that is upright: their variances add up.
+    assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
+
+
+def test_two_opposite_faces_tell_bias_and_scale_of_their_axis() -> None:
+    sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
+    # Half the difference and half the sum of two numbers.
+    assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
+    np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
+
+
+def test_the_covariance_is_the_scatter_of_estimates(rng: np.random.Generator) -> None:
+    up, n = positions(12, 3), 4000
+    covariance = constants_covariance(up, np.full(12, SD))
+    truth = rng.standard_normal((n, 9)) * PRIOR_SD
+    columns = norm_columns(up)
+    seen = truth @ columns.T + SD * rng.standard_normal((n, 12))
+    # The conditional mean of a Gaussian, by its joint covariance.
+    joint = columns * PRIOR_SD**2 @ columns.T + SD**2 * np.eye(12)
+    estimate = seen @ np.linalg.solve(joint, columns * PRIOR_SD**2)
+    # 4000 trials tell a standard deviation to 1.1 %.
+    np.testing.assert_allclose(
+        np.std(estimate - truth, axis=0), np.sqrt(np.diag(covariance)), rtol=0.06
+    )
+
+
+@pytest.mark.parametrize('n', [0, 1, 4, 7, 11])
+def test_the_next_direction_lowers_the_mean_variance(n: int, rng: np.random.Generator) -> None:
+    up, at = units(rng, n), units(rng, 2000)
+    covariance = constants_covariance(up, np.full(n, SD))
+    proposed = next_direction(covariance, SD, up)
+    before = mean_variance(up, at)
+    gain = before - mean_variance(np.vstack([up, proposed]), at)
+    others = [before - mean_variance(np.vstack([up, one]), at) for one in units(rng, 300)]
+    # A face that is easily held may be worth half of the best; that is better than most.
+    assert gain > 0.45 * max(others)
+    assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
+
+
+def test_who_follows_the_proposals_gets_a_good_test() -> None:
+    up = NOTHING
+    for _ in range(18):
+        covariance = constants_covariance(up, np.full(len(up), SD))
+        up = np.vstack([up, next_direction(covariance, SD, up)])
+    # The faces first, upright to begin with; then what tells the misalignment.
+    assert up[0].tolist() == [0.0, 0.0, 1.0]
+    assert {tuple(one) for one in up[:6]} == {tuple(one) for one in FACES}
+    proposed = worst_sd(constants_covariance(up, np.full(18, SD)))
+    spread = worst_sd(constants_covariance(positions(18), np.full(18, SD)))
+    assert proposed < 1.1 * spread
+    assert farthest(up)[1] < 36.0
+
+
+def test_the_hole_in_the_sphere() -> None:
+    # The corners of a cube are equally far from its faces.
+    up, angle = farthest(FACES)
+    assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))
+    assert angle == pytest.approx(np.degrees(np.arccos(1.0 / np.sqrt(3.0))))
+    assert farthest(FACES[4:5])[0] == pytest.approx([0.0, 0.0, -1.0])
+    assert farthest(NOTHING)[1] == 180.0
+
+
+@pytest.mark.parametrize(
+    ('up', 'words'),
+    [
+        ((0, 0, 1), '+z up: x +0.00 g, y +0.00 g, z +1.00 g'),
+        ((1, -1, 0), '+x and -y up alike: x +0.71 g, y -0.71 g, z +0.00 g'),
+        ((-1, 1, 1), '-x, +y and +z up alike: x -0.58 g, y +0.58 g, z +0.58 g'),
+        ((3, 1, 0), 'between +x and +y: x +0.95 g, y +0.32 g, z +0.00 g'),
+    ],
+)
+def test_a_direction_in_words(up: tuple[float, ...], words: str) -> None:
+    assert spoken_direction(np.array(up, float) / np.linalg.norm(up)) == words

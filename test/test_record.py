@@ -1,0 +1,315 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A test recorded position by position: from a growing bag, and on real DDS with a driver."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import ROOT, Cli
+
+from thermo_comp import simulation
+from thermo_comp.errors import RecordingError
+from thermo_comp.recording import BagWriter, RawMessages, Topics, open_recording
+from thermo_comp.recording.growing import growing_blocks
+from thermo_comp.recording.position_bags import numbered_bags
+from thermo_comp.unit.calibration_file import load_calibration
+
+N_POSITIONS, SOAK_S, TURN_S, RATE = 9, 200.0, 20.0, 10.0
+UNIT = simulation.unit_preset('plain', 1)
+UPS = simulation.positions(N_POSITIONS, 2)
+START_NS = 1_767_225_600_000_000_000
+
+
+def write_session(path: Path, ups: np.ndarray = UPS, chunk_bytes: int = 1 << 14) -> Path:
+    """Write one bag of a unit that rests in each position in turn, with hands on it between."""
+    rng = np.random.default_rng(5)
+    program = simulation.parse_cyclogram(f'20 {SOAK_S:g}s')
+    start_ns = START_NS
+    with BagWriter(path, metadata={'serial': 'lab-7'}, chunk_bytes=chunk_bytes) as writer:
+        for seed, up in enumerate(ups):
+            (run,) = simulation.simulate_blocks(
+                UNIT,
+                program,
+                up,
+                block_size=1 << 20,
+                rate_hz=RATE,
+                temperature_rate_hz=1.0,
+                seed=seed,
+            )
+            by = start_ns - int(run.accel_stamp_ns[0])
+            writer.write_counts('accel/counts', run.accel_stamp_ns + by, run.counts, 'imu_link')
+            for name, stamp_ns, celsius in (
+                ('board', run.board_stamp_ns, run.board),
+                ('case', run.case_stamp_ns, run.case),
+                ('lid', run.case_stamp_ns, run.case - 1.0),
+            ):
+                writer.write_temperature(f'temperature/{name}', stamp_ns + by, celsius)
+            end_ns = int(run.accel_stamp_ns[-1]) + by
+            stamps = end_ns + (np.arange(1, TURN_S * RATE) * 1e9 / RATE).astype(np.int64)
+            shaken = np.rint(run.counts[-1] + rng.normal(0.0, 900.0, (len(stamps), 3)))
+            writer.write_counts('accel/counts', stamps, shaken, 'imu_link')
+            start_ns = int(stamps[-1]) + round(1e9 / RATE)
+            writer.flush()
+    return path
+
+
+@pytest.fixture(scope='module')
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_session(tmp_path_factory.mktemp('session') / 'session.mcap')
+
+
+def messages_of(one: RawMessages) -> list[bytes]:
+    data = one.data.tobytes()
+    return [data[a:b] for a, b in pairwise([0, *one.ends.tolist()])]
+
+
+def contents(paths: list[Path]) -> dict[str, list[bytes]]:
+    """Give the serialized messages of bags, one after the other, by topic."""
+    found: dict[str, list[bytes]] = {}
+    for path in paths:
+        with open_recording(path, require=()) as reader:
+            for one in reader.raw(reader.info.topics):
+                found.setdefault(one.topic, []).extend(messages_of(one))
+    return found
+
+
+def check_positions(result: dict[str, Any]) -> None:
+    """Compare what was found with the truth."""
+    assert result['is_complete']
+    for found, up in zip(result['positions'], UPS, strict=True):
+        # The unit's bias turns what is read by less than a degree.
+        assert np.array(found['up']) @ up > np.cos(np.radians(1.0))
+        assert found['reason'] == ''
+        assert set(found['thermometers']) == {'board', 'case', 'lid'}
+        # Less the cells beside a motion, of three seconds at this rate.
+        assert found['still_s'] == pytest.approx(SOAK_S, abs=20.0)
+
+
+def check_fit(result: dict[str, Any], cli: Cli, folder: Path) -> None:
+    """Run the command that was printed, and compare the calibration with the truth."""
+    words = shlex.split(result['command'].replace('--gravity G', '--gravity 9.80665'))
+    assert words.pop(0) == 'thermo_comp'
+    bags = [str(one) for one in sorted(folder.glob('*.mcap'))]
+    cli(*(part for word in words for part in (bags if '*' in word else [word])), cwd=folder)
+    calibration = load_calibration(folder / 'unit.yaml')
+    assert calibration.unit.serial == 'lab-7'
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    scale = np.array([one.scale_factor for one in axes])
+    bias = np.array([one.bias for one in axes]) / scale
+    sd = np.array([one['sd_g'] for one in result['positions']]).max() * 9.80665
+    # The claim before the fit is for the noise of the positions; its constants are at 20 degC.
+    assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
+    true_bias = np.array(UNIT.bias_at_reference) / UNIT.scale_factor
+    assert bias == pytest.approx(true_bias, abs=5.0 * max(9.80665 * max(result['bias_sd_g']), sd))
+    assert np.array(calibration.misalignment) == pytest.approx(
+        UNIT.M, abs=5.0 * max(result['misalignment_sd_rad'])
+    )
+
+
+class TestGrowing:
+    def test_every_message_comes_once_however_the_file_grows(
+        self, session: Path, tmp_path: Path
+    ) -> None:
+        whole = session.read_bytes()
+        growing = tmp_path / 'growing.mcap'
+        growing.write_bytes(b'')
+        sizes = iter([0, 40, *(len(whole) * k // 7 for k in range(1, 7)), len(whole)])
+
+        def wait(_: float) -> bool:
+            growing.write_bytes(whole[: next(sizes)])
+            return False
+
+        found: dict[str, list[bytes]] = {}
+        n_looks = 0
+        for news in growing_blocks(growing, Topics(), 'auto', wait):
+            n_looks += news is None
+            if news is not None:
+                assert news.serial == 'lab-7'
+                for one in news.block.raw:
+                    found.setdefault(one.topic, []).extend(messages_of(one))
+        assert n_looks == 10
+        assert found == contents([session])
+
+    def test_what_is_no_bag_is_said(self, tmp_path: Path) -> None:
+        with pytest.raises(RecordingError, match='no such file'):
+            next(growing_blocks(tmp_path / 'no.mcap', Topics(), 'auto', lambda _: True))
+        (tmp_path / 'text.mcap').write_text('hello, this is no bag')
+        with pytest.raises(RecordingError, match=r'text\.mcap'):
+            list(growing_blocks(tmp_path / 'text.mcap', Topics(), 'auto', lambda _: False))
+
+    def test_a_whole_bag_becomes_one_for_each_position(
+        self, session: Path, cli: Cli, tmp_path: Path
+    ) -> None:
+        options = ('--positions', f'{N_POSITIONS}', '--soak', '180s', '-o', tmp_path / 'bags')
+        finished = cli('record', session, *options, '--json')
+        result = json.loads(finished.stdout)
+        check_positions(result)
+        bags = numbered_bags(tmp_path / 'bags')
+        assert [str(one) for one in bags] == result['bags']
+        assert [one.name for one in bags] == [f'{k:02d}.mcap' for k in range(1, N_POSITIONS + 1)]
+        # Nothing is lost, nothing comes twice, nothing changes its place.
+        assert contents(bags) == contents([session])
+        assert f'position {N_POSITIONS}: good' in finished.stderr
+
+    def test_a_folder_is_gone_on_with(self, cli: Cli, tmp_path: Path) -> None:
+        bags = tmp_path / 'bags'
+        for number, part in enumerate((UPS[:2], UPS[2:3]), 1):
+            bag = write_session(tmp_path / f'part{number}.mcap', part)
+            finished = cli(
+                'record',
+                bag,
+                '--positions',
+                '3',
+                '--soak',
+                '180s',
+                '-o',
+                bags,
+                '--json',
+                code=None,
+            )
+            result = json.loads(finished.stdout)
+            # Not all of it is there yet, and the bag is over.
+            assert finished.returncode == (0 if result['is_complete'] else 1)
+            assert result['n_good'] == (2, 3)[number - 1]
+        assert len(numbered_bags(bags)) == 3
+        other = ('record', bag, '-o', bags, '--serial', 'lab-8')
+        assert '01.mcap is of unit lab-7, not lab-8' in cli(*other, code=1).stderr
+
+    def test_usage(self, session: Path, cli: Cli, tmp_path: Path) -> None:
+        out = ('-o', tmp_path / 'bags')
+        said = cli('record', session, '--soak', '45', *out, code=2).stderr
+        assert "--soak: expected a duration like 45min, 1.5h or 30s, got '45'" in said
+        (tmp_path / 'file').write_text('')
+        assert (
+            'cannot be written' in cli('record', session, '-o', tmp_path / 'file', code=1).stderr
+        )
+
+
+class Recording:
+    """The command as a process of its own."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', 'thermo_comp', 'record', *map(str, arguments)],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def wait_for(self, words: str) -> None:
+        """Read what it says until it says this."""
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            if words in line:
+                return
+        raise AssertionError(f'it ended without: {words}')
+
+    def end(self, number: signal.Signals | None = None) -> tuple[int, dict[str, Any], str]:
+        """Wait for its end, after a signal; give its exit code, result and last words."""
+        if number is not None:
+            self.process.send_signal(number)
+        out, said = self.process.communicate(timeout=120)
+        assert 'Traceback' not in said
+        return self.process.returncode, json.loads(out), said
+
+
+@pytest.fixture
+def play() -> Callable[..., Any]:
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    from thermo_comp.ros.player import play
+
+    return play
+
+
+class TestLive:
+    def test_a_driver_is_recorded_and_fitted(
+        self, play: Callable[..., Any], session: Path, cli: Cli, tmp_path: Path
+    ) -> None:
+        bags = tmp_path / 'bags'
+        options = ('--positions', f'{N_POSITIONS}', '--soak', '180s', '--serial', 'lab-7')
+        recording = Recording(*options, '-o', bags, '--json')
+        recording.wait_for('nobody publishes /accel/counts or /imu/uncompensated')
+        play(session, rate=0.0, wait_s=30.0)
+        code, result, _ = recording.end()
+        assert code == 0
+        check_positions(result)
+        assert len(numbered_bags(bags)) == N_POSITIONS
+        # It ends when the last position is good: what came until then is there, byte for byte.
+        sent, got = contents([session]), contents(numbered_bags(bags))
+        assert got.keys() == sent.keys()
+        for topic, messages in got.items():
+            assert messages == sent[topic][: len(messages)]
+            assert len(messages) > 0.95 * len(sent[topic])
+        check_fit({**result, 'command': result['command'].replace(str(bags), '.')}, cli, bags)
+
+    @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+    def test_a_signal_ends_it_with_whole_bags(
+        self, play: Callable[..., Any], session: Path, tmp_path: Path, number: signal.Signals
+    ) -> None:
+        bags = tmp_path / 'bags'
+        recording = Recording('--soak', '180s', '-o', bags, '--json')
+        recording.wait_for('nobody publishes')
+        play(session, rate=0.0, wait_s=30.0)
+        recording.wait_for(f'position {N_POSITIONS}: good')
+        code, result, _ = recording.end(number)
+        assert code == 0
+        assert (result['n_good'], result['is_complete']) == (N_POSITIONS, False)
+        assert result['findings'][0] == '9 of 18 positions are missing'
+        assert contents(numbered_bags(bags)) == contents([session])
+        assert sorted(bags.iterdir()) == numbered_bags(bags)
+
+    def test_imu_messages_in_a_namespace_under_other_names(
+        self, play: Callable[..., Any], tmp_path: Path
+    ) -> None:
+        n, force = 2000, 9.81 * UPS[0]
+        stamps = START_NS + np.arange(n) * 20_000_000
+        bag = tmp_path / 'imu.mcap'
+        with BagWriter(bag) as writer:
+            noise = np.random.default_rng(3).normal(0.0, 0.01, (n, 3))
+            writer.write_imu('imu/uncompensated', stamps, force + noise, np.zeros(9))
+            writer.write_temperature('temperature/board', stamps[::50], np.full(n // 50, 20.0))
+        remap = ['-r', '__ns:=/left', '-r', 'imu/uncompensated:=imu/driver']
+        topics = ('--topic', 'imu=/left/imu/driver', '--topic', 'board=/left/temperature/board')
+        recording = Recording(
+            '--positions', '1', '--soak', '30s', *topics, '-o', tmp_path / 'bags', '--json'
+        )
+        recording.wait_for('nobody publishes /accel/counts or /left/imu/driver')
+        play(bag, rate=0.0, wait_s=30.0, ros_args=remap)
+        code, result, said = recording.end()
+        assert (code, result['n_good']) == (0, 1), said
+        got = contents(numbered_bags(tmp_path / 'bags'))
+        assert set(got) == {'/imu/uncompensated', '/temperature/board'}
+        assert (
+            got['/imu/uncompensated']
+            == contents([bag])['/imu/uncompensated'][: len(got['/imu/uncompensated'])]
+        )
+
+    @pytest.mark.usefixtures('play')
+    def test_a_topic_of_another_type_is_named(self, tmp_path: Path) -> None:
+        from geometry_msgs.msg import PointStamped
+        from ros_helpers import Peer
+
+        peer = Peer()
+        try:
+            peer.node.create_publisher(PointStamped, 'accel/counts', 10)
+            recording = Recording('-o', tmp_path / 'bags', '--json')
+            recording.wait_for(
+                '/accel/counts has the type geometry_msgs/msg/PointStamped, '
+                'expected geometry_msgs/msg/Vector3Stamped'
+            )
+            code, result, _ = recording.end(signal.SIGINT)
+        finally:
+            peer.close()
+        assert (code, result['bags'], result['command']) == (0, [], None)

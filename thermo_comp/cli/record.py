@@ -1,0 +1,285 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns ``thermo_comp record``: a test recorded position by position, with what is missing told."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..errors import OutputError, ThermoCompError
+from ..unit.gravity import STANDARD_GRAVITY, spoken
+from . import options
+from .output import Cell, Output, micro_g
+from .play import require_ros
+
+if TYPE_CHECKING:
+    from ..fitting.acquisition import Account, Acquisition
+    from ..recording import Input, Topics
+    from ..recording.growing import News
+    from ..recording.position_bags import PositionBags
+    from ..typing import Floats
+
+_COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
+
+
+def record(
+    context: typer.Context,
+    output: Annotated[
+        Path,
+        typer.Option(
+            '--output', '-o', help='Folder of the bags; one that has some is gone on with.'
+        ),
+    ],
+    bag: Annotated[
+        Path | None,
+        typer.Argument(
+            help='Bag that another recorder writes, instead of topics.', metavar='[BAG]'
+        ),
+    ] = None,
+    positions: Annotated[int, typer.Option(help='Positions wanted.', min=1, max=999)] = 18,
+    soak: Annotated[str, typer.Option(help='Rest wanted in each: 45min, 1.5h, 30s.')] = '45min',
+    serial: Annotated[
+        str | None,
+        typer.Option(help='Serial of the unit, for the bags.', callback=options.check_serial),
+    ] = None,
+    input_: options.InputOption = 'auto',
+    topic: options.Topic = None,
+    topics: options.TopicsFile = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Record a test, a bag per position, and say what is still missing.
+
+    Listens beside the driver (or follows a growing bag): whether it rests,
+    for how long, over which temperatures and ramps, how well the positions
+    so far will tell bias, scale and misalignment, and which way to turn it
+    next. Ends when all is there, or with Ctrl-C; the same command goes on.
+
+    Example:
+      thermo_comp record --positions 18 --soak 45min -o bags/unit43
+      thermo_comp record held_out.mcap --positions 1 --soak 1h -o bags/unit44
+    """
+    from ..fitting.acquisition import Acquisition
+    from ..recording.growing import growing_blocks
+    from ..recording.position_bags import PositionBags, numbered_bags
+
+    out = Output(as_json, quiet)
+    test = Acquisition(positions, options.duration(soak, '--soak'))
+    chosen = options.topics_of(topic, topics)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f'cannot be written: {error.strerror}', output) from error
+    known = numbered_bags(output)
+    bags = PositionBags(output, _take_known(out, test, known, serial))
+    try:
+        with _until_signal() as over:
+            if bag is None:
+                _listen(out, test, bags, chosen, input_, context.obj or (), over)
+            else:
+                news = growing_blocks(bag, chosen, input_, over.wait)
+                _take(out, test, bags, news, lambda: ())
+    finally:
+        bags.close()
+    account = test.account()
+    _say(out, account, output, [*known, *bags.written])
+    out.end(is_torn=not account.is_complete and not over.is_set())
+
+
+@contextmanager
+def _until_signal() -> Iterator[threading.Event]:
+    """Give what is set by SIGINT or SIGTERM; a second one ends the process at once."""
+    from ..ros.signals import SignalWatch
+
+    over = threading.Event()
+    with SignalWatch() as signals:
+        signals.on_signal(over.set)
+        yield over
+
+
+def _take_known(
+    out: Output, test: Acquisition, known: list[Path], serial: str | None
+) -> str | None:
+    """Go on after the bags that are there, each a position; return whose they are."""
+    from ..recording import open_recording
+
+    with out.progress('reading what is there', total=len(known)) as done:
+        for number, path in enumerate(known, 1):
+            with open_recording(path, require=()) as reader:
+                own = reader.info.metadata.get('serial')
+                if serial is not None and own not in (serial, None):
+                    raise ThermoCompError(f'{path} is of unit {own}, not {serial}')
+                serial = serial or own
+                for block in reader.blocks():
+                    test.add(block)
+            test.begin()
+            done(number)
+    return serial
+
+
+def _listen(
+    out: Output,
+    test: Acquisition,
+    bags: PositionBags,
+    topics: Topics,
+    kind: Input,
+    ros_args: Sequence[str],
+    over: threading.Event,
+) -> None:
+    """Record live topics."""
+    require_ros()
+    from ..ros.live import LiveTopics
+
+    with LiveTopics(topics, kind, ros_args) as live:
+        out.line('listening; Ctrl-C ends it with whole bags')
+        sys.stdout.flush()  # whoever reads this through a pipe waits for it
+        _take(out, test, bags, live.blocks(over.wait), lambda: live.problems)
+    if live.n_lost:
+        out.note(f'{live.n_lost} messages were lost on the way')
+
+
+def _take(
+    out: Output,
+    test: Acquisition,
+    bags: PositionBags,
+    news: Iterator[News | None],
+    problems: Callable[[], Sequence[str]],
+) -> None:
+    """Record until all is there or nothing more comes, and show how far it is."""
+    told: dict[str, str] = {}
+    with out.live() as show:
+        for new in news:
+            if new is not None:
+                bags.add(new)
+                for begin_ns in test.add(new.block):
+                    bags.cut(begin_ns)
+                bags.release(test.settled_ns)
+                continue
+            account = test.account()
+            if show is not None:
+                show(_COLUMNS, _rows(account), [*problems(), _now(account), *_lines(account)])
+            else:
+                _tell(out, account, problems(), told)
+            if account.is_complete:
+                break
+
+
+def _tell(out: Output, account: Account, problems: Sequence[str], told: dict[str, str]) -> None:
+    """Say in a line what has changed since it was last told."""
+    news = {'problem': ', '.join(problems)} if problems else {}
+    for number, one in enumerate(account.positions, 1):
+        if one.n_rests:
+            news[f'position {number}'] = f'{one.reason or "good"}; {_reading(one.up)}'
+    # What a rest reads moves a little all the time.
+    new = {name: said for name, said in news.items() if told.get(name) != said.partition(';')[0]}
+    for name, said in new.items():
+        told[name] = said.partition(';')[0]
+        out.note(f'{name}: {said}')
+    if any(said.startswith('good') for said in new.values()):
+        out.note(_worth(account))
+        out.note(_next(account))
+
+
+def _reading(up: Floats) -> str:
+    return ', '.join(f'{axis} {value:+.2f} g' for axis, value in zip('xyz', up, strict=True))
+
+
+def _rows(account: Account) -> list[tuple[Cell, ...]]:
+    rows: list[tuple[Cell, ...]] = []
+    for number, one in enumerate(account.positions, 1):
+        board = one.thermometers.get('board')
+        spans = ('', '')
+        if board is not None:
+            heating, cooling = board.steepest_heating_k_min, board.steepest_cooling_k_min
+            spans = (
+                f'{board.lowest:.1f} .. {board.highest:.1f}',
+                f'{cooling:.2f} .. {heating:.2f}',
+            )
+        up = [f'{value:+.2f}' for value in one.up] if one.n_rests else [''] * 3
+        state = one.reason or 'good'
+        if one.n_rests > 1:
+            state += f', {one.n_rests} rests'
+        rows.append((number, *up, f'{one.still_s / 60.0:.1f}', *spans, state))
+    return rows
+
+
+def _now(account: Account) -> str:
+    if isnan(account.now[0]):
+        return 'nothing has come yet'
+    return f'now {"at rest" if account.is_still else "moving"}: {_reading(account.now)}'
+
+
+def _next(account: Account) -> str:
+    from ..fitting.coverage import spoken_direction
+
+    by = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from here'
+    return f'next: {spoken_direction(account.next_up)}{by}'
+
+
+def _worth(account: Account) -> str:
+    bias, scale, skew = account.constants_sd.reshape(3, 3)
+    parts = (
+        f'{spoken(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
+        f'bias {" ".join(spoken(value * STANDARD_GRAVITY) for value in bias)}',
+        f'scale {" ".join(micro_g(1e6 * value) for value in scale)} ppm',
+        f'misalignment {" ".join(micro_g(1e6 * value) for value in skew)} urad',
+    )
+    return f'known to {", ".join(parts)}'
+
+
+def _lines(account: Account) -> list[str]:
+    """Say what there is beside the positions, and what is missing."""
+    from ..fitting.coverage import spoken_direction
+
+    lines = [_worth(account)]
+    if account.hole_deg > 0.0:
+        where = spoken_direction(account.hole)
+        lines.append(f'no position within {account.hole_deg:.0f} deg of {where}')
+    for name, one in account.thermometers.items():
+        lines.append(
+            f'{name} {one.lowest:.1f} .. {one.highest:.1f} degC, ramps '
+            f'{one.steepest_cooling_k_min:+.2f} .. {one.steepest_heating_k_min:+.2f} K/min'
+        )
+    if not account.is_complete:
+        lines.append(_next(account))
+    return [*lines, *(f'- {finding}' for finding in account.findings)]
+
+
+def _say(out: Output, account: Account, output: Path, bags: Sequence[Path]) -> None:
+    positions = [one for one in account.positions if one.n_rests]
+    out.table(_COLUMNS, _rows(replace(account, positions=tuple(positions))))
+    for line in _lines(account):
+        out.line(line)
+    command = f'thermo_comp fit {shlex.quote(str(output))}/*.mcap -o unit.yaml --gravity G'
+    out.line(f'{len(bags)} bag{"s" * (len(bags) != 1)} in {output}')
+    if bags:
+        out.line('now fit them, with the local gravity in m/s^2:')
+        out.line(f'  {command}')
+    bias, scale, skew = account.constants_sd.reshape(3, 3)
+    out.json(
+        {
+            'bags': bags,
+            'command': command if bags else None,
+            'positions': positions,
+            'n_good': account.n_good,
+            'is_complete': account.is_complete,
+            'worst_sd_g': account.worst_sd_g,
+            'bias_sd_g': bias,
+            'scale_sd': scale,
+            'misalignment_sd_rad': skew,
+            'thermometers': account.thermometers,
+            'next_up': account.next_up,
+            'findings': account.findings,
+        }
+    )

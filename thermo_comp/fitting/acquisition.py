@@ -1,0 +1,364 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the account of a test while it is recorded: positions, what they are worth, what is missing.
+
+Fed with blocks as they come. A rest that points elsewhere than the position so far begins the next
+position; knocks and handling in between belong to the one before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..recording import Block
+from ..recording.columns import Readings
+from ..recording.overview import ThermometerSurvey, survey_thermometer, thermal_findings
+from ..recording.stillness import CellAccumulator, Cells, still_intervals
+from ..typing import Floats, Ints
+from .attitudes import SAME_DIRECTION_DEG, rough_centre
+from .coverage import constants_covariance, farthest, next_direction, worst_sd
+
+# What is still for so long, or for a soak that is shorter, is a rest [s].
+_REST_S = 10.0
+_CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
+# However long it lasts, hysteresis, mounting and drift leave this of a position [g].
+_FLOOR_SD = 2e-5
+# A rest with so many times the noise of the others is none to be proud of; with so many times that
+# of the one before it is a hand's.
+_RESTLESS, _LOUDEST = 3.0, 10.0
+_STEP_BACK_NS = 10**9
+# Before any stamp; its opposite is after all of them.
+_EVER_NS = -(1 << 62)
+
+#: By the name of the thermometer.
+Surveys = Mapping[str, ThermometerSurvey]
+
+
+@dataclass(frozen=True)
+class Position:
+    """
+    One position: where it points, for how long, what it was warm, why it is not good ('' = it is).
+
+    up: unit vector of the force in sensor axes, shape (3,); NaN before it rests
+    still_s, n_rests: time at rest, and in how many pieces: one more with each knock
+    sd_g: noise of its mean
+    """
+
+    up: Floats
+    still_s: float
+    n_rests: int
+    sd_g: float
+    thermometers: Surveys
+    reason: str
+
+
+@dataclass(frozen=True)
+class Account:
+    """
+    What a test has and what it still lacks.
+
+    positions: in the order of recording; the last one goes on
+    n_good, is_complete: positions that are good; whether these are as many as wanted
+    worst_sd_g: what the constants leave of the force in the worst attitude
+    constants_sd: of bias [g], relative scale, M [rad], shape (9,), see `coverage`
+    next_up, next_deg: where to turn it next, and by how much from now; NaN before any sample
+    hole, hole_deg: the direction farthest from all positions, and how far that is
+    thermometers: over all positions
+    now, is_still: the newest reading's direction, NaN before any; whether it rests
+    findings: what is missing, one sentence each
+    """
+
+    positions: tuple[Position, ...]
+    n_good: int
+    is_complete: bool
+    worst_sd_g: float
+    constants_sd: Floats
+    next_up: Floats
+    next_deg: float
+    hole: Floats
+    hole_deg: float
+    thermometers: Surveys
+    now: Floats
+    is_still: bool
+    findings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """What the still cells of one position say, in input units."""
+
+    mean: Floats
+    noise: float
+    n: int
+    still_s: float
+    n_rests: int
+
+
+_NO_REST = _Rest(np.full(3, np.nan), math.nan, 0, 0.0, 0)
+
+
+class _Open:
+    """The samples of one position while they come, and the newest of them once more."""
+
+    def __init__(self) -> None:
+        self._cells = CellAccumulator(_CELL_S, None)
+        self._n = 0
+        self.recent: list[tuple[Ints, Floats]] = []
+        #: Mean of its first rest, which a quieter one later may hide.
+        self.first: Floats | None = None
+
+    def add(self, stamp_ns: Ints, samples: Floats) -> None:
+        """Take samples, shape (n, 3), or (n, 6) with angular rates."""
+        self.recent.append((stamp_ns, samples))
+        n_before, self._n = self._n, self._n + len(stamp_ns)
+        if self._n < _SAMPLES_TO_BEGIN:
+            return
+        # The length of a cell follows from the first samples: there must be some.
+        pieces = self.recent if n_before < _SAMPLES_TO_BEGIN else self.recent[-1:]
+        stamp_ns, samples = (np.concatenate(column) for column in zip(*pieces, strict=True))
+        rates = samples[:, 3:] if samples.shape[1] > 3 else None
+        self._cells.add(stamp_ns, samples[:, :3], rates)
+
+    def forget(self, stamp_ns: int) -> None:
+        if self._n >= _SAMPLES_TO_BEGIN:
+            self.recent = [one for one in self.recent if len(one[0]) and one[0][-1] >= stamp_ns]
+
+    def cells(self) -> Cells:
+        return self._cells.finish()
+
+
+class Acquisition:
+    """The test so far: so many positions wanted, each at rest for `soak_s`."""
+
+    def __init__(self, n_positions: int, soak_s: float) -> None:
+        self._n_wanted, self._soak_s = n_positions, soak_s
+        self._rest_s = min(_REST_S, soak_s)
+        self._open = _Open()
+        self._rests: list[_Rest] = []
+        self._surveys: list[Surveys] = []
+        self._readings: dict[str, list[Readings]] = {}
+        self._centre = np.zeros(3)
+        #: Before this stamp no position begins any more.
+        self.settled_ns = _EVER_NS
+        self._newest_ns = _EVER_NS
+
+    def add(self, block: Block) -> list[int]:
+        """Take what came; return the stamps [ns] at which further positions begin."""
+        for name, one in block.temperatures.items():
+            if len(one.stamp_ns):
+                self._readings.setdefault(name, []).append(one)
+        if not len(block):
+            return []
+        begins: list[int] = []
+        first_ns, newest_ns = int(block.accel_stamp_ns[0]), self._newest_ns
+        if newest_ns - first_ns > _STEP_BACK_NS:
+            # A driver that began anew, with another clock.
+            self.begin()
+            begins.append(first_ns)
+        self._newest_ns = int(block.accel_stamp_ns[-1])
+        samples = block.accel
+        if block.imu is not None:
+            samples = np.hstack([samples, block.imu.angular_velocity])
+        self._open.add(block.accel_stamp_ns, samples)
+        cells = self._open.cells()
+        while (begin_ns := self._turn(cells)) is not None:
+            begins.append(max(begin_ns, self.settled_ns))
+            self._close(begins[-1])
+            cells = self._open.cells()
+        margin_ns = round((self._rest_s + 3.0 * max(cells.cell_s, _CELL_S)) * 1e9)
+        self.settled_ns = max(self.settled_ns, self._newest_ns - margin_ns)
+        self._open.forget(self.settled_ns)
+        return begins
+
+    def begin(self) -> None:
+        """End the position; what comes next may have another clock."""
+        self._close(-_EVER_NS)
+        self.settled_ns = self._newest_ns = _EVER_NS
+
+    def _turn(self, cells: Cells) -> int | None:
+        """Find where the sensor first rests in another direction than before [ns]."""
+        ranges = still_intervals(cells, self._rest_s)
+        if not ranges:
+            return None
+        # After a quiet position a less quiet one is at rest by its own measure.
+        end = ranges[-1][1]
+        behind = cells.part(slice(end, None))
+        ranges += [
+            (end + lower, end + upper)
+            for lower, upper in still_intervals(behind, self._rest_s)
+            if _noise(behind, [(lower, upper)]) < _LOUDEST * _noise(cells, ranges)
+        ]
+        means = np.array([_mean(cells, [one]) for one in ranges])
+        if self._open.first is None:
+            self._open.first = means[0]
+        ups = self._directions(means)
+        up = self._directions(self._open.first[None])[0]
+        other = ups @ up < math.cos(math.radians(SAME_DIRECTION_DEG))
+        if not other.any():
+            return None
+        lower = ranges[int(np.argmax(other))][0]
+        return cells.start_ns + round(float(cells.index[lower]) * cells.cell_s * 1e9)
+
+    def _close(self, end_ns: int) -> None:
+        """End the position; what came since belongs to the next one."""
+        before, self._open = self._open, _Open()
+        self._rests.append(_rest(before.cells(), end_ns, self._rest_s))
+        self._surveys.append(_surveys(self._readings, end_ns))
+        for name, pieces in self._readings.items():
+            self._readings[name] = [_part(one, end_ns, -_EVER_NS) for one in pieces]
+        for stamp_ns, samples in before.recent:
+            use = stamp_ns >= end_ns
+            if use.any():
+                self._open.add(stamp_ns[use], samples[use])
+        means = np.array([one.mean for one in self._rests if one.n_rests]).reshape(-1, 3)
+        self._centre = rough_centre(means)
+
+    def _directions(self, means: Floats) -> Floats:
+        """Give unit vectors of raw means, about the centre that they have so far."""
+        arms = means - self._centre
+        return np.asarray(arms / np.linalg.norm(arms, axis=1, keepdims=True))
+
+    def account(self) -> Account:
+        """Say what there is and what is missing."""
+        cells = self._open.cells()
+        rests = [*self._rests, _rest(cells, -_EVER_NS, self._rest_s)]
+        surveys = [*self._surveys, _surveys(self._readings, -_EVER_NS)]
+        ups = self._directions(np.array([one.mean for one in rests]))
+        noise = [one.noise / float(np.linalg.norm(one.mean)) for one in rests]
+        usual = float(
+            np.median([n for n, one in zip(noise, rests, strict=True) if one.n_rests] or [1.0])
+        )
+        sds = [
+            math.hypot(n / math.sqrt(max(r.n, 1)), _FLOOR_SD)
+            for n, r in zip(noise, rests, strict=True)
+        ]
+        positions: list[Position] = []
+        for up, rest, one, sd, survey in zip(ups, rests, noise, sds, surveys, strict=True):
+            reason = self._reason(rest, up, one / usual, positions)
+            positions.append(Position(up, rest.still_s, rest.n_rests, sd, survey, reason))
+        found = [one for one in positions if one.n_rests]
+        seen = np.array([one.up for one in found]).reshape(-1, 3)
+        covariance = constants_covariance(seen, np.array([one.sd_g for one in found]))
+        next_up = next_direction(covariance, found[-1].sd_g if found else _FLOOR_SD, seen)
+        now, is_still = self._now(cells)
+        hole, hole_deg = farthest(seen)
+        n_good = sum(not one.reason for one in positions)
+        thermometers = _together(surveys)
+        return Account(
+            tuple(positions),
+            n_good,
+            n_good >= self._n_wanted,
+            worst_sd(covariance),
+            np.sqrt(np.diag(covariance)),
+            next_up,
+            float(np.degrees(np.arccos(np.clip(now @ next_up, -1.0, 1.0)))),
+            hole,
+            hole_deg,
+            thermometers,
+            now,
+            is_still,
+            self._findings(n_good, thermometers),
+        )
+
+    def _reason(self, rest: _Rest, up: Floats, noise: float, before: Sequence[Position]) -> str:
+        """Say why a position is not good; nothing where it is."""
+        if not rest.n_rests:
+            return 'not at rest yet'
+        if noise > _RESTLESS:
+            return 'restless'
+        near = math.cos(math.radians(SAME_DIRECTION_DEG))
+        for number, one in enumerate(before, 1):
+            if not one.reason and float(one.up @ up) > near:
+                return f'as position {number}'
+        if rest.still_s < self._soak_s:
+            is_last = len(before) == len(self._rests)
+            soak = (
+                f'{self._soak_s / 60.0:.4g} min' if self._soak_s > 90.0 else f'{self._soak_s:g} s'
+            )
+            return f'rests until {soak}' if is_last else f'left before {soak}'
+        return ''
+
+    def _now(self, cells: Cells) -> tuple[Floats, bool]:
+        if not len(cells.count):
+            return np.full(3, np.nan), False
+        ranges = still_intervals(cells, 0.0)
+        # The last cell is still filling, the one before may be beside a motion.
+        is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
+        last = cells.mean[-2:-1] if len(cells.count) > 1 else cells.mean
+        return self._directions(last)[0], is_still
+
+    def _findings(self, n_good: int, thermometers: Surveys) -> tuple[str, ...]:
+        found = []
+        missing = self._n_wanted - n_good
+        if missing > 0:
+            found.append(f'{missing} of {self._n_wanted} positions are missing')
+        board = thermometers.get('board')
+        if board is None:
+            found.append('no board temperature: the constants hold at the temperature of the test')
+        else:
+            found += thermal_findings(board)
+        if 'case' not in thermometers:
+            found.append('no case temperature: the regime will follow the slower board sensor')
+        return tuple(found)
+
+
+def _rest(cells: Cells, end_ns: int, rest_s: float) -> _Rest:
+    """Put the rests of one position together, up to where the next one begins."""
+    end_s = (end_ns - cells.start_ns) * 1e-9 - 0.5 * cells.cell_s
+    cells = cells.part(slice(int(np.searchsorted(cells.time, end_s))))
+    ranges = still_intervals(cells, rest_s)
+    if not ranges:
+        return _NO_REST
+    return _Rest(
+        mean=_mean(cells, ranges),
+        noise=_noise(cells, ranges),
+        n=int(sum(cells.count[a:b].sum() for a, b in ranges)),
+        still_s=cells.cell_s * sum(b - a for a, b in ranges),
+        n_rests=len(ranges),
+    )
+
+
+def _noise(cells: Cells, ranges: Sequence[tuple[int, int]]) -> float:
+    variance = np.median(np.concatenate([cells.variance[a:b] for a, b in ranges]), axis=0)
+    return float(np.sqrt(variance.mean()))
+
+
+def _mean(cells: Cells, ranges: Sequence[tuple[int, int]]) -> Floats:
+    rows = np.concatenate([np.arange(a, b) for a, b in ranges])
+    return np.asarray(np.average(cells.mean[rows], axis=0, weights=cells.count[rows]))
+
+
+def _surveys(readings: Mapping[str, Sequence[Readings]], end_ns: int) -> Surveys:
+    """Describe what each thermometer read before a stamp."""
+    found = {}
+    for name, pieces in readings.items():
+        survey = survey_thermometer([_part(one, _EVER_NS, end_ns) for one in pieces])
+        if survey is not None:
+            found[name] = survey
+    return found
+
+
+def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
+    use = (readings.stamp_ns >= begin_ns) & (readings.stamp_ns < end_ns)
+    return Readings(readings.stamp_ns[use], readings.celsius[use], readings.after[use])
+
+
+def _together(surveys: Sequence[Surveys]) -> Surveys:
+    """Describe thermometers over several positions."""
+    found: dict[str, ThermometerSurvey] = {}
+    for name, one in ((name, one) for survey in surveys for name, one in survey.items()):
+        other = found.get(name, one)
+        found[name] = replace(
+            one,
+            n=one.n + (other.n if name in found else 0),
+            lowest=min(one.lowest, other.lowest),
+            highest=max(one.highest, other.highest),
+            steepest_heating_k_min=max(one.steepest_heating_k_min, other.steepest_heating_k_min),
+            steepest_cooling_k_min=min(one.steepest_cooling_k_min, other.steepest_cooling_k_min),
+        )
+    return found

@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what directions of rest are worth: the covariance they will leave, and the next best one.
+
+At rest |f| = g is known, so each position tells one number about the nine constants of a triad:
+bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. Linearised about
+an ideal triad, and with the fit's own prior, their covariance follows from the directions alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..typing import Floats
+from ..unit.gravity import STANDARD_GRAVITY
+from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD
+
+PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, SKEW_SD], 3)
+# What is easily held is proposed if it is worth this part of the best there is ...
+_NEARLY = 0.5
+# ... and what is nearer than 20 degrees to a position never.
+_NEAR = math.cos(math.radians(20.0))
+
+
+def force_columns(up: Floats) -> Floats:
+    """Differentiate the force by the nine constants, at unit vectors (n, 3): shape (n, 3, 9)."""
+    columns = np.zeros((len(up), 3, 9))
+    for axis in range(3):
+        columns[:, axis, axis] = 1.0
+        columns[:, axis, 3 + axis] = up[:, axis]
+    columns[:, 1, 6], columns[:, 2, 7], columns[:, 2, 8] = up[:, 0], up[:, 0], up[:, 1]
+    return columns
+
+
+def norm_columns(up: Floats) -> Floats:
+    """Differentiate the magnitude by the nine constants, at unit vectors (n, 3): shape (n, 9)."""
+    return np.asarray(np.einsum('ni,nij->nj', up, force_columns(up)))
+
+
+def constants_covariance(up: Floats, sd: Floats) -> Floats:
+    """Covariance of the nine after positions `up` (n, 3), each known to `sd` (n,) [g]."""
+    seen = norm_columns(up) / sd[:, None]
+    return np.asarray(np.linalg.inv(np.diag(PRIOR_SD**-2) + seen.T @ seen))
+
+
+def worst_sd(covariance: Floats) -> float:
+    """Largest standard deviation of the force, over all attitudes and directions of error [g]."""
+    columns = force_columns(_SPHERE)
+    return math.sqrt(np.max(np.linalg.eigvalsh(columns @ covariance @ columns.transpose(0, 2, 1))))
+
+
+def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
+    """
+    Find the direction where a position of noise `sd` [g] lowers the mean variance the most.
+
+    The mean is over all attitudes; what a rank-one update takes from it has a closed form. Faces
+    of a cube are preferred where they are nearly as good, then its edges, then its corners; what
+    is near a direction of `seen` (n, 3) is not proposed.
+    """
+    columns = force_columns(_SPHERE)
+    weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
+    tells = norm_columns(_SPHERE)
+    moved = tells @ covariance
+    gain = np.einsum('ij,jk,ik->i', moved, weight, moved)
+    gain /= np.einsum('ij,ij->i', moved, tells) + sd * sd
+    gain[np.max(_SPHERE @ seen.T, axis=1, initial=-1.0) > _NEAR] = 0.0
+    good = gain >= max(_NEARLY * gain.max(), 1e-300)
+    tier = next(tier for tier in _TIERS if good[tier].any())
+    # Of those that are worth the same, the first one.
+    return np.asarray(_SPHERE[tier][np.argmax(gain[tier] >= 0.99 * gain[tier].max())])
+
+
+def farthest(up: Floats) -> tuple[Floats, float]:
+    """Find the direction that is farthest from all of `up` (n, 3), and how far [deg]."""
+    if not len(up):
+        return _SPHERE[0], 180.0
+    nearest = np.max(_SPHERE @ up.T, axis=1)
+    chosen = int(np.argmin(nearest))
+    return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
+
+
+def spoken_direction(up: Floats) -> str:
+    """Say which way a user is to hold the sensor: the axes that point up, and what they read."""
+    signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
+    size = np.abs(up)
+    axes = [sign for sign, one in zip(signs, size, strict=True) if one > 0.1]
+    reading = ', '.join(f'{name} {value:+.2f} g' for name, value in zip('xyz', up, strict=True))
+    if np.ptp(size[size > 0.1]) > 0.1:
+        return f'between {_listed(axes)}: {reading}'
+    return f'{_listed(axes)} up{" alike" if len(axes) > 1 else ""}: {reading}'
+
+
+def _listed(names: list[str]) -> str:
+    return ' and '.join(filter(None, (', '.join(names[:-1]), names[-1])))
+
+
+def _cube() -> Floats:
+    """Faces, edges and corners of a cube, in this order, the upright one first."""
+    steps = np.array([(x, y, z) for z in (1, 0, -1) for y in (0, 1, -1) for x in (0, 1, -1)])
+    order = np.argsort(np.abs(steps).sum(axis=1), kind='stable')[1:]
+    cube = steps[order].astype(np.float64)
+    return np.asarray(cube / np.linalg.norm(cube, axis=1, keepdims=True))
+
+
+def _spiral(n: int) -> Floats:
+    """Spread unit vectors evenly over the sphere."""
+    k = np.arange(n)
+    z = 1.0 - (2.0 * k + 1.0) / n
+    turn, radius = math.pi * (3.0 - math.sqrt(5.0)) * k, np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
+
+
+_CUBE = _cube()
+_SPHERE = np.concatenate([_CUBE, _spiral(500)])
+# Faces, edges, corners, anything.
+_TIERS = (slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None))

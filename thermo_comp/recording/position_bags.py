@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns a folder of numbered bags, cut out of one stream of messages: `01.mcap`, `02.mcap`, ...
+
+Where one ends and the next begins is known a little late, so the newest messages are held back.
+Whatever the topics were called, the bags have them under the node's own names.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..typing import Ints
+from .columns import RawMessages
+from .growing import News
+from .topics import IMU, Topics
+from .writer import BagWriter
+
+_USUAL = Topics()
+_NAME = re.compile(r'(\d+)\.mcap')
+
+
+def numbered_bags(folder: Path) -> list[Path]:
+    """List the bags that a folder has, in the order of their numbers."""
+    found = [one for one in folder.glob('*.mcap') if _NAME.fullmatch(one.name)]
+    return sorted(found, key=lambda one: int(one.stem))
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """Messages of one topic, with their own stamps."""
+
+    stamp_ns: Ints
+    messages: RawMessages
+
+    def split(self, stamp_ns: int) -> tuple[_Piece, _Piece]:
+        """Part them where the first one is not older than a stamp."""
+        late = np.flatnonzero(self.stamp_ns >= stamp_ns)
+        at = int(late[0]) if len(late) else len(self.stamp_ns)
+        return (
+            _Piece(self.stamp_ns[:at], self.messages.part(0, at)),
+            _Piece(self.stamp_ns[at:], self.messages.part(at)),
+        )
+
+
+class PositionBags:
+    """
+    Writes the bags; the next number is taken when its first message is written.
+
+    Raises OutputError where a bag cannot be written. `close` finishes the last one.
+    """
+
+    def __init__(self, folder: Path, serial: str | None) -> None:
+        self._folder, self._serial = folder, serial
+        self._number = max((int(one.stem) for one in numbered_bags(folder)), default=0)
+        self._writer: BagWriter | None = None
+        self._held: list[_Piece] = []
+        #: Bags that were begun.
+        self.written: list[Path] = []
+
+    def add(self, news: News) -> None:
+        """Take the serialized messages."""
+        block = news.block
+        self._serial = self._serial or news.serial
+        roles = {topic: role for role, topic in news.topics.items()}
+        for one in block.raw:
+            role = roles[one.topic]
+            if role == 'accel':
+                stamp_ns = block.accel_stamp_ns
+                name = _USUAL.imu if one.type == IMU else _USUAL.counts
+            else:
+                stamp_ns, name = block.temperatures[role].stamp_ns, f'temperature/{role}'
+            self._held.append(_Piece(stamp_ns, replace(one, topic=name)))
+
+    def release(self, stamp_ns: int) -> None:
+        """Write what is older than a stamp."""
+        parts = [one.split(stamp_ns) for one in self._held]
+        self._held = [late for _, late in parts if len(late.stamp_ns)]
+        self._write([early for early, _ in parts if len(early.stamp_ns)])
+
+    def cut(self, stamp_ns: int) -> None:
+        """End the bag before a stamp."""
+        self.release(stamp_ns)
+        self._finish()
+
+    def close(self) -> None:
+        """Write what is held and end the last bag."""
+        held, self._held = self._held, []
+        self._write(held)
+        self._finish()
+
+    def _write(self, pieces: list[_Piece]) -> None:
+        if not pieces:
+            return
+        if self._writer is None:
+            self._number += 1
+            path = self._folder / f'{self._number:02d}.mcap'
+            metadata = {} if self._serial is None else {'serial': self._serial}
+            self._writer = BagWriter(path, metadata=metadata)
+            self.written.append(path)
+        for one in pieces:
+            raw = one.messages
+            self._writer.write_raw(raw.topic, raw.type, raw.log_ns, raw)
+        self._writer.flush()
+
+    def _finish(self) -> None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()
