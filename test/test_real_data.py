@@ -20,12 +20,12 @@ from scipy.optimize import least_squares
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
 
-from recorded.data import FREEZER, GRAVITY, faces_bag, freezer_bag, handheld_bag
+from recorded.data import GRAVITY, faces_bag, freezer_bag, handheld_bag
 
-from thermo_comp.convert import load_column_map, table_log, write_log
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.fit_sources import fit_sources
+from thermo_comp.recording import Part, Topics
 
 MG = GRAVITY * 1e-3
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
@@ -106,14 +106,8 @@ def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
 
 
 def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, work):
-    head, *rows = (real_data / FREEZER).read_text().splitlines()
-    at = head.split(',').index('now[ms]')
-    before = [row for row in rows if 49e3 < float(row.split(',')[at]) < 360e3]
-    table = work / 'before.csv'
-    table.write_text('\n'.join([head, *before]) + '\n')
-    columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
-    write_log(table_log(table, columns), work / 'before.mcap')
-    result = fit(fit_sources([work / 'before.mcap'])[0], OPTIONS)
+    topics = Topics(part=Part(47.5, 358.5))
+    result = fit(fit_sources([freezer_bag(real_data, work)], topics)[0], OPTIONS)
     z = result.calibration.static.z
     # The plain slope of |a| is 1.61 mg/K from 36 to 15 degC.
     slope = np.diff(z.bias_function.value(np.array([-4.0, 14.0])))[0] / 18.0 / MG

@@ -66,6 +66,8 @@ def fit(
     input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
+    begin: options.Begin = None,
+    end: options.End = None,
     force: options.Force = False,
     verbose: Annotated[
         bool, typer.Option('--verbose', '-v', help='List the positions that were found, too.')
@@ -102,7 +104,8 @@ def fit(
         check_output(report, PAGE, overwrite=force, others=[*inputs, output])
     if certificate_info is not None and report is None:
         raise options.usage('--certificate-info fills the page of --report: give that, too')
-    sources, kind = fit_sources(bags, options.topics_of(topic, topics), input_, serial)
+    where = options.topics_of(topic, topics, begin, end)
+    sources, kind = fit_sources(bags, where, input_, serial)
     info = None
     if certificate_info is not None:
         from ..report import load_certificate_info

@@ -22,6 +22,8 @@ def info(
     path: Annotated[Path, typer.Argument(help='Bag or calibration file.', metavar='BAG|YAML')],
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
+    begin: options.Begin = None,
+    end: options.End = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -38,7 +40,7 @@ def info(
     if path.suffix in ('.yaml', '.yml'):
         _calibration(out, path)
     else:
-        _bag(out, path, options.topics_of(topic, topics))
+        _bag(out, path, options.topics_of(topic, topics, begin, end))
 
 
 def _bag(out: Output, path: Path, topics: Topics) -> None:

@@ -62,6 +62,15 @@ Topic = Annotated[
 TopicsFile = Annotated[
     Path | None, typer.Option(help='The same from a file, INPUT: TOPIC a line.', metavar='YAML')
 ]
+Begin = Annotated[
+    float | None,
+    typer.Option(
+        '--from',
+        help='Read each bag from there on: seconds from its first sample, or a stamp.',
+        metavar='S',
+    ),
+]
+End = Annotated[float | None, typer.Option('--to', help='Read to there.', metavar='S')]
 InputOption = Annotated[InputChoice, typer.Option('--input', help='What is read from the bag.')]
 Gravity = Annotated[
     float | None, typer.Option('--gravity', help='Local gravity in m/s^2.', metavar='G')
@@ -170,12 +179,19 @@ def _read_profile(path: Path) -> dict[str, str]:
     return names
 
 
-def topics_of(given: list[str] | None, profile: Path | None) -> Topics:
-    """Read where the inputs stand in a bag."""
-    from ..recording import Topics
+def topics_of(
+    given: list[str] | None,
+    profile: Path | None,
+    begin: float | None = None,
+    end: float | None = None,
+) -> Topics:
+    """Read where the inputs stand in a bag, and what part of it is meant."""
+    from ..recording import Part, Topics
 
+    with usage_of('--from, --to: '):
+        part = Part(begin, end)
     with usage_of('--topic: '):
-        return Topics.named(named_topics(given, profile))
+        return Topics.named(named_topics(given, profile), part)
 
 
 def place(gravity: float | None, latitude: float | None, height: float | None) -> float | None:

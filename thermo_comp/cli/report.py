@@ -38,6 +38,8 @@ def report(
     input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
+    begin: options.Begin = None,
+    end: options.End = None,
     force: options.Force = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -66,7 +68,7 @@ def report(
     check_output(output, PAGE, overwrite=force, others=read)
     limit = options.acceleration(tolerance)
     options.positive(window, '--window')
-    where = options.topics_of(topic, topics)
+    where = options.topics_of(topic, topics, begin, end)
     paths = bags or []
     known = [load_calibration(path) for path in calibration or []]
     loaded = known[0] if known else None

@@ -64,20 +64,21 @@ def recording_source(
     """
     path = Path(path)
     with open_recording(path, topics, input, require=require) as reader:
-        info = latest = reader.info
+        info = reader.info
+    latest = reader
 
     def blocks() -> Iterator[Block]:
         nonlocal latest
-        with open_recording(path, topics, input, require=require) as again:
-            yield from again.blocks_on_one_clock()
-            latest = again.info
+        with open_recording(path, topics, input, require=require) as latest:
+            yield from latest.blocks_on_one_clock()
 
     source = FitSource(
-        shown_name(path),
+        f'{shown_name(path)}{topics.part if topics else ""}',
         blocks,
         serial=info.metadata.get('serial'),
         chosen=info.chosen,
-        missing=lambda: latest.truncated,
+        missing=lambda: latest.info.truncated,
+        since_s=lambda: latest.since_s,
         metadata=info.metadata,
     )
     return source, info

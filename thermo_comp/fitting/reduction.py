@@ -101,6 +101,7 @@ class ReducedBag:
     cycle_s: typical interval between samples
     is_integer: whether all samples were whole numbers
     middle: the word of no force where the words have no sign, else 0
+    since_s: where the part of the bag that was read begins
     restless: what speaks against rests, where there is none
     """
 
@@ -118,6 +119,7 @@ class ReducedBag:
     cycle_s: float
     is_integer: bool
     middle: float = 0.0
+    since_s: float = 0.0
     restless: str = ''
 
     @property
@@ -190,6 +192,7 @@ def reduce_source(
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
         is_integer=found.is_integer,
         middle=found.middle,
+        since_s=source.since_s(),
         restless='' if ranges else why_restless(found, still_sd),
     )
 

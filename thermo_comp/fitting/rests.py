@@ -41,8 +41,12 @@ def judge_rests(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding
     if not jumps:
         return []
     per_mg = milli_g(bags, options.input)
-    said = '; '.join(f'{bag.source.name}: {describe(event, per_mg)}' for bag, event in jumps)
-    return [Finding('jump', 'refusal', f'{said}: leave out such a bag, or cut it at the jump')]
+    said = '; '.join(
+        f'{bag.source.name}: {describe(event, per_mg, bag.since_s)}' for bag, event in jumps
+    )
+    return [
+        Finding('jump', 'refusal', f'{said}: leave out such a bag, or end before it with --to')
+    ]
 
 
 def milli_g(bags: Sequence[ReducedBag], kind: str) -> float:
@@ -53,8 +57,9 @@ def milli_g(bags: Sequence[ReducedBag], kind: str) -> float:
     return float(np.median(np.linalg.norm(means, axis=1))) * 1e-3
 
 
-def describe(event: Event, per_mg: float) -> str:
-    """Say one step in words."""
+def describe(event: Event, per_mg: float, since_s: float = 0.0) -> str:
+    """Say one step in words; `since_s` is where the part of its bag begins."""
+    at = f'at {event.time + since_s:.1f} s'
     vector = ', '.join(f'{v / per_mg:+.3g}' for v in event.step)
     along = f'{event.along / per_mg:+.3g} mg along gravity'
     size = f'{along} ({vector}) within {event.duration_s:.2g} s'
@@ -66,11 +71,11 @@ def describe(event: Event, per_mg: float) -> str:
                 f'{event.temperature_change_sd:.2f} K'
             )
         return (
-            f'at {event.time:.1f} s the sensor jumped by {size}, without motion{warmed}: not a '
+            f'{at} the sensor jumped by {size}, without motion{warmed}: not a '
             'function of temperature'
         )
     what = 'may have been turned or jumped' if event.kind == 'turn' else 'was moved'
-    return f'at {event.time:.1f} s the unit {what}: the reading changed by {size}'
+    return f'{at} the unit {what}: the reading changed by {size}'
 
 
 def _directions(intervals: Sequence[StillInterval]) -> Floats:

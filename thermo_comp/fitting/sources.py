@@ -75,6 +75,10 @@ def _nothing() -> str | None:
     return None
 
 
+def _at_once() -> float:
+    return 0.0
+
+
 @dataclass(frozen=True)
 class FitSource:
     """
@@ -86,6 +90,7 @@ class FitSource:
     serial: unit serial found in the source's metadata
     chosen: which of its topics were taken by their type
     missing: tells what of the bag is missing, as far as it has been read; None where nothing is
+    since_s: tells, once it is read, where the part that is read begins [s]
     metadata: what the recording says of itself
     """
 
@@ -95,4 +100,5 @@ class FitSource:
     serial: str | None = None
     chosen: str | None = None
     missing: Callable[[], str | None] = _nothing
+    since_s: Callable[[], float] = _at_once
     metadata: Mapping[str, str] = field(default_factory=dict)

@@ -90,7 +90,7 @@ def open_bag(
         name = reader.topics.get('accel')
         total = info.topics[name][1] if name else 0
         source = FitSource(
-            name=shown_name(path),
+            name=f'{shown_name(path)}{topics.part if topics else ""}',
             blocks=lambda: _told(reader.blocks_on_one_clock(), total, progress),
             sha256=digest(path) if is_hashed else None,
             serial=info.metadata.get('serial'),
@@ -152,8 +152,11 @@ def evaluate(
     _, first = calibrations[0]
     gravity = first.gravity_m_s2 if gravity is None else gravity
     tell = progress or (lambda _part: None)
-    # A bag with as many samples as one of the fit may be that one: its hash is worth reading.
-    seen = {one.n_samples for _, by in calibrations for one in by.provenance.sources if one.sha256}
+    # A bag with as many samples as one of the fit may be that one, a part of one always may: its
+    # hash is worth reading.
+    fitted = [one for _, by in calibrations for one in by.provenance.sources if one.sha256]
+    seen = {one.n_samples for one in fitted}
+    has_parts = any(one.name.endswith(']') for one in fitted) or bool(topics and str(topics.part))
     bags = []
     for number, path in enumerate(paths):
         bag = open_bag(
@@ -169,7 +172,7 @@ def evaluate(
         )
         for _, calibration in calibrations:
             check_unit(calibration, bag.info, serial)
-        if bag.reduced.n_samples in seen:
+        if bag.reduced.n_samples in seen or has_parts:
             source = replace(bag.reduced.source, sha256=digest(Path(path)))
             bag = replace(bag, reduced=replace(bag.reduced, source=source))
         bags.append(bag)

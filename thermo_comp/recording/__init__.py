@@ -18,7 +18,7 @@ from .reader import (
     open_recording,
     read_recording,
 )
-from .topics import Topics
+from .topics import Part, Topics
 from .writer import STAMP_END_NS, BagWriter
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     'Input',
     'LocalFile',
     'OpenFile',
+    'Part',
     'RandomAccess',
     'RawMessages',
     'Recording',

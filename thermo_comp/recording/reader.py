@@ -33,6 +33,7 @@ from .columns import (
 from .expanded import ExpandedSource
 from .foreign import ForeignSource
 from .mcap_source import McapSource
+from .part import Cut
 from .random_access import OpenFile
 from .rosbag2_metadata import Description, read_metadata
 from .topics import Topics, select_topics, shown
@@ -81,6 +82,8 @@ class RecordingReader:
         self._names = selection.thermometers
         self.topics: Mapping[Role, str] = dict(selection.topics)
         self.definitions = source.definitions
+        self._cut = Cut(path, topics.part, self.topics)
+        self._part = topics.part
         self.info = replace(source.info, path=path, input=selection.input, chosen=selection.chosen)
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
@@ -90,6 +93,10 @@ class RecordingReader:
         `raw` keeps the serialized messages in `Block.raw`; `n_messages` is about how many make a
         block, 0 for as few as are read at good speed.
         """
+        blocks = self._blocks(raw, n_messages)
+        yield from blocks if self._part.is_whole else self._cut.blocks(blocks)
+
+    def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         n_read = dict.fromkeys(self.topics, 0)
         source = self._source.blocks(self.topics, self._names, raw=raw)
         for block in gathered(source, n_messages):
@@ -110,11 +117,19 @@ class RecordingReader:
         Raises RecordingError as `blocks` does, and for stamps that are no clock.
         """
         try:
-            yield from without_jumps(self.blocks())
+            if self._part.is_whole or self._part.is_stamped:
+                yield from without_jumps(self.blocks())
+            else:
+                yield from self._cut.blocks(without_jumps(self._blocks()))
         except RecordingError as error:
             raise RecordingError(
                 error.message, error.path or self.info.path, error.topic
             ) from error
+
+    @property
+    def since_s(self) -> float:
+        """Where the part that is read begins, since the bag's first sample [s]; known then."""
+        return self._cut.since_s
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
         """

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from typing import Literal
 
@@ -29,8 +30,51 @@ _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
+# No bag lasts three years, and no clock that was set stands before 1973 [s].
+_FIRST_STAMP_S = 1e8
+
 #: The topics of a bag with their type and number of messages.
 Present = Mapping[str, tuple[str, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """
+    From `begin` to before `end`, by default all of a bag.
+
+    Both are seconds since the bag's first sample or, from 1e8 on, stamps: seconds since 1970.
+    """
+
+    begin: float | None = None
+    end: float | None = None
+
+    def __post_init__(self) -> None:
+        limits = [limit for limit in (self.begin, self.end) if limit is not None]
+        if not all(isfinite(limit) and limit >= 0.0 for limit in limits):
+            raise ValueError('the part of a bag begins and ends at 0 or a positive time')
+        if len({limit >= _FIRST_STAMP_S for limit in limits}) > 1:
+            raise ValueError("give both times from the bag's first sample, or both as stamps")
+        if len(limits) == 2 and not limits[0] < limits[1]:
+            raise ValueError(f'the part of a bag must end after {limits[0]:g}, got {limits[1]:g}')
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is left out."""
+        return self.begin is None and self.end is None
+
+    @property
+    def is_stamped(self) -> bool:
+        """Whether the times are stamps."""
+        return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
+
+    def __str__(self) -> str:
+        """Write it behind a bag's name."""
+        begin, end = ('' if limit is None else f'{limit:.12g}' for limit in (self.begin, self.end))
+        return '' if self.is_whole else f'[{begin}:{end}]'
+
+
+#: All of a bag.
+WHOLE = Part()
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +86,7 @@ class Topics:
     with any namespace in front: ``accel/counts`` finds ``/imu0/accel/counts``. Where a usual name
     is not there, the bag's only topic of the type is taken. Further thermometers are found by
     themselves, ``temperature/<name>`` in the namespace of the board's, or named in `further`.
+    `part` is what of the bag is read.
     """
 
     counts: str = 'accel/counts'
@@ -49,9 +94,10 @@ class Topics:
     board: str = 'temperature/board'
     case: str = 'temperature/case'
     further: Mapping[str, str] = field(default_factory=dict)
+    part: Part = WHOLE
 
     @classmethod
-    def named(cls, names: Mapping[str, str]) -> Topics:
+    def named(cls, names: Mapping[str, str], part: Part = WHOLE) -> Topics:
         """Take topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``."""
         roles, further = {}, {}
         for name, topic in names.items():
@@ -66,7 +112,7 @@ class Topics:
                 raise ValueError(
                     f'`{name}` is no input; expected {", ".join(_TYPES)} or temperature/NAME'
                 )
-        return cls(**roles, further=further)
+        return cls(**roles, further=further, part=part)
 
 
 _USUAL = Topics()

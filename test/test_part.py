@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A part of a bag is read as a bag of that part would be, before every test."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from position_helpers import GRAVITY, MG, START_NS, Rest
+
+from thermo_comp.errors import FitError, RecordingError
+from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.fit_sources import fit_sources
+from thermo_comp.recording import BagWriter, Part, Topics, open_recording, read_recording
+
+OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
+
+
+def bag_of(path, rest: Rest):
+    """Write a rest of 25 Hz with a board's thermometer of 2 Hz, which begins 3 s earlier."""
+    stamp_ns = START_NS + np.rint(rest.time * 1e9).astype(np.int64)
+    board_ns = START_NS + np.rint((rest.board_time - 3.0) * 1e9).astype(np.int64)
+    with BagWriter(path) as writer:
+        writer.write_imu('/imu/uncompensated', stamp_ns, rest.accel, np.zeros((len(stamp_ns), 9)))
+        writer.write_temperature('/temperature/board', board_ns, rest.temperature(rest.board_time))
+    return path
+
+
+@pytest.fixture
+def bag(rng, tmp_path):
+    return bag_of(tmp_path / 'bag.mcap', Rest(rng, duration_s=120.0))
+
+
+def part_of(path, begin=None, end=None, **options):
+    topics = Topics(part=Part(begin, end))
+    with open_recording(path, topics, require=('accel',)) as reader:
+        return list(reader.blocks(**options)), reader.since_s
+
+
+@pytest.mark.parametrize('n_messages', [0, 100])
+@pytest.mark.parametrize(('begin', 'end'), [(20.0, 50.0), (20.0, None), (None, 50.0)])
+def test_what_is_inside_is_there_and_nothing_else(bag, begin, end, n_messages):
+    blocks, since = part_of(bag, begin, end, raw=True, n_messages=n_messages)
+    whole = read_recording(bag, require=()).columns
+    time = (whole.accel_stamp_ns - START_NS) * 1e-9
+    inside = (time >= (begin or 0.0)) & (time < (end or 1e3))
+    np.testing.assert_array_equal(np.concatenate([b.accel for b in blocks]), whole.accel[inside])
+    board = whole.temperatures['board']
+    at = (board.stamp_ns - START_NS) * 1e-9
+    own = (at >= (-9.0 if begin is None else begin)) & (at < (end or 1e3))
+    got = np.concatenate([b.temperatures['board'].celsius for b in blocks])
+    np.testing.assert_array_equal(got, board.celsius[own])
+    assert since == (begin or 0.0)
+    # A reading counts from the same sample on as in the whole bag.
+    after = [np.sum(inside[:n]) for n in board.after[own]]
+    begins = np.cumsum([0, *map(len, blocks)])
+    found = [b.temperatures['board'].after + n for b, n in zip(blocks, begins, strict=False)]
+    np.testing.assert_array_equal(np.concatenate(found), after)
+    for block in blocks:
+        assert sum(len(raw.ends) for raw in block.raw) == block.n_messages
+        assert all(len(raw.data) == raw.ends[-1] for raw in block.raw)
+
+
+def test_stamps_say_the_same_as_seconds(bag):
+    start = START_NS * 1e-9
+    (by_stamp, since), (by_time, _) = (
+        part_of(bag, start + 20.0, start + 50.0),
+        part_of(bag, 20, 50),
+    )
+    assert since == pytest.approx(20.0)
+    for one, other in zip(by_stamp, by_time, strict=True):
+        np.testing.assert_array_equal(one.accel, other.accel)
+
+
+def test_nothing_inside_is_said(bag):
+    with pytest.raises(RecordingError, match=re.escape('no sample is in [500:]')) as refused:
+        part_of(bag, 500.0)
+    assert str(bag) in str(refused.value)
+    assert 'which is 120.0 s' in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ('begin', 'end', 'reason'),
+    [
+        (5.0, 5.0, 'must end after 5, got 5'),
+        (-1.0, None, '0 or a positive time'),
+        (float('nan'), None, '0 or a positive time'),
+        (5.0, 1.7e9, 'or both as stamps'),
+    ],
+)
+def test_no_part_is_refused(begin, end, reason):
+    with pytest.raises(ValueError, match=reason):
+        Part(begin, end)
+
+
+def test_the_part_before_a_jump_is_fitted(rng, tmp_path):
+    rest = Rest(rng)
+    rest.add((0.0, 0.0, 20.0 * MG), from_s=300.0)
+    bag = bag_of(tmp_path / 'bag.mcap', rest)
+    for begin in (None, 100.0):
+        sources, kind = fit_sources([bag], Topics(part=Part(begin)))
+        with pytest.raises(FitError, match=r'at 300\.0 s the sensor jumped'):
+            fit(sources, OPTIONS)
+    sources, kind = fit_sources([bag], Topics(part=Part(100.0, 299.0)))
+    assert kind == 'imu'
+    result = fit(sources, replace(OPTIONS))
+    assert result.bags[0].n_samples == 199 * 25
+    assert result.calibration.provenance.sources[0].name == 'bag.mcap[100:299]'
+
+
+def test_a_clock_that_was_set_does_not_count(rng, tmp_path):
+    rest = Rest(rng, duration_s=120.0)
+    path = bag_of(tmp_path / 'bag.mcap', rest)
+    block = read_recording(path, require=()).columns
+    with BagWriter(tmp_path / 'set.mcap') as writer:
+        set_ns = block.accel_stamp_ns + np.where(rest.time >= 60.0, 10**17, 0)
+        writer.write_imu('/imu/uncompensated', set_ns, block.accel, np.zeros((len(set_ns), 9)))
+    topics = Topics(part=Part(30.0))
+    with open_recording(tmp_path / 'set.mcap', topics, require=('accel',)) as reader:
+        blocks = list(reader.blocks_on_one_clock())
+    assert sum(map(len, blocks)) == 90 * 25
