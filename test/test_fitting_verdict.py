@@ -50,6 +50,7 @@ def good(rng: np.random.Generator) -> tuple[ThermalWindows, np.ndarray]:
         weight=(rate != 0.0).astype(float),
         gradient=gradient,
         raw=np.zeros((len(case), 0)),
+        angular_rate=np.zeros((len(case), 0)),
         typical_count=100.0,
     )
     return windows, up

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..thermal.settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
+from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
 from ..typing import Bools, Floats
 from .reduction import Readings, ReducedBag
 
@@ -26,7 +26,6 @@ _BINS_PER_SIDE = 6
 _CLEAR = 5.0
 _LAG_RANGE_S = (30.0, 3600.0)
 _RIPPLE_RANGE_C = (0.02, 1.0)
-_SMALLEST_RAMP_K_MIN = 0.1
 # The unit may meet ramps faster than the chamber's.
 _RAMP_MARGIN = 1.5
 
@@ -168,7 +167,7 @@ def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
             if (stop - start) * _BIN_S > 600.0:
                 middle = float(np.quantile(np.abs(one.rate[start:stop]), 0.9)) * 60.0
                 slowest = min(slowest, middle)
-    return max(0.7 * slowest, _SMALLEST_RAMP_K_MIN)
+    return max(0.7 * slowest, RAMP_K_MIN)
 
 
 def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ..errors import FitError
+from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
-from ..unit.gravity import MICRO_G
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .attitudes import distinct_directions, geometry
 from .options import FitOptions
 from .reduction import ReducedBag
@@ -26,13 +27,11 @@ from .windows import ThermalWindows
 if TYPE_CHECKING:
     from .evidence import ResidualRow
 
-SPAN_ADVISED = 25.0
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_ADVISED = 6, 9, 18
 # Largest standard deviation, in units of the noise of one position, that a parameter may have: 18
 # spread positions give 1, nine 3, the six faces each done three times by hand 4.5 to 8.
 _WORST_GEOMETRY = 6.0
 _SATURATED_NEEDED, _SATURATED_ADVISED = 0.05, 0.001
-_RAMP_K_MIN = 0.1
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ def _judge_counts(bags: Sequence[ReducedBag]) -> list[Finding]:
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
     size = float(np.median(np.linalg.norm(means, axis=1)))
     whole = all(bag.is_integer for bag in bags)
-    for unit, one_g in (('m/s^2', 9.81), ('g', 1.0)):
+    for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
         if not whole and abs(size / one_g - 1.0) < 0.1:
             return [
                 Finding(
@@ -146,13 +145,13 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> list[F
 def _judge_span(windows: ThermalWindows) -> list[Finding]:
     lower, upper = float(np.min(windows.temperature)), float(np.max(windows.temperature))
     span = upper - lower
-    if span >= SPAN_ADVISED:
+    if span >= ADVISED_SPAN_K:
         return [Finding('span', 'good', f'temperature span {span:.1f} degC')]
     return [
         Finding(
             'span',
             'advice',
-            f'temperature span {span:.1f} degC ({SPAN_ADVISED:g} advised): run the chamber over '
+            f'temperature span {span:.1f} degC ({ADVISED_SPAN_K:g} advised): run the chamber over '
             'the whole range of use',
         )
     ]
@@ -160,11 +159,11 @@ def _judge_span(windows: ThermalWindows) -> list[Finding]:
 
 def _judge_ramps(windows: ThermalWindows) -> list[Finding]:
     rate = windows.rate * 60.0
-    heating, cooling = float(np.mean(rate > _RAMP_K_MIN)), float(np.mean(rate < -_RAMP_K_MIN))
+    heating, cooling = float(np.mean(rate > RAMP_K_MIN)), float(np.mean(rate < -RAMP_K_MIN))
     findings = []
     if heating + cooling < 0.02:
         text = (
-            f'no ramp: the board never changes by {_RAMP_K_MIN:g} K/min for long, so what a ramp '
+            f'no ramp: the board never changes by {RAMP_K_MIN:g} K/min for long, so what a ramp '
             'does is not known; record ramps between the soaks'
         )
         findings.append(Finding('ramps', 'advice', text))
@@ -187,7 +186,7 @@ def _judge_ramps(windows: ThermalWindows) -> list[Finding]:
 
 def _judge_order(windows: ThermalWindows) -> list[Finding]:
     """Check that the case leads: the gradient has the sign of the board's rate."""
-    moving = np.abs(windows.rate) * 60.0 > _RAMP_K_MIN
+    moving = np.abs(windows.rate) * 60.0 > RAMP_K_MIN
     if windows.data.weight[moving].sum() < 30.0 * windows.data.weight.max():
         return []
     gradient = windows.gradient - np.median(windows.gradient)

@@ -12,16 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Ints
 from .columns import Readings, RecordingInfo
 from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 from .topics import Topics
 
-# What is advised for one unit's bags together.
-ADVISED_SPAN_K = 25.0
-# Rate of the board over two minutes that counts as a ramp: well above a soak's slow drift.
-_RAMP_K_MIN = 0.1
+# A ramp's rate is that of the board over so long.
 _RAMP_WINDOW_S = 120.0
 _CELL_S, _MIN_REST_S = 0.5, 3.0
 # A pause of this many usual intervals is a gap.
@@ -113,7 +111,7 @@ def thermal_findings(board: ThermometerSurvey) -> list[str]:
         ('heating', board.steepest_heating_k_min),
         ('cooling', -board.steepest_cooling_k_min),
     ):
-        if rate < _RAMP_K_MIN:
+        if rate < RAMP_K_MIN:
             found.append(f'no {name} ramp: the dynamic set would not know {name}')
     return found
 

@@ -24,6 +24,7 @@ from .gather import evidence_of_fit
 from .html import render, utc
 from .text import spelt
 
+# Mean radius of the Earth [m]: GRS 80.
 _EARTH_RADIUS = 6.371e6
 #: Peak of the Schuler oscillation, 2 R b / g, for a bias b of one micro-g [m]: 12.7.
 SCHULER_PEAK_PER_MICRO_G = 2.0 * MICRO_G * _EARTH_RADIUS / STANDARD_GRAVITY

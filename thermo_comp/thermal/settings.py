@@ -15,6 +15,10 @@ from typing import Annotated, Final
 CELL_SIGMAS: Final = 2.5  # a quantum above this many noise sds has cells ...
 WIDE_CELL_SIGMAS: Final = 8.5  # ... that noise never crosses: six sds of a difference
 OBVIOUS_SHARE: Final = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
+#: What a thermal test of a unit should span, all bags together, as the board says [K].
+ADVISED_SPAN_K: Final = 25.0
+#: A slower change of the board is a soak's slow drift and no ramp [K/min].
+RAMP_K_MIN: Final = 0.1
 
 
 def refuse_outside(

@@ -22,6 +22,7 @@ from .calibration import Calibration
 from .columns import ColumnTable, memory_of
 from .curves import SetCurves
 from .functions import Number
+from .gravity import MICRO_G
 from .response import Sensitivity, Weights
 
 #: (bias, scale) of one axis.
@@ -30,7 +31,7 @@ BiasScale: TypeAlias = tuple[Number, Number]
 Variance: TypeAlias = tuple[Number, Number, Number]
 
 #: While the sets cross over, the output moves no faster than this [m/s^3] (1 ug per second) ...
-GENTLE_RATE = 9.80665e-6
+GENTLE_RATE = MICRO_G
 #: ... unless that took more than this many transition times.
 LONGEST_TRANSITION = 10.0
 _GAP_TEMPERATURES = 33
