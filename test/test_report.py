@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report_helpers import PROGRAM, RATE_HZ, certificate, evidence, fitted, run, write_bag
+from report_helpers import RATE_HZ, certificate, evidence, fitted, run, write_bag
 from simulation_helpers import ideal_regime
 
 from thermo_comp import __version__
@@ -27,7 +27,7 @@ from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.figures import figures_of, png_files
 from thermo_comp.report.page import render_page
 from thermo_comp.report.text import spelt
-from thermo_comp.simulation import STANDARD_GRAVITY, parse_cyclogram
+from thermo_comp.simulation import STANDARD_GRAVITY
 from thermo_comp.thermal.regime import Regime
 
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
@@ -159,7 +159,6 @@ def test_bag_says_whether_its_fit_has_seen_it(bag):
 def test_bag_alone_shows_temperatures_derivatives_and_flag(bag, tmp_path):
     found = evidence_of_bags([open_bag(bag)])
     shown = found.shown
-    assert shown.cyclogram == parse_cyclogram(PROGRAM)
     trace, truth = shown.trace, run(0).truth
     # In the middle of the first ramp the case heats at the chamber's 1.5 K/min or a little less.
     ramp = (trace.time > 17 * 60) & (trace.time < 21 * 60)
@@ -212,12 +211,6 @@ def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
     assert '$\\frac{.mcap' in page.text
     assert not page.names() & {'script', 'img'}
     assert not any(name.startswith('on') for _, attributes in page.tags for name in attributes)
-
-
-@pytest.mark.parametrize('truth', ['', '[', '3', '{"profile": 3}', '{"profile": "rm -rf"}'])
-def test_strange_truth_in_a_bag_is_no_program(tmp_path, truth):
-    found = evidence_of_bags([open_bag(write_bag(tmp_path / 'a.mcap', truth=truth))])
-    assert found.shown.cyclogram is None
 
 
 def test_hours_of_bag_stay_a_small_page(tmp_path):
@@ -314,10 +307,6 @@ def test_another_units_calibration_is_refused(bag):
 def test_refusals(bag, tmp_path):
     with pytest.raises(RecordingError, match='no such file'):
         open_bag(tmp_path / 'none.mcap')
-    with pytest.raises(ValueError, match='cyclogram step 1'):
-        evidence_of_bags([open_bag(bag)], program='warm')
-    with pytest.raises(ValueError, match='cyclogram step 1'):
-        evidence_of_fit(fitted(), program='warm')
 
 
 def test_command(cli, bag, tmp_path):

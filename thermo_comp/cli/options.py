@@ -100,9 +100,6 @@ ReferenceTemperature = Annotated[
 Allow = Annotated[
     list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
 ]
-Program = Annotated[
-    str | None, typer.Option(help="The chamber's program, like '20 1h, 35@0.5 1h'.")
-]
 JudgedBags = Annotated[
     list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
 ]

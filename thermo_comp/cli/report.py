@@ -34,7 +34,6 @@ def report(
     window: options.Window = 60.0,
     tolerance: options.Tolerance = None,
     serial: options.Serial = None,
-    program: options.Program = None,
     input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
@@ -99,7 +98,6 @@ def report(
             window_s=window,
             tolerance=limit,
             serial=serial,
-            program=program,
             others=known[1:],
         )
     is_torn = out.told(bag.info for bag in opened)

@@ -31,7 +31,6 @@ def view(
     latitude: options.Latitude = None,
     height: options.Height = None,
     serial: options.Serial = None,
-    program: options.Program = None,
     input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
@@ -60,7 +59,6 @@ def view(
         input_,
         gravity=options.place(gravity, latitude, height),
         serial=serial,
-        program=program,
     )
     try:
         server = LiveServer(report, port)

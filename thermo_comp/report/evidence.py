@@ -18,7 +18,6 @@ from ..fitting import ResidualRow
 from ..fitting.reduction import Readings
 from ..judging import Judgement, Verdict, Windows
 from ..judging.history import Epoch
-from ..simulation import Cyclogram
 from ..typing import Floats
 from ..unit.calibration import Calibration, Source
 from ..unit.metrics import norm_residual
@@ -56,7 +55,6 @@ class ShownBag:
     board: Readings
     case: Readings
     trace: ThermalTrace
-    cyclogram: Cyclogram | None  # the chamber's program, when somebody knows it
 
 
 @dataclass(frozen=True)

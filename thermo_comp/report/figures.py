@@ -117,12 +117,11 @@ def _add_of_time(evidence: Evidence, add: Callable[..., None]) -> None:
         return
     bag = f'Bag {label_text(evidence.bags[shown.index].name, 60)}.'
     read = f'Grey: the time in which the flag says dynamic. {bag} After Fig.'
-    program = ' against the chamber’s program' if shown.cyclogram else ''
     add(
         'temperatures',
         'How did the unit follow the chamber?',
         draw_temperatures,
-        f'Readings of both thermometers{program}. The board lags behind the case, so the case '
+        'Readings of both thermometers. The board lags behind the case, so the case '
         f'is the first to tell that a ramp has begun. {read} 3 of the paper.',
     )
     sensor = 'case' if shown.trace.is_case_leading else 'board'

@@ -19,7 +19,6 @@ from .style import (
     AXIS_LINES,
     BOARD_LINE,
     CASE_LINE,
-    PROGRAM_LINE,
     Sheet,
     broken,
     few_ticks,
@@ -69,16 +68,12 @@ def time_axis(axes: Axes, facts: BagFacts) -> None:
 
 
 def draw_temperatures(evidence: Evidence, sheet: Sheet) -> Figure:
-    """Draw the readings of both sensors and the chamber's program (the paper's Fig. 3)."""
+    """Draw the readings of both sensors (the paper's Fig. 3)."""
     shown, facts = shown_bag(evidence)
     unit, _ = time_unit(facts.duration_s)
     figure = new_figure(sheet, 3.2 if sheet.is_narrow else 2.5)
     axes = figure.subplots()
     shade_dynamic(axes, shown, unit)
-    if shown.cyclogram is not None:
-        cut = shown.cyclogram.cut(max(facts.duration_s, 1.0))
-        time = np.array(cut.time_s) / unit
-        axes.plot(time, cut.temperature_c, label='chamber program', **PROGRAM_LINE)
     for label, readings, line in (
         ('T case', shown.case, CASE_LINE),
         ('T board', shown.board, BOARD_LINE),

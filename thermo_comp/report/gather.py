@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,14 +16,11 @@ from ..judging import WINDOW_S, OpenedBag, judge_bags
 from ..judging.history import history_of
 from ..judging.windows import raw_windows, usual_window
 from ..replay import check_unit
-from ..simulation import CYCLOGRAM_NAMES, Cyclogram, cyclogram_preset, parse_cyclogram
 from ..unit.calibration import Calibration
 from ..unit.gravity import spoken
 from .evidence import BagFacts, Evidence, ShownBag
 from .trace import thermal_trace
 
-# A recorded program is text that somebody else wrote; no real one is longer.
-_LONGEST_PROGRAM = 4096
 # A ramp slower than this says nothing of its direction.
 _SLOWEST_RAMP_K_MIN = 0.05
 #: The key of a bag's metadata under which our simulator tells what it simulated.
@@ -39,18 +35,16 @@ def evidence_of_bags(
     window_s: float = WINDOW_S,
     tolerance: float | None = None,
     serial: str | None = None,
-    program: str | None = None,
     others: Sequence[Calibration] = (),
 ) -> Evidence:
     """
     Judge bags, with a calibration or without; no bags report on the calibration alone.
 
     Gravity is the calibration's by default; `window_s` and `tolerance` are as for `evaluate`; an
-    empty `serial` accepts any calibration; `program` is the chamber's, by default what a simulated
-    bag says of itself; `others` are further calibrations of the unit, for its history.
+    empty `serial` accepts any calibration; `others` are further ones of the unit, for its history.
 
     Raises CalibrationError for a calibration of another unit; RecordingError if samples are too
-    slow for such windows; ValueError if `program` cannot be read.
+    slow for such windows.
     """
     reduced = [bag.reduced for bag in bags]
     judgement = None
@@ -77,7 +71,7 @@ def evidence_of_bags(
         gravity=gravity,
         calibration=calibration,
         bags=tuple(map(_facts, reduced)),
-        shown=_shown(reduced, calibration, program),
+        shown=_shown(reduced, calibration),
         windows=windows,
         judgement=judgement,
         findings=() if calibration is None else _against(calibration),
@@ -86,17 +80,10 @@ def evidence_of_bags(
     )
 
 
-def evidence_of_fit(
-    result: FitResult, *, program: str | None = None, is_brief: bool = False
-) -> Evidence:
-    """
-    Gather what a fit has to show, on its own bags; a brief one lacks what only figures show.
-
-    Raises ValueError if `program` cannot be read.
-    """
+def evidence_of_fit(result: FitResult, *, is_brief: bool = False) -> Evidence:
+    """Gather what a fit has to show, on its own bags; a brief one lacks what only figures show."""
     calibration = result.calibration
-    # What can be refused comes before the judging, which takes seconds.
-    shown = None if is_brief else _shown(result.bags, calibration, program)
+    shown = None if is_brief else _shown(result.bags, calibration)
     judgement = judge_bags(result.bags, calibration, window_s=usual_window(result.bags))
     found = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
@@ -185,11 +172,8 @@ def _facts(bag: ReducedBag) -> BagFacts:
     )
 
 
-def _shown(
-    bags: Sequence[ReducedBag], calibration: Calibration | None, program: str | None
-) -> ShownBag | None:
+def _shown(bags: Sequence[ReducedBag], calibration: Calibration | None) -> ShownBag | None:
     """Prepare the bag of the time figures: the widest in temperature, then the longest."""
-    cyclogram = None if program is None else parse_cyclogram(program)
     if not bags:
         return None
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
@@ -198,25 +182,6 @@ def _shown(
     index = max(wide, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
     bag = bags[index]
     span_ns = _span_ns(bag)
-    if cyclogram is None:
-        cyclogram = _recorded_program(bag)
     detector = learn_detector(bags) if calibration is None else calibration.detector
     trace = thermal_trace(bag, span_ns, detector)
-    return ShownBag(index, span_ns[0], bag.board, bag.case, trace, cyclogram)
-
-
-def _recorded_program(bag: ReducedBag) -> Cyclogram | None:
-    """Find the chamber's program in a simulated bag's metadata, in which nothing is believed."""
-    text = bag.source.metadata.get(_SIMULATED, '')
-    if len(text) > 16 * _LONGEST_PROGRAM:
-        return None
-    try:
-        truth = json.loads(text)
-        profile = truth.get('profile') if isinstance(truth, dict) else None
-        if not isinstance(profile, str) or len(profile) > _LONGEST_PROGRAM:
-            return None
-        if profile in CYCLOGRAM_NAMES:
-            return cyclogram_preset(profile)
-        return parse_cyclogram(profile)
-    except ValueError:
-        return None
+    return ShownBag(index, span_ns[0], bag.board, bag.case, trace)

@@ -36,19 +36,17 @@ def write_report(
     *,
     info: CertificateInfo | None = None,
     figures: str | Path | None = None,
-    program: str | None = None,
     overwrite: bool = True,
 ) -> Evidence:
     """
     Write a certificate as one self-contained HTML page; give what it is made of.
 
     What the laboratory does not state in `info` stays blank. The folder `figures` gets PNG files.
-    Raises OutputError if a file may not or cannot be written; ValueError if `program` cannot be
-    read.
+    Raises OutputError if a file may not or cannot be written.
     """
     evidence = subject
     if isinstance(evidence, FitResult):
-        evidence = evidence_of_fit(evidence, program=program)
+        evidence = evidence_of_fit(evidence)
     page = render_report(evidence, info)
     if figures is not None:
         for name, content in png_files(evidence).items():

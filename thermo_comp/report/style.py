@@ -43,7 +43,6 @@ RUNG_LINES: dict[str, Line] = {
 }
 BOARD_LINE: Line = {'color': BLACK, 'linestyle': '-', 'linewidth': 1.4}
 CASE_LINE: Line = {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.2}
-PROGRAM_LINE: Line = {'color': BLUE, 'linestyle': _DOTTED, 'linewidth': 1.4}
 STATIC_LINE: Line = {'color': BLUE, 'linestyle': '-', 'linewidth': 1.4}
 DYNAMIC_LINE: Line = {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.4}
 
