@@ -11,8 +11,6 @@ bit, and against gravity.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,17 +39,6 @@ _MODELS: dict[str, dict[str, Any]] = {
 }
 
 
-@dataclass(frozen=True)
-class _Played:
-    """What went through the node."""
-
-    n_in: int
-    n_out: int
-    n_flags: int
-    wall_s: float
-    bag_s: float
-
-
 def demo(
     bags: Annotated[
         Path | None, typer.Option(help='Folder of the sample bags.', metavar='DIR')
@@ -72,46 +59,68 @@ def demo(
       thermo_comp demo --out out
     """
     require_ros()
+    # Before the first import of ROS: on this machine only.
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    from ..judging import evaluate, open_bag
+    from ..recording import inspect_recording
+    from ..report import evidence_of_bags, write_report
+    from ..ros.round_trip import round_trip
+
     out = Output(as_json, quiet)
     folder = _sample_bags(bags)
     output.mkdir(parents=True, exist_ok=True)
-    held_out, recorded = folder / 'held_out.mcap', output / 'out.mcap'
+    held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'
     fit_bags = sorted((folder / 'fit').glob('*.mcap'))
 
     calibrations = _fit(out, fit_bags, output)
-    out.line(f'fitted {output / "unit.yaml"} from {len(fit_bags)} bags of {folder / "fit"}')
+    out.line(f'fitted {unit} from {len(fit_bags)} bags of {folder / "fit"}')
+    info = inspect_recording(held_out)
+    bag_s = (info.end_ns - info.start_ns) * 1e-9
     with out.progress('playing', total=1.0) as done:
-        played = _play(held_out, output / 'unit.yaml', recorded, done)
+        trip = round_trip(
+            held_out, unit, recorded, rate=_RATE, overwrite=recorded.exists(), progress=done
+        )
+    (n_in,) = (n for name, n in trip.played.n_messages.items() if name.endswith(_SAMPLES))
+    n_out, wall_s = trip.recorded[_OUTPUT], trip.played.duration_s
     out.line(
-        f'played {held_out} through the node: {played.bag_s / 60.0:.0f} min in '
-        f'{played.wall_s:.1f} s, {played.bag_s / played.wall_s:.0f} times real time'
+        f'played {held_out} through the node: {bag_s / 60.0:.0f} min in {wall_s:.1f} s, '
+        f'{bag_s / wall_s:.0f} times real time'
     )
     out.line(
-        f'messages in {played.n_in}, messages out {played.n_out}; '
-        f'regime flags {played.n_flags}; recorded {recorded}'
+        f'messages in {n_in}, messages out {n_out}; '
+        f'regime flags {trip.recorded["regime/dynamic"]}; recorded {recorded}'
     )
     is_same = _equals_offline(recorded, held_out, calibrations['node'])
     out.line(f'node = offline replay, bit for bit: {"yes" if is_same else "NO"}')
-    result = _judge(held_out, calibrations)
+    result = evaluate(
+        [held_out],
+        [(name, calibrations[name]) for name in reversed(_MODELS)],
+        gravity=STANDARD_GRAVITY,
+    )
     out.line()
     _say(out, result)
+    page, figures = output / 'report.html', output / 'figures'
     with out.progress('drawing'):
-        page, figure = _draw(held_out, calibrations['node'], output)
+        evidence = evidence_of_bags(
+            [open_bag(held_out)], calibrations['node'], gravity=STANDARD_GRAVITY
+        )
+        write_report(evidence, page, figures=figures)
+    figure = next(figures.glob('*gravity.png'))
     out.line()
     out.line(f'figure {figure}, certificate {page}')
     out.json(
         {
-            'messages_in': played.n_in,
-            'messages_out': played.n_out,
+            'messages_in': n_in,
+            'messages_out': n_out,
             'is_equal_to_offline': is_same,
-            'bag_s': played.bag_s,
-            'wall_s': played.wall_s,
+            'bag_s': bag_s,
+            'wall_s': wall_s,
             'judgements': {name: one.facts() for name, one in result.judgements.items()},
             'recorded': recorded,
             'figure': figure,
         }
     )
-    if not is_same or played.n_out != played.n_in:
+    if not is_same or n_out != n_in:
         raise ThermoCompError('the node lost messages or differs from the offline replay')
 
 
@@ -144,26 +153,6 @@ def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
     return calibrations
 
 
-def _play(bag: Path, calibration: Path, recorded: Path, done: Callable[[float], None]) -> _Played:
-    """Send the bag through the node and record what comes out, on this machine only."""
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    from ..recording import inspect_recording
-    from ..ros.round_trip import round_trip
-
-    info = inspect_recording(bag)
-    trip = round_trip(
-        bag, calibration, recorded, rate=_RATE, overwrite=recorded.exists(), progress=done
-    )
-    (n_in,) = (n for name, n in trip.played.n_messages.items() if name.endswith(_SAMPLES))
-    return _Played(
-        n_in=n_in,
-        n_out=trip.recorded[_OUTPUT],
-        n_flags=trip.recorded['regime/dynamic'],
-        wall_s=trip.played.duration_s,
-        bag_s=(info.end_ns - info.start_ns) * 1e-9,
-    )
-
-
 def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool:
     """Compare the node's recorded output with the offline run, bit for bit."""
     import numpy as np
@@ -184,15 +173,6 @@ def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool
         and np.array_equal(
             np.concatenate([i.covariance for i in items]), live.imu.linear_acceleration_covariance
         )
-    )
-
-
-def _judge(bag: Path, calibrations: dict[str, Calibration]) -> Evaluation:
-    from ..judging import evaluate
-
-    judged = ['node', *(name for name in calibrations if name != 'node')]
-    return evaluate(
-        [bag], [(name, calibrations[name]) for name in judged], gravity=STANDARD_GRAVITY
     )
 
 
@@ -219,14 +199,3 @@ def _say(out: Output, result: Evaluation) -> None:
     )
     out.line('one set: one cubic for all; two sets: another one in the dynamic regime, as in the')
     out.line('paper; node: two sets and the thermal response that the evidence wants')
-
-
-def _draw(bag: Path, calibration: Calibration, output: Path) -> tuple[Path, Path]:
-    """Write the certificate and its figures; return the page and the figure of |g|."""
-    from ..judging import open_bag
-    from ..report import evidence_of_bags, write_report
-
-    page, figures = output / 'report.html', output / 'figures'
-    evidence = evidence_of_bags([open_bag(bag)], calibration, gravity=STANDARD_GRAVITY)
-    write_report(evidence, page, figures=figures)
-    return page, next(figures.glob('*gravity.png'))
