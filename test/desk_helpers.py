@@ -21,16 +21,9 @@ from conftest import ROOT, Cli, Once
 #: What is made when an example asks for it; all else an example itself writes, or it lies ready.
 MADE = (
     *('unit.yaml', 'unit42.yaml', 'unit01.yaml', 'unit02.yaml', 'unit03.yaml', 'map.yaml'),
-    *(
-        'autopilot.params',
-        'xsens_acc.calib',
-        'accel_calib.yaml',
-        'chamber.mcap',
-        'unit42_p01',
-        'freezer.mcap',
-        'log.csv',
-    ),
-    *('flight.ulg', 'flight.bin', 'bags/fleet', 'bags/unit42'),
+    *('autopilot.params', 'xsens_acc.calib', 'accel_calib.yaml', 'chamber.mcap', 'unit42_p01'),
+    *('freezer.mcap', 'log.csv', 'tumble.txt', 'flight.ulg', 'flight.bin', 'bags/fleet'),
+    'bags/unit42',
 )
 _EXPORTS = {
     'autopilot.params': 'px4',
@@ -113,6 +106,17 @@ class Desk:
                 )
             ]
             path.write_text('\n'.join(['t,ax,ay,az,temp', *rows]) + '\n')
+        elif name == 'tumble.txt':
+            from thermo_comp.simulation import positions
+
+            rng = np.random.default_rng(5)
+            rests = np.repeat(9.8154 * positions(12, 2) + (0.1, -0.2, 0.3), 500, axis=0)
+            rests += 0.02 * rng.standard_normal(rests.shape)
+            # Turned between two rests.
+            moves = np.arange(len(rests)) % 500 < 100
+            rests[moves] += 5.0 * rng.standard_normal((int(moves.sum()), 3))
+            time = 0.01 * np.arange(len(rests))
+            np.savetxt(path, np.column_stack([time, rests]), fmt='%.6f')
         elif name == 'map.yaml':
             path.write_text(
                 'stamp: {column: t, unit: s}\n'

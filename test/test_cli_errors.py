@@ -88,7 +88,8 @@ class TestUsage:
             (('simulate', '-o', 'a', '--plan', 'oven'), r'must be one of chamber-18'),
             (('simulate', '-o', 'a', '--profile', '20, up'), r"step 2 'up'"),
             (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
-            (('convert', 'a', '-o', 'b'), r'--columns'),
+            (('convert', 'a.parquet', '-o', 'b'), r'--columns'),
+            (('fit', 'a.mcap', '-o', 'b', '--gravity', '9.8', '--rate-hz', '9'), r'for tables'),
         ],
         ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
     )

@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -38,6 +40,7 @@ def convert(
         Path | None,
         typer.Option(help='Column map of a table (YAML): what is where, in which unit.'),
     ] = None,
+    rate_hz: options.TableRate = None,
     imu: Annotated[int | None, typer.Option(help='IMU of a log, counted from 0.')] = None,
     baro: Annotated[
         int | None, typer.Option(help='Barometer of a log, for the case temperature.')
@@ -58,8 +61,9 @@ def convert(
     Make a bag of a table of numbers or of an autopilot's log.
 
     A table needs a column map: which column is what, in which unit; what the
-    sensor reads at rest must agree with it. config/columns has examples. Of a
-    PX4 or ArduPilot log the IMU's own temperature becomes the board's, the
+    sensor reads at rest must agree with it. config/columns has examples. One
+    of [t] ax ay az [wx wy wz] without headings needs none. Of a PX4 or
+    ArduPilot log the IMU's own temperature becomes the board's, the
     barometer's the case's. Of a bag the thermometer beside the Imu topic
     becomes the board's, one beside a barometer the case's.
 
@@ -74,14 +78,14 @@ def convert(
     read_too = [] if columns is None else [columns]
     check_output(output, bag_kind(output), overwrite=force, others=[log, *read_too])
     names = options.named_topics(topic, topics)
-    is_bag = log.is_dir() or log.suffix.lower() in _BAGS
-    if is_bag:
+    if _is_bag(log):
         if not names.keys() <= {'imu', 'board', 'case'}:
             raise options.usage('--topic: of a bag, imu, board and case are converted')
-        if columns is not None or imu is not None or baro is not None or allow_compensated:
+        for_logs = (columns, rate_hz, imu, baro, allow_compensated or None)
+        if any(one is not None for one in for_logs):
             raise options.usage(
-                '--columns is for tables, --imu, --baro and --allow-compensated for logs; a bag '
-                'has --topic'
+                '--columns and --rate-hz are for tables, --imu, --baro and --allow-compensated '
+                'for logs; a bag has --topic'
             )
         read: Callable[[], ForeignLog] = partial(
             bag_log, log, names.get('imu'), names.get('board'), names.get('case'), unit
@@ -89,7 +93,7 @@ def convert(
     else:
         if names or unit != 'm/s^2':
             raise options.usage('--topic and --unit are for bags')
-        read = _reader(log, columns, imu, baro, allow_compensated)
+        read = _reader(out, log, columns, rate_hz, imu, baro, allow_compensated)
     with out.progress('converting', total=1.0) as done:
         report = write_log(read(), output, force, done)
     say(out, report)
@@ -98,16 +102,52 @@ def convert(
     out.end(is_torn=bool(report.missing))
 
 
+def _is_bag(path: Path) -> bool:
+    return path.is_dir() or path.suffix.lower() in _BAGS
+
+
+@contextmanager
+def as_bags(
+    out: Output, paths: Sequence[Path], columns: Path | None, rate_hz: float | None
+) -> Iterator[list[Path]]:
+    """Let tables and logs take part as bags, for as long as it lasts."""
+    from ..convert import write_log
+
+    others = [path for path in paths if path.is_file() and not _is_bag(path)]
+    if (columns or rate_hz) and not others:
+        raise options.usage('--columns and --rate-hz are for tables, and there is none')
+    with TemporaryDirectory(prefix='thermo_comp-') as folder:
+        bags = {}
+        for number, path in enumerate(others):
+            bags[path] = Path(folder) / str(number) / f'{path.stem}.mcap'
+            bags[path].parent.mkdir()
+            write_log(_reader(out, path, columns, rate_hz)(), bags[path])
+        yield [bags.get(path, path) for path in paths]
+
+
 def _reader(
-    log: Path, columns: Path | None, imu: int | None, baro: int | None, allow_compensated: bool
+    out: Output,
+    log: Path,
+    columns: Path | None = None,
+    rate_hz: float | None = None,
+    imu: int | None = None,
+    baro: int | None = None,
+    allow_compensated: bool = False,
 ) -> Callable[[], ForeignLog]:
     """Tell the format of a table or log by its name, and refuse options that it has no use for."""
-    from ..convert import dataflash_log, load_column_map, table_log, ulog_log
+    from ..convert import (
+        dataflash_log,
+        guess_columns,
+        load_column_map,
+        spoken_columns,
+        table_log,
+        ulog_log,
+    )
 
     suffix = log.suffix.lower()
     is_log = suffix in ('.ulg', '.bin')
-    if is_log and columns is not None:
-        raise options.usage(f'a {suffix} log needs no --columns')
+    if is_log and (columns is not None or rate_hz is not None):
+        raise options.usage(f'a {suffix} log needs no --columns and no --rate-hz')
     if allow_compensated and not is_log:
         raise options.usage('--allow-compensated is for PX4 and ArduPilot logs (.ulg, .bin)')
     if suffix == '.ulg':
@@ -116,9 +156,15 @@ def _reader(
         return partial(dataflash_log, log, imu, baro, allow_compensated)
     if imu is not None or baro is not None:
         raise options.usage('--imu and --baro are for PX4 and ArduPilot logs (.ulg, .bin)')
-    if columns is None:
-        raise options.usage('a table needs --columns MAP')
-    return partial(table_log, log, load_column_map(columns))
+    if columns is not None and rate_hz is not None:
+        raise options.usage('--rate-hz: a column map says that')
+    if columns is None and suffix in ('.parquet', '.pq'):
+        raise options.usage('a Parquet table needs --columns MAP')
+    if columns is not None:
+        return partial(table_log, log, load_column_map(columns))
+    guessed = guess_columns(log, rate_hz)
+    out.line(f'{log}: taken as {spoken_columns(guessed)}; --columns says otherwise')
+    return partial(table_log, log, guessed)
 
 
 def say(out: Output, report: ConversionReport) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from . import options
+from .convert import as_bags
 from .output import Output, micro_g
 
 if TYPE_CHECKING:
@@ -19,8 +20,9 @@ if TYPE_CHECKING:
 
 
 def fit(
+    context: typer.Context,
     bags: Annotated[
-        list[Path], typer.Argument(help='Bags of one unit: its positions.', metavar='BAG...')
+        list[Path], typer.Argument(help='Bags of one unit, or tables and logs.', metavar='BAG...')
     ],
     output: Annotated[Path, typer.Option('--output', '-o', help='Calibration to write (YAML).')],
     gravity: options.Gravity = None,
@@ -63,6 +65,10 @@ def fit(
     min_rest: options.MinRest = None,
     still_sd: options.StillSd = '50mg',
     allow: options.Allow = None,
+    columns: Annotated[
+        Path | None, typer.Option(help='Column map of the tables, as for convert.', metavar='YAML')
+    ] = None,
+    rate_hz: options.TableRate = None,
     input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
@@ -88,6 +94,7 @@ def fit(
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
+      thermo_comp fit tumble.txt -o unit42.yaml --gravity 9.8154
     """
     from ..files import CALIBRATION, PAGE, check_output
     from ..fitting import FitOptions
@@ -104,6 +111,8 @@ def fit(
         check_output(report, PAGE, overwrite=force, others=[*inputs, output])
     if certificate_info is not None and report is None:
         raise options.usage('--certificate-info fills the page of --report: give that, too')
+    # Until the command ends.
+    bags = context.with_resource(as_bags(out, bags, columns, rate_hz))
     where = options.topics_of(topic, topics, begin, end)
     sources, kind = fit_sources(bags, where, input_, serial)
     info = None

@@ -32,6 +32,10 @@ def check_serial(serial: str | None) -> str | None:
     return serial
 
 
+TableRate = Annotated[
+    float | None,
+    typer.Option(help='Samples per second of a table without times.', min=0.01, max=1e6),
+]
 Model = Annotated[
     ModelChoice, typer.Option(help="The thermal response, or the paper's two sets alone.")
 ]

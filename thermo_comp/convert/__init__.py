@@ -7,6 +7,7 @@ Owns the way from other people's logs to bags: tables with a column map, PX4, Ar
 from .bag import bag_log
 from .columns import ColumnMap, load_column_map, table_log
 from .dataflash import dataflash_log
+from .guess import guess_columns, spoken_columns
 from .log import ConversionReport, ForeignLog, write_log
 from .ulog import ulog_log
 
@@ -16,7 +17,9 @@ __all__ = [
     'ForeignLog',
     'bag_log',
     'dataflash_log',
+    'guess_columns',
     'load_column_map',
+    'spoken_columns',
     'table_log',
     'ulog_log',
     'write_log',

@@ -143,11 +143,13 @@ def _content(
     else:
         matrix /= K
         cubics[:, 0] = level
-        drift = spoken(float(np.max(np.abs(bias))))
-        notes.append(
-            f'it holds at {reference_c:g} degC: over the calibrated range the bias moves by up to '
-            f'{drift}, the scale by {1e6 * scale_drift:.2g} ppm'
+        drift = (
+            f'over the calibrated range the bias moves by up to '
+            f'{spoken(float(np.max(np.abs(bias))))}, the scale by {1e6 * scale_drift:.2g} ppm'
         )
+        if not calibration.needs_temperature:
+            drift = 'what temperature does is not known'
+        notes.append(f'it holds at {reference_c:g} degC: {drift}')
     notes += _losses(calibration)
     rate_bias = None
     if calibration.gyroscope is not None:

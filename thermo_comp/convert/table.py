@@ -47,6 +47,7 @@ class Table:
     values: the columns asked for; NaN where a cell is no number, shape (n,)
     stamp_ns: the stamp column; `NO_STAMP` where a cell is no number, shape (n,)
     n_short: rows with too few cells (the last line of a log that was cut off), left out
+    headings: of all columns, where there are some
     """
 
     path: str
@@ -54,6 +55,7 @@ class Table:
     values: dict[Column, Floats]
     stamp_ns: Ints | None
     n_short: int
+    headings: tuple[str, ...] = ()
 
 
 NO_STAMP = np.iinfo(np.int64).min
@@ -61,14 +63,15 @@ NO_STAMP = np.iinfo(np.int64).min
 
 def read_text(
     path: Path,
-    columns: Sequence[Column],
+    columns: Sequence[Column] | None = None,
     stamp: Column | None = None,
     stamp_exponent: int = 0,
     delimiter: str | None = None,
     has_header: bool | None = None,
 ) -> Table:
     """
-    Read some columns of a table of text, by their headings or numbers counted from 0.
+    Read some columns of a table of text, by their headings or numbers counted from 0; None reads
+    all, by their numbers.
 
     `stamp_exponent` is the power of ten from the stamp's unit to nanoseconds. The delimiter, a
     blank for any run of white space, and whether there are headings are found out where they are
@@ -191,7 +194,7 @@ def _collect(
     path: Path,
     heading: list[str] | None,
     rows: Iterator[tuple[int, list[str]]],
-    columns: Sequence[Column],
+    columns: Sequence[Column] | None,
     stamp: Column | None,
     stamp_exponent: int,
 ) -> Table:
@@ -201,7 +204,8 @@ def _collect(
         raise RecordingError('the table is empty', path=path)
     rows = rows if first is None else chain([first], rows)
     width = len(headings) if first is None else len(first[1])
-    places = {name: place(path, name, headings, width) for name in columns}
+    wanted = range(width) if columns is None else columns
+    places = {name: place(path, name, headings, width) for name in wanted}
     stamp_place = None if stamp is None else place(path, stamp, headings, width)
     needed = 1 + max([*places.values(), -1 if stamp_place is None else stamp_place])
 
@@ -229,6 +233,7 @@ def _collect(
         values=dict(zip(places, values, strict=True)),
         stamp_ns=np.concatenate(stamps) if stamps else None,
         n_short=n_short,
+        headings=tuple(headings),
     )
 
 

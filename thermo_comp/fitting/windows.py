@@ -85,7 +85,7 @@ class ThermalWindows:
     @property
     def was_measured(self) -> bool:
         """Whether any temperature was recorded: else the first curve's column, t, is 0."""
-        return bool(self.data.columns[:, 0].any())
+        return self.has_temperature or bool(self.data.columns[:, 0].any())
 
     @property
     def has_temperature(self) -> bool:

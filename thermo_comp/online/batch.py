@@ -249,6 +249,7 @@ def _apply(
     samples: Floats,
     angular_rate: Floats | None,
 ) -> CompensatedBlock:
+    rates: tuple[Floats, ...] = ()
     if not segments.first:
         none = np.empty((0, 3))
         found = CompensatedBlock(index[:0], stamps[:0], none, np.empty((0, 9)))
@@ -277,7 +278,6 @@ def _apply(
     keep: Bools = np.asarray((np.abs(samples) < full_scale).all(axis=1))
     is_stuck = _stuck(compensator, stamps, samples)
     _judge(compensator, segments, counts, stamps, samples, force, covariance, keep, is_stuck)
-    rates: tuple[Floats, ...] = ()
     if angular_rate is not None and compensator.thermal.rate_correction is not None:
         columns = lines_of(compensator.thermal.rate_correction, 9)
         rates = correct_rates(Lines(start_ns, columns, counts), stamps, angular_rate[index])
