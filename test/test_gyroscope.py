@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from thermo_comp.errors import CalibrationError
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.gyroscope import within_positions
+from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.judging import Verdict, judge_bags
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import Block, ImuColumns
@@ -102,7 +104,7 @@ def test_the_fit_tells_what_other_positions_see(fitted):
 
 
 def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
-    records = arrays(unit, plan('tumble-1', 2), 2)
+    records = arrays(unit, plan('chamber-9', 2)[:2], 2)
     with_rate = fit([source_of(one, unit.scale_factor) for one in records], OPTIONS)
     silent = [np.zeros((len(one.time_s), 3)) for one in records]
     sources = [
@@ -204,3 +206,48 @@ def test_the_rate_is_corrected_by_hand_numbers():
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
+
+
+def judged_on(unit, calibration, seed, kind='held-out'):
+    records = arrays(unit, plan(kind, 2), seed)[:3]
+    bags = [
+        reduce_source(
+            source_of(one, unit.scale_factor), k, window_s=10.0, cell_s=0.5, full_scale=None
+        )
+        for k, one in enumerate(records)
+    ]
+    return judge_bags(bags, calibration)
+
+
+def test_evaluation_judges_the_changes_by_their_claim(unit, fitted):
+    calibration = fitted.calibration
+    judged = judged_on(unit, calibration, 99)
+    rate = judged.rate
+    assert rate.kind is Verdict.VALID
+    assert judged.exit_code == 0
+    for name in ('static', 'dynamic', 'all'):
+        section = rate.sections[name]
+        # Honest: above what the noise alone is, and of lags that start unseen more than needed.
+        assert 0.7 < section.ratio < 1.2
+        assert section.rms < 1.3 * FLOOR
+        assert section.raw_rms > 50.0 * FLOOR
+    # The Earth's rate and the turn-on, 4.2e-5 and 3.5e-5 of nine numbers; raw the bias, too.
+    assert 2e-5 < rate.level_rms < 1e-4
+    assert rate.raw_level_rms > 1e-3
+    assert judged.facts()['angular_rate']['reason'] == rate.reason
+    assert 'angular rate: valid: 0.' in str(rate)
+    # A gyroscope of another unit is found out, and so is one that claims nothing.
+    own = calibration.gyroscope
+    other = replace(own, response=(), static=own.dynamic, dynamic=own.dynamic, posterior=None)
+    wrong = judged_on(unit, replace(calibration, gyroscope=other), 99)
+    assert wrong.is_valid
+    assert wrong.rate.kind is Verdict.RECALIBRATE
+    assert wrong.exit_code == 1
+    assert judged_on(unit, replace(calibration, gyroscope=None), 99).rate is None
+
+
+def test_where_no_temperature_changes_nothing_is_wrong(unit, fitted):
+    rate = judged_on(unit, fitted.calibration, 3, 'tumble').rate
+    section = rate.sections['all']
+    assert section.rms < section.raw_rms < 1.3 * section.rms
+    assert rate.kind is Verdict.WIDE

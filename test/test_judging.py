@@ -100,6 +100,7 @@ def made(
         force=force,
         claimed_sd=np.full(n, claimed * MICRO_G),
         noise_sd=np.zeros(n),
+        gyro=np.zeros((n, 0)),
     )
 
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -139,6 +139,7 @@ def _say(out: Output, result: Evaluation, drifts: Sequence[Drift]) -> None:
         'ranges',
     )
     _say_axes(out, judged)
+    _say_rates(out, judgements)
     if drifts:
         out.table(
             ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
@@ -155,6 +156,34 @@ def _say(out: Output, result: Evaluation, drifts: Sequence[Drift]) -> None:
     for line in result.notes:
         out.line(f'- {line}')
     out.line(str(judged))
+    if judged.rate is not None:
+        out.line(str(judged.rate))
+
+
+def _say_rates(out: Output, judgements: Mapping[str, Judgement]) -> None:
+    """Print what the gyroscopes make of the angular rate at rest."""
+    from ..judging import SECTIONS
+    from ..unit.gyroscope import MILLIDEGREE
+
+    found = {name: one.rate for name, one in judgements.items() if one.rate is not None}
+    rows: list[tuple[Cell, ...]] = []
+    for section in SECTIONS:
+        for k, (name, judged) in enumerate(found.items()):
+            one = judged.sections[section]
+            if not one.n:
+                continue
+            if not k:
+                raw = (f'{value / MILLIDEGREE:.3g}' for value in (one.raw_rms, one.raw_peak))
+                rows.append((section, 'raw', one.n, *raw, None, None))
+            numbers = (one.rms, one.peak, one.claimed_rms)
+            said = (f'{value / MILLIDEGREE:.3g}' for value in numbers)
+            rows.append((section, name, one.n, *said, f'{one.ratio:.2f}'))
+    if rows:
+        out.table(
+            ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),
+            rows,
+            title='angular rate at rest less the mean of each rest, of all axes in mdeg/s',
+        )
 
 
 def _say_axes(out: Output, judged: Judgement) -> None:

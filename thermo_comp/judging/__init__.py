@@ -3,8 +3,10 @@
 """Owns the judgement of a calibration against recordings: one judge, for every command."""
 
 from .evaluation import Evaluation, OpenedBag, evaluate, judge_bags, open_bag
-from .judgement import SECTIONS, Judgement, Section, Verdict, judge
+from .judgement import Judgement, judge
+from .rates import RateJudgement
 from .shifts import AxisShift
+from .verdicts import SECTIONS, Section, Verdict
 from .windows import WINDOW_S, Windows, corrected_windows
 
 __all__ = [
@@ -14,6 +16,7 @@ __all__ = [
     'Evaluation',
     'Judgement',
     'OpenedBag',
+    'RateJudgement',
     'Section',
     'Verdict',
     'Windows',

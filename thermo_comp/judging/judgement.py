@@ -11,7 +11,6 @@ outside the calibrated ranges is told apart and decides nothing.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -21,56 +20,13 @@ from ..typing import Bools, Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G, spoken
 from ..unit.metrics import residual_statistics
+from .rates import RateJudgement, judge_rates
 from .shifts import AxisShift, axis_shifts, distinct_positions, rms_by_axis, what_moved
+from .verdicts import FEWEST, LARGEST_RATIO, SECTIONS, WIDE_PART, Section, Verdict
 from .windows import Windows
 
-#: A calibration holds while its error is within this many times what it claims.
-LARGEST_RATIO = 2.0
-# A claim promises little if it is not below this part of the raw error, or above 1 mg.
-_WIDE_PART, _WIDE_CLAIM = 0.5, 1e3 * MICRO_G
-# Fewer windows of a regime are judged with the others only.
-_FEWEST = 6
-
-SECTIONS = ('static', 'dynamic', 'all', 'outside')
-
-
-class Verdict(Enum):
-    """The verdicts; the value is the verdict's wording."""
-
-    VALID = 'valid'
-    WIDE = 'valid, but it only claims'
-    RECALIBRATE = 'recalibrate'
-    NO_BETTER = 'no better than raw'
-    OUTSIDE = 'outside the calibrated range: not judged'
-    NO_CLAIM = 'no claim'
-
-    @property
-    def is_valid(self) -> bool:
-        """Whether the calibration was shown to hold."""
-        return self in (Verdict.VALID, Verdict.WIDE)
-
-
-@dataclass(frozen=True)
-class Section:
-    """
-    ``|f| - g`` of the `n` windows of one section [m/s^2].
-
-    Raw is by the constants at the reference temperature, the others by the calibration;
-    `claimed_rms` is the RMS of what is claimed for the same windows, NaN where nothing is.
-    """
-
-    n: int
-    raw_rms: float
-    raw_peak: float
-    rms: float
-    mean: float
-    peak: float
-    claimed_rms: float
-
-    @property
-    def ratio(self) -> float:
-        """RMS over claimed RMS."""
-        return self.rms / self.claimed_rms
+# Nor is it one above 1 mg.
+_WIDE_CLAIM = 1e3 * MICRO_G
 
 
 @dataclass(frozen=True)
@@ -81,7 +37,8 @@ class Judgement:
     Sections are ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside``
     them. `left_out_rms` is, of windows that the fit has seen, what it left on positions left out,
     else NaN; `tolerance` the user's limit [m/s^2]. Shifts are per axis, none with fewer than six
-    distinct positions; `moved` says those that are sure. For `axis_rms` see `rms_by_axis`.
+    distinct positions; `moved` says those that are sure. For `axis_rms` see `rms_by_axis`. The
+    gyroscope is judged apart, where there is one.
     """
 
     kind: Verdict
@@ -94,6 +51,7 @@ class Judgement:
     axis_rms: Floats
     n_positions: int
     windows: Windows
+    rate: RateJudgement | None
 
     @property
     def is_valid(self) -> bool:
@@ -102,8 +60,9 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """0 for a calibration that was shown to hold, else 1."""
-        return 0 if self.is_valid else 1
+        """0 for a calibration that was shown to hold, its gyroscope as well, else 1."""
+        is_rate_valid = self.rate is None or self.rate.kind.is_valid
+        return 0 if self.is_valid and is_rate_valid else 1
 
     @property
     def headline_rms(self) -> float:
@@ -138,6 +97,7 @@ class Judgement:
             'moved': self.moved,
             'shifts': self.shifts,
             'axis_rms_m_s2': self.axis_rms,
+            'angular_rate': None if self.rate is None else self.rate.facts(),
         }
 
 
@@ -182,6 +142,7 @@ def judge(
         axis_rms=rms_by_axis(windows),
         n_positions=distinct_positions(windows),
         windows=windows,
+        rate=judge_rates(windows, calibration),
     )
 
 
@@ -209,12 +170,12 @@ def _verdict(
             f'all {_windows(outside.n, windows)} lie there, {_span(windows)}; {_numbers(outside)}'
         )
         return Verdict.OUTSIDE, reason
-    judged = [s for s in (sections['static'], sections['dynamic']) if s.n >= _FEWEST] or [one]
+    judged = [s for s in (sections['static'], sections['dynamic']) if s.n >= FEWEST] or [one]
     headline = _headline(left_out, one)
     worst = max(*(s.rms for s in judged), headline)
     ratio = max(s.ratio for s in (*judged, one))
     # A NaN of no claim compares false.
-    is_wide = one.claimed_rms > (tolerance or min(_WIDE_PART * one.raw_rms, _WIDE_CLAIM))
+    is_wide = one.claimed_rms > (tolerance or min(WIDE_PART * one.raw_rms, _WIDE_CLAIM))
     if one.rms >= one.raw_rms and is_thermal:
         kind = Verdict.NO_BETTER
     elif tolerance is not None and worst > tolerance:

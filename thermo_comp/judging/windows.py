@@ -24,6 +24,7 @@ from ..fitting.reduction import ReducedBag, StillInterval
 from ..online.compensator import Compensator
 from ..online.snapshot import take_snapshot
 from ..online.status import CompensatorConfig
+from ..thermal.state import Layout
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
@@ -57,7 +58,9 @@ class Windows:
     prevails, inside those that lie inside the calibrated ranges as a whole. `raw` is the specific
     force by the constants at the reference temperature, `force` that by the calibration, shapes
     (n, 3); `claimed_sd` is claimed for the norm of `force`: the calibration's error and the white
-    noise of the mean, which is `noise_sd` alone.
+    noise of the mean, which is `noise_sd` alone. `gyro` is for `rates` to read: a row of the
+    angular rate, raw and corrected, of its claimed variances and of the thermal state; empty
+    where the calibration has no gyroscope.
     """
 
     window_s: float
@@ -76,6 +79,7 @@ class Windows:
     force: Floats
     claimed_sd: Floats
     noise_sd: Floats
+    gyro: Floats
 
     def __len__(self) -> int:
         """Count the windows."""
@@ -135,12 +139,14 @@ def corrected_windows(
     def correct(bag: ReducedBag, sums: Floats) -> None:
         _correct(Compensator(calibration, config), bag, sums)
 
-    table = _table(bags, window_s, correct)
+    thermal = Compensator(calibration, config).thermal
+    n_gyro = 9 + Layout(thermal.correction.memory).width if thermal.rate_correction else 0
+    table = _table(bags, window_s, correct, n_gyro)
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     K, bias = np.array([(axis.scale_factor, axis.bias) for axis in axes]).T
     M = np.array(calibration.misalignment)
     along = table[:, _FORCE] / np.linalg.norm(table[:, _FORCE], axis=1, keepdims=True) @ M
-    noise = along**2 @ np.array(Compensator(calibration, config).thermal.correction.noise)
+    noise = along**2 @ np.array(thermal.correction.noise)
     # Of a message's noise the rounding is carried on to the next: a mean has none of it.
     white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
     mean_white = white / (calibration.unit.cycle_time_s * table[:, _COUNT])
@@ -211,13 +217,18 @@ def means_by(labels: Ints, values: Floats) -> Floats:
 # Columns of a sum and of a window. Averaged over a window's sums are all from the time on.
 _BAG, _POSITION, _START, _COUNT, _EXCESS, _TIME, _BOARD, _RATE, _WEIGHT, _VARIANCE = range(10)
 _MEAN, _FORCE, _WIDTH = slice(10, 13), slice(13, 16), 16
+# What a calibration with a gyroscope adds: the rate, and what `Windows.gyro` says.
+_ANGULAR = slice(_WIDTH, _WIDTH + 3)
 
 
 def _table(
-    bags: Sequence[ReducedBag], window_s: float, correct: Callable[[ReducedBag, Floats], None]
+    bags: Sequence[ReducedBag],
+    window_s: float,
+    correct: Callable[[ReducedBag, Floats], None],
+    n_gyro: int = 0,
 ) -> Floats:
     """Put the sums of bags together to windows, a row each."""
-    parts = [np.zeros((0, _WIDTH))]
+    parts = [np.zeros((0, _WIDTH + n_gyro))]
     first_position = 0
     for number, bag in enumerate(bags):
         per = max(1, round(window_s / bag.window_s))
@@ -228,7 +239,7 @@ def _table(
                 path=bag.source.name,
             )
         sums = [
-            _sums(interval, bag.window_s, interval.n_whole // per * per)
+            _sums(interval, bag.window_s, interval.n_whole // per * per, n_gyro)
             for interval in bag.intervals
         ]
         for place, one in enumerate(sums):
@@ -244,18 +255,20 @@ def _table(
     return np.concatenate(parts)
 
 
-def _sums(interval: StillInterval, sum_s: float, n: int) -> Floats:
-    sums = np.full((n, _WIDTH), np.nan)
+def _sums(interval: StillInterval, sum_s: float, n: int, n_gyro: int) -> Floats:
+    sums = np.full((n, _WIDTH + n_gyro), np.nan)
     sums[:, _START] = interval.begin_s + sum_s * np.arange(n)
     sums[:, _COUNT] = interval.count[:n]
     sums[:, _TIME] = interval.time[:n]
     sums[:, _MEAN] = interval.mean[:n]
+    if n_gyro and interval.angular_rate is not None:
+        sums[:, _ANGULAR] = interval.angular_rate[:n]
     return sums
 
 
 def _joined(sums: Floats, per: int) -> Floats:
     """Join so many sums to a window each; out are those that were not corrected as a whole."""
-    grouped = sums.reshape(-1, per, _WIDTH)
+    grouped = sums.reshape(-1, per, sums.shape[1])
     count = grouped[:, :, _COUNT]
     result = np.array(grouped[:, 0])
     result[:, _COUNT] = count.sum(axis=1)
@@ -293,6 +306,7 @@ def _windows(
         force=table[:, _FORCE],
         claimed_sd=claimed_sd,
         noise_sd=noise_sd,
+        gyro=table[:, _WIDTH:],
     )
 
 
@@ -316,6 +330,9 @@ def _correct(compensator: Compensator, bag: ReducedBag, sums: Floats) -> None:
         row[_EXCESS] = status.relative_excess
         state = status.state
         row[_BOARD], row[_RATE], row[_WEIGHT] = state.board, state.rate, state.weight
+        if compensator.corrects_rate:
+            row[_WIDTH + 3 : _WIDTH + 9] = compensator.correct_rate(stamp_ns, *row[_ANGULAR])
+            row[_WIDTH + 9 :] = compensator.thermal.tracker.sample(stamp_ns)
 
 
 def _along(force: Sequence[float], covariance: Sequence[float]) -> float:

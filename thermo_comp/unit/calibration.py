@@ -341,9 +341,7 @@ class Calibration:
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
     ) -> Corrected:
-        """
-        Correct arrays of samples: `thermo_comp.correct` says what it takes, and gives.
-        """
+        """Correct arrays of samples: `thermo_comp.correct` says what it takes, and gives."""
         from .. import correct
 
         return correct(self, time_s, counts, board=board, **others)
@@ -354,9 +352,7 @@ class Calibration:
 
     @property
     def needs_temperature(self) -> bool:
-        """
-        Whether temperature changes what it says; else it is constants, of the reference.
-        """
+        """Whether temperature changes what it says; else it is constants, of the reference."""
         curves = [axis for one in self.regime_sets() for axis in one.axes()]
         weights = [axis.delta for axis in curves]
         for axis in curves:
@@ -370,9 +366,7 @@ class Calibration:
 
     @property
     def has_uncertainty(self) -> bool:
-        """
-        Whether the calibration says anything of how well it is known; else it claims nothing.
-        """
+        """Whether it says anything of how well it is known; else it claims nothing."""
         return (
             self.posterior is not None
             or any(self.misalignment_sd)
@@ -381,20 +375,7 @@ class Calibration:
 
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
-    """
-    Say where each parameter of a calibration stands in its posterior.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The unit; only the sizes of its functions and of its response count.
-
-    Returns
-    -------
-    ParameterLayout
-        The offsets.
-
-    """
+    """Say where each parameter of a calibration stands in its posterior."""
     blocks = []
     at = 0
     for static, dynamic in zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True):

@@ -91,7 +91,7 @@ class SetCurves:
         t = hold(board - self._reference, *self._t_range)
         return [(one.bias_function.slope(t), one.scale_function.slope(t)) for one in self._sets]
 
-    def bases(self, board: float) -> list[tuple[list[float], list[float]]]:
+    def bases(self, board: Number) -> list[tuple[list[Number], list[Number]]]:
         """Give the regressors of each axis' free coefficients, of bias and of relative scale."""
         t = hold(board - self._reference, *self._t_range)
         return [(one.bias_function.basis(t), one.scale_function.basis(t)) for one in self._sets]

@@ -9,7 +9,7 @@ have the same bits whatever library multiplies.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -80,6 +80,33 @@ class SlowUncertainty:
                 c += more[2] + float((var_scale * on_scale * on_scale).sum())
             result.append((a, b, c))
         return result
+
+    def of_bias(
+        self, states: Floats, mean_of: Callable[[Floats], Floats]
+    ) -> tuple[Floats, Floats]:
+        """
+        Say what the parameters leave uncertain of the bias at each of many states, shape (n, w).
+
+        Returns the variance of the bias, and that of its distance from a mean over states, as
+        `mean_of` takes it of rows, shapes (n, 3) [m^2/s^4].
+        """
+        columns = list(np.ascontiguousarray(states.T))
+        table = self._correction.table
+        board, weight = columns[BOARD], columns[WEIGHT]
+        phi = table.weighted(table.held(table.raw(columns)), board, weight)
+        static, dynamic = (
+            self._correction.static.bases(board),
+            self._correction.dynamic.bases(board),
+        )
+        rest = 1.0 - weight
+        whole, away = np.zeros((2, len(states), 3))
+        for axis, (rows, variances, _, _) in enumerate(self._blocks):
+            on_bias = [rest, *(rest * value for value in static[axis][0])]
+            on_bias += [weight, *(weight * value for value in dynamic[axis][0]), *phi]
+            felt = np.column_stack(on_bias) / self._K[axis]
+            for result, one in ((whole, felt), (away, felt - mean_of(felt))):
+                result[:, axis] = ((one @ rows) ** 2).sum(axis=1) + one**2 @ variances
+        return whole, away
 
     def _regressors(
         self, state: Sequence[float], phi: list[float], axis: int
