@@ -56,7 +56,7 @@ class Design:
         self._rows = [slice(a, b) for a, b in pairwise(edges.tolist())]
         self._bags = windows.bag_of_position
         self.n_bags = int(windows.bag.max()) + 1
-        self._start_information = np.asarray(np.linalg.inv(windows.start_covariance))
+        self.start_information = np.asarray(np.linalg.inv(windows.start_covariance))
         self._cache: list[_Whitened | None] = [None] * 3
 
     def reweight(self, weight: Floats) -> None:
@@ -162,7 +162,7 @@ class Design:
         if prior.known is not None:
             result.append((slice(0, layout.n_unit), prior.known.precision))
         result += [
-            (slice(places[0], places[-1] + 1), self._start_information)
+            (slice(places[0], places[-1] + 1), self.start_information / prior.start_share)
             for places in layout.start
             if len(places)
         ]

@@ -27,7 +27,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..typing import Bools, Floats, Ints
 from .posterior import Posterior, Regression
 from .unknowns import Prior, State
-from .worth import GroupWorth, earned, group_worth, places_of, told_of, widths_of
+from .worth import GroupWorth, earned, group_worth, mode_of, places_of, told_of, widths_of
 
 # Of the three weights of a column, what the data must tell under a wide prior to be asked.
 _SILENT = 0.05
@@ -39,8 +39,18 @@ _PATIENCE = 4
 _MOST_ROUNDS = 40
 # A round that moves no width by more than this part is the last.
 _SETTLED = 0.03
+# Start states are never known better than this part of the run-time prior's variance.
+_LEAST_START = 1e-4
+# The memory is as short as it can be [s]: the longest lags of a bank and the curves over
+# temperature are almost one thing to bags that all begin at one temperature.
+_REACHES_S = (2000.0, 4000.0, np.inf)
+# ... which is more than what a model that is almost right gains by a longer one.
+_LONGER_EARNED = 10.0
+# Widths that are tried for a column that takes no part, in parts of what it would begin with.
+_WIDTHS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
 # What must be gained in log evidence to stay.
-_EARNED = 0.5
+import os
+_EARNED = float(os.environ.get("EARN","0.5"))
 # No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
 _LEAST_SIGMA = 1e-8
 # Of the noise of a window, what a column may add unseen before it counts.
@@ -87,7 +97,8 @@ def learn(
     kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
     held = np.zeros(len(prior.on_bias), dtype=bool) if held is None else held
     allowed = prior
-    if prior.known is None and not kept.all():
+    asks = prior.known is None and not kept.all()
+    if asks:
         silent = _silent(regression.solve(state, prior), prior)
     else:
         # Nothing is asked of columns whose weights are known beforehand, nor where all must stay.
@@ -95,21 +106,22 @@ def learn(
         silent = {part: widths_of(prior, part) > 0.0 for part in ('bias', 'scale')}
     silent['scale'] |= held
     fixed = _Fixed(silent, kept)
-    # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
-    posterior, prior = _settle(regression, state, prior, fixed, rounds=_PATIENCE)
-    _downweight(regression, posterior)
-    posterior, prior = _settle(regression, posterior.state, prior, fixed)
-    tell(0.4)
-    _downweight(regression, posterior)
-    if walks:
-        prior = _walk(regression, posterior, prior)
-    posterior, prior = _settle(regression, posterior.state, prior, fixed)
-    tell(0.7)
+    for reach in _REACHES_S if asks else (np.inf,):
+        prior = _within(allowed, reach, regression.windows.tau, kept)
+        # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
+        posterior, prior = _settle(regression, state, prior, fixed, rounds=_PATIENCE)
+        _downweight(regression, posterior)
+        posterior, prior = _settle(regression, posterior.state, prior, fixed)
+        tell(0.4)
+        _downweight(regression, posterior)
+        if walks:
+            prior = _walk(regression, posterior, prior)
+        posterior, prior = _settle(regression, posterior.state, prior, fixed)
+        tell(0.7)
+        if not asks or _longer_gain(regression, posterior, prior, allowed, reach) < _LONGER_EARNED:
+            break
     while True:
-        idle = {
-            part: _idle(posterior, prior, part, kept | held if part == 'scale' else kept)
-            for part in ('bias', 'scale')
-        }
+        idle = _idle(posterior, prior, {'bias': kept, 'scale': kept | held})
         if not any(idle.values()):
             break
         prior = _without(prior, idle)
@@ -119,21 +131,66 @@ def learn(
         prior = _walk(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, fixed)
     claim = posterior
-    if prior.known is None and not kept.all():
+    if asks:
         wider = _left_open(regression, posterior, prior, allowed)
         claim = regression.solve(posterior.state, wider, n_steps=1)
     tell(1.0)
     return Learnt(posterior, prior, group_worth(regression, posterior, prior), claim)
 
 
-def _idle(posterior: Posterior, prior: Prior, part: str, kept: Bools) -> list[int]:
-    """Find the columns that do not earn their place."""
-    sd, places = widths_of(prior, part), places_of(posterior, part)
-    return [
-        column
-        for column in np.flatnonzero((sd > 0.0) & ~kept).tolist()
-        if earned(posterior, places[:, column], float(sd[column])) < _EARNED
+def _within(allowed: Prior, reach: float, tau: Floats, kept: Bools) -> Prior:
+    """Leave out the columns of a longer memory than `reach`."""
+    stays = (tau <= reach) | kept
+    return replace(
+        allowed,
+        on_bias=np.where(stays, allowed.on_bias, 0.0),
+        on_scale=np.where(stays, allowed.on_scale, 0.0),
+    )
+
+
+def _longer_gain(
+    regression: Regression, posterior: Posterior, prior: Prior, allowed: Prior, reach: float
+) -> float:
+    """
+    Return the most that one column of a longer memory would add to the log evidence.
+
+    With S and q of its weights, and their width at its best, it adds ``sum(q^2 / (1 / sd^2 + S) -
+    log(1 + S sd^2)) / 2``.
+    """
+    asked = regression.asked_of_absent(posterior.state, prior, allowed)
+    longer = regression.windows.tau > reach
+    most = 0.0
+    for part in ('bias', 'scale'):
+        S, q = (values[:, longer] for values in asked[part])
+        for width in widths_of(allowed, part)[longer] * _WIDTHS[:, None]:
+            with np.errstate(divide='ignore'):
+                gain = q**2 / (1.0 / width**2 + S) - np.log1p(S * width**2)
+            most = max(most, 0.5 * float(gain.sum(axis=0).max(initial=0.0)))
+    return most
+
+
+def _idle(posterior: Posterior, prior: Prior, kept: dict[str, Bools]) -> dict[str, list[int]]:
+    """
+    Find the columns that do not earn their place: the least first, the others then without it.
+    """
+    mode, covariance = mode_of(posterior), posterior.covariance
+    asked = [
+        (part, column, places_of(posterior, part)[:, column], float(widths_of(prior, part)[column]))
+        for part in ('bias', 'scale')
+        for column in np.flatnonzero((widths_of(prior, part) > 0.0) & ~kept[part]).tolist()
     ]
+    result: dict[str, list[int]] = {'bias': [], 'scale': []}
+    while asked:
+        gains = [earned(mode, covariance, places, sd) for _, _, places, sd in asked]
+        least = int(np.argmin(gains))
+        if gains[least] >= _EARNED:
+            break
+        part, column, places, _ = asked.pop(least)
+        result[part].append(column)
+        gone = np.linalg.solve(covariance[np.ix_(places, places)], covariance[places])
+        mode = mode - gone.T @ mode[places]
+        covariance = covariance - covariance[:, places] @ gone
+    return result
 
 
 def _left_open(
@@ -146,10 +203,10 @@ def _left_open(
     they say of it beside the columns that stayed. Where that is more than some sds of a window's
     noise the covariance has it back, with this width; its weight stays 0, the likeliest.
     """
-    told = regression.told_of_absent(posterior.state, prior, allowed)
+    asked = regression.asked_of_absent(posterior.state, prior, allowed)
     widths = {}
     for part, unit in (('bias', 1.0), ('scale', 1.0 / (regression.gravity or 1.0))):
-        wide, S = widths_of(allowed, part), told[part]
+        wide, S = widths_of(allowed, part), asked[part][0].mean(axis=0)
         sd = np.minimum(1.0 / np.sqrt(np.maximum(S, 1e-300)), wide)
         matters = (widths_of(prior, part) == 0.0) & (wide > 0.0)
         matters &= sd > _OPEN * float(np.mean(prior.sigma)) * unit
@@ -218,6 +275,8 @@ def _settle(
         told_skew, power = _told_of(posterior, vector, posterior.layout.skew)
         if told_skew > 1.0:
             skew_sd = max(np.sqrt(power / told_skew), 1e-6)
+        start_share = _start_share(regression, posterior, prior)
+        change = max(change, float(np.abs(np.log(start_share / prior.start_share))) / 2.0)
         sigma = _sigma(posterior, prior)
         change = max(change, float(np.abs(np.log(sigma / prior.sigma)).max()))
         prior = replace(
@@ -227,6 +286,7 @@ def _settle(
             offset_sd=float(offset_sd),
             skew_sd=float(skew_sd),
             sigma=sigma,
+            start_share=start_share,
         )
         prior = _without(prior, gone)
         if change < _SETTLED and not any(gone.values()):
@@ -246,6 +306,23 @@ def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float,
     """Effective parameters of some unknowns, and the sum of their squares."""
     where = places.ravel()
     return float(posterior.told[where].sum()), float(np.sum(vector[where] ** 2))
+
+
+def _start_share(regression: Regression, posterior: Posterior, prior: Prior) -> float:
+    """
+    Learn how far from rest the bags began, in parts of the run-time prior's variance.
+
+    Bags of a chamber begin in a soak, and what is free there at every start hides in lags of hours
+    with opposite weights, which another start then shows.
+    """
+    places, start = posterior.layout.start, posterior.state.start
+    if not places.size:
+        return 1.0
+    told = float(posterior.told[places].sum())
+    if told < 1.0:
+        return prior.start_share
+    power = float(np.einsum('bi,ij,bj->', start, regression.start_information, start))
+    return float(np.clip(power / told, _LEAST_START, 1.0))
 
 
 def _position_sd(regression: Regression, prior: Prior) -> float:

@@ -164,40 +164,51 @@ class Regression(Design):
         )
         return other, G, g
 
-    def told_of_absent(self, state: State, prior: Prior, allowed: Prior) -> dict[str, Floats]:
-        """Ask the data for columns that take no part, beside those that do."""
+    def asked_of_absent(
+        self, state: State, prior: Prior, allowed: Prior
+    ) -> dict[str, tuple[Floats, Floats]]:
+        """
+        Ask the data for columns that take no part, each alone beside those that do.
+
+        `state`: the mode under `prior`. Returns by part S and q, shape (3, m): the data's
+        information on each weight, and its pull on it; 0 for columns that take part.
+        """
         everything = replace(
             prior,
             on_bias=np.maximum(prior.on_bias, allowed.on_bias),
             on_scale=np.maximum(prior.on_scale, allowed.on_scale),
         )
         layout = self.layout(everything)
-        hessian = self._equations(state, everything, layout).hessian
-        absent = np.zeros(layout.n, dtype=bool)
+        equations = self._equations(state, everything, layout)
+        hessian, precision = equations.hessian, self.precision(everything, layout)
+        told, pull = np.zeros((2, layout.n + 1))
         parts = (
             ('bias', layout.on_bias, prior.on_bias),
             ('scale', layout.on_scale, prior.on_scale),
         )
+        absent = np.zeros(layout.n, dtype=bool)
         for _, places, sd in parts:
-            away = places[:, (sd == 0.0) & (places[0] >= 0)]
-            absent[away] = True
-        present = np.flatnonzero(~absent)
-        hessian[np.diag_indices(layout.n)] += self.precision(everything, layout)
+            absent[places[:, (sd == 0.0) & (places[0] >= 0)]] = True
+        away = self.vector(state, layout) - self.prior_mean(everything, layout)
+        gradient = equations.gradient - precision * away
+        information = np.diag(hessian).copy()
+        hessian[np.diag_indices(layout.n)] += precision
         for where, matrix in self._inform(prior, layout):
             hessian[where, where] += matrix
+            gradient[where] -= matrix @ away[where]
+        present = np.flatnonzero(~absent)
         kept = hessian[np.ix_(present, present)]
         root = np.sqrt(np.diag(kept))
         factor = cho_factor(kept / np.outer(root, root) + JITTER * np.eye(len(root)))
         cross = hessian[np.ix_(present, np.flatnonzero(absent))] / root[:, None]
-        told = np.zeros(layout.n + 1)
-        told[np.flatnonzero(absent)] = np.diag(hessian)[absent] - np.sum(
-            cross * cho_solve(factor, cross), axis=0
-        )
-        precision = np.append(self.precision(everything, layout), 0.0)
+        solved = cho_solve(factor, cross)
+        told[:-1][absent] = np.maximum(information[absent] - np.sum(cross * solved, axis=0), 0.0)
+        # A mode is one to some digits: columns that are almost others' sums would feel the rest.
+        pull[:-1][absent] = gradient[absent] - solved.T @ (gradient[present] / root)
         result = {}
         for part, places, sd in parts:
-            data = np.where((places >= 0) & (sd == 0.0), told[places] - precision[places], 0.0)
-            result[part] = np.maximum(data.mean(axis=0), 0.0)
+            places = np.where((places >= 0) & (sd == 0.0), places, -1)
+            result[part] = told[places], pull[places]
         return result
 
     def without(self, posterior: Posterior, prior: Prior, p: int) -> State | None:
@@ -224,7 +235,7 @@ class Regression(Design):
         away = self.vector(posterior.state, layout)
         known = np.diag(self.precision(prior, layout)[local])
         if len(own[2]):
-            known[-len(own[2]) :, -len(own[2]) :] += self._start_information
+            known[-len(own[2]) :, -len(own[2]) :] += self.start_information / prior.start_share
         gradient[n:] -= known @ away[local]
         inner = np.linalg.solve(
             hessian[n:, n:] + known, np.column_stack((hessian[n:, :n], gradient[n:]))

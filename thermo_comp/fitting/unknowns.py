@@ -28,6 +28,7 @@ class Windows:
         shape (n, m)
     groups: group of each column
     lag: the lag whose start state moves a column; -1 for none, shape (m,)
+    tau: time constant that each column has or follows [s]; 0 for none, shape (m,)
     start: derivative of each column by that state, shape (n, m)
     start_covariance: prior of the start states [K^2], shape (n_lags, n_lags)
     in_scale: which columns the scale may have as well as the bias, shape (m,)
@@ -41,6 +42,7 @@ class Windows:
     columns: Floats
     groups: tuple[str, ...]
     lag: Ints
+    tau: Floats
     start: Floats
     start_covariance: Floats
     in_scale: Bools
@@ -84,6 +86,7 @@ class Prior:
     sigma: white noise of a typical window [m/s^2], shape (3,)
     rho: variance per second of the walk over that of the white noise, shape (3,)
     least_offset_sd: what offset_sd is at least, whatever the data say [m/s^2]
+    start_share: of the run-time prior's variance of the start states, what these bags have
     known: takes the place of all widths of the unit's own parameters; these say only which columns
         take part
     """
@@ -98,6 +101,7 @@ class Prior:
     sigma: Floats
     rho: Floats
     least_offset_sd: float = 0.0
+    start_share: float = 1.0
     known: Known | None = None
 
 

@@ -62,14 +62,23 @@ def widths_of(prior: Prior, part: str) -> Floats:
     return prior.on_bias if part == 'bias' else prior.on_scale
 
 
-def earned(posterior: Posterior, places: Ints, sd: float | Floats) -> float:
+def mode_of(posterior: Posterior) -> Floats:
+    """Return the weights of all columns at their places among what belongs to the unit."""
+    layout, state = posterior.layout, posterior.state
+    vector = np.zeros(layout.n + 1)
+    vector[layout.on_bias] = state.on_bias
+    vector[layout.on_scale] = state.on_scale
+    return vector[: layout.n_unit]
+
+
+def earned(mode: Floats, covariance: Floats, places: Ints, sd: float | Floats) -> float:
     """
     How much the log evidence falls when some weights are held at 0 (Savage-Dickey).
 
-    `places`: their places, shape (k,). `sd`: their prior, shape (k,).
+    `mode`, `covariance`: of what belongs to the unit. `places`: their places, shape (k,). `sd`:
+    their prior, shape (k,).
     """
-    mode = _mode(posterior, places)
-    covariance = posterior.covariance[np.ix_(places, places)]
+    mode, covariance = mode[places], covariance[np.ix_(places, places)]
     root = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
     values = np.maximum(values, 1e-12)
@@ -79,20 +88,13 @@ def earned(posterior: Posterior, places: Ints, sd: float | Floats) -> float:
     return 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant - known
 
 
-def _mode(posterior: Posterior, places: Ints) -> Floats:
-    layout, state = posterior.layout, posterior.state
-    vector = np.zeros(layout.n + 1)
-    vector[layout.on_bias] = state.on_bias
-    vector[layout.on_scale] = state.on_scale
-    return np.asarray(vector[places])
-
-
 def group_worth(
     regression: Regression, posterior: Posterior, prior: Prior
 ) -> tuple[GroupWorth, ...]:
     """Say what each group explains, spends and earns."""
     names = np.array(regression.windows.groups)
     columns = regression.windows.columns / regression.rms
+    mode = mode_of(posterior)
     force = regression.gravity * posterior.state.up[regression.windows.position]
     result = []
     for part in ('bias', 'scale'):
@@ -112,7 +114,7 @@ def group_worth(
                     group,
                     float(np.sqrt(np.mean(added**2))),
                     float(told[used].sum()),
-                    earned(posterior, places.ravel(), np.tile(sd[used], 3)),
+                    earned(mode, posterior.covariance, places.ravel(), np.tile(sd[used], 3)),
                     tuple(float(value) for value in sd[used]),
                 )
             )
