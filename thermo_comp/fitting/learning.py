@@ -39,8 +39,6 @@ _PATIENCE = 4
 _MOST_ROUNDS = 40
 # A round that moves no width by more than this part is the last.
 _SETTLED = 0.03
-# Start states are never known better than this part of the run-time prior's variance.
-_LEAST_START = 1e-4
 # The memory is as short as it can be [s]: the longest lags of a bank and the curves over
 # temperature are almost one thing to bags that all begin at one temperature.
 _REACHES_S = (2000.0, 4000.0, np.inf)
@@ -48,9 +46,8 @@ _REACHES_S = (2000.0, 4000.0, np.inf)
 _LONGER_EARNED = 10.0
 # Widths that are tried for a column that takes no part, in parts of what it would begin with.
 _WIDTHS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
-# What must be gained in log evidence to stay.
-import os
-_EARNED = float(os.environ.get("EARN","0.5"))
+# What must be gained in log evidence to stay: of the many columns few are needed.
+_EARNED = 3.0
 # No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
 _LEAST_SIGMA = 1e-8
 # Of the noise of a window, what a column may add unseen before it counts.
@@ -174,22 +171,24 @@ def _idle(posterior: Posterior, prior: Prior, kept: dict[str, Bools]) -> dict[st
     Find the columns that do not earn their place: the least first, the others then without it.
     """
     mode, covariance = mode_of(posterior), posterior.covariance
-    asked = [
-        (part, column, places_of(posterior, part)[:, column], float(widths_of(prior, part)[column]))
-        for part in ('bias', 'scale')
-        for column in np.flatnonzero((widths_of(prior, part) > 0.0) & ~kept[part]).tolist()
-    ]
+    asked = []
+    for part in ('bias', 'scale'):
+        places, sd = places_of(posterior, part), widths_of(prior, part)
+        asked += [
+            (part, column, places[:, column], float(sd[column]))
+            for column in np.flatnonzero((sd > 0.0) & ~kept[part]).tolist()
+        ]
     result: dict[str, list[int]] = {'bias': [], 'scale': []}
     while asked:
-        gains = [earned(mode, covariance, places, sd) for _, _, places, sd in asked]
+        gains = [earned(mode, covariance, at, sd) for _, _, at, sd in asked]
         least = int(np.argmin(gains))
         if gains[least] >= _EARNED:
             break
-        part, column, places, _ = asked.pop(least)
+        part, column, at, _ = asked.pop(least)
         result[part].append(column)
-        gone = np.linalg.solve(covariance[np.ix_(places, places)], covariance[places])
-        mode = mode - gone.T @ mode[places]
-        covariance = covariance - covariance[:, places] @ gone
+        gone = np.linalg.solve(covariance[np.ix_(at, at)], covariance[at])
+        mode = mode - gone.T @ mode[at]
+        covariance = covariance - covariance[:, at] @ gone
     return result
 
 
@@ -275,7 +274,7 @@ def _settle(
         told_skew, power = _told_of(posterior, vector, posterior.layout.skew)
         if told_skew > 1.0:
             skew_sd = max(np.sqrt(power / told_skew), 1e-6)
-        start_share = _start_share(regression, posterior, prior)
+        start_share = _start_share(regression, posterior)
         change = max(change, float(np.abs(np.log(start_share / prior.start_share))) / 2.0)
         sigma = _sigma(posterior, prior)
         change = max(change, float(np.abs(np.log(sigma / prior.sigma)).max()))
@@ -308,7 +307,7 @@ def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float,
     return float(posterior.told[where].sum()), float(np.sum(vector[where] ** 2))
 
 
-def _start_share(regression: Regression, posterior: Posterior, prior: Prior) -> float:
+def _start_share(regression: Regression, posterior: Posterior) -> float:
     """
     Learn how far from rest the bags began, in parts of the run-time prior's variance.
 
@@ -319,10 +318,9 @@ def _start_share(regression: Regression, posterior: Posterior, prior: Prior) -> 
     if not places.size:
         return 1.0
     told = float(posterior.told[places].sum())
-    if told < 1.0:
-        return prior.start_share
     power = float(np.einsum('bi,ij,bj->', start, regression.start_information, start))
-    return float(np.clip(power / told, _LEAST_START, 1.0))
+    # The run-time prior counts for one: a single bag must not be sure of itself.
+    return float(min((power + 1.0) / (told + 1.0), 1.0))
 
 
 def _position_sd(regression: Regression, prior: Prior) -> float:

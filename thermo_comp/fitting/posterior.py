@@ -207,8 +207,8 @@ class Regression(Design):
         pull[:-1][absent] = gradient[absent] - solved.T @ (gradient[present] / root)
         result = {}
         for part, places, sd in parts:
-            places = np.where((places >= 0) & (sd == 0.0), places, -1)
-            result[part] = told[places], pull[places]
+            at = np.where((places >= 0) & (sd == 0.0), places, -1)
+            result[part] = told[at], pull[at]
         return result
 
     def without(self, posterior: Posterior, prior: Prior, p: int) -> State | None:

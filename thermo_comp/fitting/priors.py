@@ -186,8 +186,8 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
             )
     keys: dict[Column, list[tuple[float, float]]] = {}
     for one in calibrations:
-        for column in prior_columns(one):
-            keys.setdefault(replace(column, range=(0.0, 1.0)), []).append(column.range)
+        for column, key in zip(prior_columns(one), _unranged(prior_columns(one)), strict=True):
+            keys.setdefault(key, []).append(column.range)
     columns = [
         replace(key, range=(min(r[0] for r in ranges), max(r[1] for r in ranges)))
         for key, ranges in keys.items()
@@ -201,7 +201,47 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     scatter[np.diag_indices_from(scatter)] += _ALONE * np.sum(away**2, axis=0)
     # Of the mean itself, too.
     scatter *= 1.0 + 1.0 / len(vectors)
+    # What none of the units told is as alike in all as their prior was: it stays as unknown.
+    for one in calibrations:
+        scatter += _own_covariance(one, columns, mean_K) / len(calibrations)
     return _calibration(calibrations, columns, mean_K, mean, scatter)
+
+
+def _unranged(columns: Sequence[Column]) -> list[Column]:
+    """Return columns as they are told apart: units differ in what range each has seen."""
+    return [replace(column, range=(0.0, 1.0)) for column in columns]
+
+
+def _own_covariance(calibration: Calibration, columns: Sequence[Column], mean_K: Floats) -> Floats:
+    """
+    Return a unit's covariance in the order of `_vector`; 0 for columns that it does not have.
+
+    Raises FitError if the calibration makes no claim.
+    """
+    if calibration.posterior is None:
+        raise FitError(
+            f'{calibration.unit.serial} has no covariance: an import says nothing of its type'
+        )
+    own = _unranged(prior_columns(calibration))
+    terms = [own.index(c) if c in own else -1 for c in _unranged(columns)]
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    places: list[int] = []
+    factor: list[float] = []
+    at = 0
+    pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
+    for axis, sets in enumerate(pairs):
+        for name in ('bias_function', 'scale_function'):
+            n = 2 + sum(getattr(one, name).n_free for one in sets)
+            places += [*range(at, at + n), *(at + n + k if k >= 0 else -1 for k in terms)]
+            relative = mean_K[axis] / axes[axis].scale_factor if name == 'bias_function' else 1.0
+            factor += [relative] * (n + len(terms))
+            at += n + len(own)
+    places += range(at, at + 3)
+    factor += [1.0] * 3
+    there = np.array(places) >= 0
+    scale = np.where(there, factor, 0.0)
+    covariance = calibration.posterior.covariance()[np.ix_(places, places)]
+    return np.asarray(covariance * np.outer(scale, scale))
 
 
 def _shape(calibration: Calibration) -> list[tuple[str, int]]:
@@ -215,11 +255,9 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 
 def _vector(calibration: Calibration, columns: Sequence[Column], mean_K: Floats) -> Floats:
     """Return a unit's parameters in the order of the file, at the mean scale factors."""
-    weights = {
-        replace(column, range=(0.0, 1.0)): term
-        for column, term in zip(prior_columns(calibration), calibration.response, strict=True)
-    }
-    terms = [weights.get(replace(column, range=(0.0, 1.0))) for column in columns]
+    own = _unranged(prior_columns(calibration))
+    weights = dict(zip(own, calibration.response, strict=True))
+    terms = [weights.get(column) for column in _unranged(columns)]
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     result: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
