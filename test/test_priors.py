@@ -85,8 +85,15 @@ def test_population_is_the_mean_unit_and_its_scatter():
     variance = np.diag(found.posterior.covariance())
     at = parameter_layout(found).bias[0].static + 1
     sd = np.sqrt(variance[at]) / found.axes.x.scale_factor
-    # The scatter of three units, and that of their mean.
-    assert sd == pytest.approx(np.std(slopes, ddof=1) * np.sqrt(4.0 / 3.0), rel=1e-3)
+    # The scatter of three units, and that of their mean; and what is not known of any.
+    own = []
+    for one in siblings():
+        assert one.posterior is not None
+        variance = np.diag(one.posterior.covariance())
+        own.append(variance[parameter_layout(one).bias[0].static + 1])
+    own = np.array(own) / K[:, 0] ** 2
+    expected = np.sqrt(np.var(slopes, ddof=1) * 4.0 / 3.0 + own.mean())
+    assert sd == pytest.approx(expected, rel=1e-3)
 
 
 def test_siblings_make_one_position_worth_more():
