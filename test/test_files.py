@@ -243,3 +243,13 @@ def test_a_bag_has_no_other_suffix(folder: Path, cli: Cli, suffix: str) -> None:
     finished = cli('convert', 'raw.mcap', '-o', output, code=1, cwd=folder)
     assert f'{output}: cannot be written: {suffix} is none of' in finished.stderr
     assert not (folder / output).exists()
+
+
+@pytest.mark.parametrize(('kind', 'name'), [(CSV, 'w.parquet'), (PAGE, 'unit.pdf')])
+def test_a_table_and_a_page_are_what_their_suffix_says(
+    kind: Kind, name: str, tmp_path: Path
+) -> None:
+    with pytest.raises(OutputError, match=rf'{name}: cannot be written: \.\w+ is not \*'):
+        check_output(tmp_path / name, kind)
+    for good in (Path(name).with_suffix(one).name for one in ('', *kind.suffixes)):
+        check_output(tmp_path / good, kind)

@@ -43,6 +43,7 @@ class Kind:
     name: str
     mark: bytes
     is_folder: bool = False
+    suffixes: tuple[str, ...] = ()  # any, if there are none
 
     def refusal(self, path: Path) -> str:
         """Say why what stands under a name is not of this kind; nothing where it is."""
@@ -65,12 +66,12 @@ class Kind:
 
 
 CALIBRATION = Kind('calibration', rb'(?m)^(format_version|unit)\s*:')
-PAGE = Kind('HTML page', rb'(?i)\A\s*<!doctype html')
+PAGE = Kind('HTML page', rb'(?i)\A\s*<!doctype html', suffixes=('.html', '.htm'))
 PICTURE = Kind('PNG picture', rb'\A\x89PNG\r\n')
 PARAMETERS = Kind('parameter file of ours', rb'\A# Thermal calibration of unit ')
 RECORD = Kind('JSON record', rb'\A\{')
 PARQUET = Kind('Parquet file', rb'\APAR1')
-CSV = Kind('CSV table of ours', rb'\A(stamp_ns|name|section|bag),')
+CSV = Kind('CSV table of ours', rb'\A(stamp_ns|name|section|bag),', suffixes=('.csv',))
 MCAP = Kind('MCAP file', rb'\A\x89MCAP')
 BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z', is_folder=True)
 
@@ -133,6 +134,10 @@ def check_output(
     for other in others:
         if _overlaps(target, Path(os.path.realpath(other))):
             raise OutputError(f'is {other} or a part of it, which the command needs', path)
+    suffix = target.suffix.lower()
+    if kind.suffixes and suffix[1:2].isalpha() and suffix not in kind.suffixes:
+        names = ' or '.join(f'*{one}' for one in kind.suffixes)
+        raise OutputError(f'cannot be written: {suffix} is not {names}', path)
     if target.exists():
         if not overwrite:
             raise OutputError('exists already; --force overwrites it', path)
