@@ -56,6 +56,7 @@ def report(
     from ..files import PAGE, check_output
     from ..judging import open_bag
     from ..judging.history import drifts_of
+    from ..replay import needed_roles
     from ..report import evidence_of_bags, load_certificate_info, write_report
     from ..unit.calibration_file import load_calibration
 
@@ -87,6 +88,7 @@ def report(
                     number=number,
                     window_s=window,
                     calibration=loaded,
+                    require=('board',) if loaded is None else needed_roles(loaded),
                     progress=partial(_tell, done, number),
                 )
             )

@@ -168,8 +168,10 @@ def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]
 def legend_above(axes: Axes, sheet: Sheet, *, share: float = 1.0, **keys: Any) -> None:
     """Put the legend above axes with a `share` of the width, in as many columns as fit."""
     labels = axes.get_legend_handles_labels()[1]
+    if not labels:
+        return
     # An entry takes its label and a handle as wide as some eight letters.
-    letters = 8 + max((len(label) for label in labels), default=0)
+    letters = 8 + max(len(label) for label in labels)
     columns = max(1, int(share * (50 if sheet.is_narrow else 100) / letters))
     axes.legend(
         loc='lower left', bbox_to_anchor=(0.0, 1.01), ncols=min(columns, len(labels)), **keys
