@@ -395,3 +395,19 @@ def test_kalibr_without_bias_and_with_several_imus() -> None:
 def test_matrices_that_are_none_are_refused(text: str, message: str) -> None:
     with pytest.raises(CalibrationError, match=message):
         import_calibration(text, serial='7')
+
+
+def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibration) -> None:
+    # WHY: an axis without a third power had fewer coefficients than another, and no array was made.
+    rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
+    lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
+    lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']
+    text = export_calibration(cubic, 'px4').text + '\n'.join(lines) + '\n'
+    back = import_calibration(text, serial='7')
+    assert back.gyroscope is not None
+    for axis, row in enumerate(rows):
+        curve = back.gyroscope.static.axes()[axis].bias_function
+        for celsius in (5.0, 20.0, 44.0):
+            theirs = sum(c * (celsius - 31.0) ** p for p, c in enumerate(row))
+            ours = back.gyroscope.bias_rad_s[axis] + curve.value(celsius - 20.0)
+            assert ours == pytest.approx(theirs, abs=1e-12)

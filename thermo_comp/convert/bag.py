@@ -22,11 +22,11 @@ from ..recording.columns import Role
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 from .log import ForeignLog, Readings, origin
+from .units import PER_G
 
 _IMU = 'sensor_msgs/msg/Imu'
 _TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
-_FACTORS = {'m/s^2': 1.0, 'g': STANDARD_GRAVITY, 'mg': STANDARD_GRAVITY / 1000.0}
 
 Unit = Literal['m/s^2', 'g', 'mg']
 Present = Mapping[str, tuple[str, int]]
@@ -61,7 +61,7 @@ def bag_log(
         path=str(path),
         input='imu',
         unit=unit,
-        factor=_FACTORS[unit],
+        factor=STANDARD_GRAVITY / PER_G[unit],
         stamp_ns=columns.accel_stamp_ns,
         accel=columns.accel,
         gyro=None if columns.imu is None else columns.imu.angular_velocity,

@@ -21,11 +21,11 @@ from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
 from .log import NO_READINGS, ForeignLog, Readings, origin, thin
-from .table import NO_STAMP, Column, Table, read_parquet, read_text
+from .table import NO_STAMP, STAMP_EXPONENTS, Column, Table, read_parquet, read_text
+from .units import PER_G
 
 #: A map takes some kB.
 _SIZE_LIMIT = 1 << 20
-_STAMP_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Stamp:
     @property
     def exponent(self) -> int:
         """Power of ten from the unit to nanoseconds."""
-        return _STAMP_EXPONENTS[self.unit or 'ns']
+        return STAMP_EXPONENTS[self.unit or 'ns']
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,7 @@ class Accel:
         """What a reading is multiplied by to become the message's value."""
         if self.output == 'counts':
             return 1.0
-        per_g = {'m/s^2': STANDARD_GRAVITY, 'g': 1.0, 'mg': 1000.0}
-        return STANDARD_GRAVITY / per_g.get(self.unit, self.counts_per_g or 1.0)
+        return STANDARD_GRAVITY / PER_G.get(self.unit, self.counts_per_g or 1.0)
 
 
 @dataclass(frozen=True)

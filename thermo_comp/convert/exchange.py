@@ -46,31 +46,29 @@ _NEAR_ONE = 2.0
 @dataclass(frozen=True)
 class _Tool:
     """
-    One tool's file: how it is written, whether a text is one, how it is read.
+    One tool's file: how it is written, and read; None of a text that is no such file.
 
     `is_thermal`: whether it keeps a bias over temperature, about `reference_c` where that is
     fixed; the others keep scale and misalignment.
     """
 
     write: Callable[[Content, int | None, int], str]
-    is_mine: Callable[[str], bool]
-    read: Callable[[str, int | None], Content]
+    read: Callable[[str, int | None], Content | None]
     is_thermal: bool = False
     reference_c: float | None = None
 
 
 TOOLS = {
-    'px4': _Tool(parameters.write_px4, parameters.is_px4, parameters.read_px4, True),
+    'px4': _Tool(parameters.write_px4, parameters.read_px4, True),
     'ardupilot': _Tool(
         parameters.write_ardupilot,
-        parameters.is_ardupilot,
         parameters.read_ardupilot,
         True,
         parameters.ARDUPILOT_REFERENCE_C,
     ),
-    'imu_tk': _Tool(triads.write_imu_tk, triads.is_imu_tk, triads.read_imu_tk),
-    'imu_calib': _Tool(triads.write_imu_calib, triads.is_imu_calib, triads.read_imu_calib),
-    'kalibr': _Tool(triads.write_kalibr, triads.is_kalibr, triads.read_kalibr),
+    'imu_tk': _Tool(triads.write_imu_tk, triads.read_imu_tk),
+    'imu_calib': _Tool(triads.write_imu_calib, triads.read_imu_calib),
+    'kalibr': _Tool(triads.write_kalibr, triads.read_kalibr),
 }
 
 
@@ -228,13 +226,13 @@ def import_calibration(
     m/s^2. The result has the same set in both regimes. Raises CalibrationError if the text is no
     such file, or an incomplete or impossible one.
     """
-    tool = next((tool for tool in TOOLS.values() if tool.is_mine(text)), None)
-    if tool is None:
+    read = (tool.read(text, number) for tool in TOOLS.values())
+    content = next((one for one in read if one is not None), None)
+    if content is None:
         raise CalibrationError(
             'no TC_A* (PX4) or INS_TCAL* (ArduPilot) parameters in the text, nor the matrices of '
             'imu_tk (.calib), imu_calib (SM, bias) or Kalibr (accelerometers.M)'
         )
-    content = tool.read(text, number)
     lower, upper = content.range_c
     if not lower < upper:
         raise CalibrationError(f'temperature range {lower:g}..{upper:g} degC is empty')

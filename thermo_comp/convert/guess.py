@@ -58,20 +58,16 @@ def guess_columns(path: str | Path, rate_hz: float | None = None) -> ColumnMap:
     believed, reason = believed_unit(
         find_stillness(np.arange(len(accel)) * 10**7, accel).magnitude
     )
-    units: dict[str, Accel] = {
-        'm/s^2': Accel((x, y, z), 'm/s^2', 'imu'),
-        'g': Accel((x, y, z), 'g', 'imu'),
-        'mg': Accel((x, y, z), 'mg', 'imu'),
-        'counts': Accel((x, y, z), 'counts', 'counts'),
-    }
-    if believed not in units:
+    if believed == 'unknown':
         raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
+    output: Literal['counts', 'imu'] = 'counts' if believed == 'counts' else 'imu'
     gyro = None
     if width > 4 and believed != 'counts':
         rates = np.abs([table.values[column + 3] for column in (x, y, z)])
         is_fast = np.nanquantile(rates, 0.999) > _FASTEST_RAD_S
         gyro = Gyro((x + 3, y + 3, z + 3), 'deg/s' if is_fast else 'rad/s')
-    return ColumnMap(stamp, units[believed], gyro=gyro, format=Format(header=False))
+    accel_map = Accel((x, y, z), believed, output)
+    return ColumnMap(stamp, accel_map, gyro=gyro, format=Format(header=False))
 
 
 def spoken_columns(columns: ColumnMap) -> str:

@@ -91,21 +91,14 @@ def _within(number: int | None, lowest: int, highest: int) -> int:
     return number
 
 
-def is_px4(text: str) -> bool:
-    """Whether a text holds PX4's thermal parameters."""
-    return any(re.match(r'TC_A\d_X1_', name) for name in _parse(text))
-
-
-def is_ardupilot(text: str) -> bool:
-    """Whether a text holds ArduPilot's thermal parameters."""
-    return any(name.startswith('INS_TCAL') for name in _parse(text))
-
-
-def read_px4(text: str, number: int | None) -> Content:
-    """Read PX4 parameters as QGroundControl saves them, or as ``NAME=VALUE``."""
+def read_px4(text: str, number: int | None) -> Content | None:
+    """Read PX4 parameters as QGroundControl saves them, or as ``NAME=VALUE``; None if not one."""
     values = _parse(text)
+    found = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
+    if not found:
+        return None
     number = _choose(
-        {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)},
+        found,
         number,
         lambda n: any(values.get(f'TC_A{n}_X{p}_{a}') for p in range(4) for a in range(3)),
     )
@@ -119,20 +112,21 @@ def read_px4(text: str, number: int | None) -> Content:
         rate_bias, its_own, (lower, upper) = _px4_set(values, of_rate)
         # One reference for both, and the range where both hold.
         moved = np.polynomial.Polynomial((reference - its_own, 1.0))
-        rate_bias = np.array([np.polynomial.Polynomial(row)(moved).coef for row in rate_bias])
+        for row in rate_bias:
+            coefficients = np.polynomial.Polynomial(row)(moved).coef
+            row[:] = np.pad(coefficients, (0, 4 - len(coefficients)))
         edges = max(edges[0], lower), min(edges[1], upper)
     source = f'PX4 {prefix}*'
     return Content(np.eye(3), bias, reference, edges, [_NOTE], source, rate_bias=rate_bias)
 
 
-def read_ardupilot(text: str, number: int | None) -> Content:
-    """Read ArduPilot parameters as Mission Planner or MAVProxy save them."""
+def read_ardupilot(text: str, number: int | None) -> Content | None:
+    """Read ArduPilot parameters as Mission Planner or MAVProxy save them; None if not one."""
     values = _parse(text)
-    number = _choose(
-        {int(name[8]) for name in values if name.startswith('INS_TCAL')},
-        number,
-        lambda n: values.get(f'INS_TCAL{n}_ENABLE') == 1.0,
-    )
+    found = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
+    if not found:
+        return None
+    number = _choose(found, number, lambda n: values.get(f'INS_TCAL{n}_ENABLE') == 1.0)
     prefix = f'INS_TCAL{number}_'
     if _need(values, f'{prefix}ENABLE') != 1.0:
         raise CalibrationError('is not 1: the set is not in use', key=f'{prefix}ENABLE')

@@ -35,7 +35,7 @@ _SNIFF_BYTES = 65536
 _PREAMBLE_ROWS = 1000
 #: What packs numbers more tightly holds no measurement.
 _MOST_ROWS_PER_BYTE = 4
-_STAMP_UNITS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
+STAMP_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 
 @dataclass(frozen=True)
@@ -363,7 +363,7 @@ def _parquet_stamps(path: Path, name: Column, column: Any, exponent: int) -> Int
 
     known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)
     if pa.types.is_timestamp(column.type):
-        exponent = _STAMP_UNITS[column.type.unit]
+        exponent = STAMP_EXPONENTS[column.type.unit]
         column = column.cast(pa.int64())
     if pa.types.is_integer(column.type):
         values = column.fill_null(0).to_numpy()

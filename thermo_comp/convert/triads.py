@@ -87,42 +87,40 @@ def write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
     )
 
 
-def is_imu_tk(text: str) -> bool:
-    """Whether a text is what imu_tk saves: 21 numbers, perhaps with its headings."""
+def read_imu_tk(text: str, _number: int | None) -> Content | None:
+    """Read imu_tk's ``.calib``: 21 numbers, perhaps with its headings; None if not one."""
+    lines = (line for line in text.splitlines() if not _HEADING.match(line))
     try:
-        return len(_numbers(text)) == 21
+        numbers = np.array([float(cell) for line in lines for cell in line.split()])
     except ValueError:
-        return False
-
-
-def is_imu_calib(text: str) -> bool:
-    """Whether a text is imu_calib's YAML."""
-    return {'SM', 'bias'} <= _mapping(text).keys()
-
-
-def is_kalibr(text: str) -> bool:
-    """Whether a text is Kalibr's YAML of IMUs with intrinsics."""
-    return bool(_imus(text))
-
-
-def read_imu_tk(text: str, _number: int | None) -> Content:
-    """Read imu_tk's ``.calib``."""
-    numbers = np.array(_numbers(text))
+        return None
+    if len(numbers) != 21:
+        return None
     T, K = numbers[:18].reshape(2, 3, 3)
     return _content('imu_tk', _regular(T @ K), numbers[18:], _NOTE)
 
 
-def read_imu_calib(text: str, _number: int | None) -> Content:
-    """Read imu_calib's YAML."""
+def read_imu_calib(text: str, _number: int | None) -> Content | None:
+    """Read imu_calib's YAML; None if not one."""
     data = _mapping(text)
+    if not {'SM', 'bias'} <= data.keys():
+        return None
     matrix = _regular(_array(data['SM'], 'SM', 9).reshape(3, 3))
     bias = np.asarray(np.linalg.solve(matrix, _array(data['bias'], 'bias', 3)), np.float64)
     return _content('imu_calib', matrix, bias, _NOTE)
 
 
-def read_kalibr(text: str, number: int | None) -> Content:
-    """Read one IMU of Kalibr's YAML, by its number."""
-    imus = _imus(text)
+def read_kalibr(text: str, number: int | None) -> Content | None:
+    """Read one IMU of Kalibr's YAML, by its number; None if there is none with a matrix."""
+    imus = {
+        str(name): part
+        for name, part in _mapping(text).items()
+        if isinstance(part, dict)
+        and isinstance(part.get('accelerometers'), dict)
+        and 'M' in part['accelerometers']
+    }
+    if not imus:
+        return None
     name = next(iter(imus)) if number is None else f'imu{number}'
     if name not in imus or (number is None and len(imus) > 1):
         raise CalibrationError(f'choose one of the IMUs: there are {", ".join(imus)}')
@@ -146,28 +144,12 @@ def _content(source: str, matrix: Floats, bias: Floats, note: str) -> Content:
     return Content(matrix, cubic, _REFERENCE_C, _RANGE_C, [note], source)
 
 
-def _numbers(text: str) -> list[float]:
-    lines = (line for line in text.splitlines() if not _HEADING.match(line))
-    return [float(cell) for line in lines for cell in line.split()]
-
-
 def _mapping(text: str) -> dict[str, Any]:
     try:
         data = load_plain_yaml(text)
     except ValueError:
         return {}
     return data if isinstance(data, dict) else {}
-
-
-def _imus(text: str) -> dict[str, Any]:
-    """Find the IMUs of a file that have an accelerometer's matrix."""
-    return {
-        str(name): part
-        for name, part in _mapping(text).items()
-        if isinstance(part, dict)
-        and isinstance(part.get('accelerometers'), dict)
-        and 'M' in part['accelerometers']
-    }
 
 
 def _array(value: object, key: str, size: int) -> Floats:
