@@ -398,7 +398,7 @@ def test_matrices_that_are_none_are_refused(text: str, message: str) -> None:
 
 
 def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibration) -> None:
-    # WHY: an axis without a third power had fewer coefficients than another, and no array was made.
+    # WHY: an axis without a third power had fewer coefficients than another: no array was made.
     rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
     lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
     lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']

@@ -18,13 +18,11 @@ import numpy as np
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 
+Unit = Literal['m/s^2', 'g', 'mg', 'counts']
+
 # |a| of a still sensor in each unit. A cheap one is off by a few per cent (bias and scale), a
 # thermal chamber adds some more; 20 % is beyond all of them and far below the ratios to be told.
-PER_G: dict[Literal['m/s^2', 'g', 'mg', 'counts'], float] = {
-    'g': 1.0,
-    'm/s^2': STANDARD_GRAVITY,
-    'mg': 1000.0,
-}
+PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # The usual sensitivities, from +-16 g to +-2 g of a 16-bit sensor.
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
@@ -95,9 +93,7 @@ def _merge(start: Ints, end: Ints) -> tuple[tuple[int, int], ...]:
     return tuple(parts)
 
 
-def believed_unit(
-    magnitude: float,
-) -> tuple[Literal['m/s^2', 'g', 'mg', 'counts', 'unknown'], str]:
+def believed_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
     """Say which unit a still |a| speaks for (``counts`` and ``unknown`` among them), and why."""
     for unit, gravity in PER_G.items():
         if abs(magnitude / gravity - 1.0) <= _TOLERANCE:
