@@ -72,6 +72,12 @@ the middleware some four times, a quarter of the node's CPU time. A sample lost 
 calibration at this thermal state. Without angular rate or orientation in the input, the first element
 of their covariance is -1 (REP 145).
 
+## Recording a test
+
+`thermo_comp record` is a node of its own, `thermo_comp_record`: it subscribes to the inputs above, and to every other
+`temperature/<name>`, once somebody publishes them, reliable where that is offered. It publishes nothing.
+[Recording](recording.md#recording) says what for.
+
 ## Parameters
 
 {parameters}

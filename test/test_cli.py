@@ -199,8 +199,8 @@ class TestPlay:
         assert 'nobody listened to /here/accel/counts' in finished.stderr
 
     def test_ros_arguments_end_where_ros_says(self) -> None:
-        words = ['play', 'a', '--ros-args', '-r', 'x:=y', '--', '--loop']
-        assert split_ros_arguments(words) == (['play', 'a', '--loop'], ['-r', 'x:=y'])
+        words = ['play', 'a', '--ros-args', '-r', 'x:=y', '--', '-q']
+        assert split_ros_arguments(words) == (['play', 'a', '-q'], ['-r', 'x:=y'])
         assert split_ros_arguments(['info', '--', 'a']) == (['info', '--', 'a'], [])
 
 

@@ -135,7 +135,8 @@ class TestGrowing:
         for news in growing_blocks(growing, Topics(), 'auto', wait):
             n_looks += news is None
             if news is not None:
-                assert news.serial == 'lab-7'
+                assert news.info is not None
+                assert news.info.metadata['serial'] == 'lab-7'
                 for one in news.block.raw:
                     found.setdefault(one.topic, []).extend(messages_of(one))
         assert n_looks == 10

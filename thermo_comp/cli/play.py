@@ -22,10 +22,6 @@ def play(
         float,
         typer.Option(help='Seconds of the bag per second; 0 = as fast as it is taken.', min=0.0),
     ] = 1.0,
-    loop: Annotated[bool, typer.Option('--loop', '-l', help='Play it again and again.')] = False,
-    clock: Annotated[
-        bool, typer.Option('--clock/--no-clock', help='Publish /clock, the time of the bag.')
-    ] = True,
     wait: Annotated[
         float, typer.Option(help='Longest wait for a subscriber on every topic, in s.', min=0.0)
     ] = 10.0,
@@ -41,7 +37,7 @@ def play(
     Whatever the topics are called in the bag, they go out as accel/counts
     (or imu/uncompensated), temperature/board and temperature/case; remap
     them after --ros-args. It ends when every reliable subscriber has got
-    everything.
+    everything. For other topics, pauses and loops there is ros2 bag play.
 
     Example:
       thermo_comp play chamber.mcap --rate 20
@@ -57,8 +53,6 @@ def play(
         report = run(
             bag,
             rate=rate,
-            n_loops=0 if loop else 1,
-            clock=clock,
             wait_s=wait,
             topics=options.topics_of(topic, topics),
             input=input_,

@@ -161,6 +161,9 @@ def _take(
     with out.live() as show:
         for new in news:
             if new is not None:
+                if new.info is not None and new.info.chosen and 'chosen' not in told:
+                    told['chosen'] = new.info.chosen
+                    out.note(f'{new.info.path}: {new.info.chosen}')
                 bags.add(new)
                 for begin_ns in test.add(new.block):
                     bags.cut(begin_ns)

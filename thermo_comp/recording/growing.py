@@ -18,17 +18,17 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import RecordingError
-from .columns import Block, Input, Readings, Role
+from .columns import Block, Input, Readings, RecordingInfo, Role
 from .reader import open_recording
 from .topics import Topics
 
 
 class News(NamedTuple):
-    """What has come: a block with its serialized messages, topics by role, and whose it is."""
+    """What has come: a block with its serialized messages, topics by role, and from which bag."""
 
     block: Block
     topics: Mapping[Role, str]
-    serial: str | None = None
+    info: RecordingInfo | None = None
 
 
 _PERIOD_S = 1.0
@@ -73,7 +73,7 @@ def growing_blocks(
                     for role, log_ns in block.log_ns.items():
                         n_read[role] = n_read.get(role, 0) + len(log_ns)
                     new = _without(block, known, reader.topics)
-                    yield News(new, reader.topics, reader.info.metadata.get('serial'))
+                    yield News(new, reader.topics, reader.info)
                 n_seen = n_read
                 is_whole = reader.info.truncated is None and bool(n_seen)
         yield None

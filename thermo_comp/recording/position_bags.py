@@ -66,7 +66,8 @@ class PositionBags:
     def add(self, news: News) -> None:
         """Take the serialized messages."""
         block = news.block
-        self._serial = self._serial or news.serial
+        if news.info is not None and self._serial is None:
+            self._serial = news.info.metadata.get('serial')
         roles = {topic: role for role, topic in news.topics.items()}
         for one in block.raw:
             role = roles[one.topic]
