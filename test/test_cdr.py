@@ -68,7 +68,7 @@ def test_counts_become_an_imu(
     converter = SampleConverter(Vector3Stamped)
     written = convert(converter, *[cdr(order, (sec, nanosec), frame, values)] * 2)
     assert written[0] == written[1]
-    assert converter.n_fallback == 0
+    assert converter.traffic.n_fallback == 0
     imu = deserialize_message(written[0], Imu)
     assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (sec, nanosec)
     assert imu.header.frame_id == frame
@@ -95,7 +95,7 @@ def test_imu_passes_everything_else_bit_for_bit(
 ) -> None:
     converter = SampleConverter(Imu, override)
     (written,) = convert(converter, cdr(order, (5, 7), frame, values))
-    assert converter.n_fallback == 0
+    assert converter.traffic.n_fallback == 0
     assert deserialize_message(written, Imu).header.frame_id == (override or frame)
     assert b''.join(doubles(written)[:25]) == pack('<', values[:25])
     x, y, z = values[25:28]
@@ -110,7 +110,7 @@ def test_signalling_nan_survives_the_byte_swap() -> None:
     converter = SampleConverter(Imu)
     written = converter.convert(message, lambda *_: tuple(map(float, range(9))))
     assert written is not None
-    assert converter.n_fallback == 0
+    assert converter.traffic.n_fallback == 0
     assert doubles(written)[:25] == [struct.pack('<Q', payload)] * 25
 
 
@@ -122,7 +122,7 @@ def test_frames_of_other_lengths_in_one_stream() -> None:
     read = [deserialize_message(data, Imu) for data in written]
     assert [imu.header.frame_id for imu in read] == names
     assert [imu.linear_acceleration.y for imu in read] == list(range(6))
-    assert converter.n_fallback == 0
+    assert converter.traffic.n_fallback == 0
 
 
 def test_frames_without_end_use_bounded_memory() -> None:
@@ -142,13 +142,13 @@ def test_what_no_layout_fits_goes_through_rclpy(kind: Any, override: str) -> Non
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
     # rclpy reads a message with bytes behind its end; the layout, which is exact, does not.
     (expected,), (found,) = convert(fast, good), convert(slow, good + bytes(8))
-    assert (fast.n_fallback, slow.n_fallback) == (0, 1)
+    assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
     assert deserialize_message(found, Imu) == deserialize_message(expected, Imu)
     assert doubles(found) == doubles(expected)
     assert slow.last_result == fast.last_result is not None
     # The stream goes on the fast way.
     convert(slow, good)
-    assert slow.n_fallback == 1
+    assert slow.traffic.n_fallback == 1
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad: bytes) -> None
     written = convert(converter, good, bad, good)
     assert len(written) == 2
     assert written[0] == written[1]
-    assert converter.n_malformed == 1
+    assert converter.traffic.n_malformed == 1
 
 
 def test_the_first_message_may_be_any_bytes() -> None:
@@ -178,7 +178,7 @@ def test_the_first_message_may_be_any_bytes() -> None:
         converter = SampleConverter(Vector3Stamped)
         good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
         assert len(convert(converter, bytes(n), good)) == 1
-        assert converter.n_malformed == 1
+        assert converter.traffic.n_malformed == 1
 
 
 def test_dropped_samples_give_nothing() -> None:

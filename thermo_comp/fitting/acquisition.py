@@ -26,6 +26,8 @@ from .coverage import constants_covariance, farthest, next_direction, worst_sd
 # What is still for so long, or for a soak that is shorter, is a rest [s].
 _REST_S = 10.0
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
+# Cells that are looked at again for where a rest begins.
+_LOOKED_BACK = 200
 # However long it lasts, hysteresis, mounting and drift leave this of a position [g].
 _FLOOR_SD = 2e-5
 # A rest with so many times the noise of the others is none to be proud of; with so many times that
@@ -111,6 +113,7 @@ class _Open:
         self.recent: list[tuple[Ints, Floats]] = []
         #: Mean of its first rest, which a quieter one later may hide.
         self.first: Floats | None = None
+        self.n_looked = 0
 
     def add(self, stamp_ns: Ints, samples: Floats) -> None:
         """Take samples, shape (n, 3), or (n, 6) with angular rates."""
@@ -141,7 +144,7 @@ class Acquisition:
         self._open = _Open()
         self._rests: list[_Rest] = []
         self._surveys: list[Surveys] = []
-        self._readings: dict[str, list[Readings]] = {}
+        self._readings: dict[str, Readings] = {}
         self._centre = np.zeros(3)
         #: Before this stamp no position begins any more.
         self.settled_ns = _EVER_NS
@@ -151,7 +154,8 @@ class Acquisition:
         """Take what came; return the stamps [ns] at which further positions begin."""
         for name, one in block.temperatures.items():
             if len(one.stamp_ns):
-                self._readings.setdefault(name, []).append(one)
+                known = self._readings.get(name)
+                self._readings[name] = one if known is None else _joined(known, one)
         if not len(block):
             return []
         begins: list[int] = []
@@ -182,6 +186,9 @@ class Acquisition:
 
     def _turn(self, cells: Cells) -> int | None:
         """Find where the sensor first rests in another direction than before [ns]."""
+        # What was looked at before is over, but for its end.
+        n_looked, self._open.n_looked = self._open.n_looked, len(cells.count)
+        cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
@@ -209,8 +216,9 @@ class Acquisition:
         before, self._open = self._open, _Open()
         self._rests.append(_rest(before.cells(), end_ns, self._rest_s))
         self._surveys.append(_surveys(self._readings, end_ns))
-        for name, pieces in self._readings.items():
-            self._readings[name] = [_part(one, end_ns, -_EVER_NS) for one in pieces]
+        self._readings = {
+            name: _part(one, end_ns, -_EVER_NS) for name, one in self._readings.items()
+        }
         for stamp_ns, samples in before.recent:
             use = stamp_ns >= end_ns
             if use.any():
@@ -286,6 +294,7 @@ class Acquisition:
     def _now(self, cells: Cells) -> tuple[Floats, bool]:
         if not len(cells.count):
             return np.full(3, np.nan), False
+        cells = cells.part(slice(-_LOOKED_BACK, None))
         ranges = still_intervals(cells, 0.0)
         # The last cell is still filling, the one before may be beside a motion.
         is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
@@ -333,14 +342,20 @@ def _mean(cells: Cells, ranges: Sequence[tuple[int, int]]) -> Floats:
     return np.asarray(np.average(cells.mean[rows], axis=0, weights=cells.count[rows]))
 
 
-def _surveys(readings: Mapping[str, Sequence[Readings]], end_ns: int) -> Surveys:
+def _surveys(readings: Mapping[str, Readings], end_ns: int) -> Surveys:
     """Describe what each thermometer read before a stamp."""
-    found = {}
-    for name, pieces in readings.items():
-        survey = survey_thermometer([_part(one, _EVER_NS, end_ns) for one in pieces])
-        if survey is not None:
-            found[name] = survey
-    return found
+    surveys = {
+        name: survey_thermometer([_part(one, _EVER_NS, end_ns)]) for name, one in readings.items()
+    }
+    return {name: one for name, one in surveys.items() if one is not None}
+
+
+def _joined(one: Readings, other: Readings) -> Readings:
+    return Readings(
+        np.concatenate([one.stamp_ns, other.stamp_ns]),
+        np.concatenate([one.celsius, other.celsius]),
+        np.concatenate([one.after, other.after]),
+    )
 
 
 def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:

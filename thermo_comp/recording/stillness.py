@@ -146,11 +146,12 @@ class CellAccumulator:
 
     def finish(self) -> Cells:
         """Return all cells so far, the last one as it is."""
-        ids, sums_of = self._ids, self._sums
-        if self._open_id >= 0:
-            ids, sums_of = [*ids, np.array([self._open_id])], [*sums_of, self._open]
-        index = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)
-        sums = np.concatenate(sums_of) if sums_of else np.zeros((0, self._width))
+        # Whoever asks often asks for little more each time.
+        self._ids = [np.concatenate([np.zeros(0, np.int64), *self._ids])]
+        self._sums = [np.concatenate([np.zeros((0, self._width)), *self._sums])]
+        n_open = int(self._open_id >= 0)
+        index = np.concatenate([*self._ids, np.full(n_open, self._open_id)])
+        sums = np.concatenate([*self._sums, self._open[:n_open]])
         count = sums[:, 0]
         mean, variance = _moments(count, sums[:, 2:5], sums[:, 5:8])
         rate = rate_variance = np.zeros_like(mean)

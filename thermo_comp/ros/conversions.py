@@ -94,6 +94,19 @@ class _Layout:
         )  # fmt: skip
 
 
+@dataclass(slots=True)
+class Traffic:
+    """What the node itself counts, beside the compensator's counters."""
+
+    n_lost: int = 0  # samples that the driver sent and the node did not get
+    n_unpublished: int = 0  # output messages that the middleware did not accept
+    n_malformed: int = 0  # messages that could not be read
+    n_flags: int = 0  # regime flags published, one for each reading that decides
+    n_fallback: int = 0  # samples that took the slow way through rclpy's deserialization
+    n_contested: int = 0  # messages not used because their input had more than one publisher
+    n_failures: int = 0  # callbacks of the node that ended in an exception
+
+
 _NOTHING = Struct('')
 _UNKNOWN = _Layout(_NOTHING.unpack, b'', b'', _NOTHING.pack, b'', 0, False)
 
@@ -103,17 +116,16 @@ class SampleConverter:
     Turns serialized samples into serialized Imu; an empty `frame_id` keeps that of the input.
     """
 
-    def __init__(self, message_type: Any, frame_id: str = '') -> None:
+    def __init__(
+        self, message_type: Any, frame_id: str = '', traffic: Traffic | None = None
+    ) -> None:
         self._message_type = message_type
         self._frame_id = frame_id
+        self.traffic = traffic or Traffic()
         self._layout = _UNKNOWN
         self._layouts: dict[tuple[bytes, bytes, int], _Layout | None] = {}
         #: What `process` last gave, for reports.
         self.last_result: tuple[float, ...] | None = None
-        #: Messages that neither the layout nor rclpy could read.
-        self.n_malformed = 0
-        #: Messages that took the way through rclpy's deserialization.
-        self.n_fallback = 0
 
     def convert(
         self, data: bytes, process: Process, correct_rate: CorrectRate | None = None
@@ -188,14 +200,14 @@ class SampleConverter:
     ) -> bytes | None:
         """Take the ordinary way, for what no layout fits."""
         if len(data) > _LONGEST_MESSAGE:
-            self.n_malformed += 1
+            self.traffic.n_malformed += 1
             return None
         try:
             message = deserialize_message(data, self._message_type)
         except _UNREADABLE:
-            self.n_malformed += 1
+            self.traffic.n_malformed += 1
             return None
-        self.n_fallback += 1
+        self.traffic.n_fallback += 1
         result = process(_stamp_ns(message), *_components(message))
         if result is None:
             return None

@@ -23,6 +23,7 @@ from ..online.status import CompensatorStatus, Counters
 from ..text import one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
+from .conversions import Traffic
 from .reader import LoadedCalibration
 
 #: A sample rate further from the calibrated one than this is worth a warning.
@@ -41,19 +42,6 @@ _DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
 
 #: Level and text.
 Finding = tuple[int, str]
-
-
-@dataclass(frozen=True, slots=True)
-class Traffic:
-    """What the node itself counts, beside the compensator's counters."""
-
-    n_lost: int = 0  # samples that the driver sent and the node did not get
-    n_unpublished: int = 0  # output messages that the middleware did not accept
-    n_malformed: int = 0  # messages that could not be read
-    n_flags: int = 0  # regime flags published
-    n_fallback: int = 0  # samples that took the slow way through rclpy's deserialization
-    n_contested: int = 0  # messages not used because their input had more than one publisher
-    n_failures: int = 0  # callbacks of the node that ended in an exception
 
 
 @dataclass(frozen=True, slots=True)

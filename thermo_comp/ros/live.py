@@ -27,7 +27,7 @@ from .raw import RawSubscription
 
 NODE_NAME = 'thermo_comp_record'
 #: Time between two looks at what is published, and between two blocks [s].
-LOOK_S, BLOCK_S = 0.5, 0.5
+LOOK_S, BLOCK_S = 0.5, 1.0
 
 _CLASSES = {VECTOR3_STAMPED: Vector3Stamped, IMU: Imu, TEMPERATURE: Temperature}
 

@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from copy import copy
+from dataclasses import replace
 from functools import partial
 
 import rclpy
@@ -39,8 +40,8 @@ from ..online.snapshot import take_snapshot
 from ..online.stamped_flag import STAMPED_TOPIC
 from ..text import hold_standard_streams, one_line
 from . import parameters
-from .conversions import SampleConverter
-from .diagnostics import Snapshot, Traffic, build, look_at
+from .conversions import SampleConverter, Traffic
+from .diagnostics import Snapshot, build, look_at
 from .middleware import use_profile
 from .parameters import NodeConfig, ParameterError
 from .raw import RawSubscription
@@ -120,7 +121,6 @@ class CompensationNode:
             self._loaded.calibration, self._config.compensator_config()
         )
         self._n_publishers = 0
-        self._n_lost = 0
         self._level = b''
         self._last_samples = time.monotonic()
         self._loop = WaitLoop(self.node, REST_S)
@@ -185,6 +185,7 @@ class CompensationNode:
                     (DiagnosticArray, '/diagnostics', DIAGNOSTICS_QOS),
                 )
             )
+        self._traffic = Traffic()
         converter = self._new_converter(self._config)
         return Relay(self.node, compensator, converter, samples, temperatures, imu, flag, stamped)
 
@@ -192,38 +193,24 @@ class CompensationNode:
         with _opening():
             return self._loop.subscribe(*_INPUTS[config.input], SAMPLE_QOS)
 
-    @staticmethod
-    def _new_converter(config: NodeConfig, old: SampleConverter | None = None) -> SampleConverter:
-        converter = SampleConverter(_INPUTS[config.input][0], config.frame_id)
-        if old is not None:
-            converter.n_malformed, converter.n_fallback = old.n_malformed, old.n_fallback
-        return converter
+    def _new_converter(self, config: NodeConfig) -> SampleConverter:
+        return SampleConverter(_INPUTS[config.input][0], config.frame_id, self._traffic)
 
     def _snapshot(self) -> Snapshot:
-        relay, converter = self._relay, self._relay.converter
-        last = converter.last_result
-        traffic = Traffic(
-            n_lost=self._n_lost,
-            n_unpublished=relay.n_unpublished,
-            n_malformed=relay.n_malformed + converter.n_malformed,
-            n_flags=relay.n_flags,
-            n_fallback=converter.n_fallback,
-            n_contested=relay.n_contested,
-            n_failures=self._loop.n_failures,
-        )
+        last = self._relay.converter.last_result
         variances = None if last is None else (last[3], last[6], last[8])
         thermal = self._compensator.thermal
         noise = [(1.0 + thermal.noise_excess) * one for one in thermal.correction.noise]
         names = ('sample', *self._thermometers)
         return Snapshot(
             take_snapshot(self._compensator),
-            traffic,
+            replace(self._traffic, n_failures=self._loop.n_failures),
             variances,
             noise,
             time.monotonic() - self._last_samples,
             tuple(
                 look_at(self.node, name, one.subscription)
-                for name, one in zip(names, relay.inputs, strict=True)
+                for name, one in zip(names, self._relay.inputs, strict=True)
             ),
         )
 
@@ -257,7 +244,7 @@ class CompensationNode:
         n_lost, samples.n_lost = samples.n_lost, 0
         before, self._n_publishers = self._n_publishers, samples.subscription.get_publisher_count()
         if before == self._n_publishers == 1:
-            self._n_lost += n_lost
+            self._traffic.n_lost += n_lost
 
     def _prepare(self, changes: list[Parameter]) -> LoadedCalibration | None:
         """Read the calibration that a change asks for, beside the samples."""
@@ -318,7 +305,7 @@ class CompensationNode:
         if config.compensator_config() != before.compensator_config():
             self._compensator.reconfigure(config.compensator_config())
         if (config.input, config.frame_id) != (before.input, before.frame_id):
-            relay.converter = self._new_converter(config, relay.converter)
+            relay.converter = self._new_converter(config)
         if samples is not relay.samples:
             self._loop.unsubscribe(relay.samples)
             relay.samples = samples

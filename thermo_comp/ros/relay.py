@@ -67,14 +67,7 @@ class Relay:
         self._publish_flag, self._publish_stamped = flag.publish, stamped.publish
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
-        #: Readings that were none.
-        self.n_malformed = 0
-        #: Messages that the middleware did not take.
-        self.n_unpublished = 0
-        #: Flags, one for each reading that decides.
-        self.n_flags = 0
-        #: Messages not used because their input had more than one publisher.
-        self.n_contested = 0
+        self._traffic = converter.traffic
         self._contested: set[RawSubscription] = set()
 
     @property
@@ -104,7 +97,7 @@ class Relay:
             self._contested.remove(subscription)
         else:
             return True
-        self.n_contested += n
+        self._traffic.n_contested += n
         return False
 
     def advance_without_samples(self, silence_ns: int) -> None:
@@ -131,7 +124,7 @@ class Relay:
         for data, received in zip(messages, received_ns, strict=True):
             reading = read_temperature(data)
             if reading is None:
-                self.n_malformed += 1
+                self._traffic.n_malformed += 1
             else:
                 stamp_ns, celsius = reading
                 self._newest_reading_ns = stamp_ns
@@ -174,10 +167,10 @@ class Relay:
                 self._publish_stamped(stamped_flag(stamp_ns, is_dynamic, serial))
             except RCLError:
                 self._count_unpublished()
-            self.n_flags += 1
+            self._traffic.n_flags += 1
 
     def _count_unpublished(self) -> None:
         """Go on after a message that the middleware did not take, but not after the shutdown."""
         if not self._node.context.ok():
             raise ExternalShutdownException
-        self.n_unpublished += 1
+        self._traffic.n_unpublished += 1
