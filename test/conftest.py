@@ -7,6 +7,7 @@ Owns what every test shares: an own DDS domain per test process, seeds, the comm
 from __future__ import annotations
 
 import fcntl
+import gc
 import logging
 import os
 import shutil
@@ -69,6 +70,12 @@ _LONG = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     rank = {name: place for place, name in enumerate(_LONG)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(_LONG)))
+
+
+def pytest_collection_finish() -> None:
+    """Keep the collector from walking through what was imported, again and again."""
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 20)
 
 
 class Cli(Protocol):
