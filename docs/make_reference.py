@@ -38,7 +38,8 @@ same file.
 The parameters of the posterior are, for each axis x, y, z: the bias (level of the static set, free
 coefficients of its Fs, level of the dynamic set, free coefficients of its Fs, weights of the response
 in the order of the file), in input units; then the scale in the same order, relative; at the end
-`M[1][0]`, `M[2][0]`, `M[2][1]`. `covariance = factor @ factor.T + diag(rest)`.
+`M[1][0]`, `M[2][0]`, `M[2][1]`. `covariance = factor @ factor.T + diag(rest)`. That of a `gyroscope` holds the bias alone,
+in rad/s, in the same order; ranges, reference temperature and thermometers are the unit's.
 """
 
 INTERFACE = """\
@@ -52,7 +53,7 @@ stamps are carried through; the node never stamps with its own clock and needs n
 | direction | topic | type | QoS |
 |---|---|---|---|
 | in | `accel/counts` | geometry_msgs/Vector3Stamped, counts per cycle | best effort, keep last 2000 |
-| in, with `input:=imu` | `imu/uncompensated` | sensor_msgs/Imu, m/s^2; angular rate, orientation and their covariances pass through | same |
+| in, with `input:=imu` | `imu/uncompensated` | sensor_msgs/Imu, m/s^2; orientation and its covariance pass through, and so do angular rate and its covariance unless the calibration has a `gyroscope` | same |
 | in | `temperature/board`, `temperature/case`, and `temperature/<name>` for any more that the calibration names | sensor_msgs/Temperature, degC | best effort, keep last 50 |
 | out | `imu/data_raw` | sensor_msgs/Imu, specific force in m/s^2 | reliable |
 | out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every case temperature; nothing while unknown | reliable, transient local |
@@ -70,7 +71,8 @@ the middleware some four times, a quarter of the node's CPU time. A sample lost 
 
 `linear_acceleration_covariance` is a full 3x3: noise of the sample plus what is uncertain about the
 calibration at this thermal state. Without angular rate or orientation in the input, the first element
-of their covariance is -1 (REP 145).
+of their covariance is -1 (REP 145). Where the calibration has a `gyroscope`, `angular_velocity` is less its bias at this
+thermal state, and `angular_velocity_covariance` is ours: the noise of one message and what is uncertain of that bias.
 
 ## Recording a test
 
@@ -137,6 +139,10 @@ def calibration_page() -> str:
         'CubicSpline',
         'Exponential',
         'ResponseTerm',
+        'Gyroscope',
+        'RateSet',
+        'RateCurve',
+        'RateTerm',
         'Posterior',
         'GroupEvidence',
         'DetectorSettings',

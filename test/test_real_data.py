@@ -25,6 +25,7 @@ from recorded.data import GRAVITY, faces_bag, freezer_bag, handheld_bag
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.fit_sources import fit_sources
+from thermo_comp.judging import evaluate
 from thermo_comp.recording import Part, Topics
 
 MG = GRAVITY * 1e-3
@@ -113,6 +114,26 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
     slope = np.diff(z.bias_function.value(np.array([-4.0, 14.0])))[0] / 18.0 / MG
     assert slope == pytest.approx(1.61, abs=0.2)
     assert result.residuals[-1].fitted.rms / MG < 0.75
+
+
+def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
+    bag = freezer_bag(real_data, work)
+    # After the last jump, from the first sample on, 1.5 s after the log's zero; near 860 and
+    # 1134 s somebody knocked.
+    parts = [Part(518.5, 638.5), Part(860.5, 1130.5), Part(1134.5, 1938.5)]
+    seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
+    calibration = fit(seen, OPTIONS).calibration
+    held_out = Topics(part=Part(638.5, 853.5))
+    judged = evaluate([bag], [('unit', calibration)], topics=held_out).judgements['unit'].rate
+    section = judged.sections['all']
+    density = np.mean(calibration.gyroscope.noise_density_rad_s_sqrt_hz)
+    floor = density / np.sqrt(60.0)
+    assert section.raw_rms > 1.7 * floor
+    assert section.rms < 1.3 * floor
+    assert 0.3 < section.ratio < 2.0
+    # The datasheet of an MPU6050 has 5 mdeg/s per root hertz; 12.7 samples a second that nothing
+    # has filtered before hold what lies above 6 Hz, too.
+    assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 
 def test_no_recording_is_in_the_project():
