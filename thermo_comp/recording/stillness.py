@@ -146,12 +146,12 @@ class CellAccumulator:
 
     def finish(self) -> Cells:
         """Return all cells so far, the last one as it is."""
-        # Whoever asks often asks for little more each time.
-        self._ids = [np.concatenate([np.zeros(0, np.int64), *self._ids])]
-        self._sums = [np.concatenate([np.zeros((0, self._width)), *self._sums])]
         n_open = int(self._open_id >= 0)
         index = np.concatenate([*self._ids, np.full(n_open, self._open_id)])
         sums = np.concatenate([*self._sums, self._open[:n_open]])
+        if n_open:
+            # Whoever asks again asks for little more.
+            self._ids, self._sums = [index[:-1]], [sums[:-1]]
         count = sums[:, 0]
         mean, variance = _moments(count, sums[:, 2:5], sums[:, 5:8])
         rate = rate_variance = np.zeros_like(mean)
