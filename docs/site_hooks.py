@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import typer
@@ -18,4 +19,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return markdown
     command = typer.main.get_command(app)
     said = get_docs_for_click(obj=command, ctx=typer.Context(command), name='thermo_comp')
-    return f'{markdown}\n{said.replace(chr(10) + "#", chr(10) + "##").removeprefix("# ")}'
+    # From the first command on; what stands before is on the page already.
+    commands = said[said.index('\n## ') :]
+    return markdown + re.sub(
+        r'^Examples?:\n((?: +.*\n)+)', r'Example:\n\n```sh\n\1```\n', commands, flags=re.MULTILINE
+    )
