@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import http.client
 import os
+import re
 import shutil
 import signal
 import socket
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import threading
 import urllib.request
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -189,6 +191,12 @@ class Watched(LiveReport):
             return self.changed.wait_for(lambda: self.shown[-1:] == expected, TIMEOUT_S)
 
 
+HEADLESS = (
+    *('--headless', '--no-sandbox', '--disable-gpu', '--no-first-run', '--disable-sync'),
+    *('--disable-background-networking', '--disable-component-update'),
+)
+
+
 def browser() -> str:
     found = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
     if found is None:
@@ -200,13 +208,7 @@ def browser() -> str:
 def browsing(url: str, profile: Path) -> Iterator[None]:
     command = [
         browser(),
-        '--headless',
-        '--no-sandbox',
-        '--disable-gpu',
-        '--no-first-run',
-        '--disable-background-networking',
-        '--disable-component-update',
-        '--disable-sync',
+        *HEADLESS,
         f'--user-data-dir={profile}',
         '--remote-debugging-port=0',  # keeps it alive, on a port of its own
         url,
@@ -235,13 +237,7 @@ def test_browser_draws_the_page_without_a_complaint(tmp_path):
     finished = subprocess.run(
         [
             browser(),
-            '--headless',
-            '--no-sandbox',
-            '--disable-gpu',
-            '--no-first-run',
-            '--disable-background-networking',
-            '--disable-component-update',
-            '--disable-sync',
+            *HEADLESS,
             '--enable-logging=stderr',
             f'--user-data-dir={tmp_path / "profile"}',
             '--window-size=390,800',
@@ -255,6 +251,59 @@ def test_browser_draws_the_page_without_a_complaint(tmp_path):
     )
     assert 'CONSOLE' not in finished.stderr
     assert (tmp_path / 'phone.png').stat().st_size > 10_000
+
+
+def test_nothing_is_cut_on_a_phone(tmp_path):
+    # No window of a headless browser is as narrow as a phone; a frame in it is.
+    (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
+    frame = tmp_path / 'frame.html'
+    frame.write_text("""<iframe src="page.html" style="width:390px;height:800px;border:0"></iframe>
+<script>onload = () => {
+  const page = frames[0].document, shown = [page.documentElement, ...page.querySelectorAll("div")];
+  document.title = shown.filter(one => one.scrollWidth > Math.max(one.clientWidth, 1)).length
+    + " of " + page.querySelectorAll("table").length + " tables";
+}</script>""")
+    finished = subprocess.run(
+        [
+            browser(),
+            *HEADLESS,
+            '--allow-file-access-from-files',
+            f'--user-data-dir={tmp_path / "profile"}',
+            '--dump-dom',
+            frame.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=True,
+    )
+    cut, n_tables = re.search(r'<title>(\d+) of (\d+) tables', finished.stdout).groups()
+    assert int(n_tables) >= 5
+    assert cut == '0'
+
+
+def test_no_printed_page_is_empty(tmp_path):
+    (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
+    subprocess.run(
+        [
+            browser(),
+            *HEADLESS,
+            f'--user-data-dir={tmp_path / "profile"}',
+            '--no-pdf-header-footer',
+            f'--print-to-pdf={tmp_path / "page.pdf"}',
+            (tmp_path / 'page.html').as_uri(),
+        ],
+        capture_output=True,
+        timeout=TIMEOUT_S,
+        check=True,
+    )
+    printed = (tmp_path / 'page.pdf').read_bytes()
+    pages = re.findall(rb'/Type /Page\n.*?/Contents (\d+) 0 R', printed, re.DOTALL)
+    assert 5 <= len(pages) <= 12
+    for number in pages:
+        drawn = re.search(rb'\n%s 0 obj.*?stream\r?\n' % number, printed, re.DOTALL)
+        # The margin alone takes some lines.
+        assert zlib.decompressobj().decompress(printed[drawn.end() :]).count(b'\n') > 200
 
 
 def test_command_serves_until_it_is_interrupted(unit):
