@@ -143,9 +143,7 @@ def fit(
         )
     with out.progress('fitting', total=1.0) as done:
         result = run(sources, settings, lambda _stage, part: done(part))
-    for source in sources:
-        if source.chosen:
-            out.note(f'{source.name}: {source.chosen}')
+    out.chosen((source.name, source.chosen) for source in sources)
     losses = [f'{source.name}: {loss}' for source in sources if (loss := source.missing())]
     for loss in losses:
         out.note(loss)

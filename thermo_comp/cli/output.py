@@ -51,12 +51,22 @@ class Output:
 
     def told(self, infos: Iterable[RecordingInfo]) -> bool:
         """Say what was chosen in each bag, and where it was cut off; tell whether one was."""
-        is_torn = False
-        for info in infos:
-            for said in filter(None, (info.chosen, info.truncated)):
-                self.note(f'{info.path}: {said}')
-            is_torn |= bool(info.truncated)
-        return is_torn
+        found = list(infos)
+        self.chosen((info.path, info.chosen) for info in found)
+        torn = [info for info in found if info.truncated]
+        for info in torn:
+            self.note(f'{info.path}: {info.truncated}')
+        return bool(torn)
+
+    def chosen(self, bags: Iterable[tuple[object, str | None]]) -> None:
+        """Say which topics were taken by their type, once for all bags that are alike."""
+        alike: dict[str, list[object]] = {}
+        for bag, said in bags:
+            if said:
+                alike.setdefault(said, []).append(bag)
+        for said, names in alike.items():
+            more = f' and {len(names) - 1} more' if len(names) > 1 else ''
+            self.note(f'{names[0]}{more}: {said}')
 
     @staticmethod
     def end(*, is_torn: bool) -> None:

@@ -63,8 +63,7 @@ def play(
         out.note(f'nobody listened to {name}')
     for name in report.lossy:
         out.note(f'{name} has a best-effort subscriber, which can lose messages')
-    if report.chosen:
-        out.note(f'{bag}: {report.chosen}')
+    out.chosen([(bag, report.chosen)])
     if report.missing:
         out.note(f'{bag}: {report.missing}')
     out.table(('topic', 'messages'), sorted(report.n_messages.items()))
