@@ -100,6 +100,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | NaN or infinite counts | dropped, counted, WARN |
 | counts at full scale | dropped, counted, ERROR while it lasts |
 | no board temperature yet | nothing is published, ERROR |
+| no board temperature, and a calibration that knows nothing of temperature | its constants are published, with what 10 K may do in the covariance |
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
 | case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
 | temperature or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |

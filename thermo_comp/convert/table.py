@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import os
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -266,17 +265,7 @@ def _floats(cells: Sequence[str]) -> Floats:
     try:
         return np.array(cells, dtype=np.float64)
     except ValueError:
-        return np.array([_float(cell) for cell in cells], dtype=np.float64)
-
-
-def _float(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return float('nan')
-
-
-_WHOLE = re.compile(r'\s*[+-]?\d{1,19}\s*')
+        return np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
 
 
 def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
@@ -288,18 +277,14 @@ def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
     factor = 10**exponent
     stamps = np.full(len(cells), NO_STAMP, dtype=np.int64)
     for i, cell in enumerate(cells):
-        if _WHOLE.fullmatch(cell):
-            value = int(cell) * factor
-        else:
-            try:
-                number = Decimal(cell.strip())
-            except InvalidOperation:
-                continue
-            if not number.is_finite() or abs(number.adjusted()) > 30:
-                continue
+        try:
+            number = Decimal(cell.strip())
+        except InvalidOperation:
+            continue
+        if number.is_finite() and abs(number.adjusted()) <= 30:
             value = round(number * factor)
-        if abs(value) < 2**63:
-            stamps[i] = value
+            if abs(value) < 2**63:
+                stamps[i] = value
     return stamps
 
 

@@ -133,20 +133,15 @@ class LagBank:
         if not self.taus:
             return
         change = value - self.input
-        self.input = value
         dt_ns = stamp_ns - seen_ns
         if dt_ns <= 0:
             self.lagging = [m + change for m in self.lagging]
-            return
-        self.stamp_ns = stamp_ns
-        decays, gains = self._steps.get(dt_ns) or self._coefficients(dt_ns)
-        self.lagging = [
-            m * e + change * gain for m, e, gain in zip(self.lagging, decays, gains, strict=True)
-        ]
-        if self.has_extra:
-            self.extra = [v * e * e for v, e in zip(self.extra, decays, strict=True)]
-        if sd or dt_ns * 1e-9 > self._sparse_s:
-            self._doubt(decays, dt_ns * 1e-9, change, sd)
+        else:
+            self.lagging, self.extra = self.at(stamp_ns, value)
+            self.stamp_ns = stamp_ns
+            if sd or dt_ns * 1e-9 > self._sparse_s:
+                self._doubt(self._steps[dt_ns][0], dt_ns * 1e-9, change, sd)
+        self.input = value
 
     def _doubt(self, decays: list[float], dt: float, change: float, sd: float) -> None:
         self.has_extra = True

@@ -201,7 +201,7 @@ class ThermalTracker:
     def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
         board = self.board if self.board.stamp_ns is not None else None
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
-        if decided_ns is not None and self._is_unwatched(decided_ns, stamp_ns):
+        if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s:
             # Nobody has seen whether a ramp began or ended meanwhile.
             self.detector.reset()
             self.lead.reset()
@@ -211,9 +211,6 @@ class ThermalTracker:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
             self._target = target
-
-    def _is_unwatched(self, decided_ns: int, stamp_ns: int) -> bool:
-        return (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s
 
     def weight_at(self, stamp_ns: int) -> float:
         """Weight of the dynamic set at a stamp, moving linearly over the transition time."""
