@@ -177,6 +177,13 @@ TOLD = [
         f'{_FILES}::test_a_full_disk',
     ),
     Told(
+        'the disk is full in a test',
+        '`record` onto a file system of 300 KiB',
+        'exit code 1, whole bags stay, the last one can be read as far as it was written',
+        'one line: the bag, No space left on device, where what was written is',
+        f'{_FILES}::test_a_recording_on_a_full_disk_keeps_what_was_written',
+    ),
+    Told(
         'the output folder is read-only',
         '`fit`, `report` and `replay`',
         'exit code 1',

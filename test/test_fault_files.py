@@ -8,12 +8,14 @@ half; one clear line; what a killed writer left can be read.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from builders import calibration
 from conftest import ROOT, Cli
@@ -34,11 +36,12 @@ COMMANDS = {
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """Return a file system of 4 KiB."""
+def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """Return a file system of 4 KiB, or as many as the test says."""
     disk = tmp_path / 'disk'
     disk.mkdir()
-    command = ['mount', '-t', 'tmpfs', '-o', 'size=4k', 'none', str(disk)]
+    size = f'size={getattr(request, "param", 4)}k'
+    command = ['mount', '-t', 'tmpfs', '-o', size, 'none', str(disk)]
     try:
         mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
     except FileNotFoundError:
@@ -65,6 +68,32 @@ def test_a_full_disk(small_disk: Path, folder: Path, cli: Cli, name: str) -> Non
     assert str(output) in line
     assert line.endswith('No space left on device')
     assert list(small_disk.iterdir()) == []
+
+
+@pytest.mark.parametrize('small_disk', [300], indirect=True)
+def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk: Path, cli: Cli) -> None:
+    # Some 700 KB of noise, of which no compression makes less than half.
+    n = 20000
+    stamps = np.arange(n) * 10**8
+    samples = np.random.default_rng(1).normal((0.0, 0.0, 2942.0), 3.0, (n, 3))
+    bag = small_disk.parent / 'session.mcap'
+    with BagWriter(bag) as writer:
+        writer.write_counts('accel/counts', stamps, samples)
+    options = ('--positions', '1', '--soak', '30min', '-o', small_disk)
+    finished = cli('record', bag, *options, '-q', code=1)
+    (line,) = finished.stderr.strip().splitlines()
+    found = re.fullmatch(
+        rf'thermo_comp: error: {small_disk}/01.mcap: cannot be written: No space left on device; '
+        r'what was written is (\S+)',
+        line,
+    )
+    assert found, line
+    (kept,) = small_disk.iterdir()
+    assert kept.name == found[1]
+    torn = read_recording(kept, require=['accel'])
+    assert torn.info.truncated
+    assert 1000 < len(torn.columns) < n
+    assert torn.columns.accel[:1000] == pytest.approx(samples[:1000])
 
 
 @pytest.mark.parametrize('name', COMMANDS)

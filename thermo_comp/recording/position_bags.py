@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import OutputError
 from ..typing import Ints
 from .columns import RawMessages
 from .growing import News
@@ -22,6 +23,8 @@ from .topics import IMU, Topics
 from .writer import BagWriter
 
 _USUAL = Topics()
+# Little is lost with a process that is killed: half a minute at 100 Hz.
+_CHUNK_BYTES = 1 << 17
 _NAME = re.compile(r'(\d+)\.mcap')
 
 
@@ -102,12 +105,19 @@ class PositionBags:
             self._number += 1
             path = self._folder / f'{self._number:02d}.mcap'
             metadata = {} if self._serial is None else {'serial': self._serial}
-            self._writer = BagWriter(path, metadata=metadata)
+            self._writer = BagWriter(
+                path, metadata=metadata, chunk_bytes=_CHUNK_BYTES, is_precious=True
+            )
             self.written.append(path)
-        for one in pieces:
-            raw = one.messages
-            self._writer.write_raw(raw.topic, raw.type, raw.log_ns, raw)
-        self._writer.flush()
+        try:
+            for one in pieces:
+                raw = one.messages
+                self._writer.write_raw(raw.topic, raw.type, raw.log_ns, raw)
+            self._writer.flush()
+        except OutputError:
+            # It is said once, and not tried again.
+            self._writer, self._held = None, []
+            raise
 
     def _finish(self) -> None:
         writer, self._writer = self._writer, None

@@ -41,8 +41,9 @@ class BagWriter:
 
     ``*.mcap`` makes a bare file, anything else a rosbag2 directory. `level` is that of the
     compression (``zstd``, ``lz4`` or ``none``), by default a fast one; `chunk_bytes` counts before
-    it. `RecordingInfo.metadata` gives the metadata back. Raises OutputError where the output
-    exists and is not to be overwritten, is no bag that may be replaced, or cannot be created.
+    it. `RecordingInfo.metadata` gives the metadata back. What `is_precious` is not dropped where
+    it cannot be finished. Raises OutputError where the output exists and is not to be overwritten,
+    is no bag that may be replaced, or cannot be created.
 
     Messages are buffered until `flush`, which merges all topics in log-time order; 64 MiB of them
     are flushed unasked. So one group of calls whose time spans overlap and a `flush` make a file
@@ -63,11 +64,13 @@ class BagWriter:
         metadata: Mapping[str, str] | None = None,
         overwrite: bool = False,
         chunk_bytes: int = 1 << 20,
+        is_precious: bool = False,
     ) -> None:
         if compression not in {'zstd', 'lz4', 'none'}:
             raise ValueError(f'`compression` must be zstd, lz4 or none, got {compression!r}')
         self._path = Path(path)
         self._metadata = dict(metadata or {})
+        self._is_precious = is_precious
         self._batches: list[Records] = []
         self._n_buffered_bytes = 0
         self._file: McapOutput | None = None
@@ -223,7 +226,8 @@ class BagWriter:
         if file is not None:
             with suppress(OSError):
                 file.close()
-        self._draft.drop()
+        if not self._is_precious:
+            self._draft.drop()
 
     def __enter__(self) -> BagWriter:
         """Give the open writer."""
@@ -284,8 +288,9 @@ class BagWriter:
             yield
         except OSError as error:
             self.abort()
+            kept = f'; what was written is {self._draft.partial.name}' * self._is_precious
             raise OutputError(
-                f'cannot be written: {error.strerror or error}', self._path
+                f'cannot be written: {error.strerror or error}{kept}', self._path
             ) from error
 
 
