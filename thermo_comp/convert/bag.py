@@ -18,7 +18,6 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..recording import Topics, inspect_recording, read_recording
-from ..recording.columns import Role
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 from .log import ForeignLog, Readings, origin
@@ -53,8 +52,7 @@ def bag_log(
     topics = Topics(
         imu=found['imu'] or '', board=found['board'] or '/none', case=found['case'] or '/none'
     )
-    needed: tuple[Role, ...] = ('accel',)
-    recording = read_recording(path, topics, 'imu', require=needed)
+    recording = read_recording(path, topics, 'imu', require=('accel',))
     columns = recording.columns
     serial = recording.info.metadata.get('serial')
     return ForeignLog(
@@ -88,7 +86,9 @@ def find_topics(
     Raises RecordingError if there is no Imu topic, or several and none was chosen; or more
     thermometers than neighbourhood can tell apart.
     """
-    imu = imu or _only(path, _of_type(present, _IMU), 'Imu')
+    imu = imu or _most(path, _of_type(present, _IMU), 'Imu')
+    if imu is None:
+        raise RecordingError('the bag holds no Imu messages', path=path)
     thermometers = [name for name in _of_type(present, _TEMPERATURE) if name not in (board, case)]
     if case is None:
         baros = _of_type(present, _PRESSURE)
@@ -122,13 +122,6 @@ def _common(one: str, other: str) -> int:
             break
         shared += 1
     return shared
-
-
-def _only(path: Path, names: list[str], what: str) -> str:
-    if not names:
-        raise RecordingError(f'the bag holds no {what} messages', path=path)
-    found = _most(path, names, what)
-    return found or names[0]
 
 
 def _most(path: Path, names: list[str], what: str) -> str | None:
