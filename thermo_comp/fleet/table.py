@@ -25,7 +25,7 @@ from ..judging import Judgement, Verdict
 from ..text import one_line
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
-from ..unit.prediction import bias_and_scale, predicted_sd, ramp_states
+from ..unit.prediction import in_a_soak
 
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
@@ -162,10 +162,7 @@ def judged_cells(judgement: Judgement) -> dict[str, Cell]:
 def calibration_cells(calibration: Calibration) -> dict[str, Cell]:
     """Take the cells that a calibration alone fills."""
     sets = calibration.regime_sets()
-    reference = np.array([calibration.reference_temperature_c])
-    soak = ramp_states(calibration, reference, 0.0, 0.0)
-    bias, scale = bias_and_scale(calibration, soak)
-    sd = predicted_sd(calibration, reference, 0.0)
+    bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
     cells: dict[str, Cell] = {
         'gravity_m_s2': calibration.gravity_m_s2,
         'reference_temperature_c': calibration.reference_temperature_c,
@@ -179,11 +176,11 @@ def calibration_cells(calibration: Calibration) -> dict[str, Cell]:
         static = getattr(calibration.static, axis)
         one_ug = getattr(calibration.axes, axis).scale_factor * MICRO_G
         cells |= {
-            f'scale_{axis}': float(scale[0, i]),
-            f'scale_sd_{axis}_ppm': float(sd.scale[0, i]) * 1e6,
+            f'scale_{axis}': float(scale[i]),
+            f'scale_sd_{axis}_ppm': float(scale_sd[i]) * 1e6,
             f'scale_slope_{axis}_ppm_k': static.scale_function.slope(0.0) * 1e6,
-            f'bias_{axis}_ug': float(bias[0, i]) / MICRO_G,
-            f'bias_sd_{axis}_ug': float(sd.bias[0, i]) / MICRO_G,
+            f'bias_{axis}_ug': float(bias[i]) / MICRO_G,
+            f'bias_sd_{axis}_ug': float(bias_sd[i]) / MICRO_G,
             f'bias_slope_{axis}_ug_k': static.bias_function.slope(0.0) / one_ug,
             f'noise_{axis}_ug_sqrt_hz': calibration.noise_density_m_s2_sqrt_hz[i] / MICRO_G,
         }

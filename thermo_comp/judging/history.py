@@ -13,7 +13,7 @@ import numpy as np
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration, Source
 from ..unit.gravity import MICRO_G
-from ..unit.prediction import bias_and_scale, predicted_sd, ramp_states
+from ..unit.prediction import in_a_soak
 
 # A change must be this sure to be called one.
 _SURE_SDS = 3.0
@@ -65,21 +65,19 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
             ordered.append(one)
         known.add(sources)
     ordered.sort(key=lambda one: one.provenance.created)
-    reference = np.array([ordered[0].reference_temperature_c])
     found: list[Epoch] = []
     first = np.ones(3)
     for number, one in enumerate(ordered):
-        bias, scale = bias_and_scale(one, ramp_states(one, reference, 0.0, 0.0))
-        first = first if number else scale[0]
-        sd = predicted_sd(one, reference, 0.0)
+        bias, bias_sd, scale, scale_sd = in_a_soak(one, ordered[0].reference_temperature_c)
+        first = first if number else scale
         claim = 1.0 if one.has_uncertainty else np.nan
         found.append(
             Epoch(
                 created=one.provenance.created or f'no. {number + 1}',
-                bias=bias[0] / MICRO_G,
-                bias_sd=claim * sd.bias[0] / MICRO_G,
-                scale=1e6 * (scale[0] / first - 1.0),
-                scale_sd=claim * 1e6 * sd.scale[0],
+                bias=bias / MICRO_G,
+                bias_sd=claim * bias_sd / MICRO_G,
+                scale=1e6 * (scale / first - 1.0),
+                scale_sd=claim * 1e6 * scale_sd,
             )
         )
     return tuple(found)

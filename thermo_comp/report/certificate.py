@@ -20,7 +20,7 @@ from ..plain_yaml import read_plain_yaml
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
-from ..unit.prediction import bias_and_scale, predicted_sd, ramp_states
+from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states
 from ..unit.schema import Bounds, NotNegative, SchemaError, build
 from .evidence import Evidence
 from .text import number, rounded
@@ -207,22 +207,19 @@ def results(
     if calibration is None:
         return []
     unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
-    at = np.array([calibration.reference_temperature_c])
-    sd = predicted_sd(calibration, at, 0.0)
+    bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
     # Without a claim there is no uncertainty to expand.
     known = COVERAGE if calibration.has_uncertainty else np.nan
     by_gravity = (info.gravity.standard_uncertainty_m_s2 or 0.0) / calibration.gravity_m_s2
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    found = []
-    for i, axis in enumerate(axes):
-        expanded = known * np.hypot(sd.scale[0, i], by_gravity) * abs(axis.scale_factor)
-        said = rounded(axis.scale_factor, float(expanded))
-        found.append(Result(f'scale factor {AXES[i]}', *said, f'{unit} per m/s²'))
-    for i, axis in enumerate(axes):
-        bias = axis.bias / axis.scale_factor / MICRO_G
-        found.append(
-            Result(f'bias {AXES[i]}', *rounded(bias, float(known * sd.bias[0, i] / MICRO_G)), 'µg')
+    scale_sd = np.hypot(scale_sd, by_gravity) * np.abs(scale)
+    found = [
+        Result(f'{name} {axis}', *rounded(value, known * sd), of)
+        for name, values, sds, of in (
+            ('scale factor', scale, scale_sd, f'{unit} per m/s²'),
+            ('bias', bias / MICRO_G, bias_sd / MICRO_G, 'µg'),
         )
+        for axis, value, sd in zip(AXES, values.tolist(), sds.tolist(), strict=True)
+    ]
     for k, (row, column) in enumerate(((1, 0), (2, 0), (2, 1))):
         said = rounded(
             1e6 * calibration.misalignment[row][column],

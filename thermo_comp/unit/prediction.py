@@ -46,6 +46,20 @@ def predicted_sd(calibration: Calibration, temperature: Floats, rate: float) -> 
     return sd_of_states(calibration, ramp_states(calibration, temperature, rate, np.inf))
 
 
+def in_a_soak(
+    calibration: Calibration, temperature: float | None = None
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """
+    Evaluate a soak, at the reference temperature by default, shapes (3,).
+
+    Returns bias [m/s^2] and its sd, scale [input units per m/s^2] and its relative sd.
+    """
+    at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
+    bias, scale = bias_and_scale(calibration, ramp_states(calibration, at, 0.0, 0.0))
+    sd = predicted_sd(calibration, at, 0.0)
+    return bias[0], sd.bias[0], scale[0], sd.scale[0]
+
+
 def sd_of_states(calibration: Calibration, states: Floats) -> PredictedSd:
     """Predict the uncertainty of states, shape (n, width), as `ramp_states` gives them."""
     correction = Correction(calibration)
