@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set, term
+from builders import axis_set, calibration, regime_set, rich_calibration, term
 from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
 from matplotlib.container import ErrorbarContainer
@@ -26,6 +26,7 @@ from thermo_comp.report.figures_unit import (
     draw_functions,
     draw_history,
     draw_hysteresis,
+    draw_rates,
     draw_step,
     hysteresis_loop,
     soak_measurements,
@@ -204,3 +205,21 @@ def test_label_of_a_drawing_is_escaped():
         text = svg(draw_temperatures(evidence(), NARROW), 'x', '"><script>')
     assert '<script>' not in text
     assert 'aria-label="&quot;&gt;&lt;script&gt;"' in text
+
+
+def test_rates_are_those_of_the_gyroscope():
+    unit = rich_calibration()
+    with drawing():
+        figure = draw_rates(replace(evidence(), calibration=unit), WIDE)
+    own = unit.gyroscope
+    for axes, curve in zip(figure.axes, own.static.axes(), strict=True):
+        soak = axes.get_lines()[0]
+        celsius, drawn = np.array(soak.get_data(), dtype=float)
+        bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
+        slope = np.polyfit(celsius, bias, 1)[0]
+        # To rounding; nothing of it in micro-g.
+        np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
+        assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
+    names = [one.name for one in figures_of(replace(evidence(), calibration=unit))]
+    assert 'rates' in names
+    assert 'rates' not in [one.name for one in figures_of(evidence())]

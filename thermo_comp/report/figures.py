@@ -14,7 +14,7 @@ from .evidence import Evidence
 from .figures_position import draw_every_position, draw_positions
 from .figures_residual import draw_gravity, draw_histograms, draw_residuals
 from .figures_thermal import draw_dynamics, draw_temperatures
-from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_step
+from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_rates, draw_step
 from .style import NARROW, WIDE, Sheet, drawing, png, svg
 from .text import label_text
 
@@ -180,6 +180,18 @@ def _add_of_unit(evidence: Evidence, add: Callable[..., None]) -> None:
         if evidence.windows is not None and evidence.residuals
         else '',
     )
+    if calibration.gyroscope is not None:
+        judged = None if evidence.judgement is None else evidence.judgement.rate
+        add(
+            'rates',
+            'What is corrected of the angular rate?',
+            draw_rates,
+            'Bias of the gyroscope over temperature, in a soak and in ramps as above, less the '
+            'value at the reference temperature and less a straight line, whose slope stands '
+            'above each panel. Hatched: 95 % band, of the constant as well, which the Earth’s '
+            'rate and the turn-on blur.',
+            '' if judged is None else f'Judged on these bags, {judged}.',
+        )
     if any(term.lag for term in calibration.response):
         add(
             'step',

@@ -17,7 +17,9 @@ from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
+from ..unit.gyroscope import MILLIDEGREE
 from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
+from ..unit.rate_triad import rate_triad
 from .evidence import CHOSEN, Evidence, given
 from .style import (
     AXIS_LINES,
@@ -87,6 +89,32 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
             if part and (i == 2 or not sheet.is_narrow):
                 axes.set_xlabel('T board, °C')
     shared_legend(figure, panels[0, 0], 1 if sheet.is_narrow else 4)
+    return figure
+
+
+def draw_rates(evidence: Evidence, sheet: Sheet) -> Figure:
+    """Draw the bias of the angular rate over temperature, less a line, with bands."""
+    triad = rate_triad(given(evidence.calibration))
+    figure = new_figure(sheet, 5.6 if sheet.is_narrow else 2.5)
+    panels = figure.subplots(*((3, 1) if sheet.is_narrow else (1, 3)), sharex=True)
+    drawn = curves(triad)
+    # What is said in m/s^2 of a triad is rad/s of this one.
+    unit = MICRO_G / MILLIDEGREE
+    for i, axes in enumerate(panels):
+        slope = float(np.polyfit(drawn[0].temperature, drawn[0].bias[:, i], 1)[0]) * unit
+        for curve in drawn:
+            line = slope * (curve.temperature - triad.reference_temperature_c)
+            value = unit * curve.bias[:, i] - line
+            if triad.posterior is not None:
+                _draw_band(axes, curve, value, BAND_SDS * unit * curve.sd_bias[:, i])
+            axes.plot(curve.temperature, value, label=curve.name, **curve.line)
+        axes.set_title(f'{AXES[i]}: {minus(f"{slope:+.3g}")} mdeg/s/K')
+        axes.axvline(triad.reference_temperature_c, color=GREY, linewidth=0.8)
+        if sheet.is_narrow or not i:
+            axes.set_ylabel('bias less the line, mdeg/s')
+        if i == 2 or not sheet.is_narrow:
+            axes.set_xlabel('T board, °C')
+    shared_legend(figure, panels[0], 1 if sheet.is_narrow else 3)
     return figure
 
 
