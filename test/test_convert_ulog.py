@@ -279,6 +279,7 @@ def test_command(tmp_path, rng, cli):
     log = tmp_path / 'flight.ulg'
     write_two_imus(log, rng)
     finished = cli('convert', log, '--imu', '1', '-o', tmp_path / 'bag.mcap')
+    assert 'SDLOG_PROFILE' not in finished.stdout
     assert f'{N:8} imu/uncompensated' in finished.stdout
     finished = cli('convert', log, '--columns', log, '-o', tmp_path / 'two.mcap', code=2)
     assert 'needs no --columns' in finished.stderr

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
 import yaml
 from builders import term
 
+from thermo_comp.cli.exchange import Tool
 from thermo_comp.convert.exchange import TOOLS, export_calibration, import_calibration
 from thermo_comp.errors import CalibrationError
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
@@ -411,3 +413,7 @@ def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibrati
             theirs = sum(c * (celsius - 31.0) ** p for p, c in enumerate(row))
             ours = back.gyroscope.bias_rad_s[axis] + curve.value(celsius - 20.0)
             assert ours == pytest.approx(theirs, abs=1e-12)
+
+
+def test_the_command_offers_every_tool() -> None:
+    assert get_args(Tool) == tuple(TOOLS)

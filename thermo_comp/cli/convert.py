@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from ..convert.log import Finding
 
 _BAGS = {'.mcap', '.db3', '.bag'}
-#: Slower logs tell of soaks alone.
-_SLOW_HZ = 5.0
 
 
 def convert(
@@ -119,7 +117,7 @@ def as_bags(
     with TemporaryDirectory(prefix='thermo_comp-') as folder:
         bags = {}
         for number, path in enumerate(others):
-            bags[path] = Path(folder) / str(number) / f'{path.stem}.mcap'
+            bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
             bags[path].parent.mkdir()
             write_log(_reader(out, path, columns, rate_hz)(), bags[path])
         yield [bags.get(path, path) for path in paths]
@@ -169,6 +167,8 @@ def _reader(
 
 def say(out: Output, report: ConversionReport) -> None:
     """Print the account of a conversion."""
+    from ..convert.log import SLOW_HZ
+
     out.line(
         f'{report.source}: {report.rows} rows, {report.duration_s:.1f} s '
         f'at {report.rate_hz:.4g} Hz'
@@ -179,12 +179,12 @@ def say(out: Output, report: ConversionReport) -> None:
     out.line(f'  {report.board_messages:8} temperature/board')
     out.line(f'  {report.case_messages:8} temperature/case')
     out.line(f'unit: {report.unit}; {report.believed}')
-    if report.rate_hz < _SLOW_HZ:
+    if report.rate_hz < SLOW_HZ:
         out.line(
             f'{report.rate_hz:.3g} Hz: good for soaks of minutes; rests by hand are too short for '
             'it, and it sees neither vibration nor a knock between two samples'
         )
-    if report.hint and (report.rate_hz < _SLOW_HZ or not report.case_messages):
+    if report.hint:
         out.line(report.hint)
     _say_finding(out, 'rows left out, too short', report.short_rows)
     _say_finding(out, 'rows left out, no number', report.non_numeric)

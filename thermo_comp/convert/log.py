@@ -32,6 +32,8 @@ _HEARTBEAT_NS = 10 * 10**9
 # Messages are written in runs of this many rows: bounded memory in the writer.
 _RUN_ROWS = 100_000
 _EXAMPLES = 5
+#: Slower logs tell of soaks alone.
+SLOW_HZ = 5.0
 _OUT_OF_RANGE = 'before 1970 or after January 2038, which no ROS message can hold'
 
 

@@ -27,7 +27,7 @@ from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Floats, Ints
 from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
-from .log import ForeignLog, Readings
+from .log import SLOW_HZ, ForeignLog, Readings
 from .table import NO_STAMP
 
 _TOPICS = (
@@ -97,7 +97,12 @@ def read_ulog(path: str | Path) -> tuple[AutopilotLog, bool]:
         )
         for number, columns in by_topic[topic].items()
     }
-    metadata, hint = _metadata(log), _PROFILE
+    metadata = _metadata(log)
+    is_slow = any(
+        len(one.stamp_ns) > 1 and np.median(np.diff(one.stamp_ns[:100])) > 1e9 / SLOW_HZ
+        for one in imus.values()
+    )
+    hint = _PROFILE if is_slow else ''
     is_combined = not imus and bool(by_topic['sensor_combined'])
     if is_combined:
         imus = {n: _combined(columns) for n, columns in by_topic['sensor_combined'].items()}
