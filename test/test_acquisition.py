@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -155,6 +156,30 @@ def test_a_clock_that_goes_back_begins_a_position(stream: Stream) -> None:
         begins = [begin for block in stream.blocks(0.5, start_ns) for begin in test.add(block)]
     assert begins == [10**15]
     assert [one.still_s for one in test.account().positions] == pytest.approx([40.0] * 2, abs=1.0)
+
+
+def test_a_dead_sensor_points_nowhere() -> None:
+    stamp_ns = START_NS + np.arange(3000) * 20_000_000
+    test = Acquisition(1, 30.0)
+    log_ns = {'accel': stamp_ns}
+    assert test.add(Block(stamp_ns, np.zeros((3000, 3)), '', None, {}, log_ns)) == []
+    account = test.account()
+    assert [one.reason for one in account.positions] == ['reads zero']
+    assert (account.n_good, account.hole_deg) == (0, 180.0)
+
+
+def test_words_without_a_sign_have_their_zero_in_the_middle(stream: Stream) -> None:
+    for up in UPS:
+        stream.rest(up, 40.0)
+        stream.turn()
+    stream.rest((0, 0, 1), 40.0)
+    test = Acquisition(6, 30.0)
+    for block in stream.blocks(5.0):
+        test.add(replace(block, accel=block.accel + 32768.0))
+    found = test.account().positions
+    for position, up in zip(found, [*UPS, UPS[0]], strict=True):
+        assert position.up @ up > np.cos(np.radians(3.0))
+    assert [one.reason for one in found] == [''] * 6 + ['as position 1']
 
 
 def test_nothing_has_come() -> None:

@@ -229,27 +229,25 @@ class Acquisition:
     def _directions(self, means: Floats) -> Floats:
         """Give unit vectors of raw means, about the centre that they have so far."""
         arms = means - self._centre
-        return np.asarray(arms / np.linalg.norm(arms, axis=1, keepdims=True))
+        norms = np.linalg.norm(arms, axis=1, keepdims=True)
+        return np.asarray(arms / np.where(norms > 0.0, norms, np.nan))
 
     def account(self) -> Account:
         """Say what there is and what is missing."""
         cells = self._open.cells()
         rests = [*self._rests, _rest(cells, -_EVER_NS, self._rest_s)]
         surveys = [*self._surveys, _surveys(self._readings, -_EVER_NS)]
-        ups = self._directions(np.array([one.mean for one in rests]))
-        noise = [one.noise / float(np.linalg.norm(one.mean)) for one in rests]
-        usual = float(
-            np.median([n for n, one in zip(noise, rests, strict=True) if one.n_rests] or [1.0])
-        )
-        sds = [
-            math.hypot(n / math.sqrt(max(r.n, 1)), _FLOOR_SD)
-            for n, r in zip(noise, rests, strict=True)
-        ]
+        means = np.array([one.mean for one in rests])
+        ups = self._directions(means)
+        one_g = np.sum((means - self._centre) * ups, axis=1)
+        noise = np.array([one.noise for one in rests]) / one_g
+        usual = float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 1.0
+        sds = np.hypot(noise / np.sqrt([max(one.n, 1) for one in rests]), _FLOOR_SD)
         positions: list[Position] = []
         for up, rest, one, sd, survey in zip(ups, rests, noise, sds, surveys, strict=True):
             reason = self._reason(rest, up, one / usual, positions)
-            positions.append(Position(up, rest.still_s, rest.n_rests, sd, survey, reason))
-        found = [one for one in positions if one.n_rests]
+            positions.append(Position(up, rest.still_s, rest.n_rests, float(sd), survey, reason))
+        found = [one for one in positions if np.isfinite(one.up).all()]
         seen = np.array([one.up for one in found]).reshape(-1, 3)
         covariance = constants_covariance(seen, np.array([one.sd_g for one in found]))
         next_up = next_direction(covariance, found[-1].sd_g if found else _FLOOR_SD, seen)
@@ -277,6 +275,8 @@ class Acquisition:
         """Say why a position is not good; nothing where it is."""
         if not rest.n_rests:
             return 'not at rest yet'
+        if np.isnan(up).any():
+            return 'reads zero'
         if noise > _RESTLESS:
             return 'restless'
         near = math.cos(math.radians(SAME_DIRECTION_DEG))
