@@ -173,7 +173,7 @@ def test_words_without_a_sign_have_their_zero_in_the_middle(stream: Stream) -> N
         stream.rest(up, 40.0)
         stream.turn()
     stream.rest((0, 0, 1), 40.0)
-    test = Acquisition(6, 30.0)
+    test = Acquisition(6, 30.0, offset=32768.0)
     for block in stream.blocks(5.0):
         test.add(replace(block, accel=block.accel + 32768.0))
     found = test.account().positions

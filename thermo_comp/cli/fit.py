@@ -54,13 +54,7 @@ def fit(
     certificate_info: options.CertificateInfo = None,
     serial: options.NewSerial = None,
     full_scale: options.FullScale = None,
-    offset: Annotated[
-        float | None,
-        typer.Option(
-            help='What raw words read without a force, as 32768; found out by itself if it can.',
-            metavar='WORD',
-        ),
-    ] = None,
+    offset: options.Offset = None,
     reference_temperature: options.ReferenceTemperature = 20.0,
     min_rest: options.MinRest = None,
     still_sd: options.StillSd = '50mg',

@@ -107,6 +107,13 @@ Allow = Annotated[
 JudgedBags = Annotated[
     list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
 ]
+Offset = Annotated[
+    float | None,
+    typer.Option(
+        help='What raw words read without a force, as 32768; found out by itself if it can.',
+        metavar='WORD',
+    ),
+]
 Window = Annotated[
     float, typer.Option('--window', help='Length of a window at rest, in s.', metavar='S')
 ]

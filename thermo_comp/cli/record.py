@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..errors import OutputError, ThermoCompError
+from ..errors import ThermoCompError
 from ..unit.gravity import STANDARD_GRAVITY, spoken
 from . import options
 from .output import Cell, Output, micro_g
@@ -52,6 +52,7 @@ def record(
         str | None,
         typer.Option(help='Serial of the unit, for the bags.', callback=options.check_serial),
     ] = None,
+    offset: options.Offset = None,
     input_: options.InputOption = 'auto',
     topic: options.Topic = None,
     topics: options.TopicsFile = None,
@@ -75,12 +76,8 @@ def record(
     from ..recording.position_bags import PositionBags, numbered_bags
 
     out = Output(as_json, quiet)
-    test = Acquisition(positions, options.duration(soak, '--soak'))
+    test = Acquisition(positions, options.duration(soak, '--soak'), offset or 0.0)
     chosen = options.topics_of(topic, topics)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f'cannot be written: {error.strerror}', output) from error
     known = numbered_bags(output)
     bags = PositionBags(output, _take_known(out, test, known, serial))
     try:
@@ -93,7 +90,7 @@ def record(
     finally:
         bags.close()
     account = test.account()
-    _say(out, account, output, [*known, *bags.written])
+    _say(out, account, output, [*known, *bags.written], offset)
     out.end(is_torn=not account.is_complete and not over.is_set())
 
 
@@ -259,12 +256,16 @@ def _lines(account: Account) -> list[str]:
     return [*lines, *(f'- {finding}' for finding in account.findings)]
 
 
-def _say(out: Output, account: Account, output: Path, bags: Sequence[Path]) -> None:
+def _say(
+    out: Output, account: Account, output: Path, bags: Sequence[Path], offset: float | None
+) -> None:
     positions = [one for one in account.positions if one.n_rests]
     out.table(_COLUMNS, _rows(replace(account, positions=tuple(positions))))
     for line in _lines(account):
         out.line(line)
     command = f'thermo_comp fit {shlex.quote(str(output))}/*.mcap -o unit.yaml --gravity G'
+    if offset is not None:
+        command += f' --offset {offset:g}'
     out.line(f'{len(bags)} bag{"s" * (len(bags) != 1)} in {output}')
     if bags:
         out.line('now fit them, with the local gravity in m/s^2:')

@@ -136,10 +136,14 @@ class _Open:
 
 
 class Acquisition:
-    """The test so far: so many positions wanted, each at rest for `soak_s`."""
+    """
+    The test so far: so many positions wanted, each at rest for `soak_s`.
 
-    def __init__(self, n_positions: int, soak_s: float) -> None:
-        self._n_wanted, self._soak_s = n_positions, soak_s
+    `offset` is the word of no force; where nothing is said, it is looked for from four on.
+    """
+
+    def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
+        self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset
         self._rest_s = min(_REST_S, soak_s)
         self._open = _Open()
         self._rests: list[_Rest] = []
@@ -165,7 +169,7 @@ class Acquisition:
             self.begin()
             begins.append(first_ns)
         self._newest_ns = int(block.accel_stamp_ns[-1])
-        samples = block.accel
+        samples = block.accel - self._offset
         if block.imu is not None:
             samples = np.hstack([samples, block.imu.angular_velocity])
         self._open.add(block.accel_stamp_ns, samples)

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import OutputError
+from ..files import MCAP, check_output
 from ..typing import Ints
 from .columns import RawMessages
 from .growing import News
@@ -61,10 +62,14 @@ class PositionBags:
     def __init__(self, folder: Path, serial: str | None) -> None:
         self._folder, self._serial = folder, serial
         self._number = max((int(one.stem) for one in numbered_bags(folder)), default=0)
+        check_output(self._path(self._number + 1), MCAP)
         self._writer: BagWriter | None = None
         self._held: list[_Piece] = []
         #: Bags that were begun.
         self.written: list[Path] = []
+
+    def _path(self, number: int) -> Path:
+        return self._folder / f'{number:02d}.mcap'
 
     def add(self, news: News) -> None:
         """Take the serialized messages."""
@@ -103,7 +108,7 @@ class PositionBags:
             return
         if self._writer is None:
             self._number += 1
-            path = self._folder / f'{self._number:02d}.mcap'
+            path = self._path(self._number)
             metadata = {} if self._serial is None else {'serial': self._serial}
             self._writer = BagWriter(
                 path, metadata=metadata, chunk_bytes=_CHUNK_BYTES, is_precious=True
