@@ -134,12 +134,13 @@ def _reader(
 ) -> Callable[[], ForeignLog]:
     """Tell the format of a table or log by its name, and refuse options that it has no use for."""
     from ..convert import (
-        dataflash_log,
+        foreign_log,
         guess_columns,
         load_column_map,
+        read_dataflash,
+        read_ulog,
         spoken_columns,
         table_log,
-        ulog_log,
     )
 
     suffix = log.suffix.lower()
@@ -148,10 +149,9 @@ def _reader(
         raise options.usage(f'a {suffix} log needs no --columns and no --rate-hz')
     if allow_compensated and not is_log:
         raise options.usage('--allow-compensated is for PX4 and ArduPilot logs (.ulg, .bin)')
-    if suffix == '.ulg':
-        return partial(ulog_log, log, imu, baro, allow_compensated)
-    if suffix == '.bin':
-        return partial(dataflash_log, log, imu, baro, allow_compensated)
+    if is_log:
+        read = read_ulog if suffix == '.ulg' else read_dataflash
+        return lambda: foreign_log(read(log), imu, baro, allow_compensated)
     if imu is not None or baro is not None:
         raise options.usage('--imu and --baro are for PX4 and ArduPilot logs (.ulg, .bin)')
     if columns is not None and rate_hz is not None:

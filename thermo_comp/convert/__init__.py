@@ -4,23 +4,25 @@
 Owns the way from other people's logs to bags: tables with a column map, PX4, ArduPilot, bags.
 """
 
+from .autopilot import foreign_log
 from .bag import bag_log
 from .columns import ColumnMap, load_column_map, table_log
-from .dataflash import dataflash_log
+from .dataflash import read_dataflash
 from .guess import guess_columns, spoken_columns
 from .log import ConversionReport, ForeignLog, write_log
-from .ulog import ulog_log
+from .ulog import read_ulog
 
 __all__ = [
     'ColumnMap',
     'ConversionReport',
     'ForeignLog',
     'bag_log',
-    'dataflash_log',
+    'foreign_log',
     'guess_columns',
     'load_column_map',
+    'read_dataflash',
+    'read_ulog',
     'spoken_columns',
     'table_log',
-    'ulog_log',
     'write_log',
 ]

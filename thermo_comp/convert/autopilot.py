@@ -56,15 +56,25 @@ class AutopilotLog:
     metadata: dict[str, str] = field(default_factory=dict)
     #: How a log would hold more.
     hint: str = ''
+    #: Why the thermal drift of an IMU is gone from its readings already.
+    compensated: dict[int, str] = field(default_factory=dict)
 
 
-def foreign_log(log: AutopilotLog, imu: int | None = None, baro: int | None = None) -> ForeignLog:
+def foreign_log(
+    log: AutopilotLog,
+    imu: int | None = None,
+    baro: int | None = None,
+    allow_compensated: bool = False,
+) -> ForeignLog:
     """
     Take one IMU and one barometer out of an autopilot's log; None takes the lowest instance.
 
-    Raises RecordingError if the instance is not there, or the readings have no noise: a
-    simulator's.
+    Raises RecordingError if the instance is not there, its drift is already corrected and that is
+    not allowed, or the readings have no noise: a simulator's.
     """
+    why = log.compensated.get(min(log.imus, default=0) if imu is None else imu)
+    if why and not allow_compensated:
+        raise RecordingError(why, path=log.path)
     rows = _choose(log.imus, imu, 'IMU', log.path)
     _refuse_noiseless(log.path, rows)
     baros = {number: _reported(readings) for number, readings in log.baros.items()}

@@ -28,8 +28,8 @@ import numpy.typing as npt
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Bools, Floats, Ints
-from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
-from .log import ForeignLog, Readings
+from .autopilot import AutopilotLog, ImuRows, stamps_ns
+from .log import Readings
 
 _HEADER_BYTES = 3
 # What struct calls a field -> what numpy calls it; strings and arrays are kept as bytes.
@@ -40,35 +40,12 @@ _TYPES = {
 _TEMPERATURES = ('T', 'Temp')
 
 
-def dataflash_log(
-    path: str | Path,
-    imu: int | None = None,
-    baro: int | None = None,
-    allow_compensated: bool = False,
-) -> ForeignLog:
+def read_dataflash(path: str | Path) -> AutopilotLog:
     """
-    Read one IMU and one barometer of an ArduPilot log; None takes the lowest instance.
+    Read the inertial sensors of an ArduPilot log, counted from 0: the old type ``IMU2`` is 1.
 
-    IMUs are counted from 0: the old type ``IMU2`` is 1. `allow_compensated` takes a log whose
-    thermal drift ArduPilot has already corrected.
-
-    Raises RecordingError if pymavlink is not installed, the file is no DataFlash log, it holds no
-    such instance, its drift is already corrected, or its accelerometer has no noise.
+    Raises RecordingError if pymavlink is not installed, or the file is no DataFlash log.
     """
-    log, parameters = read_dataflash(path)
-    number = min(log.imus, default=0) if imu is None else imu
-    name = f'INS_TCAL{number + 1}_ENABLE'
-    if parameters.get(name) == 1.0 and not allow_compensated:
-        raise RecordingError(
-            f'{name} was 1: ArduPilot has already taken the thermal drift out of these readings; '
-            'set it to 0 and record again',
-            path=path,
-        )
-    return foreign_log(log, imu, baro)
-
-
-def read_dataflash(path: str | Path) -> tuple[AutopilotLog, dict[str, float]]:
-    """Read the inertial sensors of an ArduPilot log, and its parameters at the log's end."""
     try:
         from pymavlink.DFReader import DFReader_binary
     except ImportError as failure:
@@ -104,7 +81,13 @@ def read_dataflash(path: str | Path) -> tuple[AutopilotLog, dict[str, float]]:
     metadata = {}
     if any(key.startswith('SIM_') for key in parameters):
         metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
-    return AutopilotLog(str(path), imus, baros, metadata), parameters
+    compensated = {
+        number: f'{name} was 1: ArduPilot has already taken the thermal drift out of these '
+        'readings; set it to 0 and record again'
+        for number in imus
+        if parameters.get(name := f'INS_TCAL{number + 1}_ENABLE') == 1.0
+    }
+    return AutopilotLog(str(path), imus, baros, metadata, compensated=compensated)
 
 
 def _messages(reader: Any, name: str, path: Path) -> tuple[dict[str, npt.NDArray[Any]], int]:

@@ -26,8 +26,8 @@ import numpy as np
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Floats, Ints
-from .autopilot import AutopilotLog, ImuRows, foreign_log, stamps_ns
-from .log import SLOW_HZ, ForeignLog, Readings
+from .autopilot import AutopilotLog, ImuRows, stamps_ns
+from .log import SLOW_HZ, Readings
 from .table import NO_STAMP
 
 _TOPICS = (
@@ -40,32 +40,12 @@ _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_a
 _NOT_THERE = 2**31 - 1
 
 
-def ulog_log(
-    path: str | Path,
-    imu: int | None = None,
-    baro: int | None = None,
-    allow_compensated: bool = False,
-) -> ForeignLog:
+def read_ulog(path: str | Path) -> AutopilotLog:
     """
-    Read one IMU and one barometer of a PX4 log; None takes the lowest instance.
+    Read the inertial sensors of a PX4 log.
 
-    `allow_compensated` takes ``sensor_combined`` though PX4 has corrected its thermal drift.
-
-    Raises RecordingError if pyulog is not installed, the file is no ULog, it holds no such
-    instance, its drift is already corrected, or its accelerometer has no noise.
+    Raises RecordingError if pyulog is not installed, or the file is no ULog.
     """
-    log, is_compensated = read_ulog(path)
-    if is_compensated and not allow_compensated:
-        raise RecordingError(
-            'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
-            f'thermal drift out of these readings; {_PROFILE}',
-            path=path,
-        )
-    return foreign_log(log, imu, baro)
-
-
-def read_ulog(path: str | Path) -> tuple[AutopilotLog, bool]:
-    """Read the inertial sensors of a PX4 log, and whether PX4 has corrected their drift."""
     try:
         from pyulog import ULog
     except ImportError as failure:
@@ -103,13 +83,18 @@ def read_ulog(path: str | Path) -> tuple[AutopilotLog, bool]:
         for one in imus.values()
     )
     hint = _PROFILE if is_slow else ''
-    is_combined = not imus and bool(by_topic['sensor_combined'])
-    if is_combined:
+    compensated: dict[int, str] = {}
+    if not imus and by_topic['sensor_combined']:
         imus = {n: _combined(columns) for n, columns in by_topic['sensor_combined'].items()}
         metadata['px4_topic'] = 'sensor_combined'
         hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
-    is_compensated = is_combined and log.initial_parameters.get('TC_A_ENABLE') == 1
-    return AutopilotLog(str(path), imus, baros, metadata, hint), is_compensated
+        if log.initial_parameters.get('TC_A_ENABLE') == 1:
+            why = (
+                'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
+                f'thermal drift out of these readings; {_PROFILE}'
+            )
+            compensated = dict.fromkeys(imus, why)
+    return AutopilotLog(str(path), imus, baros, metadata, hint, compensated)
 
 
 def _imu(columns: dict[str, Any], gyro: dict[str, Any] | None) -> ImuRows:
