@@ -189,6 +189,7 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
             'slow_noise_m_s2_sqrt_h': calibration.slow_noise_m_s2_sqrt_h,
             'gyroscope': _facts_of_gyroscope(result),
             'positions': result.positions,
+            'least_known': result.least_known,
             'findings': result.findings,
         }
     )

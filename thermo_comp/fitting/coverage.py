@@ -11,10 +11,12 @@ an ideal triad, and with the fit's own prior, their covariance follows from the 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..typing import Floats
+from ..unit.calibration import Calibration, parameter_layout
 from ..unit.gravity import STANDARD_GRAVITY
 from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD
 
@@ -80,6 +82,48 @@ def farthest(up: Floats) -> tuple[Floats, float]:
     nearest = np.max(_SPHERE @ up.T, axis=1)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
+
+
+@dataclass(frozen=True)
+class LeastKnown:
+    """
+    The attitude of which a calibration knows least, at its reference temperature and at rest.
+
+    up: the direction, a unit vector
+    away_deg: angle to the nearest position; 180 without any
+    sd_m_s2, seen_sd_m_s2: standard deviation of |f| there; its median in the positions
+    """
+
+    up: tuple[float, float, float]
+    away_deg: float
+    sd_m_s2: float
+    seen_sd_m_s2: float
+
+
+def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
+    """Find what positions at unit vectors (n, 3) left unseen; None where nothing is claimed."""
+    if calibration.posterior is None:
+        return None
+    layout, axes = parameter_layout(calibration), calibration.axes
+    levels = [block.static for block in (*layout.bias, *layout.scale)]
+    places = [*levels, *range(layout.misalignment, layout.misalignment + 3)]
+    # What a bias or a scale has too much, the force has too little.
+    unit = np.array([-1.0 / axis.scale_factor for axis in (axes.x, axes.y, axes.z)])
+    unit = np.concatenate((unit, np.repeat((-1.0, 1.0), 3) * calibration.gravity_m_s2))
+    covariance = calibration.posterior.covariance()[np.ix_(places, places)] * np.outer(unit, unit)
+    sd, seen_sd = (
+        np.sqrt(np.einsum('ij,jk,ik->i', columns, covariance, columns))
+        for columns in (norm_columns(_SPHERE), norm_columns(up))
+    )
+    worst = int(np.argmax(sd))
+    nearest = float(np.max(up @ _SPHERE[worst], initial=-1.0))
+    x, y, z = _SPHERE[worst].tolist()
+    return LeastKnown(
+        (x, y, z),
+        math.degrees(math.acos(min(nearest, 1.0))),
+        float(sd[worst]),
+        float(np.median(seen_sd)),
+    )
 
 
 def spoken_direction(up: Floats) -> str:

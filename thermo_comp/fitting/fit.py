@@ -18,11 +18,12 @@ from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
 from .assembly import UnitFacts, build_calibration
 from .attitudes import distinct_directions
+from .coverage import LeastKnown, least_known
 from .curves import sets_of
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import GyroscopeFit, fit_gyroscope
 from .learning import Learnt, learn
-from .offset import about, centred, find_offset
+from .offset import about, centred, find_offset, with_notes
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .posterior import Regression
 from .priors import constants_of, known_of, prior_columns, prior_sets, state_of
@@ -32,7 +33,15 @@ from .sensors import learn_detector
 from .sources import FitSource
 from .start import ConstantCalibration, constant_calibration, position_means
 from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD, Prior, initial_state
-from .verdict import POSITIONS_NEEDED, Finding, enforce, judge_bags, judge_result, judge_windows
+from .verdict import (
+    POSITIONS_NEEDED,
+    Finding,
+    enforce,
+    judge_bags,
+    judge_coverage,
+    judge_result,
+    judge_windows,
+)
 from .windows import CURVE, FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
 
 Progress = Callable[[str, float], None]
@@ -59,6 +68,7 @@ class FitResult:
     residuals: over the windows of the fit
     positions: the still intervals
     findings: what the data lacked, or not
+    least_known: the attitude that the positions left unseen most
     windows: the windows of the regression
     bags: the reduced bags
     gyroscope: that of the angular rate; None where the bags have none, or there is a prior
@@ -69,6 +79,7 @@ class FitResult:
     residuals: tuple[ResidualRow, ...]
     positions: tuple[PositionReport, ...]
     findings: tuple[Finding, ...]
+    least_known: LeastKnown | None
     windows: ThermalWindows
     bags: tuple[ReducedBag, ...]
     gyroscope: GyroscopeFit | None = None
@@ -147,7 +158,7 @@ def fit_bags(
     found = _fit([centred(bag, offset) for bag in bags], replace(options, prior=known), tell)
     return replace(
         found,
-        calibration=about(found.calibration, offset, note),
+        calibration=with_notes(about(found.calibration, offset), [f'offset: {note}']),
         findings=(Finding('offset', 'advice', note), *found.findings),
         bags=tuple(bags),
     )
@@ -252,12 +263,17 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
             )
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
+    least = least_known(calibration, learnt.posterior.state.up)
+    unseen = judge_coverage(least)
+    findings += unseen
+    calibration = with_notes(calibration, [f'{one.name}: {one.message}' for one in unseen])
     return FitResult(
         calibration=calibration,
         learnt=learnt,
         residuals=residuals,
         positions=position_reports(windows, bags, regression, learnt, left_out),
         findings=tuple(findings),
+        least_known=least,
         windows=windows,
         bags=tuple(bags),
         gyroscope=gyroscope,

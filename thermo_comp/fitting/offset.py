@@ -59,9 +59,9 @@ def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
     )
 
 
-def about(calibration: Calibration, offset: Floats, note: str = '') -> Calibration:
+def about(calibration: Calibration, offset: Floats) -> Calibration:
     """Make a calibration of words above those of no force one of the words themselves."""
-    axes, unit, provenance = calibration.axes, calibration.unit, calibration.provenance
+    axes, unit = calibration.axes, calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
         # Words of 16 bits without a sign, of which nobody said how long they are.
@@ -75,5 +75,10 @@ def about(calibration: Calibration, offset: Floats, note: str = '') -> Calibrati
                 for axis, by in zip((axes.x, axes.y, axes.z), offset.tolist(), strict=True)
             )
         ),
-        provenance=replace(provenance, notes=(*((note,) if note else ()), *provenance.notes)),
     )
+
+
+def with_notes(calibration: Calibration, notes: Sequence[str]) -> Calibration:
+    """Add notes to a calibration's provenance."""
+    provenance = calibration.provenance
+    return replace(calibration, provenance=replace(provenance, notes=(*provenance.notes, *notes)))

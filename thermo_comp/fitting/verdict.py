@@ -18,8 +18,9 @@ import numpy as np
 from ..errors import FitError
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
-from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
 from .attitudes import distinct_directions, geometry
+from .coverage import LeastKnown, spoken_direction
 from .options import FitOptions
 from .reduction import ReducedBag
 from .windows import ThermalWindows
@@ -32,6 +33,8 @@ POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_ADVISED = 6, 9, 18
 # spread positions give 1, nine 3, the six faces each done three times by hand 4.5 to 8.
 _WORST_GEOMETRY = 6.0
 _SATURATED_NEEDED, _SATURATED_ADVISED = 0.05, 0.001
+# A direction is unseen whose |f| is known so many times less than in the positions.
+_UNSEEN = 3.0
 
 
 @dataclass(frozen=True)
@@ -221,6 +224,18 @@ def _judge_positions(up: Floats) -> list[Finding]:
         text = f'{n} positions; {POSITIONS_ADVISED} give more'
         return [Finding('positions', 'advice', text)]
     return [Finding('positions', 'good', f'{n} positions')]
+
+
+def judge_coverage(least: LeastKnown | None) -> list[Finding]:
+    """Judge whether the positions left a direction unseen, and say what that costs."""
+    if least is None or least.sd_m_s2 < _UNSEEN * least.seen_sd_m_s2:
+        return []
+    text = (
+        f'{least.away_deg:.0f} deg away from every position |f| is known to '
+        f'{spoken(least.sd_m_s2)} (1 sd), in them to {spoken(least.seen_sd_m_s2)}: record one '
+        f'with {spoken_direction(np.array(least.up))}'
+    )
+    return [Finding('unseen', 'advice', text)]
 
 
 def can_tell_misalignment(up: Floats) -> bool:

@@ -15,6 +15,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from ..fitting import ResidualRow
+from ..fitting.coverage import LeastKnown, least_known
 from ..fitting.reduction import Readings
 from ..judging import Judgement, Verdict, Windows
 from ..judging.history import Epoch
@@ -150,6 +151,13 @@ class Evidence:
         if self.gravity is None:
             return {}
         return {name: norm_residual(force, self.gravity) for name, force in self.forces.items()}
+
+    @cached_property
+    def least_known(self) -> LeastKnown | None:
+        """The attitude of which the calibration knows least; None where it claims nothing."""
+        if self.calibration is None:
+            return None
+        return least_known(self.calibration, np.array([one.up for one in self.positions]))
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:

@@ -106,6 +106,10 @@ def figures_of(evidence: Evidence) -> list[ReportFigure]:
             'which is what a new attitude will see; the area of a ring is in proportion.'
             if evidence.left_out
             else '',
+            'Red cross: the direction of which the calibration knows least, and the standard '
+            'deviation of |f| there: a position would tell most.'
+            if evidence.least_known
+            else '',
         )
     return found
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..unit.gravity import MICRO_G
+from ..unit.gravity import MICRO_G, spoken
 from .evidence import LEFT_OUT, RAW, Evidence, Position, given
 from .style import BLACK, RED, Line, Sheet, legend_above, log_axis, new_figure, time_unit
 from .text import number
@@ -66,9 +66,22 @@ def draw_positions(evidence: Evidence, sheet: Sheet) -> Figure:
         figure = new_figure(sheet, 2.9)
         grid = figure.add_gridspec(1, 3, width_ratios=[1.0, 1.0, 1.25])
         places = (grid[0, 0], grid[0, 1], grid[0, 2])
+    least = evidence.least_known
     for side, place, name in ((1, places[0], 'z up'), (-1, places[1], 'z down')):
         axes = figure.add_subplot(place)
         _draw_hemisphere(axes, positions, side)
+        if least is not None and (least.up[2] >= 0.0) == (side > 0):
+            x, y = equal_area(least.up, side)
+            axes.plot(x, y, 'x', markersize=7.0, color=RED, mew=1.6)
+            axes.annotate(
+                '±' + spoken(least.sd_m_s2).replace('ug', 'µg'),
+                (x, y),
+                xytext=(0.0, -9.0),
+                textcoords='offset points',
+                ha='center',
+                color=RED,
+                fontsize=7.5,
+            )
         axes.set_title(name, loc='center')
     dots = figure.add_subplot(places[2])
     if evidence.residuals:
