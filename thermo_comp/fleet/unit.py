@@ -79,10 +79,8 @@ class _Bag:
     sha256: str = ''
     reduced: ReducedBag | None = None
     input: Literal['counts', 'm/s^2'] = 'counts'
-    lot: str = ''
     problem: str = ''
     is_passing: bool = False  # the file system failed, not the bag
-    note: str = ''
 
 
 def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcome:
@@ -90,17 +88,17 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
     began = time.process_time()
     storage = Storage(url)
     bags = [_read(storage, bag, options) for bag in unit.bags]
-    good = [one for one in bags if one.reduced is not None]
-    serials = sorted({one.reduced.source.serial or '' for one in good if one.reduced} - {''})
+    good = [one.reduced.source for one in bags if one.reduced is not None]
+    serials = sorted({source.serial for source in good if source.serial})
     serial = serials[0] if serials else unit.name.rpartition('/')[2]
     outcome = UnitOutcome(
         row=empty_row(
             name=unit.name,
             serial=serial,
-            lot=next((one.lot for one in good if one.lot), unit.lot),
+            lot=next(filter(None, (one.metadata.get('lot') for one in good)), unit.lot),
             n_bags=len(bags),
             n_left_out=len(bags) - len(good),
-            n_torn=sum(bool(one.note) for one in good),
+            n_torn=sum(bool(source.missing()) for source in good),
             left_out='; '.join(one.problem for one in bags if one.problem),
             n_bytes=sum(bag.n_bytes for bag in unit.bags),
             prior=options.prior_sha256,
@@ -112,7 +110,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
     try:
         if len(serials) > 1:
             raise FitError(f'the bags are of different units: {", ".join(serials)}')
-        outcome = _fitted(outcome, good, serial, options)
+        outcome = _fitted(outcome, bags, serial, options)
     except FitError as refusal:
         outcome.row.update(verdict=REFUSED, problem=one_line(str(refusal)))
     except ThermoCompError as failure:
@@ -131,7 +129,6 @@ def _read(storage: Storage, bag: FoundBag, options: FleetOptions) -> _Bag:
             source = replace(source, sha256=result.sha256)
             unit: Literal['counts', 'm/s^2'] = 'm/s^2' if info.input == 'imu' else 'counts'
             reduced = reduce_bag(source, 0, replace(options.fit, input=unit))
-            torn = source.missing()
     except RecordingError as error:
         # Named as the fleet does, wherever it lies.
         said = ': '.join(part for part in (bag.name, error.topic, error.message) if part)
@@ -141,31 +138,27 @@ def _read(storage: Storage, bag: FoundBag, options: FleetOptions) -> _Bag:
         return replace(result, problem=said, is_passing=True)
     except FitError as error:
         return replace(result, problem=str(error))
-    return replace(
-        result,
-        reduced=reduced,
-        input=unit,
-        lot=info.metadata.get('lot', ''),
-        note=f'{source.name}: {torn}' if torn else '',
-    )
+    return replace(result, reduced=reduced, input=unit)
 
 
 def _fitted(
-    outcome: UnitOutcome, good: Sequence[_Bag], serial: str, options: FleetOptions
+    outcome: UnitOutcome, bags: Sequence[_Bag], serial: str, options: FleetOptions
 ) -> UnitOutcome:
     from ..report import evidence_of_fit, render_report
 
     row = outcome.row
+    good = [(one, one.reduced) for one in bags if one.reduced is not None]
     if not good:
         raise ThermoCompError('none of its bags can be used')
-    kinds = {one.input: one.name for one in good}
+    kinds = {one.input: one.name for one, _ in good}
     if len(kinds) > 1:
         said = ', '.join(f'{name} holds {kind}' for kind, name in sorted(kinds.items()))
         raise FitError(f'{said}: choose one with --input')
-    settings = replace(options.fit, input=good[0].input, serial=serial)
-    result = fit_bags(_numbered([one.reduced for one in good if one.reduced]), settings)
+    settings = replace(options.fit, input=good[0][0].input, serial=serial)
+    result = fit_bags(_numbered([reduced for _, reduced in good]), settings)
     calibration = dump_calibration(result.calibration)
-    lost = [one.note for one in good if one.note]
+    sources = [reduced.source for _, reduced in good]
+    lost = [f'{source.name}: {torn}' for source in sources if (torn := source.missing())]
     if row['n_left_out']:
         lost.append(f'{row["n_left_out"]} of {row["n_bags"]} bags are left out: {row["left_out"]}')
     evidence = evidence_of_fit(result, is_brief=not options.certificates)
