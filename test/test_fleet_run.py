@@ -264,8 +264,8 @@ def command(folder: Path, out: Path, *options: str) -> int:
 def test_the_command_s_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command(tmp_path, tmp_path / 'out') == 2
     assert 'give --gravity, or --latitude and --height' in capsys.readouterr().err
-    assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 2
-    assert '`gravity` must be positive' in capsys.readouterr().err
+    assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 1
+    assert 'local gravity -1 m/s^2 is not found on Earth' in capsys.readouterr().err
     assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
     said = capsys.readouterr().err
     assert 'no bag in it' in said
