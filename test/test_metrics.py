@@ -18,19 +18,9 @@ def test_statistics_of_scalars_by_hand() -> None:
     assert found.rms == pytest.approx(12.5**0.5, rel=1e-15)
 
 
-def test_statistics_of_vectors_use_the_norm() -> None:
-    found = residual_statistics(np.array([[3.0, 4.0, 0.0], [0.0, 0.0, -12.0]]))
-    assert found.peak == 12.0
-    # Squares of the norms: 25 and 144.
-    assert found.rms == pytest.approx((169.0 / 2.0) ** 0.5, rel=1e-15)
-    # The mean vector is (1.5, 2, -6).
-    assert found.mean == pytest.approx(6.5, rel=1e-15)
-
-
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 def test_values_that_are_not_finite_are_left_out(bad: float) -> None:
     assert residual_statistics(np.array([1.0, bad, 1.0])) == residual_statistics(np.ones(2))
-    assert residual_statistics(np.array([[1.0, 0, 0], [0, bad, 0]])).n == 1
 
 
 def test_nothing_to_count_gives_nan() -> None:

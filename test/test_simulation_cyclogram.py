@@ -73,13 +73,6 @@ def test_air_is_straight_between_points_and_rests_outside() -> None:
     np.testing.assert_allclose(program.at([-1.0, 300.0, 900.0, 5000.0]), [20.0, 22.5, 25.0, 25.0])
 
 
-def test_cut_shortens_in_mid_ramp_and_draws_out_by_resting() -> None:
-    program = Cyclogram((0.0, 600.0), (20.0, 30.0))
-    assert program.cut(300.0) == Cyclogram((0.0, 300.0), (20.0, 25.0))
-    assert program.cut(900.0) == Cyclogram((0.0, 600.0, 900.0), (20.0, 30.0, 30.0))
-    assert program.cut(600.0) == program
-
-
 def test_program_refuses_what_is_not_one() -> None:
     with pytest.raises(ValueError, match='one length of at least 2, got 2 and 1'):
         Cyclogram((0.0, 1.0), (20.0,))
@@ -93,5 +86,3 @@ def test_program_refuses_what_is_not_one() -> None:
         ramps_and_soaks(20.0, -1.0, [(30.0, 1.0, 10.0)])
     with pytest.raises(ValueError, match=r"`name` must be one of paper, .*, got 'oven'"):
         cyclogram_preset('oven')
-    with pytest.raises(ValueError, match='`duration` must be positive, got 0'):
-        cyclogram_preset('paper').cut(0.0)

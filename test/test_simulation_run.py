@@ -14,6 +14,7 @@ from simulation_helpers import ideal_regime, rippled
 from thermo_comp.simulation import (
     MICRO_G,
     START_NS,
+    Cyclogram,
     SimulatedRun,
     UnitModel,
     cyclogram_preset,
@@ -257,7 +258,7 @@ def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:
     with pytest.raises(ValueError, match='`rate_hz` must be positive, got 0'):
         simulate(unit, SHORT, UP, rate_hz=0.0)
     with pytest.raises(ValueError, match='shorter than one cycle'):
-        simulate(unit, SHORT.cut(0.5), UP, rate_hz=1.0)
+        simulate(unit, Cyclogram((0.0, 0.5), (20.0, 20.0)), UP, rate_hz=1.0)
     with pytest.raises(ValueError, match='`block_size` must be at least 1, got 0'):
         simulate_blocks(unit, SHORT, UP, block_size=0)
     with pytest.raises(ValueError, match='`gravity` must be positive, got nan'):

@@ -22,6 +22,7 @@ from ..errors import RecordingError
 from ..fitting.history import readings_in_order
 from ..fitting.reduction import ReducedBag, StillInterval
 from ..online.compensator import Compensator
+from ..online.gravity_check import variance_along
 from ..online.snapshot import take_snapshot
 from ..online.status import CompensatorConfig
 from ..thermal.state import Layout
@@ -326,18 +327,10 @@ def _correct(compensator: Compensator, bag: ReducedBag, sums: Floats) -> None:
         if corrected is None or status.state is None:
             continue
         row[_FORCE] = corrected[:3]
-        row[_VARIANCE] = _along(corrected[:3], corrected[3:])
+        row[_VARIANCE] = variance_along(corrected[:3], corrected[3:])
         row[_EXCESS] = status.relative_excess
         state = status.state
         row[_BOARD], row[_RATE], row[_WEIGHT] = state.board, state.rate, state.weight
         if compensator.corrects_rate:
             row[_WIDTH + 3 : _WIDTH + 9] = compensator.correct_rate(stamp_ns, *row[_ANGULAR])
             row[_WIDTH + 9 :] = compensator.thermal.tracker.sample(stamp_ns)
-
-
-def _along(force: Sequence[float], covariance: Sequence[float]) -> float:
-    """Project a covariance xx, xy, xz, yy, yz, zz on the direction of a force."""
-    x, y, z = force
-    xx, xy, xz, yy, yz, zz = covariance
-    square = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)
-    return square / (x * x + y * y + z * z)

@@ -37,6 +37,14 @@ RESTORING_WINDOWS: Final = 2
 REFUTING_SIGMAS: Final = 5.0
 
 
+def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float:
+    """Project a covariance xx, xy, xz, yy, yz, zz on the direction of a force."""
+    x, y, z = force
+    xx, xy, xz, yy, yz, zz = covariance
+    square = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)
+    return square / (x * x + y * y + z * z)
+
+
 class GravityCheck:
     """
     Compare |f| with gravity over still windows; `is_refuted` tells whether the last of them all
@@ -118,17 +126,9 @@ class GravityCheck:
         if not self._is_still:
             return
         size = math.sqrt(sum([value * value for value in mean], 0.0))
-        ux, uy, uz = mean[0] / size, mean[1] / size, mean[2] / size
-        xx, xy, xz, yy, yz, zz = covariance
-        along = (
-            ux * ux * xx
-            + uy * uy * yy
-            + uz * uz * zz
-            + 2.0 * (ux * uy * xy + ux * uz * xz + uy * uz * yz)
-        )
         # The calibration's error is common to the samples of a window, their noise averages out.
         noise = noise_variance / 3.0
-        variance = max(along - noise, 0.0) + noise / n
+        variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
         self._judge(abs(size - self.gravity), math.sqrt(variance))
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0

@@ -172,28 +172,12 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     )
 
 
-def values(
-    columns: Sequence[Column],
-    state: Sequence[Number],
-    reference_temperature: float,
-    memory: MemorySpec,
-    temperature_range_c: tuple[float, float] = UNBOUNDED,
-) -> list[Number]:
-    """
-    Evaluate columns.
-
-    `reference_temperature`: T_ref [degC]. `temperature_range_c`: at the edges of which t is held
-    [degC].
-    """
-    table = ColumnTable(columns, memory, reference_temperature, temperature_range_c)
-    return table.values(state)
-
-
 class ColumnTable:
     """
     Columns, ready to be evaluated; the same bits for one state and for many.
 
-    columns, memory, reference_temperature, temperature_range_c: see `values`
+    reference_temperature: T_ref [degC]
+    temperature_range_c: at the edges of which t is held [degC]
     """
 
     def __init__(
