@@ -21,7 +21,7 @@ from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
 from .log import NO_READINGS, ForeignLog, Readings, origin, thin
-from .table import NO_STAMP, STAMP_EXPONENTS, Column, Table, read_parquet, read_text
+from .table import NO_STAMP, STAMP_EXPONENTS, Column, Table, TimeUnit, read_parquet, read_text
 from .units import PER_G
 
 #: A map takes some kB.
@@ -51,7 +51,7 @@ class Stamp:
     """
 
     column: Column | None = None
-    unit: Literal['s', 'ms', 'us', 'ns'] | None = None
+    unit: TimeUnit | None = None
     rate_hz: Positive | None = None
     start_s: NotNegative = 1.0
 

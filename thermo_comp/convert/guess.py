@@ -17,17 +17,11 @@ import numpy as np
 from ..errors import RecordingError
 from ..typing import Floats
 from .columns import Accel, ColumnMap, Format, Gyro, Stamp
-from .table import read_text
+from .table import STAMP_EXPONENTS, read_text
 from .units import believed_unit, find_stillness
 
 #: Between two samples lies more than the first [s], and less than the second: so times are told.
 _STEPS_S = (5e-5, 0.5)
-_TIME_UNITS: dict[float, Literal['s', 'ms', 'us', 'ns']] = {
-    1.0: 's',
-    1e-3: 'ms',
-    1e-6: 'us',
-    1e-9: 'ns',
-}
 #: No gyroscope is turned by hand faster than this [rad/s].
 _FASTEST_RAD_S = 20.0
 _GIVE_MAP = 'give a column map: --columns MAP'
@@ -92,7 +86,7 @@ def _stamp(path: Path, times: Floats | None, rate_hz: float | None) -> Stamp:
     step = float(np.median(steps)) if len(steps) else 0.0
     is_time = len(steps) > 0 and (steps > 0.0).mean() > 0.9
     # From the largest unit on: a step of 5 is no time in seconds, but one in ms.
-    for seconds, unit in _TIME_UNITS.items():
-        if is_time and _STEPS_S[0] < step * seconds < _STEPS_S[1]:
+    for unit, exponent in STAMP_EXPONENTS.items():
+        if is_time and _STEPS_S[0] < step * 10.0 ** (exponent - 9) < _STEPS_S[1]:
             return Stamp(0, unit)
     raise RecordingError(f'its first column is no time that rises: {_GIVE_MAP}', path=path)

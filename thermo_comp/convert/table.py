@@ -17,7 +17,7 @@ from decimal import Decimal, InvalidOperation
 from io import TextIOWrapper
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from ..files import open_regular
 from ..typing import Floats, Ints
 
 Column = str | int
+TimeUnit = Literal['s', 'ms', 'us', 'ns']
 
 # A row is parsed in one go with this many others: bounded memory for text, one array each.
 _CHUNK_ROWS = 65536
@@ -34,7 +35,8 @@ _SNIFF_BYTES = 65536
 _PREAMBLE_ROWS = 1000
 #: What packs numbers more tightly holds no measurement.
 _MOST_ROWS_PER_BYTE = 4
-STAMP_EXPONENTS = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
+#: Powers of ten from a unit of time to nanoseconds.
+STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 
 @dataclass(frozen=True)
