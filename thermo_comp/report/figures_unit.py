@@ -53,37 +53,16 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
     drawn = curves(calibration)
     soak = drawn[0]
     measured = soak_measurements(evidence)
-    reference = calibration.reference_temperature_c
     for part, (name, unit) in enumerate((('bias', 'µg'), ('scale', 'ppm'))):
         for i, axes in enumerate(panels[part]):
-            # All curves are 0 in a soak at the reference, and so is the line.
-            slope = float(np.polyfit(soak.temperature, getattr(soak, name)[:, i], 1)[0])
-            title = f'{AXES[i]}: {minus(f"{slope:+.3g}")} {unit}/K'
-            widest = 0.0
-            for curve in drawn:
-                value = getattr(curve, name)[:, i] - slope * (curve.temperature - reference)
-                if calibration.posterior is not None:
-                    half = BAND_SDS * getattr(curve, f'sd_{name}')[:, i]
-                    _draw_band(axes, curve, value, half)
-                    widest = max(widest, float(half.max()))
-                # The ends of the valid range are marked; a range of a few K stays visible so.
-                axes.plot(
-                    curve.temperature,
-                    value,
-                    label=curve.name,
-                    markersize=3.5,
-                    markevery=[0, -1],
-                    marker=curve.marker,
-                    **curve.line,
-                )
+            slope = _draw_less_line(axes, calibration, drawn, (name, i), unit)
             temperature, error = measured.temperature, getattr(measured, name)[:, i]
             if np.isfinite(error).any():
                 level = np.interp(temperature, soak.temperature, getattr(soak, name)[:, i])
-                value = level - slope * (temperature - reference) + error
-                axes.plot(temperature, value, 'o', label='measured in a soak', **_POINT)
-            axes.set_title(f'{title}, ±{number(widest, 2)} {unit}' if widest else title)
-            axes.axvline(reference, color=GREY, linewidth=0.8)
-            axes.yaxis.set_major_locator(MaxNLocator(5))
+                line = slope * (temperature - calibration.reference_temperature_c)
+                axes.plot(
+                    temperature, level - line + error, 'o', label='measured in a soak', **_POINT
+                )
             if sheet.is_narrow or not i:
                 axes.set_ylabel(f'{name} less the line, {unit}')
             if part and (i == 2 or not sheet.is_narrow):
@@ -98,24 +77,55 @@ def draw_rates(evidence: Evidence, sheet: Sheet) -> Figure:
     figure = new_figure(sheet, 5.6 if sheet.is_narrow else 2.5)
     panels = figure.subplots(*((3, 1) if sheet.is_narrow else (1, 3)), sharex=True)
     drawn = curves(triad)
-    # What is said in m/s^2 of a triad is rad/s of this one.
-    unit = MICRO_G / MILLIDEGREE
     for i, axes in enumerate(panels):
-        slope = float(np.polyfit(drawn[0].temperature, drawn[0].bias[:, i], 1)[0]) * unit
-        for curve in drawn:
-            line = slope * (curve.temperature - triad.reference_temperature_c)
-            value = unit * curve.bias[:, i] - line
-            if triad.posterior is not None:
-                _draw_band(axes, curve, value, BAND_SDS * unit * curve.sd_bias[:, i])
-            axes.plot(curve.temperature, value, label=curve.name, **curve.line)
-        axes.set_title(f'{AXES[i]}: {minus(f"{slope:+.3g}")} mdeg/s/K')
-        axes.axvline(triad.reference_temperature_c, color=GREY, linewidth=0.8)
+        # What is said in m/s^2 of a triad is rad/s of this one.
+        _draw_less_line(axes, triad, drawn, ('bias', i), 'mdeg/s', MICRO_G / MILLIDEGREE)
         if sheet.is_narrow or not i:
             axes.set_ylabel('bias less the line, mdeg/s')
         if i == 2 or not sheet.is_narrow:
             axes.set_xlabel('T board, °C')
     shared_legend(figure, panels[0], 1 if sheet.is_narrow else 3)
     return figure
+
+
+def _draw_less_line(
+    axes: Axes,
+    calibration: Calibration,
+    drawn: list[Curve],
+    part: tuple[str, int],
+    unit: str,
+    factor: float = 1.0,
+) -> float:
+    """Draw the curves of one axis, with bands, less the line of the soak; give its slope."""
+    name, i = part
+    reference = calibration.reference_temperature_c
+    # All curves are 0 in a soak at the reference, and so is the line.
+    soak = factor * getattr(drawn[0], name)[:, i]
+    slope = float(np.polyfit(drawn[0].temperature, soak, 1)[0])
+    widest = 0.0
+    for curve in drawn:
+        value = factor * getattr(curve, name)[:, i] - slope * (curve.temperature - reference)
+        if calibration.posterior is not None:
+            half = BAND_SDS * factor * getattr(curve, f'sd_{name}')[:, i]
+            axes.fill_between(
+                curve.temperature,
+                value - half,
+                value + half,
+                facecolor=curve.line['color'],
+                edgecolor=curve.line['color'],
+                alpha=0.25,
+                hatch=curve.hatch,
+                linewidth=0,
+            )
+            widest = max(widest, float(half.max()))
+        # The ends of the valid range are marked; a range of a few K stays visible so.
+        look: Line = {'marker': curve.marker, 'markersize': 3.5, 'markevery': [0, -1]}
+        axes.plot(curve.temperature, value, label=curve.name, **look, **curve.line)
+    title = f'{AXES[i]}: {minus(f"{slope:+.3g}")} {unit}/K'
+    axes.set_title(f'{title}, ±{number(widest, 2)} {unit}' if widest else title)
+    axes.axvline(reference, color=GREY, linewidth=0.8)
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    return slope
 
 
 @dataclass(frozen=True)
@@ -203,19 +213,6 @@ def curves(calibration: Calibration) -> list[Curve]:
             )
         )
     return found
-
-
-def _draw_band(axes: Axes, curve: Curve, value: Floats, half: Floats) -> None:
-    axes.fill_between(
-        curve.temperature,
-        value - half,
-        value + half,
-        facecolor=curve.line['color'],
-        edgecolor=curve.line['color'],
-        alpha=0.25,
-        hatch=curve.hatch,
-        linewidth=0,
-    )
 
 
 def draw_step(evidence: Evidence, sheet: Sheet) -> Figure:
