@@ -19,6 +19,7 @@ from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.judging import Verdict, judge_bags
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
+from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.recording import Block, ImuColumns
 from thermo_comp.recording.columns import Readings
 from thermo_comp.simulation import arrays, plan, unit_preset
@@ -206,6 +207,17 @@ def test_the_rate_is_corrected_by_hand_numbers():
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
+    # What an INS is told: the same without the noise of a message.
+    sd = take_snapshot(compensator).rate_bias_sd
+    noise = np.square((1e-4, 2e-4, 1e-4)) / 0.01
+    np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)
+
+
+def test_with_a_prior_the_gyroscope_is_the_priors(unit, fitted):
+    record = arrays(unit, plan('tumble', 2)[:1], 5)[0]
+    again = fit([source_of(record, unit.scale_factor)], replace(OPTIONS, prior=fitted.calibration))
+    assert again.calibration.gyroscope == fitted.calibration.gyroscope
+    assert again.gyroscope is None
 
 
 def judged_on(unit, calibration, seed, kind='held-out'):

@@ -250,9 +250,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
             windows, regression, learnt, columns, sets, nominal, bags, facts, residuals, findings
         )
         gyroscope = None
-        if known is not None:
+        if known is not None and known.gyroscope is not None:
             calibration = replace(calibration, gyroscope=known.gyroscope, sensors=sensors)
-        else:
+        elif known is None:
             gyroscope = fit_gyroscope(windows, columns, sets, bags, facts, options.groups)
         if gyroscope is not None:
             needed = {*calibration.sensors, *gyroscope.sensors}

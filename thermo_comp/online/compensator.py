@@ -40,6 +40,8 @@ class Compensator:
         self.thermal = ThermalSide(calibration, self.config, self.counters)
         self._use(calibration)
         self.last_ns = self._event_ns = EVER_NS
+        #: Of the present segment, as `lay_lines` gives it; empty where no rate is corrected.
+        self.rate_line: list[float] = []
 
     def _use(self, calibration: Calibration) -> None:
         self.calibration = calibration
@@ -129,7 +131,7 @@ class Compensator:
         Returns the rate and the variance of each axis [rad^2/s^2]; they have nothing in common.
         """
         dt = (stamp_ns - self._segment[0]) * 1e-9
-        bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = self._rate_line
+        bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = self.rate_line
         return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz
 
     def _count_bad(self, x: float, y: float, z: float) -> None:
@@ -167,7 +169,7 @@ class Compensator:
         slow, excess = thermal.slow_at(start_ns, end), thermal.noise_excess
         line = lay_lines(thermal.correction, start, end, slow[:3], excess)
         if thermal.rate_correction is not None:
-            self._rate_line = lay_lines(thermal.rate_correction, start, end, slow[3:], excess)
+            self.rate_line = lay_lines(thermal.rate_correction, start, end, slow[3:], excess)
         self._segment = (start_ns, line[:12], line[12:], thermal.correction.misalignment)
         if not is_new:
             return self.process(stamp_ns, x, y, z)

@@ -62,5 +62,15 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         is_too_fast=thermal.rate_refuses,
         gravity=compensator.gravity.result,
         is_refuted=compensator.gravity.is_refuted,
+        rate_bias_sd=_rate_bias_sd(compensator),
         pending_ahead_s=ahead_s,
     )
+
+
+def _rate_bias_sd(compensator: Compensator) -> tuple[float, ...] | None:
+    thermal, line = compensator.thermal, compensator.rate_line
+    if thermal.rate_correction is None or not line:
+        return None
+    noises = [(1.0 + thermal.noise_excess) * one for one in thermal.rate_correction.noise]
+    pairs = zip(line[12::3], noises, strict=True)
+    return tuple(math.sqrt(max(0.0, whole - noise)) for whole, noise in pairs)

@@ -141,5 +141,7 @@ class CompensatorStatus:
     gravity: GravityResidual | None = None
     #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
     is_refuted: bool = False
+    #: What is uncertain of the bias of each axis' angular rate [rad/s]; None where none is known.
+    rate_bias_sd: tuple[float, ...] | None = None
     #: How far the stamps of the readings that wait are ahead of the samples' [s].
     pending_ahead_s: float = 0.0

@@ -246,6 +246,11 @@ def _values(loaded: LoadedCalibration, now: Snapshot, before: Snapshot) -> list[
         values.append((f'sd {axis} [m/s^2]', f'{math.sqrt(variance):.3e}'))
         bias_sd = math.sqrt(max(0.0, variance - noise))
         values.append((f'bias sd {axis} [m/s^2]', f'{bias_sd:.3e}'))
+    gyroscope = loaded.calibration.gyroscope
+    for axis, density in zip('xyz', gyroscope.noise_density_rad_s_sqrt_hz if gyroscope else ()):  # noqa: B905
+        values.append((f'noise density of rate {axis} [rad/s/sqrt(Hz)]', f'{density:.3e}'))
+    for axis, bias_sd in zip('xyz', status.rate_bias_sd or ()):  # noqa: B905
+        values.append((f'bias sd of rate {axis} [rad/s]', f'{bias_sd:.3e}'))
     rate = _sample_rate(now, before)
     values += [
         ('sample rate [Hz]', 'unknown' if rate is None else f'{rate:.2f}'),
