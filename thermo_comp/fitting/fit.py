@@ -397,7 +397,7 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale is None and options.input == 'counts':
         full_scale = COUNTS_FULL_SCALE
     if full_scale is None:
-        largest = max(float(np.abs(i.mean).max()) for bag in bags for i in bag.intervals)
+        largest = max(bag.reach for bag in bags)
         full_scale = next(
             (r * STANDARD_GRAVITY for r in _G_RANGES if r * STANDARD_GRAVITY > 1.1 * largest),
             2.0 * largest,

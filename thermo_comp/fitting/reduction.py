@@ -101,6 +101,7 @@ class ReducedBag:
     cycle_s: typical interval between samples
     is_integer: whether all samples were whole numbers
     middle: the word of no force where the words have no sign, else 0
+    reach: how far the readings go, handling included, but for single glitches
     since_s: where the part of the bag that was read begins
     restless: what speaks against rests, where there is none
     """
@@ -119,6 +120,7 @@ class ReducedBag:
     cycle_s: float
     is_integer: bool
     middle: float = 0.0
+    reach: float = 0.0
     since_s: float = 0.0
     restless: str = ''
 
@@ -192,9 +194,17 @@ def reduce_source(
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
         is_integer=found.is_integer,
         middle=found.middle,
+        reach=_reach(found),
         since_s=source.since_s(),
         restless='' if ranges else why_restless(found, still_sd),
     )
+
+
+def _reach(cells: Cells) -> float:
+    if not len(cells.count):
+        return 0.0
+    sizes = np.max(np.abs(cells.mean) + 3.0 * np.sqrt(cells.variance), axis=1)
+    return float(np.quantile(sizes, 0.99))
 
 
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
