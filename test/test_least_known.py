@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from position_helpers import GRAVITY, MG, Rest
+from position_helpers import GRAVITY, Rest
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.coverage import least_known
@@ -19,7 +19,7 @@ FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
 def fitted(rng, ups):
-    rests = [Rest(rng, 60.0, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in ups]
+    rests = [Rest(rng, 60.0, level=tuple(GRAVITY * up)) for up in ups]
     return fit([rest.source(name=f'bag{k}') for k, rest in enumerate(rests)], OPTIONS)
 
 
@@ -35,8 +35,6 @@ def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
     # d|f| = g (xy, xz, yz) . (three angles of 1 mrad); noise and curve of the faces add some.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-3 / 3.0**0.5, rel=0.2)
-    assert f'{least.away_deg:.0f} deg away from every position' in said(result)
-    assert said(result) in ' '.join(result.calibration.provenance.notes)
 
 
 def test_a_side_that_was_never_up_is_named(rng):
@@ -44,6 +42,7 @@ def test_a_side_that_was_never_up_is_named(rng):
     result = fitted(rng, ups[ups[:, 2] > 0.2])
     assert result.least_known.up == (0.0, 0.0, -1.0)
     assert '-z up' in said(result)
+    assert said(result) in ' '.join(result.calibration.provenance.notes)
 
 
 def test_spread_positions_leave_nothing_unseen(rng):
