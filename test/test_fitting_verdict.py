@@ -129,13 +129,11 @@ def test_geometry_is_the_scatter_of_the_parameters(rng: np.random.Generator) -> 
 
 
 def test_refusals_stop_and_may_be_allowed() -> None:
-    refusal = Finding('span', 'refusal', 'temperature span 3.0 degC')
-    with pytest.raises(
-        FitError, match=r'temperature span 3.0 degC \(override with --allow span\)'
-    ):
+    refusal = Finding('swapped', 'refusal', 'the board leads')
+    with pytest.raises(FitError, match=r'the board leads \(override with --allow swapped\)'):
         enforce([refusal], FitOptions(gravity=9.81))
-    (allowed,) = enforce([refusal], FitOptions(gravity=9.81, allow=('span',)))
-    assert (allowed.level, allowed.message) == ('advice', 'allowed: temperature span 3.0 degC')
+    (allowed,) = enforce([refusal], FitOptions(gravity=9.81, allow=('swapped',)))
+    assert (allowed.level, allowed.message) == ('advice', 'allowed: the board leads')
 
 
 def judged(raw: float, fitted: float, slow: float, left_out: float | None = None, **options: str):

@@ -42,7 +42,8 @@ def fit_sources(
         sources.append(replace(source, sha256=digest(path)) if hashed else source)
     if len(kinds) > 1:
         raise FitError(
-            f'{kinds["counts"]} holds counts, {kinds["imu"]} Imu messages: choose one with --input'
+            f'{kinds["counts"]} holds counts, {kinds["imu"]} Imu messages: leave one kind out, or '
+            'choose with --input where a bag has both'
         )
     if serial is None and len(serials) > 1:
         found = ', '.join(f'{path} of {unit}' for unit, path in sorted(serials.items()))

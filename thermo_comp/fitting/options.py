@@ -21,6 +21,8 @@ CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
 GROUPS = (
     'curve', 'set', 'now', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play',
 )  # fmt: skip
+#: What is refused, and may be allowed by its name.
+REFUSALS = ('saturation', 'units', 'jump', 'swapped')
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,9 @@ class FitOptions:
         for group in (*(self.groups or ()), *self.forced):
             if group not in GROUPS:
                 raise ValueError(f'`groups` must be of {", ".join(GROUPS)}, got {group!r}')
+        for name in self.allow:
+            if name not in REFUSALS:
+                raise ValueError(f'`allow` must be of {", ".join(REFUSALS)}, got {name!r}')
         if not self.cell_s <= self.window_s:
             raise ValueError(
                 f'`cell_s` must not exceed `window_s` ({self.window_s}), got {self.cell_s}'

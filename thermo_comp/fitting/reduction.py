@@ -196,7 +196,7 @@ def reduce_source(
         middle=found.middle,
         reach=_reach(found),
         since_s=source.since_s(),
-        restless='' if ranges else why_restless(found, still_sd),
+        restless='' if ranges else _why_restless(found, n_samples, still_sd),
     )
 
 
@@ -205,6 +205,13 @@ def _reach(cells: Cells) -> float:
         return 0.0
     sizes = np.max(np.abs(cells.mean) + 3.0 * np.sqrt(cells.variance), axis=1)
     return float(np.quantile(sizes, 0.99))
+
+
+def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
+    if 2 * cells.n_saturated > n_samples:
+        share = 100.0 * cells.n_saturated / n_samples
+        return f'{share:.0f} % of its samples are at the full scale, see --full-scale'
+    return why_restless(cells, still_sd)
 
 
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:

@@ -110,7 +110,7 @@ def _judge_counts(bags: Sequence[ReducedBag]) -> list[Finding]:
                     'units',
                     'refusal',
                     f'the samples have norm {size:.3g} and are no whole numbers: they look like '
-                    f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2 (--input imu)',
+                    f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2',
                 )
             ]
     if not whole:

@@ -1,0 +1,83 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is refused by name can be allowed by that name, and then there is a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from position_helpers import GRAVITY, MG, Rest
+
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting.options import REFUSALS
+from thermo_comp.simulation import positions
+
+COUNTS, FORCE = FitOptions(gravity=GRAVITY), FitOptions(gravity=GRAVITY, input='m/s^2')
+
+
+def saturated(rest: Rest) -> None:
+    rest.accel = np.rint(rest.accel * 400.0)
+    rest.accel[::7] = 32767.0
+
+
+def jumped(rest: Rest) -> None:
+    rest.add(20.0 * MG * np.array(rest.level) / GRAVITY, from_s=300.0)
+
+
+def as_it_is(rest: Rest) -> None:
+    return None
+
+
+def swapped(source: FitSource, rest: Rest) -> FitSource:
+    """Let the board cool at once and the case through a lag of two minutes."""
+    (block,) = source.blocks()
+    time = (block.board_stamp_ns - block.board_stamp_ns[0]) * 1e-9
+    late = np.empty_like(block.board)
+    late[0] = block.board[0]
+    for i in range(1, len(late)):
+        late[i] = late[i - 1] + (block.board[i] - late[i - 1]) * (time[i] - time[i - 1]) / 120.0
+    block = replace(block, case_stamp_ns=block.board_stamp_ns, case=late)
+    return replace(source, blocks=lambda: [block])
+
+
+@pytest.mark.parametrize(
+    ('name', 'spoil', 'options', 'n'),
+    [
+        ('saturation', saturated, COUNTS, 1),
+        ('saturation', saturated, COUNTS, 7),
+        ('units', as_it_is, COUNTS, 1),
+        ('units', as_it_is, COUNTS, 7),
+        ('jump', jumped, FORCE, 1),
+        ('jump', jumped, FORCE, 7),
+        # Ten minutes are too short to see which one leads.
+        ('swapped', as_it_is, FORCE, 7),
+    ],
+)
+def test_what_is_allowed_goes_on_to_the_end(rng, name, spoil, options, n):
+    assert name in REFUSALS
+    sources = []
+    for number, up in enumerate(positions(n, 3)):
+        rest = Rest(rng, level=tuple(GRAVITY * up))
+        spoil(rest)
+        source = rest.source(name=f'bag{number}')
+        sources.append(swapped(source, rest) if name == 'swapped' else source)
+    with pytest.raises(FitError, match=rf'\(override with --allow {name}\)$'):
+        fit(sources, options)
+    found = fit(sources, replace(options, allow=(name,)))
+    assert any(one.name == name and 'allowed: ' in one.message for one in found.findings)
+    assert f'{name}: allowed' in ' '.join(found.calibration.provenance.notes)
+
+
+def test_what_cannot_be_allowed_is_said():
+    with pytest.raises(ValueError, match=r'`allow` must be of saturation, .* got .span.'):
+        FitOptions(gravity=GRAVITY, allow=('span',))
+
+
+def test_a_bag_at_the_rails_says_so(rng):
+    rest = Rest(rng)
+    rest.accel[:] = -40000.0
+    with pytest.raises(FitError, match='100 % of its samples are at the full scale, see --full'):
+        fit([rest.source()], replace(COUNTS, allow=('saturation',)))
