@@ -22,7 +22,7 @@ from .schema import Positive, SchemaError, build, naming
 
 Regime = Literal['static', 'dynamic']
 REGIMES: tuple[Regime, Regime] = ('static', 'dynamic')
-_NEW_KEYS = ('sensors', 'response', 'posterior', 'evidence', 'slow_noise_m_s2_sqrt_h')
+_NEW_KEYS = ('sensors', 'response', 'posterior', 'evidence', 'slow_noise_m_s2_sqrt_h', 'gyroscope')
 _Part = TypeVar('_Part')
 
 
