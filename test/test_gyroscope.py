@@ -124,7 +124,14 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     sources = [
         source_of(o, unit.scale_factor, rate) for o, rate in zip(records, broken, strict=True)
     ]
-    assert fit(sources, OPTIONS).calibration.gyroscope is None
+    result = fit(sources, OPTIONS)
+    assert result.calibration.gyroscope is None
+    (said,) = (one.message for one in result.findings if one.name == 'rate')
+    assert (
+        said
+        == f'{records[0].name}: not every sample has an angular rate, so no gyroscope was fitted'
+    )
+    assert 'rate' not in {one.name for one in (*with_rate.findings, *without.findings)}
 
 
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=30), st.integers(0, 2**32 - 1))

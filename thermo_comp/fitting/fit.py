@@ -21,7 +21,7 @@ from .attitudes import distinct_directions
 from .coverage import LeastKnown, least_known
 from .curves import sets_of
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
-from .gyroscope import GyroscopeFit, fit_gyroscope
+from .gyroscope import GyroscopeFit, add_gyroscope, judge_rates
 from .learning import Learnt, learn
 from .offset import about, centred, find_offset, with_notes
 from .options import COUNTS_FULL_SCALE, FitOptions
@@ -69,8 +69,7 @@ class FitResult:
     positions: the still intervals
     findings: what the data lacked, or not
     least_known: the attitude that the positions left unseen most
-    windows: the windows of the regression
-    bags: the reduced bags
+    windows, bags: the windows of the regression; the reduced bags
     gyroscope: that of the angular rate; None where the bags have none, or there is a prior
     """
 
@@ -168,7 +167,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     """Fit a calibration to bags in which no force is about zero."""
     _check_temperatures(bags)
     findings = list(enforce(judge_bags(bags, options), options))
-    findings += enforce(judge_rests(bags, options), options)
+    findings += enforce(judge_rests(bags, options), options) + tuple(judge_rates(bags))
     known = options.prior
     detector = options.detector or (known.detector if known else learn_detector(bags))
     tell('temperatures', 0.55)
@@ -249,18 +248,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         calibration = build_calibration(
             windows, regression, learnt, columns, sets, nominal, bags, facts, residuals, findings
         )
-        gyroscope = None
-        if known is not None and known.gyroscope is not None:
-            calibration = replace(calibration, gyroscope=known.gyroscope, sensors=sensors)
-        elif known is None:
-            gyroscope = fit_gyroscope(windows, columns, sets, bags, facts, options.groups)
-        if gyroscope is not None:
-            needed = {*calibration.sensors, *gyroscope.sensors}
-            calibration = replace(
-                calibration,
-                gyroscope=gyroscope.gyroscope,
-                sensors=tuple(name for name in sensors if name in needed),
-            )
+        calibration, gyroscope = add_gyroscope(
+            calibration, windows, columns, sets, bags, facts, options
+        )
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     least = least_known(calibration, learnt.posterior.state.up)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..typing import Floats, Ints
+from ..unit.calibration import Calibration
 from ..unit.columns import Column
 from ..unit.gravity import EARTH_RATE
 from ..unit.gyroscope import Gyroscope
@@ -25,10 +26,12 @@ from ..unit.metrics import ResidualStatistics, statistics_by_regime
 from ..unit.rate_triad import gyroscope_of
 from .assembly import UnitFacts, build_calibration
 from .learning import Learnt, learn
+from .options import FitOptions
 from .posterior import Regression
 from .reduction import ReducedBag
 from .start import position_means
 from .unknowns import Prior, initial_state
+from .verdict import Finding
 from .windows import CURVE, Sets, ThermalWindows
 
 # What it is on one axis, of an attitude that nobody knows.
@@ -63,6 +66,29 @@ class GyroscopeFit:
     sensors: tuple[str, ...]
     learnt: Learnt
     residuals: tuple[RateRow, ...]
+
+
+def add_gyroscope(
+    calibration: Calibration,
+    windows: ThermalWindows,
+    columns: Sequence[Column],
+    sets: Sets,
+    bags: Sequence[ReducedBag],
+    facts: UnitFacts,
+    options: FitOptions,
+) -> tuple[Calibration, GyroscopeFit | None]:
+    """Give a calibration the gyroscope of its prior or, without one, of the bags."""
+    known = options.prior
+    if known is not None:
+        if known.gyroscope is None:
+            return calibration, None
+        return replace(calibration, gyroscope=known.gyroscope, sensors=facts.sensors), None
+    found = fit_gyroscope(windows, columns, sets, bags, facts, options.groups)
+    if found is None:
+        return calibration, None
+    needed = {*calibration.sensors, *found.sensors}
+    sensors = tuple(name for name in facts.sensors if name in needed)
+    return replace(calibration, gyroscope=found.gyroscope, sensors=sensors), found
 
 
 def fit_gyroscope(
@@ -108,6 +134,15 @@ def fit_gyroscope(
     told = replace(learnt, prior=replace(learnt.prior, offset_sd=turn_on))
     triad = build_calibration(windows, regression, told, columns, sets, one, bags, facts)
     return GyroscopeFit(gyroscope_of(triad), triad.sensors, learnt, residuals)
+
+
+def judge_rates(bags: Sequence[ReducedBag]) -> list[Finding]:
+    """Say which bags keep the others from giving a gyroscope."""
+    if all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
+        return []
+    names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
+    text = f'{names}: not every sample has an angular rate, so no gyroscope was fitted'
+    return [Finding('rate', 'advice', text)]
 
 
 def _rows(windows: ThermalWindows, regression: Regression, learnt: Learnt) -> tuple[RateRow, ...]:

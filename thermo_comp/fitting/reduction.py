@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -104,6 +105,7 @@ class ReducedBag:
     reach: how far the readings go, handling included, but for single glitches
     since_s: where the part of the bag that was read begins
     restless: what speaks against rests, where there is none
+    angular_rate: how much of the bag has one, of finite numbers
     """
 
     source: FitSource
@@ -123,6 +125,7 @@ class ReducedBag:
     reach: float = 0.0
     since_s: float = 0.0
     restless: str = ''
+    angular_rate: Literal['none', 'part', 'whole'] = 'none'
 
     @property
     def board(self) -> Readings:
@@ -197,6 +200,7 @@ def reduce_source(
         reach=_reach(found),
         since_s=source.since_s(),
         restless='' if ranges else _why_restless(found, n_samples, still_sd),
+        angular_rate='whole' if has_rate else 'part' if found.rate.any() else 'none',
     )
 
 
