@@ -35,7 +35,7 @@ from thermo_comp.simulation import (
     plan,
     unit_preset,
 )
-from thermo_comp.typing import Floats, Ints
+from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import Calibration, parameter_layout
 
 WINDOW_S = 60.0
@@ -76,30 +76,13 @@ PLAN_GOALS = {
 }
 
 
-@dataclass(frozen=True)
-class Block(ArrayBlock):
-    """A record as the recording layer would hand it over."""
-
-    @property
-    def temperatures(self) -> dict[str, tuple[Ints, Floats, Ints]]:
-        """Readings by the name of their thermometer, with the samples that came before."""
-        readings = {
-            'board': (self.board_stamp_ns, self.board),
-            'case': (self.case_stamp_ns, self.case),
-        }
-        return {
-            name: (stamps, value, np.searchsorted(self.accel_stamp_ns, stamps))
-            for name, (stamps, value) in readings.items()
-        }
-
-
-def block(record: Record) -> Block:
+def block(record: Record) -> ArrayBlock:
     """Return one record as a block."""
     accel, board, case = (
         np.rint(1e9 * time_s).astype(np.int64)
         for time_s in (record.time_s, record.board_time_s, record.case_time_s)
     )
-    return Block(accel, record.counts, board, record.board, case, record.case)
+    return ArrayBlock(accel, record.counts, board, record.board, case, record.case)
 
 
 @dataclass(frozen=True)

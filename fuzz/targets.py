@@ -22,13 +22,15 @@ import zstandard
 
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording import open_mcap
+from thermo_comp.recording import open_recording
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 MAGIC = b'\x89MCAP0\r\n'
+#: Where the bytes that may be a bag are put.
+BAG = Path(files.FOLDER.name, 'any.mcap')
 
 
 @dataclass(frozen=True)
@@ -98,26 +100,12 @@ noise_density_m_s2_sqrt_hz: [1, 1, 1]
 """.encode()
 
 
-class MemoryFile:
-    """A file that is nowhere."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self.size = len(data)
-
-    def read_at(self, at: int, n_bytes: int) -> bytes:
-        """Read as `pread` does."""
-        return self._data[at : at + n_bytes]
-
-    def close(self) -> None:
-        """Forget nothing."""
-
-
 def check_mcap(data: bytes) -> None:
     """Any bytes are a bag, or one clear line; no more comes out than can have been in it."""
     with suppress(RecordingError):
         try:
-            with open_mcap([Path('fuzz.mcap')], lambda _: MemoryFile(data), require=()) as reader:
+            BAG.write_bytes(data)
+            with open_recording(BAG, require=()) as reader:
                 n = sum(block.n_messages for block in reader.blocks())
                 # A message is 22 bytes at least, and zstd makes at most 30 kB of a byte.
                 assert n <= 1000 * len(data), n

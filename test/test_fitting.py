@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,24 +40,9 @@ def stamps(seconds: Floats) -> np.ndarray:
     return np.rint(1e9 * np.asarray(seconds)).astype(np.int64)
 
 
-@dataclass(frozen=True)
-class CausalBlock(ArrayBlock):
-    """A block that also says when each reading arrived among the samples."""
-
-    @property
-    def temperatures(self) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        return {
-            name: (at, value, np.searchsorted(self.accel_stamp_ns, at))
-            for name, at, value in (
-                ('board', self.board_stamp_ns, self.board),
-                ('case', self.case_stamp_ns, self.case),
-            )
-        }
-
-
-def block_of(record: Record, has_temperature: bool = True) -> CausalBlock:
+def block_of(record: Record, has_temperature: bool = True) -> ArrayBlock:
     n = None if has_temperature else 0
-    return CausalBlock(
+    return ArrayBlock(
         stamps(record.time_s), record.counts,
         stamps(record.board_time_s)[:n], record.board[:n],
         stamps(record.case_time_s)[:n], record.case[:n],

@@ -9,7 +9,7 @@ from .fit import FitResult, fit, fit_bags, reduce_bag
 from .gravity import normal_gravity, resolve_gravity
 from .options import FitOptions
 from .reduction import ReducedBag
-from .sources import ArrayBlock, FitSource, SourceBlock
+from .sources import ArrayBlock, FitSource
 from .verdict import Finding
 
 __all__ = [
@@ -21,7 +21,6 @@ __all__ = [
     'PositionReport',
     'ReducedBag',
     'ResidualRow',
-    'SourceBlock',
     'fit',
     'fit_bags',
     'normal_gravity',

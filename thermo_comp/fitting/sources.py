@@ -3,33 +3,18 @@
 """
 Owns what the fit reads: blocks of accelerometer samples and temperature readings, by source.
 
-The fit lives below the recording layer, so it says here what it needs and lets bags, tables and
-simulated runs provide it.
+Bags, tables and simulated runs provide the same blocks as to the compensator.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
 
+import numpy as np
+
+from ..online.blocks import AccelBlock, Readings
 from ..typing import Floats, Ints
-
-
-class SourceBlock(Protocol):
-    """A run of messages; `recording.Block` is one."""
-
-    @property
-    def accel_stamp_ns(self) -> Ints:
-        """Stamps of the samples, shape (n,)."""
-
-    @property
-    def accel(self) -> Floats:
-        """Counts, or m/s^2, shape (n, 3)."""
-
-    @property
-    def temperatures(self) -> Mapping[str, tuple[Ints, Floats, Any]]:
-        """Stamps and readings by the name of their thermometer."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +38,16 @@ class ArrayBlock:
     others: Mapping[str, tuple[Ints, Floats]] = field(default_factory=dict)
 
     @property
-    def temperatures(self) -> Mapping[str, tuple[Ints, Floats, Any]]:
-        """Stamps and readings by the name of their thermometer."""
+    def temperatures(self) -> Mapping[str, Readings]:
+        """Stamps, readings and how many samples came before, by the name of the thermometer."""
+        own = {
+            'board': (self.board_stamp_ns, self.board),
+            'case': (self.case_stamp_ns, self.case),
+            **self.others,
+        }
         return {
-            'board': (self.board_stamp_ns, self.board, None),
-            'case': (self.case_stamp_ns, self.case, None),
-            **{name: (stamps, value, None) for name, (stamps, value) in self.others.items()},
+            name: (stamp_ns, celsius, np.searchsorted(self.accel_stamp_ns, stamp_ns))
+            for name, (stamp_ns, celsius) in own.items()
         }
 
 
@@ -95,7 +84,7 @@ class FitSource:
     """
 
     name: str
-    blocks: Callable[[], Iterable[SourceBlock]]
+    blocks: Callable[[], Iterable[AccelBlock]]
     sha256: str | None = None
     serial: str | None = None
     chosen: str | None = None

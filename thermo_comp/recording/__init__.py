@@ -9,12 +9,10 @@ The only package that knows `rosbags` and `mcap`.
 from __future__ import annotations
 
 from .columns import ROLES, Block, ImuColumns, Input, RawMessages, Recording, RecordingInfo, Role
-from .random_access import LocalFile, OpenFile, RandomAccess
 from .reader import (
     RecordingReader,
     in_split_order,
     inspect_recording,
-    open_mcap,
     open_recording,
     read_recording,
 )
@@ -28,10 +26,7 @@ __all__ = [
     'Block',
     'ImuColumns',
     'Input',
-    'LocalFile',
-    'OpenFile',
     'Part',
-    'RandomAccess',
     'RawMessages',
     'Recording',
     'RecordingInfo',
@@ -40,7 +35,6 @@ __all__ = [
     'Topics',
     'in_split_order',
     'inspect_recording',
-    'open_mcap',
     'open_recording',
     'read_recording',
 ]

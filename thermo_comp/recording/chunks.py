@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ..typing import Bytes, Ints
-from .random_access import RandomAccess
+from .random_access import LocalFile
 from .unpack import MAX_CHUNK_BYTES, DamagedError, unpack, unpack_beginning
 from .wire import field, gather, scatter
 
@@ -154,7 +154,7 @@ def parse_chunk_head(head: bytes, position: int) -> ChunkHead:
     return ChunkHead(span, compression, data_at, checksum)
 
 
-def load(handle: RandomAccess, span: Span, on_record: OnRecord) -> Messages:
+def load(handle: LocalFile, span: Span, on_record: OnRecord) -> Messages:
     """Read a stretch of the file and find its messages, in the order of their places."""
     try:
         if span.kind == 'loose':
@@ -168,7 +168,7 @@ def load(handle: RandomAccess, span: Span, on_record: OnRecord) -> Messages:
         raise DamagedError(f'{place} byte {span.position}: {error}') from error
 
 
-def _load_chunk(handle: RandomAccess, span: Span, on_record: OnRecord) -> Messages:
+def _load_chunk(handle: LocalFile, span: Span, on_record: OnRecord) -> Messages:
     n_bytes = span.length + span.index_length
     if max(span.size, n_bytes) > MAX_CHUNK_BYTES:
         raise DamagedError(
@@ -189,7 +189,7 @@ def _load_chunk(handle: RandomAccess, span: Span, on_record: OnRecord) -> Messag
     return messages
 
 
-def _load_torn(handle: RandomAccess, span: Span, on_record: OnRecord) -> Messages:
+def _load_torn(handle: LocalFile, span: Span, on_record: OnRecord) -> Messages:
     record = handle.read_at(span.position, min(span.length, MAX_CHUNK_BYTES))
     head = parse_chunk_head(record[:HEAD_BYTES], span.position)
     packed = np.frombuffer(record, np.uint8)[head.data_at :]

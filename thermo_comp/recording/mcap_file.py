@@ -36,7 +36,7 @@ from .chunks import (
     parse_chunk_head,
     walk,
 )
-from .random_access import LocalFile, OpenFile, RandomAccess
+from .random_access import LocalFile
 from .unpack import MAX_CHUNK_BYTES, DamagedError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -69,7 +69,7 @@ class McapFile:
     missing. Raises RecordingError for what is no MCAP file, or damaged other than at its end.
     """
 
-    def __init__(self, path: Path, open_file: OpenFile = LocalFile) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.spans: list[Span] = []
         self.topics: dict[int, Topic] = {}
@@ -82,7 +82,7 @@ class McapFile:
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
         try:
-            self.handle: RandomAccess = open_file(path)
+            self.handle = LocalFile(path)
         except OSError as error:
             raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
         try:

@@ -25,7 +25,6 @@ from .chunks import Messages, Span, join_messages, load, pack
 from .columns import Block, RawMessages, RecordingInfo, Role, count_topics
 from .decode import Decoder, Feed
 from .mcap_file import McapFile, translated
-from .random_access import LocalFile, OpenFile
 from .topics import shown
 from .unpack import DamagedError
 from .wire import Encoding
@@ -54,14 +53,13 @@ class McapSource:
         files: Sequence[Path],
         metadata: Mapping[str, str] | None = None,
         note: str | None = None,
-        open_file: OpenFile = LocalFile,
     ) -> None:
         self._is_closed = False
         self._pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
         self._files: list[McapFile] = []
         try:
             for path in files:
-                self._files.append(McapFile(path, open_file))
+                self._files.append(McapFile(path))
         except BaseException:
             self.close()
             raise

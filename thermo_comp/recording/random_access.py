@@ -2,35 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the way to the bytes of a file: so many from such a place, from any thread.
-
-A file on this machine is one kind; whoever keeps bags elsewhere brings another.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 from ..files import open_regular
-
-
-class RandomAccess(Protocol):
-    """An open file of `size` bytes that is read at places, by several threads at once."""
-
-    size: int
-
-    def read_at(self, at: int, n_bytes: int) -> bytes:
-        """Read up to so many bytes, fewer only where the file ends; OSError where it cannot."""
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
-
-
-OpenFile = Callable[[Path], RandomAccess]
 
 
 class LocalFile:
@@ -41,7 +20,7 @@ class LocalFile:
         self.size = os.fstat(self._file.fileno()).st_size
 
     def read_at(self, at: int, n_bytes: int) -> bytes:
-        """Read up to so many bytes."""
+        """Read up to so many bytes, fewer only where the file ends."""
         return os.pread(self._file.fileno(), n_bytes, at)
 
     def close(self) -> None:

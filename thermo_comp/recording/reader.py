@@ -34,7 +34,6 @@ from .expanded import ExpandedSource
 from .foreign import ForeignSource
 from .mcap_source import McapSource
 from .part import Cut
-from .random_access import OpenFile
 from .rosbag2_metadata import Description, read_metadata
 from .topics import Topics, select_topics, shown
 
@@ -171,33 +170,6 @@ def open_recording(
         source = _open_source(path)
     except OSError as error:
         raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
-    return _reader(path, source, topics, input, require)
-
-
-def open_mcap(
-    files: Sequence[Path],
-    open_file: OpenFile,
-    topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
-    *,
-    require: Collection[Role] = ROLES,
-) -> RecordingReader:
-    """
-    Open the MCAP files of one bag, in their order, that lie where only the caller can read.
-
-    `open_file` opens one of them for reading at places, `OSError` where it cannot; the others and
-    the errors are those of `open_recording`. The reader's path is that of the first file.
-    """
-    return _reader(files[0], McapSource(files, open_file=open_file), topics, input, require)
-
-
-def _reader(
-    path: Path,
-    source: Source,
-    topics: Topics | None,
-    input: Input,  # noqa: A002
-    require: Collection[Role],
-) -> RecordingReader:
     try:
         return RecordingReader(path, source, topics or Topics(), input, require)
     except BaseException:
