@@ -56,10 +56,7 @@ _NATIVE = Struct('<25Q')
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """
-    Where a sample of one kind has its values (what of an Imu is passed on, from `passed`; 0 for
-    none).
-    """
+    """Where a sample of one kind has its values; what of an Imu is passed on, from `passed`."""
 
     unpack: Callable[[bytes], tuple[Any, ...]]
     encapsulation: bytes
@@ -112,9 +109,7 @@ _UNKNOWN = _Layout(_NOTHING.unpack, b'', b'', _NOTHING.pack, b'', 0, False)
 
 
 class SampleConverter:
-    """
-    Turns serialized samples into serialized Imu; an empty `frame_id` keeps that of the input.
-    """
+    """Turns samples into Imu, both serialized; an empty `frame_id` keeps the input's."""
 
     def __init__(
         self, message_type: Any, frame_id: str = '', traffic: Traffic | None = None

@@ -46,9 +46,7 @@ Finding = tuple[int, str]
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """
-    A topic that the node reads, remapped, with those it hears, and why it does not hear another.
-    """
+    """An input, remapped, with those it hears, and why it does not hear another."""
 
     name: str
     topic: str

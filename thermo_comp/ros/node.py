@@ -100,9 +100,7 @@ def _opening() -> Iterator[None]:
 
 
 class CompensationNode:
-    """
-    The node around a `Compensator`; ThermoCompError if a parameter or the file can't be used.
-    """
+    """The node around a `Compensator`; ThermoCompError if it cannot start."""
 
     def __init__(self, context: Context | None = None) -> None:
         self.node = rclpy.create_node(NODE_NAME, context=context)

@@ -38,10 +38,7 @@ def _parameter(
 
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
-    """
-    The node's parameters, all of them live but `calibration_directory`; descriptions have the
-    units.
-    """
+    """The parameters, all live but `calibration_directory`; descriptions have the units."""
 
     calibration_file: str = _parameter(
         '',

@@ -66,9 +66,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
 
 
 def load(config: NodeConfig) -> LoadedCalibration:
-    """
-    Read the calibration that a configuration asks for; CalibrationError where it can't be used.
-    """
+    """Read the calibration that is configured; CalibrationError where it cannot be used."""
     if not config.calibration_file:
         raise CalibrationError(
             'parameter `calibration_file` is not set; start with '

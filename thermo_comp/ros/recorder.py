@@ -92,9 +92,7 @@ class Recorder:
             return dict(self._counts)
 
     def newest(self, name: str) -> Any | None:
-        """
-        Return the newest message of a topic, recorded or waiting for a stamp; None before any.
-        """
+        """Return the newest message of a topic, be it recorded or not; None before any."""
         data = self._newest.get(name)
         return None if data is None else deserialize_message(data, self._topics[name])
 

@@ -42,9 +42,7 @@ _Reading = tuple[int, int, float, Push]
 
 
 class Relay:
-    """
-    What stands between inputs and outputs; each thermometer comes with who takes its readings.
-    """
+    """What stands between inputs and outputs; each thermometer comes with who takes it."""
 
     def __init__(
         self,

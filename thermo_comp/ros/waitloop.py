@@ -61,9 +61,7 @@ Serve = Callable[[Any, Callable[[Any], None]], None]
 
 @dataclass(frozen=True, slots=True)
 class _Entities:
-    """
-    A wait set and its content: the loop's own services are the first ones.
-    """
+    """A wait set and its content: the loop's own services are the first ones."""
 
     wait_set: Any
     content: list[tuple[Callable[[Any], Any], Any]]
@@ -123,10 +121,7 @@ class WaitLoop:
     def subscribe(
         self, message_type: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
     ) -> RawSubscription:
-        """
-        Subscribe in serialized form; each message of a hot one wakes the loop, others wait a
-        little.
-        """
+        """Subscribe in serialized form; a hot one wakes the loop, others wait a little."""
         subscription = self._node.create_subscription(
             message_type,
             topic,
@@ -164,9 +159,7 @@ class WaitLoop:
             self._look_guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """
-        Call back every so often [s], instead of the last one; a timer of rclpy costs ten times it.
-        """
+        """Call back every so often [s], in place of the last one; a timer costs ten times it."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback
@@ -178,9 +171,7 @@ class WaitLoop:
             self._stop_guard.trigger()
 
     def run(self, on_data: Callable[[], None]) -> None:
-        """
-        Serve until the end; `on_data` is called after a wake-up and drains all subscriptions.
-        """
+        """Serve until the end; `on_data` is called when woken and drains all subscriptions."""
         try:
             while not self._is_stopping:
                 with ExitStack() as in_use:
