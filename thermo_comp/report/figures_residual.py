@@ -38,7 +38,6 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
     height = 1.25 if sheet.is_narrow else 1.05
     figure = new_figure(sheet, 0.5 + height * len(residuals))
     panels = np.atleast_1d(figure.subplots(len(residuals), sharex=True))
-    shared = _shared_limit([r[rows] for rung, r in residuals.items() if rung != RAW])
     for axes, (rung, residual) in zip(panels, residuals.items(), strict=True):
         shade_dynamic(axes, shown, unit)
         for i, axis in enumerate('xyz'):
@@ -47,10 +46,9 @@ def draw_residuals(evidence: Evidence, sheet: Sheet) -> Figure:
         axes.set_ylabel('µg')
         axes.axhline(0.0, color='black', linewidth=0.5)
         few_ticks(axes, 5)
-        if rung != RAW and shared:
-            axes.set_ylim(-shared, shared)
-        text = _rms_text(residual[rows], windows.is_dynamic[rows])
-        title = f'{rung}: {text}'
+        if rung != RAW:
+            _symmetric(axes, residual[rows])
+        title = f'{rung}: {_rms_text(residual[rows], windows.is_dynamic[rows])}'
         if axes is panels[0]:
             legend_above(axes, sheet, title=title, alignment='left')
         else:
@@ -67,9 +65,8 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
     windows, gravity = given(evidence.windows), given(evidence.gravity)
     residuals = evidence.residuals
     rows = windows.bag == shown.index
-    rungs = list(residuals)
-    corrected = [rung for rung in rungs if rung != RAW]
-    sets = [rungs, corrected] if corrected else [rungs]
+    corrected = [rung for rung in residuals if rung != RAW]
+    sets = [list(residuals), *([corrected] if corrected else [])]
     figure = new_figure(sheet, 0.4 + (2.1 if sheet.is_narrow else 1.6) * len(sets))
     panels = np.atleast_1d(figure.subplots(len(sets), sharex=True))
     for axes, drawn in zip(panels, sets, strict=True):
@@ -81,9 +78,8 @@ def draw_gravity(evidence: Evidence, sheet: Sheet) -> Figure:
         axes.set_ylabel('|f| − g, µg')
         _absolute_scale(axes, gravity)
         legend_above(axes, sheet)
-    if corrected:
-        limit = _shared_limit([residuals[rung][rows][:, None] for rung in corrected])
-        panels[-1].set_ylim(-limit, limit)
+    for rung in corrected:
+        _symmetric(panels[-1], residuals[rung][rows])
     time_axis(panels[-1], facts)
     return figure
 
@@ -131,9 +127,11 @@ def _draw_signed(axes: Axes, values: Floats, line: Line) -> None:
     few_ticks(axes, 4)
 
 
-def _shared_limit(residuals: list[Floats]) -> float:
-    largest = [float(np.quantile(np.abs(r), 0.998)) for r in residuals if r.size]
-    return 1.15 * max(largest, default=0.0) / MICRO_G
+def _symmetric(axes: Axes, residual: Floats) -> None:
+    """Put zero into the middle of a panel; single spikes may leave it."""
+    limit = 1.15 * float(np.quantile(np.abs(residual), 0.998)) / MICRO_G
+    if limit > 0.0:
+        axes.set_ylim(-limit, limit)
 
 
 def _rms_text(residual: Floats, is_dynamic: Bools) -> str:
