@@ -269,6 +269,16 @@ class TestColumnMap:
         ('changes', 'key', 'message'),
         [
             ({'gravity': 9.8}, 'gravity', 'unknown key'),
+            (
+                {'further': [{'name': 'case', 'column': 'c'}]},
+                'further[0].name',
+                'serve in a topic',
+            ),
+            (
+                {'further': [{'name': 'a', 'column': column} for column in 'bc']},
+                None,
+                'two thermometers of one',
+            ),
             ({'stamp': {'column': 't'}}, 'stamp.unit', 'ns where there is a column'),
             ({'stamp': {}}, 'stamp', 'give either `column` and `unit`, or `rate_hz`'),
             ({'stamp': {'column': 't', 'unit': 's', 'rate_hz': 1.0}}, 'stamp', 'give either'),
@@ -395,6 +405,11 @@ class TestFreezer:
         assert len(block) == 24514
         assert block.temperatures['case'].celsius.min() == pytest.approx(-17.8, abs=0.1)
         assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
+        # Three thermometers in three places.
+        assert block.temperatures['barometer'].celsius.min() == pytest.approx(-17.0, abs=0.1)
+        assert report.further_messages == {
+            'barometer': len(block.temperatures['barometer'].celsius)
+        }
         # The air sensor holds its value between readings of its own: fewer messages than rows.
         assert report.case_messages < 0.75 * report.rows
 

@@ -27,7 +27,7 @@ from thermo_comp.thermal.state import Layout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import Calibration, parameter_layout
-from thermo_comp.unit.columns import ColumnTable, bank, memory_of
+from thermo_comp.unit.columns import Column, ColumnTable, bank, memory_of
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
 
@@ -54,9 +54,9 @@ def bags() -> list[ReducedBag]:
     return [reduce_bag(source, k, OPTIONS) for k, source in enumerate(sources(2))]
 
 
-def windows_of(bags: list[ReducedBag]) -> ThermalWindows:
+def windows_of(bags: list[ReducedBag], columns: tuple[Column, ...] = bank()) -> ThermalWindows:
     return thermal_windows(
-        bags, bank(), sets_of(OPTIONS, bags), DetectorSettings(), ThermalConfig(), 20.0, 60.0
+        bags, columns, sets_of(OPTIONS, bags), DetectorSettings(), ThermalConfig(), 20.0, 60.0
     )
 
 
@@ -142,6 +142,15 @@ def test_sets_and_start_states_by_hand(bags: list[ReducedBag]) -> None:
         if column.kind in ('board', 'neighbour') and column.power == 0:
             np.testing.assert_allclose(data.start[:, k], fades, atol=0.15)
         assert np.abs(data.start[-1, k]) <= np.abs(data.start[:, k]).max()
+
+
+def test_each_column_stands_without_the_others(bags: list[ReducedBag]) -> None:
+    together = windows_of(bags).data
+    for kind in ('board', 'neighbour', 'square'):
+        number = next(k for k, one in enumerate(bank()) if one.kind == kind and one.tau_s == 960.0)
+        alone = windows_of(bags, (bank()[number],)).data
+        np.testing.assert_array_equal(alone.columns[:, 6], together.columns[:, 6 + number])
+        np.testing.assert_array_equal(alone.start[:, 6], together.start[:, 6 + number])
 
 
 def test_the_lag_of_a_column_moves_it_as_its_start_says(bags: list[ReducedBag]) -> None:

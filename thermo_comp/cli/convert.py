@@ -178,6 +178,8 @@ def say(out: Output, report: ConversionReport) -> None:
     out.line(f'  {report.accel_messages:8} {topic}')
     out.line(f'  {report.board_messages:8} temperature/board')
     out.line(f'  {report.case_messages:8} temperature/case')
+    for name, count in report.further_messages.items():
+        out.line(f'  {count:8} temperature/{name}')
     out.line(f'unit: {report.unit}; {report.believed}')
     if report.rate_hz < SLOW_HZ:
         out.line(

@@ -8,7 +8,7 @@ A map is a small YAML file beside the log; config/columns/ has examples.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import load_plain_yaml
+from ..recording.topics import is_thermometer
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
@@ -138,6 +139,20 @@ class Thermometer:
 
 
 @dataclass(frozen=True)
+class Further(Thermometer):
+    """A thermometer beside board and case; its topic is ``temperature/<name>``."""
+
+    name: Annotated[str, Bounds(shortest=1)] = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not is_thermometer(self.name):
+            raise ValueError(
+                f'`name` must serve in a topic, as temperature/magnet, got {self.name!r}'
+            )
+
+
+@dataclass(frozen=True)
 class ColumnMap:
     """The whole map."""
 
@@ -145,12 +160,15 @@ class ColumnMap:
     accel: Accel
     board: Thermometer | None = None
     case: Thermometer | None = None
+    further: tuple[Further, ...] = ()
     gyro: Gyro | None = None
     format: Format = Format()
     frame_id: str = 'imu_link'
     serial: Annotated[str, Bounds(shortest=1)] | None = None
 
     def __post_init__(self) -> None:
+        if len({one.name for one in self.further}) < len(self.further):
+            raise ValueError('`further` has two thermometers of one name')
         if self.gyro is not None and self.accel.output == 'counts':
             raise ValueError('a gyro travels in an Imu message: accel output must be imu')
 
@@ -209,6 +227,7 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
         gyro=gyro,
         board=_readings(table, stamp_ns, columns.board),
         case=_readings(table, stamp_ns, columns.case),
+        further={one.name: _readings(table, stamp_ns, one) for one in columns.further},
         line=table.line,
         counts_per_g=columns.accel.counts_per_g,
         clip=clip and (clip[0] - columns.accel.offset, clip[1] - columns.accel.offset),
@@ -223,7 +242,7 @@ def _wanted(columns: ColumnMap) -> list[Column]:
     wanted = list(columns.accel.columns)
     if columns.gyro is not None:
         wanted += columns.gyro.columns
-    wanted += [t.column for t in (columns.board, columns.case) if t is not None]
+    wanted += [t.column for t in (columns.board, columns.case, *columns.further) if t]
     return list(dict.fromkeys(wanted))
 
 

@@ -8,7 +8,7 @@ A reader of a format makes a `ForeignLog`; `write_log` does the rest, the same f
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -61,6 +61,7 @@ class ForeignLog:
     n_short: rows that were left out because they are too short
     missing: what of the log could not be read
     hint: how its recorder would have logged more
+    further: thermometers beside board and case, by name
     """
 
     path: str
@@ -81,6 +82,7 @@ class ForeignLog:
     metadata: dict[str, str] = field(default_factory=dict)
     missing: str | None = None
     hint: str = ''
+    further: Mapping[str, Readings] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,7 @@ class ConversionReport:
     accel_messages: int
     board_messages: int
     case_messages: int
+    further_messages: Mapping[str, int]
     input: str
     rate_hz: float
     duration_s: float
@@ -168,7 +171,12 @@ def write_log(
             valid_serial(log.serial)
         except ValueError as mistake:
             raise RecordingError(str(mistake), path=log.path) from mistake
-    log = replace(log, board=_stampable(log.board), case=_stampable(log.case))
+    log = replace(
+        log,
+        board=_stampable(log.board),
+        case=_stampable(log.case),
+        further={name: _stampable(readings) for name, readings in log.further.items()},
+    )
     holds_numbers = _usable(log)
     usable = holds_numbers & _is_in_range(log.stamp_ns)
     if holds_numbers.any() and not usable.any():
@@ -199,6 +207,7 @@ def write_log(
         accel_messages=len(stamp_ns),
         board_messages=len(log.board.stamp_ns),
         case_messages=len(log.case.stamp_ns),
+        further_messages={name: len(one.stamp_ns) for name, one in log.further.items()},
         input=log.input,
         rate_hz=1e9 / float(np.median(steps)) if len(steps) else float('nan'),
         duration_s=float(newest[-1] - stamp_ns[0]) * 1e-9,
@@ -247,7 +256,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
             f'the accelerometer is stated in {log.unit}, but {reason}', path=log.path
         )
     low, high = _PLAUSIBLE_CELSIUS
-    for name, readings in (('board', log.board), ('case', log.case)):
+    for name, readings in (('board', log.board), ('case', log.case), *log.further.items()):
         if not len(readings.celsius):
             continue
         typical = float(np.nanmedian(readings.celsius))
@@ -275,7 +284,11 @@ def _write(
     gyro = None if log.gyro is None else log.gyro[usable]
     waiting = [
         (topic, readings, np.maximum.accumulate(readings.stamp_ns))
-        for topic, readings in ((topics.board, log.board), (topics.case, log.case))
+        for topic, readings in (
+            (topics.board, log.board),
+            (topics.case, log.case),
+            *((f'temperature/{name}', readings) for name, readings in log.further.items()),
+        )
         if len(readings.celsius)
     ]
     with BagWriter(output, metadata=log.metadata, overwrite=force) as writer:

@@ -126,7 +126,7 @@ def thermal_windows(
         raw = table.raw(tuple(states.T))
         curves, groups = sets.columns(states[:, BOARD] - reference_temperature, states[:, WEIGHT])
         values = [*curves, *table.weighted(raw, states[:, BOARD], states[:, WEIGHT])]
-        moved = _moved(columns, spec, raw, states, shares, reference_temperature)
+        moved = _moved(columns, spec, states, shares, reference_temperature)
         whole = np.column_stack((states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved))
         for interval in reduced.intervals:
             use = interval.time >= begin
@@ -222,7 +222,6 @@ def _states(
 def _moved(
     columns: Sequence[Column],
     spec: MemorySpec,
-    raw: Sequence[Floats],
     states: Floats,
     shares: Floats,
     reference_temperature: float,
@@ -230,13 +229,13 @@ def _moved(
     """Differentiate each column by the start state of its lag, shape (n, k)."""
     t = states[:, BOARD] - reference_temperature
     result = np.zeros((len(states), len(columns)))
-    by_lag = {column.lag: raw[k] for k, column in enumerate(columns) if column.kind == 'board'}
+    places = Layout(spec).lags
     for k, column in enumerate(columns):
         if column.lag is None or column.kind == 'play':
             continue
         share = shares[:, spec.lags.index(column.lag)]
         if column.kind == 'square':
-            share = 2.0 * by_lag[column.lag] * share
+            share = 2.0 * states[:, places[column.lag]] * share
         result[:, k] = share * t**column.power
     return result
 
