@@ -119,7 +119,7 @@ class LiveServer(ThreadingHTTPServer):
     """Serves one live report on the loopback interface; port 0 is any. OSError if it is taken."""
 
     daemon_threads = True
-    #: Who comes while others are looked at waits here; without a place TCP asks again seconds later.
+    #: Who comes while others are looked at waits here; else TCP asks again seconds later.
     request_queue_size = 512
 
     def __init__(self, report: LiveReport, port: int = 0) -> None:
