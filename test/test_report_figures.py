@@ -182,8 +182,9 @@ def test_figures_are_legible_in_black_and_white(draw, sheet):
 
 @pytest.mark.parametrize(
     ('value', 'text'),
-    [(0.0, '0'), (1951.3, '1950'), (-0.0824, '−0.082'), (4.2e-5, '0.000'), (302.992252, '303'),
-     (9.99, '9.99'), (999.6, '1000'), (3.2e10, '3.20e+10'), (float('nan'), '–')],
+    [(0.0, '0'), (1951.3, '1950'), (-0.0824, '−0.082'), (4.2e-5, '0.000'),
+     (-4.2e-5, '0.000'), (302.992252, '303'), (9.99, '9.99'), (999.6, '1000'),
+     (3.2e10, '3.20e+10'), (float('nan'), '–')],
 )  # fmt: skip
 def test_numbers_are_spelt_for_readers(value, text):
     assert number(value) == text

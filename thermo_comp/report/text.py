@@ -17,8 +17,9 @@ def number(value: float, digits: int = 3) -> str:
     size = math.floor(math.log10(abs(value)))
     if size > 8:
         return f'{value:.{digits - 1}e}'
-    decimals = digits - 1 - size
-    return minus(f'{round(value, decimals):.{min(max(decimals, 0), digits)}f}')
+    decimals = min(digits - 1 - size, digits)
+    # Not -0.
+    return minus(f'{round(value, decimals) + 0.0:.{max(decimals, 0)}f}')
 
 
 def minus(text: str) -> str:
