@@ -263,6 +263,12 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted):
     assert wrong.rate.kind is Verdict.RECALIBRATE
     assert wrong.exit_code == 1
     assert judged_on(unit, replace(calibration, gyroscope=None), 99).rate is None
+    # One that claims nothing, as an import, is not shown to be wrong.
+    silent = replace(other, residual_sd_rad_s=(0.0, 0.0, 0.0))
+    unknown = judged_on(unit, replace(calibration, gyroscope=silent), 99)
+    assert unknown.rate.kind is Verdict.NO_CLAIM
+    assert np.isnan(unknown.rate.sections['all'].claimed_rms)
+    assert unknown.exit_code == 0
 
 
 def test_where_no_temperature_changes_nothing_is_wrong(unit, fitted):

@@ -175,9 +175,11 @@ def _say_rates(out: Output, judgements: Mapping[str, Judgement]) -> None:
             if not k:
                 raw = (f'{value / MILLIDEGREE:.3g}' for value in (one.raw_rms, one.raw_peak))
                 rows.append((section, 'raw', one.n, *raw, None, None))
-            numbers = (one.rms, one.peak, one.claimed_rms)
-            said = (f'{value / MILLIDEGREE:.3g}' for value in numbers)
-            rows.append((section, name, one.n, *said, f'{one.ratio:.2f}'))
+            said = (f'{value / MILLIDEGREE:.3g}' for value in (one.rms, one.peak))
+            claim: tuple[Cell, Cell] = (None, None)
+            if isfinite(one.claimed_rms):
+                claim = (f'{one.claimed_rms / MILLIDEGREE:.3g}', f'{one.ratio:.2f}')
+            rows.append((section, name, one.n, *said, *claim))
     if rows:
         out.table(
             ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),

@@ -60,9 +60,9 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """0 for a calibration that was shown to hold, its gyroscope as well, else 1."""
-        is_rate_valid = self.rate is None or self.rate.kind.is_valid
-        return 0 if self.is_valid and is_rate_valid else 1
+        """0 for a calibration that was shown to hold, unless its gyroscope does not; else 1."""
+        is_rate_wrong = self.rate is not None and self.rate.is_wrong
+        return 0 if self.is_valid and not is_rate_wrong else 1
 
     @property
     def headline_rms(self) -> float:

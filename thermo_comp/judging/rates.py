@@ -42,6 +42,11 @@ class RateJudgement:
     raw_level_rms: float
     level_rms: float
 
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the gyroscope was shown not to hold."""
+        return self.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
+
     def __str__(self) -> str:
         """Give the verdict with its numbers, as every command prints it."""
         return f'angular rate: {self.kind.value}: {self.reason}'
@@ -70,8 +75,10 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     reference = _Means(windows.position, windows.is_inside)
     counts = reference.counts
     is_judged = counts > 1
-    claimed = np.sqrt(_variance(windows, calibration, variance, reference))
-    triad = rate_triad(calibration)
+    claims = rate_triad(calibration).has_uncertainty
+    claimed = np.full_like(corrected, np.nan)
+    if claims:
+        claimed = np.sqrt(_variance(windows, calibration, variance, reference))
     inside, dynamic = windows.is_inside & is_judged, windows.is_dynamic
     rows_of = (inside & ~dynamic, inside & dynamic, inside, ~windows.is_inside & is_judged)
     changes = raw - reference.of(raw), corrected - reference.of(corrected)
@@ -79,7 +86,7 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
         name: _section(*(change[rows].ravel() for change in (*changes, claimed)))
         for name, rows in zip(SECTIONS, rows_of, strict=True)
     }
-    kind, reason = _verdict(sections, windows.window_s, triad.has_uncertainty)
+    kind, reason = _verdict(sections, windows.window_s, claims)
     _, first = np.unique(windows.position, return_index=True)
     levels = [reference.of(rate)[first] for rate in (raw, corrected)]
     raw_level, level = (float(np.sqrt(np.mean(one**2))) for one in levels)
@@ -135,16 +142,18 @@ def _verdict(sections: dict[str, Section], window_s: float, claims: bool) -> tup
         return Verdict.OUTSIDE, f'{outside.n} windows of {window_s:g} s lie there'
     judged = [s for s in (sections['static'], sections['dynamic']) if s.n >= FEWEST]
     ratio = max(s.ratio for s in (*judged, one))
+    said = f'{_mdeg(one.rms)} RMS of its changes at rest, {_mdeg(one.raw_rms)} raw'
+    over = f'over {one.n} windows of {window_s:g} s'
+    if not claims:
+        kind = Verdict.NO_BETTER if one.rms > one.raw_rms else Verdict.NO_CLAIM
+        return kind, f'{said} {over}; the calibration says nothing of its uncertainty'
     said = (
-        f'{_mdeg(one.rms)} RMS of its changes at rest, {_mdeg(one.raw_rms)} raw, '
-        f'{_mdeg(one.claimed_rms)} claimed over {one.n} windows of {window_s:g} s; '
+        f'{said}, {_mdeg(one.claimed_rms)} claimed {over}; '
         f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
     # Where no temperature changes, nothing is corrected: that is no fault.
     if ratio > LARGEST_RATIO:
         return Verdict.NO_BETTER if one.rms >= one.raw_rms else Verdict.RECALIBRATE, said
-    if not claims:
-        return Verdict.NO_CLAIM, said
     return Verdict.WIDE if one.claimed_rms > WIDE_PART * one.raw_rms else Verdict.VALID, said
 
 
