@@ -178,6 +178,8 @@ def _take(
 def _tell(out: Output, account: Account, problems: Sequence[str], told: dict[str, str]) -> None:
     """Say in a line what has changed since it was last told."""
     news = {'problem': ', '.join(problems)} if problems else {}
+    if not problems:
+        told.pop('problem', None)
     for number, one in enumerate(account.positions, 1):
         if one.n_rests:
             news[f'position {number}'] = f'{one.reason or "good"}; {_reading(one.up)}'
