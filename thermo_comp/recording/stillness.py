@@ -293,7 +293,7 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
             f'than {1e3 * still_sd:.3g} mg at rest (--still-sd)'
         )
     if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():
-        return 'its gyroscope turns all the time'
+        return 'its gyroscope turns all the time (is it in rad/s?)'
     return 'the unit must rest in each position'
 
 
