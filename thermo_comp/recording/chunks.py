@@ -10,17 +10,19 @@ they do not, or there is no index, the records are walked one by one. Layout: ht
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from ..files import open_regular
 from ..typing import Bytes, Ints
-from .random_access import LocalFile
 from .unpack import MAX_CHUNK_BYTES, DamagedError, unpack, unpack_beginning
 from .wire import field, gather, scatter
 
@@ -46,6 +48,26 @@ ZERO_OPCODE = 'a record has the opcode 0'
 
 #: Is given opcode and content of every record that is no message.
 OnRecord = Callable[[int, bytes], None]
+
+
+class LocalFile:
+    """
+    A file that is read at places, from any thread.
+
+    OSError if it is a FIFO or a device: these would never end.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = open_regular(path)
+        self.size = os.fstat(self._file.fileno()).st_size
+
+    def read_at(self, at: int, n_bytes: int) -> bytes:
+        """Read up to so many bytes, fewer only where the file ends."""
+        return os.pread(self._file.fileno(), n_bytes, at)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
 @dataclass(frozen=True, slots=True)

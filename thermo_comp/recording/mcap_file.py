@@ -30,13 +30,13 @@ from .chunks import (
     HEAD_BYTES,
     PREFIX,
     ZERO_OPCODE,
+    LocalFile,
     Messages,
     Span,
     load,
     parse_chunk_head,
     walk,
 )
-from .random_access import LocalFile
 from .unpack import MAX_CHUNK_BYTES, DamagedError
 
 MAGIC = b'\x89MCAP0\r\n'
