@@ -59,10 +59,11 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 _LONG = (
     *('test_cli_help', 'test_report', 'test_faults', 'test_priors', 'test_fault_process'),
     *('test_fleet_run', 'test_fitting', 'test_docs', 'test_cli_demo', 'test_degenerate'),
-    *('test_third_thermometer', 'test_fault_files', 'test_report_live', 'test_plausibility'),
+    *('test_gyroscope', 'test_third_thermometer', 'test_fault_files', 'test_plausibility'),
+    *('test_compensator', 'test_least_known', 'test_allow', 'test_report_live'),
     *('test_regime', 'test_player', 'test_one_judge', 'test_judging_history', 'test_correction'),
     *('test_node_defence', 'test_node_parity', 'test_recording_write', 'test_replay'),
-    *('test_compensator', 'test_cli', 'test_fitting_learning', 'test_fitting_posterior'),
+    *('test_cli', 'test_fitting_learning', 'test_fitting_posterior'),
 )
 
 

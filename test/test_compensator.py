@@ -131,6 +131,9 @@ def test_gradient_has_the_sign_of_the_ramp():
         assert x == pytest.approx(-sign * 30.0 * 2.0 / 300.0, rel=1e-6)
 
 
+#: For every example: a calibration does not change.
+RICH = rich_calibration()
+
 sample_value = st.one_of(
     st.floats(-33000.0, 33000.0), st.sampled_from([math.nan, math.inf, 32767.0, -32768.0])
 )
@@ -178,9 +181,9 @@ def at_seconds(*events):
 @settings(max_examples=300, deadline=None)
 def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, transition_s):
     config = CompensatorConfig(transition_time_s=transition_s, case_timeout_s=2.0)
-    streamed = Compensator(rich_calibration(), config)
-    whole = Compensator(rich_calibration(), config)
-    cut = Compensator(rich_calibration(), config)
+    streamed = Compensator(RICH, config)
+    whole = Compensator(RICH, config)
+    cut = Compensator(RICH, config)
     rows, index = stream(streamed, events)
     assert_same([batch(whole, events)], rows, index)
     pieces = [batch(cut, events[k : k + chunk]) for k in range(0, len(events), chunk)]
@@ -192,7 +195,7 @@ def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, trans
 @given(event_lists())
 @settings(max_examples=200, deadline=None)
 def test_whatever_comes_in_what_goes_out_is_sound(events):
-    compensator = Compensator(rich_calibration(), CompensatorConfig(case_timeout_s=2.0))
+    compensator = Compensator(RICH, CompensatorConfig(case_timeout_s=2.0))
     block = batch(compensator, events)
     assert np.isfinite(block.specific_force).all()
     assert np.isfinite(block.angular_rate).all()
