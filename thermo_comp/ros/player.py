@@ -101,9 +101,14 @@ def play(
     with open_recording(path, topics, input, require=('accel',)) as reader:
         rclpy.init(args=['--ros-args', *ros_args], context=context)
         try:
-            player = _Player(rclpy.create_node(NODE_NAME, context=context), reader, rate)
-            player.wait_for_subscribers(wait_s, is_found)
-            return player.run(throttle or (lambda _: None), progress or (lambda _: None))
+            node = rclpy.create_node(NODE_NAME, context=context)
+            try:
+                player = _Player(node, reader, rate)
+                player.wait_for_subscribers(wait_s, is_found)
+                return player.run(throttle or (lambda _: None), progress or (lambda _: None))
+            finally:
+                # Else its publishers stay until the garbage collector comes by.
+                node.destroy_node()
         finally:
             context.try_shutdown()
 

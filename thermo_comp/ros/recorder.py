@@ -109,12 +109,12 @@ class Recorder:
         return True
 
     def wait_until(self, is_done: Callable[[Mapping[str, int]], bool], timeout_s: float) -> bool:
-        """Wait until the counts are as wanted; False after so long without a new message [s]."""
+        """Wait until the counts are as wanted; False after the time-out [s]."""
         with self._changed:
-            while not is_done(self._counts):
-                if self._failure is not None or not self._changed.wait(timeout_s):
-                    return False
-        return True
+            self._changed.wait_for(
+                lambda: self._failure is not None or is_done(self._counts), timeout_s
+            )
+            return self._failure is None and is_done(self._counts)
 
     def _take(self) -> None:
         """Write what has arrived, until that fails."""

@@ -16,9 +16,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import rclpy
@@ -34,6 +34,8 @@ from .node import NODE_NAME
 from .player import PlayReport, play
 from .recorder import OUTPUTS, Recorder
 
+#: What the node makes of samples.
+SAMPLES = 'imu/data_raw'
 #: How long node and recorder may take to find each other [s].
 DISCOVERY_S = 30.0
 #: How long the node may take to answer [s]; then it is asked again.
@@ -206,7 +208,6 @@ def _is_found(recorder: Recorder, player: Node, roles: Collection[Role]) -> bool
 
 def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
     """Wait until the node has taken all, and the recorder all that the node published."""
-    deadline = time.monotonic() + COMPLETION_S
     account: dict[str, str] = {}
 
     def is_complete(counts: Mapping[str, int]) -> bool:
@@ -214,7 +215,7 @@ def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
         keys = ('samples in', 'samples out', 'flags', 'flags')
         expected = [account.get(key, '') for key in keys]
         found = [n_sent, *(counts[topic] for topic in OUTPUTS)]
-        return expected == [str(count) for count in found] or time.monotonic() > deadline
+        return expected == [str(count) for count in found]
 
     recorder.wait_until(is_complete, COMPLETION_S)
     return account
@@ -228,8 +229,14 @@ class _Throttle:
         self._n_dropped = 0
 
     def __call__(self, n_sent: int) -> None:
-        def is_close(counts: Mapping[str, int]) -> bool:
-            return n_sent - self._n_dropped - counts['imu/data_raw'] <= IN_FLIGHT
+        n_out = self._recorder.counts[SAMPLES]
+        while n_sent - self._n_dropped - n_out > IN_FLIGHT:
+            # Diagnostics go on coming, whatever becomes of the samples.
+            is_more = partial(_is_more, n_out)
+            if not self._recorder.wait_until(is_more, DROPPED_S):
+                self._n_dropped = n_sent - n_out
+            n_out = self._recorder.counts[SAMPLES]
 
-        if not self._recorder.wait_until(is_close, DROPPED_S):
-            self._n_dropped = n_sent - self._recorder.counts['imu/data_raw']
+
+def _is_more(n_out: int, counts: Mapping[str, int]) -> bool:
+    return counts[SAMPLES] > n_out
