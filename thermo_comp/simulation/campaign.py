@@ -46,7 +46,6 @@ class Record:
         [degC], shape (m,)
     specific_force: true specific force in the orthogonal frame, m/s^2, shape (3,)
     angular_rate: of a unit with a gyroscope, mean of each cycle, rad/s, shape (n, 3)
-    rate_bias: the bias of that every second, without the Earth's rate and the turn-on, rad/s
     bias, scale: what the unit's temperatures make of bias [counts/cycle] and relative scale, every
         second from 0; without the walk of the bias, which no model can know, shape (k, 3)
     """
@@ -62,7 +61,6 @@ class Record:
     bias: Floats
     scale: Floats
     angular_rate: Floats | None = None
-    rate_bias: Floats | None = None
 
     def means(self, window_s: float = 60.0) -> Floats:
         """Return the means of the counts over whole windows, shape (w, 3)."""
@@ -152,7 +150,6 @@ def arrays(
                 chamber.thermal.bias,
                 chamber.thermal.scale,
                 run.angular_rate,
-                chamber.thermal.rate_bias,
             )
         )
     return records
