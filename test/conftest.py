@@ -76,7 +76,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Keep the collector from walking through what was imported, again and again."""
     gc.freeze()
-    gc.set_threshold(100_000, 20, 20)
 
 
 class Cli(Protocol):
