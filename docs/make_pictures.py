@@ -45,23 +45,13 @@ def draw_chamber(axes: Axes) -> None:
     axes.text(3.2, 2.82, 'board', fontsize=7, ha='center', va='center', rotation=-15)
     axes.add_patch(Circle((3.62, 2.98), 0.09, color=BLUE))
     axes.add_patch(Circle((4.02, 2.66), 0.09, color=RED))
-    axes.annotate(
-        'T case: leads',
-        (4.08, 2.68),
-        (3.95, 1.5),
-        fontsize=8,
-        color=RED,
-        arrowprops={'arrowstyle': '-', 'color': RED},
-    )
-    axes.annotate(
-        'T board: lags',
-        (3.66, 3.04),
-        (3.9, 4.3),
-        fontsize=8,
-        color=BLUE,
-        arrowprops={'arrowstyle': '-', 'color': BLUE},
-    )
-    axes.text(0.6, 3.2, 'unit, at rest\nin any attitude', fontsize=8)
+    for text, at, beside, color in (
+        ('T case: leads', (4.08, 2.62), (4.2, 2.0), RED),
+        ('T board: lags', (3.66, 3.04), (3.9, 4.3), BLUE),
+    ):
+        line = {'arrowstyle': '-', 'color': color}
+        axes.annotate(text, at, beside, fontsize=8, color=color, arrowprops=line)
+    axes.text(0.45, 3.9, 'unit, at rest\nin any attitude', fontsize=8)
     axes.annotate(
         'g', (1.2, 1.5), (1.2, 2.6), ha='center', arrowprops={'arrowstyle': '-|>', 'lw': 1.5}
     )
@@ -88,7 +78,8 @@ def draw_cyclogram(axes: Axes) -> None:
         word = 'soak' if pair[0] == pair[1] else 'ramp'
         if word == 'ramp':
             axes.axvspan(start, stop, color='#E9E9E9', lw=0)
-        axes.text((start + stop) / 2, 39.2, word, ha='center', fontsize=7, color=GREY)
+        if stop - start > 0.25:
+            axes.text((start + stop) / 2, 39.2, word, ha='center', fontsize=7, color=GREY)
     axes.set(xlabel='time, h', ylabel='°C', ylim=(2, 41), xlim=(0, hours[-1]))
     axes.legend(loc='lower left', fontsize=7, frameon=False)
 
@@ -131,14 +122,10 @@ def draw_layout(figure: Figure) -> None:
             return
         panel = saved['configById'][node]
         title = panel.get('title') or panel.get('foxglovePanelTitle') or node.split('!')[1]
-        margin = 0.028
+        # Beside each panel its numbers, below it those of time, above it its title.
+        left, below, above = 0.04, 0.048, 0.032
         axes = figure.add_axes(
-            (
-                x + margin + 0.012,
-                1.0 - y - height + margin,
-                width - 2 * margin,
-                height - 2 * margin,
-            )
+            (x + left, 1.0 - y - height + below, width - left - 0.016, height - below - above)
         )
         axes.set_title(title, fontsize=7, loc='left', pad=2)
         axes.tick_params(labelsize=5.5, length=2)

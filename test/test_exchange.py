@@ -244,9 +244,15 @@ def test_what_is_lost_is_said(cubic: Calibration) -> None:
         ('TC_A_ENABLE 0\nTC_A0_X1_0 1', 'TC_A_ENABLE: is 0'),
         ('TC_A0_X1_0 1\nTC_A1_X1_0 1', 'several sets'),
         ('TC_A0_X1_0', 'has no value'),
+        ('SM: [1, 0, 0]\nbias: [0, 0, 0]', 'SM: must be 9 finite numbers'),
+        ('SM: [1, 0, 0, 0, 1, 0, 0, 0, -1]\nbias: [0, 0, 0]', 'mirrors or flattens'),
+        ('SM: [9.8, 0, 0, 0, 9.8, 0, 0, 0, 9.8]\nbias: [0, 0, 0]', 'neither m/s.2 nor counts'),
+        ('1 0 0 0 1 0 0 0 1  0 0 0 0 0 0 0 0 0  1 2 3', 'mirrors or flattens'),
+        ('imu0: {accelerometers: {M: [[1, 0], [0, 1]]}}', 'M: must be 9 finite numbers'),
+        ('imu0: {rostopic: /imu}', 'nor the matrices of imu_tk'),
     ],
 )
-def test_bad_parameters_are_refused(text: str, message: str) -> None:
+def test_what_is_no_calibration_is_refused(text: str, message: str) -> None:
     with pytest.raises(CalibrationError, match=message):
         import_calibration(text, serial='7')
 
@@ -381,22 +387,6 @@ def test_kalibr_without_bias_and_with_several_imus() -> None:
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(CalibrationError, match='choose one of the IMUs: there are imu0, imu1'):
         import_calibration(f'imu0:\n{one}imu1:\n{one}', serial='7')
-
-
-@pytest.mark.parametrize(
-    ('text', 'message'),
-    [
-        ('SM: [1, 0, 0]\nbias: [0, 0, 0]', 'SM: must be 9 finite numbers'),
-        ('SM: [1, 0, 0, 0, 1, 0, 0, 0, -1]\nbias: [0, 0, 0]', 'mirrors or flattens'),
-        ('SM: [9.8, 0, 0, 0, 9.8, 0, 0, 0, 9.8]\nbias: [0, 0, 0]', 'neither m/s.2 nor counts'),
-        ('1 0 0 0 1 0 0 0 1  0 0 0 0 0 0 0 0 0  1 2 3', 'mirrors or flattens'),
-        ('imu0: {accelerometers: {M: [[1, 0], [0, 1]]}}', 'M: must be 9 finite numbers'),
-        ('imu0: {rostopic: /imu}', 'nor the matrices of imu_tk'),
-    ],
-)
-def test_matrices_that_are_none_are_refused(text: str, message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
-        import_calibration(text, serial='7')
 
 
 def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibration) -> None:
