@@ -133,7 +133,7 @@ def spoken_direction(up: Floats) -> str:
     axes = [sign for sign, one in zip(signs, size, strict=True) if one > 0.1]
     reading = ', '.join(f'{name} {value:+.2f} g' for name, value in zip('xyz', up, strict=True))
     if np.ptp(size[size > 0.1]) > 0.1:
-        return f'between {_listed(axes)}: {reading}'
+        return f'{_listed(axes)} up in part: {reading}'
     return f'{_listed(axes)} up{" alike" if len(axes) > 1 else ""}: {reading}'
 
 
