@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermo_comp.errors import CalibrationError, OutputError
+from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import GroupEvidence, parameter_layout
 from thermo_comp.unit.calibration_file import (
     SIZE_LIMIT,
@@ -82,6 +83,16 @@ def calibrations(draw):
 @settings(max_examples=100, deadline=None)
 def test_round_trip_is_exact(value):
     assert parse_calibration(dump_calibration(value).encode()) == value
+
+
+@pytest.mark.parametrize('closes', ['board', 'case'])
+def test_when_the_dynamic_state_closes_is_in_the_file(closes):
+    value = calibration(detector=DetectorSettings(closes=closes))
+    text = dump_calibration(value)
+    assert parse_calibration(text.encode()) == value
+    without = text.replace(f'  closes: {closes}\n', '')
+    assert without != text
+    assert parse_calibration(without.encode()).detector.closes == 'board'
 
 
 @pytest.mark.parametrize('serial', ['no', '1e5', '0x1F', '12', 'null', '~', 'a: b', '- x', '1:30'])
@@ -177,6 +188,7 @@ TEXT = dump_calibration(rich_calibration())
             'detector.smallest_ramp_k_min',
             'must be',
         ),
+        ('closes: board', 'closes: both', 'detector.closes', "'board' or 'case', got 'both'"),
     ],
 )
 def test_refusals_name_key_value_and_rule(old, new, key, message):

@@ -8,6 +8,7 @@ of 24 scatters by about 0.3 of the delays' sd, 1 s at 1 mK and 3 s with coarse s
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -273,6 +274,34 @@ def test_the_relaxed_rate_moves_the_end():
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
 
+@pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
+def test_it_closes_with_the_case_or_the_board(sensor):
+    # The case lags by 3 min, the board by 15 min more. After the ramp the case's rate falls as
+    # exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): to the relaxed rate, a tenth of
+    # the ramp's, 7 and 38 min after. Steps of 62.5 mK hide the case's last 5 min of that.
+    noise, quantum = SENSORS[sensor]
+    lag, behind = 180.0, 900.0
+    board_too = DetectorSettings(
+        case=ThermometerSettings(noise, quantum, lag_s=lag),
+        board=ThermometerSettings(noise, quantum, lag_s=lag + behind),
+    )
+    case_alone = replace(board_too, closes='case')
+    earlier = behind * math.log(10.0 * behind / (behind - lag)) - lag * math.log(10.0)
+    rng = np.random.default_rng(5)
+    t = np.arange(-1500.0, 6600.0)
+    truths = lagged(t, RAMP, lag), lagged_twice(t, RAMP, lag, behind)
+    case, board = (read(20.0 + truth, noise, quantum, rng) for truth in truths)
+    late, early = (switches(one, t, case, board) for one in (board_too, case_alone))
+    assert [regime for _, regime, _ in late] == [STATIC, DYNAMIC, STATIC]
+    assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
+    assert early[1] == late[1]
+    assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
+    # The same bits as without a board; and where the case is lost, the board leads as ever.
+    assert early == switches(board_too, t, case, None)
+    t, board = t[:3000], board[:3000]
+    assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
+
+
 TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 
 
@@ -422,6 +451,7 @@ def test_switches_do_not_depend_on_the_origin_of_time():
         ({'relaxed_rate_k_min': math.nan}, '`relaxed_rate_k_min` must be positive and finite'),
         ({'ripple_c': -0.1}, '`ripple_c` must be zero or positive and finite, got -0.1'),
         ({'dwell_s': math.inf}, '`dwell_s` must be zero or positive and finite, got inf'),
+        ({'closes': 'chamber'}, "`closes` must be 'board' or 'case', got 'chamber'"),
         (
             {'smallest_ramp_k_min': 0.06},
             '`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / 1.5, got 0.05 and 0.06',

@@ -7,7 +7,9 @@ The dynamic state *opens* when the rate of the leading sensor has left the basel
 (`change_detector`: the integral of the second derivative against ripple and noise), or when any
 rate is obviously that of a ramp. It is *held* as long as any sensor's rate, now or half a lag
 ahead, may exceed the relaxed rate: through the ramp, where the second derivative is nil, and after
-it, until the lag of the board has died. The derivation is in docs/regime.md.
+it, until the lag of the board has died; or, where `closes` is 'case' (the paper's), until the
+change of the case has ended, the board being asked only while the case is lost. The derivation is
+in docs/regime.md.
 
 References
 ----------
@@ -52,6 +54,7 @@ class RegimeDetector:
         self._relaxed_rate = settings.relaxed_rate_k_min / 60.0
         self._dwell_ns = round(settings.dwell_s * 1e9)
         self._turn_ns = self._dwell_ns // 2
+        self._asks_board = settings.closes == 'board'
         self._forget_ns = round(1e9 * max(settings.case.lag_s, settings.board.lag_s))
         test = (
             settings.smallest_ramp_k_min / 60.0,
@@ -83,6 +86,8 @@ class RegimeDetector:
         """Decide after a used reading of the leading sensor, the case if it is not None."""
         if case is not None:
             lead, change = case, self._case_change
+            if not self._asks_board:
+                board = None
         elif board is not None:
             lead, change = board, self._board_change
         else:

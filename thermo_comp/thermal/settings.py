@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import inf
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal, get_args
 
 CELL_SIGMAS: Final = 2.5  # a quantum above this many noise sds has cells ...
 WIDE_CELL_SIGMAS: Final = 8.5  # ... that noise never crosses: six sds of a difference
@@ -66,6 +66,9 @@ class ThermometerSettings:
         return self.quantum_c > WIDE_CELL_SIGMAS * self.noise_sd_c
 
 
+Closes = Literal['board', 'case']
+
+
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
     """
@@ -89,6 +92,11 @@ class DetectorSettings:
     dwell_s: Annotated[
         float, 'How long it must have been below, and the shortest dynamic state, s.'
     ] = 60.0
+    closes: Annotated[
+        Closes,
+        'What must be calm for the dynamic state to end: the leading sensor alone (`case`, the '
+        'end of the change as in the paper), or the board, too (`board`).',
+    ] = 'board'
     case: Annotated[ThermometerSettings, 'The two sensors.'] = field(
         default_factory=ThermometerSettings
     )
@@ -103,6 +111,8 @@ class DetectorSettings:
             positive=('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'),
             not_negative=('ripple_c', 'dwell_s'),
         )
+        if self.closes not in get_args(Closes):
+            raise ValueError(f"`closes` must be 'board' or 'case', got {self.closes!r}")
         if self.relaxed_rate_k_min * OBVIOUS_SHARE >= self.smallest_ramp_k_min:
             raise ValueError(
                 f'`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / {OBVIOUS_SHARE}, '
