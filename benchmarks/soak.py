@@ -72,6 +72,7 @@ class Soak:
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import Vector3Stamped
         from rcl_interfaces.srv import SetParameters
+        from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
         from sensor_msgs.msg import Imu, Temperature
         from std_msgs.msg import Bool
@@ -82,7 +83,12 @@ class Soak:
         self.process = node
         self.rate = rate
         self.node = rclpy.create_node('soak', context=context)
-        self.client = self.node.create_client(SetParameters, 'thermo_comp/set_parameters')
+        # The loop of the samples serves no clients.
+        self._operator = rclpy.create_node('operator', context=context)
+        self.client = self._operator.create_client(SetParameters, 'thermo_comp/set_parameters')
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self._operator)
+        threading.Thread(target=self._executor.spin, daemon=True).start()
         self._loop = WaitLoop(self.node)
         self._imu = self._loop.subscribe(Imu, 'imu/data_raw', qos)
         self._diagnostics = self._loop.subscribe(DiagnosticArray, '/diagnostics', qos)
@@ -111,6 +117,8 @@ class Soak:
         self._loop.stop()
         self._thread.join(TIMEOUT_S)
         self._loop.close()
+        self._executor.shutdown()
+        self._operator.destroy_node()
         self.node.destroy_node()
 
     def _hear(self) -> None:

@@ -30,6 +30,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from ros_helpers import Peer
 from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.ros.round_trip import NodeProcess, lossless
@@ -86,7 +87,11 @@ class Bench:
     def __init__(self, node: NodeProcess, context: Context) -> None:
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
-        self._client = self.node.create_client(SetParameters, 'thermo_comp/set_parameters')
+        # The loop serves no clients.
+        self._operator = Peer()
+        self._client = self._operator.node.create_client(
+            SetParameters, 'thermo_comp/set_parameters'
+        )
         self._loop = WaitLoop(self.node)
         self._imu = self._loop.subscribe(Imu, 'imu/data_raw', QOS)
         self._diagnostics = self._loop.subscribe(DiagnosticArray, '/diagnostics', QOS)
@@ -127,6 +132,7 @@ class Bench:
         self._loop.stop()
         self._thread.join(TIMEOUT_S)
         self._loop.close()
+        self._operator.close()
         self.node.destroy_node()
 
     def _hear(self) -> None:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Serialized in, serialized out: always what rclpy would make of the same message, or a fallback.
+Serialized in, serialized out: always what rclpy would make of the same message.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def test_counts_become_an_imu(
     converter = SampleConverter(Vector3Stamped)
     written = convert(converter, *[cdr(order, (sec, nanosec), frame, values)] * 2)
     assert written[0] == written[1]
-    assert converter.traffic.n_fallback == 0
+    assert converter.traffic.n_fallback == 2 * (order == '>')
     imu = deserialize_message(written[0], Imu)
     assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (sec, nanosec)
     assert imu.header.frame_id == frame
@@ -95,7 +95,7 @@ def test_imu_passes_everything_else_bit_for_bit(
 ) -> None:
     converter = SampleConverter(Imu, override)
     (written,) = convert(converter, cdr(order, (5, 7), frame, values))
-    assert converter.traffic.n_fallback == 0
+    assert converter.traffic.n_fallback == (order == '>')
     assert deserialize_message(written, Imu).header.frame_id == (override or frame)
     assert b''.join(doubles(written)[:25]) == pack('<', values[:25])
     x, y, z = values[25:28]
@@ -103,14 +103,13 @@ def test_imu_passes_everything_else_bit_for_bit(
 
 
 def test_signalling_nan_survives_the_byte_swap() -> None:
-    # A float that passes through a register may come out quiet; these must not pass through one.
+    # A float that passes through a register may come out quiet; rclpy's must not.
     payload = 0x7FF0_0000_0000_0001
     values = struct.pack('>37Q', *[payload] * 37)
     message = cdr('>', (1, 2), 'imu', [])[:] + values
     converter = SampleConverter(Imu)
     written = converter.convert(message, lambda *_: tuple(map(float, range(9))))
     assert written is not None
-    assert converter.traffic.n_fallback == 0
     assert doubles(written)[:25] == [struct.pack('<Q', payload)] * 25
 
 
@@ -125,22 +124,13 @@ def test_frames_of_other_lengths_in_one_stream() -> None:
     assert converter.traffic.n_fallback == 0
 
 
-def test_frames_without_end_use_bounded_memory() -> None:
-    converter = SampleConverter(Vector3Stamped)
-    written = convert(converter, *(cdr('<', (1, 0), str(k), [1, 2, 3]) for k in range(300)))
-    assert [deserialize_message(data, Imu).header.frame_id for data in written] == [
-        str(k) for k in range(300)
-    ]
-    assert len(converter._layouts) < 100
-
-
 @pytest.mark.parametrize('kind', [Vector3Stamped, Imu])
 @pytest.mark.parametrize('override', ['', 'other_link'])
-def test_what_no_layout_fits_goes_through_rclpy(kind: Any, override: str) -> None:
+def test_what_has_another_form_goes_through_rclpy(kind: Any, override: str) -> None:
     values = [float(k) for k in range(37 if kind is Imu else 3)]
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
-    # rclpy reads a message with bytes behind its end; the layout, which is exact, does not.
+    # rclpy reads a message with bytes behind its end; their plain form, which is exact, has none.
     (expected,), (found,) = convert(fast, good), convert(slow, good + bytes(8))
     assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
     assert deserialize_message(found, Imu) == deserialize_message(expected, Imu)

@@ -86,12 +86,9 @@ def test_rclpy_still_has_what_is_used_beyond_its_documented_api() -> None:
             'clear_entities',
             'add_subscription',
             'add_guard_condition',
-            'add_timer',
-            'add_client',
             'add_service',
             'wait',
             'is_ready',
-            'get_ready_entities',
         ),
         'Subscription': ('take_message', 'pointer', 'get_publisher_count'),
         'Service': ('service_take_request',),
@@ -171,7 +168,7 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Pee
     ticks: list[int] = []
     heard: list[bool] = []
     running = Running(node)
-    node.create_timer(0.01, lambda: ticks.append(len(running.messages)))
+    running.loop.call_every(0.01, lambda: ticks.append(len(running.messages)))
     node.create_subscription(Bool, 'ordinary', lambda m: heard.append(m.data), 10)
     node.create_service(Trigger, 'ask', lambda _, answer: answer)
     with running:
@@ -244,22 +241,13 @@ def test_a_callback_that_fails_stops_no_samples(node: Node, peer: Peer) -> None:
         # The middleware's own, and any other.
         raise RCLError('the client went away') if len(failed) % 2 else KeyError('key')
 
-    node.create_timer(0.005, fail)
-    with Running(node) as running:
+    running = Running(node)
+    running.loop.call_every(0.005, fail)
+    with running:
         publisher = peer.publisher(Vector3Stamped, 'samples')
         peer.poll(lambda: len(failed) > 2, 'failures')
         publisher.publish(Vector3Stamped())
         running.wait_for(lambda: running.messages)
-
-
-def test_raw_subscriptions_are_never_the_executors(node: Node, peer: Peer) -> None:
-    # The executor would take a message, and the sample would be lost.
-    node.create_timer(0.001, lambda: None)
-    with Running(node) as running:
-        publisher = peer.publisher(Vector3Stamped, 'samples')
-        for _ in range(300):
-            publisher.publish(Vector3Stamped())
-        running.wait_for(lambda: len(running.messages) == 300)
 
 
 def test_stops_from_another_thread_and_at_shutdown(node: Node) -> None:
@@ -309,48 +297,6 @@ def test_quality_of_service_is_open_to_overrides(node: Node) -> None:
     loop.close()
 
 
-def test_a_subscription_that_was_ready_stays_in_the_wait_set(node: Node, peer: Peer) -> None:
-    # The loop does not put it in anew: should rcl ever take it out, the second wait would not end.
-    subscription = node.create_subscription(Vector3Stamped, 'samples', print, 10, raw=True)
-    publisher = peer.publisher(Vector3Stamped, 'samples')
-    with subscription.handle, node.context.handle:
-        wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
-        assert not wait_set.is_ready('subscription', 0)
-        wait_set.add_subscription(subscription.handle)
-        for _ in range(3):
-            publisher.publish(Vector3Stamped())
-            wait_set.wait(int(TIMEOUT * 1e9))
-            assert wait_set.is_ready('subscription', 0)
-            assert subscription.handle.take_message(Vector3Stamped, True) is not None
-        wait_set.wait(0)
-        assert not wait_set.is_ready('subscription', 0)
-
-
-def test_a_paced_drain_leaves_nothing_behind_for_long(node: Node, peer: Peer) -> None:
-    """What comes in bursts, against any expectation of the next message, is all taken in order."""
-    running = Running(node)
-    paced = running.raw
-
-    def take() -> None:
-        messages, received_ns = paced.drain(is_paced=True)
-        with running.news:
-            running.messages += messages
-            running.received_ns += received_ns
-            running.news.notify_all()
-
-    running.thread = threading.Thread(target=running.loop.run, args=(take,), daemon=True)
-    with running:
-        publisher = peer.publisher(Vector3Stamped, 'samples')
-        pause = threading.Event()
-        for k in range(300):
-            publisher.publish(Vector3Stamped())
-            if k % 30 == 0:
-                pause.wait(0.02)
-        running.wait_for(lambda: len(running.messages) == 300)
-    assert running.received_ns == sorted(running.received_ns)
-    assert paced.interval_ns > 0
-
-
 @pytest.mark.parametrize(
     ('qos', 'interval_s', 'is_resting'),
     [
@@ -380,7 +326,7 @@ def test_only_best_effort_messages_that_crowd_gather(
     def take() -> None:
         nonlocal n_taken
         with news:
-            n_taken += len(raw.drain(is_paced=True)[0])
+            n_taken += len(raw.drain()[0])
             if interval_s is not None:
                 raw.interval_ns = int(interval_s * 1e9)
             news.notify_all()

@@ -23,7 +23,7 @@ from ..recording.decode import Decoder, Feed
 from ..recording.growing import News
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
 from .listener import Listener
-from .raw import RawSubscription
+from .waitloop import RawSubscription
 
 NODE_NAME = 'thermo_comp_record'
 #: Time between two looks at what is published, and between two blocks [s].

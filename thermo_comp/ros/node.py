@@ -44,12 +44,11 @@ from .conversions import SampleConverter, Traffic
 from .diagnostics import Snapshot, build, look_at
 from .middleware import use_profile
 from .parameters import NodeConfig, ParameterError
-from .raw import RawSubscription
 from .reader import LoadedCalibration, Reader, check, load, read
 from .relay import Relay
 from .requests import ParameterRequests
 from .signals import SignalWatch
-from .waitloop import WaitLoop, undeclared_overrides
+from .waitloop import RawSubscription, WaitLoop, undeclared_overrides
 
 NODE_NAME = 'thermo_comp'
 

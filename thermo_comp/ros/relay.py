@@ -24,8 +24,7 @@ from std_msgs.msg import Bool
 from ..online.compensator import Compensator
 from ..online.stamped_flag import stamped_flag
 from .conversions import SampleConverter, read_temperature
-from .raw import RawSubscription
-from .waitloop import RCLError
+from .waitloop import RawSubscription, RCLError
 
 #: Without samples, readings take effect but for those not older than the newest by this [ns]: a
 #: sample that Fast DDS has to repeat can be 3 s late.
@@ -75,7 +74,7 @@ class Relay:
 
     def on_data(self) -> None:
         """Work through everything that has arrived."""
-        messages, received_ns = self.samples.drain(is_paced=True)
+        messages, received_ns = self.samples.drain()
         for subscription, push in self._temperatures:
             readings, read_ns = subscription.drain()
             if readings and self._is_of_one(subscription, len(readings)):
