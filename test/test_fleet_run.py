@@ -24,10 +24,9 @@ from thermo_comp.errors import FleetError
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet import COLUMNS, FleetOptions, fit_fleet, read_parquet
 from thermo_comp.fleet.cluster import connected, outcome_of
-from thermo_comp.fleet.discovery import find_units
 from thermo_comp.fleet.results import Results
-from thermo_comp.fleet.storage import Storage
 from thermo_comp.fleet.table import is_valid
+from thermo_comp.fleet.units import Storage, find_units
 from thermo_comp.recording import Topics
 from thermo_comp.simulation import unit_preset
 from thermo_comp.unit.calibration_file import load_calibration

@@ -19,9 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from thermo_comp.errors import FleetError
 from thermo_comp.fitting.fit_sources import digest
-from thermo_comp.fleet.discovery import FoundBag, FoundUnit, find_units, group_files
-from thermo_comp.fleet.storage import Storage, StoredFile
 from thermo_comp.fleet.unit import process_unit
+from thermo_comp.fleet.units import FoundUnit, Storage, StoredFile, find_units, group_files
 from thermo_comp.unit.calibration_file import parse_calibration
 
 fsspec = pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
@@ -66,7 +65,7 @@ class TestElsewhere:
         fs, url = memory
         fs.put(f'{unit}/', f'{url}/unit/', recursive=True)
         (here,), (there,) = find_units(Storage(str(unit.parent))), find_units(Storage(url))
-        assert [bag.name for bag in here.bags] == [bag.name for bag in there.bags]
+        assert list(here.bags) == list(there.bags)
         one, other = (
             process_unit(here, str(unit.parent), OPTIONS),
             process_unit(there, url, OPTIONS),
@@ -75,7 +74,7 @@ class TestElsewhere:
         # The date of the fit is all that differs.
         assert replace(first, provenance=second.provenance) == second
         assert first.provenance.sources == second.provenance.sources
-        assert other.hashes == {bag.name: digest(unit.parent / bag.name) for bag in here.bags}
+        assert other.hashes == {name: digest(unit.parent / name) for name in here.bags}
 
     @pytest.mark.parametrize('name', ['pos1', 'pos1.db3'])
     def test_any_storage_is_read_from_elsewhere_and_leaves_no_copy(
@@ -89,7 +88,7 @@ class TestElsewhere:
             shutil.rmtree(path)
         fs.put(f'{tmp_path}/bags/', f'{url}/', recursive=True)
         (found,) = find_units(Storage(url))
-        assert [bag.name for bag in found.bags] == [f'unit/{name}']
+        assert list(found.bags) == [f'unit/{name}']
         (tmp_path / 'scratch').mkdir()
         monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'scratch'))
         outcome = process_unit(found, url, OPTIONS)
@@ -99,8 +98,8 @@ class TestElsewhere:
 
     def test_a_file_that_vanishes_may_come_back(self, memory: tuple[Any, str]) -> None:
         _, url = memory
-        gone = FoundBag('unit/a.mcap', (StoredFile('unit/a.mcap', 5, ''),))
-        outcome = process_unit(FoundUnit('unit', '', (gone,)), url, OPTIONS)
+        gone = {'unit/a.mcap': [StoredFile('unit/a.mcap', 5, '')]}
+        outcome = process_unit(FoundUnit('unit', '', gone), url, OPTIONS)
         assert not outcome.is_final
         assert outcome.row['verdict'] == 'failed'
         assert str(outcome.row['left_out']).startswith('unit/a.mcap: ')
@@ -124,7 +123,7 @@ class TestDiscovery:
     )
     def test_files_to_bags(self, files: list[str], bags: list[str]) -> None:
         stored = [StoredFile(name, 1, '') for name in files]
-        assert [bag.name for bag in group_files(stored)] == bags
+        assert list(group_files(stored)) == bags
 
     def test_a_folder_per_unit_and_lot(self, tmp_path: Path) -> None:
         for name in ('lot-A/u1/1.mcap', 'lot-A/u1/2.mcap', 'lot-B/u2/1.mcap', 'u3/1.mcap'):
@@ -145,7 +144,7 @@ class TestDiscovery:
         write_unit(tmp_path, 3, 1, serial='', names=['e.mcap'])
         (tmp_path / 'f.mcap').write_bytes(b'no bag')
         found = find_units(Storage(str(tmp_path)))
-        assert {one.name: [bag.name for bag in one.bags] for one in found} == {
+        assert {one.name: list(one.bags) for one in found} == {
             'mems-0001': ['a.mcap', 'd.mcap'],
             'mems-0002': ['b.mcap', 'c.mcap'],
             # Nothing says whose it is but the folder; and one that cannot even be asked.
@@ -173,7 +172,7 @@ class TestDiscovery:
         (fleet / 'again').symlink_to(fleet)
         (fleet / 'nowhere.mcap').symlink_to(tmp_path / 'gone')
         found = find_units(Storage(str(fleet)))
-        assert [bag.name for one in found for bag in one.bags] == ['unit/1.mcap']
+        assert [name for one in found for name in one.bags] == ['unit/1.mcap']
 
     def test_a_relative_path_is_the_same_for_every_process(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -17,7 +17,7 @@ from thermo_comp.errors import FleetError
 from thermo_comp.fleet.page import render_fleet
 from thermo_comp.fleet.results import Results
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
-from thermo_comp.fleet.table import COLUMNS, Row, empty_row, read_parquet, to_csv, to_parquet
+from thermo_comp.fleet.table import COLUMNS, Row, read_parquet, row_of, to_csv, to_parquet
 
 pa = pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
 
@@ -41,20 +41,20 @@ def fleet_of(
         for quantity in QUANTITIES:
             noise = float(rng.standard_normal())
             if like:
-                before = float(like[i][quantity.column])
+                before = float(like[i][quantity.name])
                 sd = float(like[i][quantity.sd]) if quantity.sd else 0.0
-                per_unit = abs(before) * 1e-6 if quantity.is_relative else 1.0
+                per_unit = abs(before) * 1e-6 if quantity.by == 'ppm' else 1.0
                 # What two tests of one unit differ by: the noise of this one, see `sds`.
-                cells[quantity.column] = before + noise * sd * per_unit
-            elif quantity.is_relative:
-                cells[quantity.column] = 300.0 * (1.0 + 1e-3 * noise)
-            elif quantity.is_size:
-                cells[quantity.column] = 4.0 * np.exp(0.1 * noise)
+                cells[quantity.name] = before + noise * sd * per_unit
+            elif quantity.by == 'ppm':
+                cells[quantity.name] = 300.0 * (1.0 + 1e-3 * noise)
+            elif quantity.by == 'logarithm':
+                cells[quantity.name] = 4.0 * np.exp(0.1 * noise)
             else:
-                cells[quantity.column] = 50.0 * noise
+                cells[quantity.name] = 50.0 * noise
         sds = {quantity.sd: 2.0 for quantity in QUANTITIES if quantity.sd}
         rows.append(
-            empty_row(
+            row_of(
                 name=f'{lots[i % len(lots)]}/u{i:03d}@{day:g}',
                 serial=f'S{i:03d}',
                 lot=lots[i % len(lots)],
@@ -107,7 +107,7 @@ class TestOutliers:
 
     def test_alike_units_have_no_spread_to_stand_out_of(self, rng: np.random.Generator) -> None:
         rows = [{**row, 'm_10_urad': 0.0} for row in fleet_of(20, rng)]
-        spread = next(one for one in summarise(rows).spreads if one.quantity.column == 'm_10_urad')
+        spread = next(one for one in summarise(rows).spreads if one.quantity.name == 'm_10_urad')
         assert (spread.sd, set(spread.z.tolist())) == (0.0, {0.0})
 
 
@@ -120,7 +120,7 @@ class TestDrift:
         assert len(drifts) == 10
         assert [serial for serial, one in drifts.items() if one.is_significant] == ['S003']
         found = drifts['S003']
-        assert (found.worst.label, found.worst.unit, found.days) == ('bias x', 'µg', 30.0)
+        assert (found.worst.constant, found.worst.unit, found.days) == ('bias x', 'µg', 30.0)
         assert found.worst.change == pytest.approx(40.0)
         assert found.worst.sd == pytest.approx(2.0 * np.sqrt(2.0))
         assert (found.earlier, found.later) == ('/u003@0', '/u003@30')
@@ -130,7 +130,7 @@ class TestDrift:
         second = fleet_of(2, rng, day=7.0, like=first)
         second[0] = {**second[0], 'scale_z': float(first[0]['scale_z']) * (1.0 + 90e-6)}
         drift = next(one for one in summarise(first + second).drifts if one.serial == 'S000')
-        assert (drift.worst.label, drift.worst.unit) == ('scale factor z', 'ppm')
+        assert (drift.worst.constant, drift.worst.unit) == ('scale factor z', 'ppm')
         assert drift.worst.change == pytest.approx(90.0)
 
     def test_an_earlier_table_counts(self, rng: np.random.Generator, tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def hostile(rng: np.random.Generator) -> list[Row]:
         {**row, 'serial': f'{evil}{row["serial"]}', 'name': f'{evil}{row["name"]}'} for row in rows
     ]
     rows[0] = {**rows[0], 'bias_x_ug': 1e5}
-    rows[1] = empty_row(name=evil, serial=evil, verdict='refused', problem=f'3.5 {evil}')
+    rows[1] = row_of(name=evil, serial=evil, verdict='refused', problem=f'3.5 {evil}')
     return rows
 
 
@@ -177,7 +177,7 @@ class TestPage:
         assert page.count('<figure') == 2
 
     def test_a_fleet_without_a_calibration(self) -> None:
-        rows = [empty_row(name='u', serial='u', verdict='failed', problem='x: damaged')]
+        rows = [row_of(name='u', serial='u', verdict='failed', problem='x: damaged')]
         page = render_fleet(rows, summarise(rows), lambda _: '')
         assert '0 of 1 test gave a calibration.' in page
         assert '<figure' not in page
@@ -185,7 +185,7 @@ class TestPage:
 
 class TestTable:
     def test_a_spreadsheet_runs_nothing(self) -> None:
-        text = to_csv([empty_row(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)])
+        text = to_csv([row_of(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)])
         heading, line = text.splitlines()
         assert heading.split(',') == [column.name for column in COLUMNS]
         cells = dict(zip(heading.split(','), line.split(','), strict=True))
@@ -211,7 +211,7 @@ class TestTable:
 
     def test_a_strange_column_is_a_mistake(self) -> None:
         with pytest.raises(ValueError, match="no column 'colour'"):
-            empty_row(colour='red')
+            row_of(colour='red')
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,7 @@ def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
         if drift.is_significant:
             worst = drift.worst
             out.line(
-                f'- {drift.serial}: {worst.label} changed by {worst.change:+.4g} {worst.unit} '
+                f'- {drift.serial}: {worst.constant} changed by {worst.change:+.4g} {worst.unit} '
                 f'(sd {worst.sd:.2g}) from {drift.earlier} to {drift.later}'
             )
     if result.prior is not None:

@@ -13,11 +13,10 @@ from typing import Any
 
 from .. import __version__
 from ..errors import FleetError
-from .discovery import FoundUnit
-from .table import FAILED, empty_row
-from .unit import FleetOptions, UnitOutcome, process_unit
+from .table import FAILED
+from .unit import FleetOptions, UnitOutcome, process_unit, started_row
+from .units import FoundUnit
 
-_HINT = "a fleet needs Dask: pip install 'thermo_comp[fleet]'"
 _WAIT_S = 30.0
 
 
@@ -34,7 +33,9 @@ def require_libraries() -> None:
         import fsspec
         import pyarrow as pa
     except ImportError as error:
-        raise FleetError(f'{_HINT} ({error.name} is not installed)') from error
+        raise FleetError(
+            f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({error.name} is not installed)"
+        ) from error
     del distributed, fsspec, pa
 
 
@@ -51,9 +52,9 @@ def connected(
     from distributed import Client, LocalCluster
 
     # What a worker does on its way down is in the fleet table, in words that its reader knows.
-    settings = {'logging.distributed': 'critical', 'distributed.scheduler.http.routes': []}
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
-    with dask.config.set(settings):
+    quiet = {'logging.distributed': 'critical', 'distributed.scheduler.http.routes': []}
+    with dask.config.set(quiet):
         if scheduler is None:
             with (
                 LocalCluster(
@@ -73,24 +74,19 @@ def connected(
         except (OSError, ValueError, TypeError) as error:
             raise FleetError(f'{scheduler}: no Dask scheduler answers there') from error
         with client:
-            _check_workers(client, scheduler)
+            try:
+                client.wait_for_workers(1, timeout=_WAIT_S)
+                versions = client.run(version)
+            except TimeoutError as error:
+                raise FleetError(f'{scheduler}: has no worker') from error
+            except Exception as error:  # whatever an import fails with over there
+                said = f'{scheduler}: a worker lacks thermo_comp {__version__}'
+                raise FleetError(said) from error
+            for worker, found in versions.items():
+                if found != __version__:
+                    said = f'worker {worker} runs thermo_comp {found}, not {__version__}'
+                    raise FleetError(f'{scheduler}: {said}')
             yield client
-
-
-def _check_workers(client: Any, scheduler: str) -> None:
-    try:
-        client.wait_for_workers(1, timeout=_WAIT_S)
-    except TimeoutError as error:
-        raise FleetError(f'{scheduler}: has no worker') from error
-    try:
-        versions = client.run(version)
-    except Exception as error:  # whatever an import fails with over there
-        raise FleetError(f'{scheduler}: a worker lacks thermo_comp {__version__}') from error
-    for worker, found in versions.items():
-        if found != __version__:
-            raise FleetError(
-                f'{scheduler}: worker {worker} runs thermo_comp {found}, not {__version__}'
-            )
 
 
 def version() -> str:
@@ -121,22 +117,13 @@ def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
     if future.status == 'finished':
         result: UnitOutcome = future.result()
         return result
-    problem = 'the scheduler was lost'
-    if future.status == 'error':
-        error = future.exception()
-        if isinstance(error, KilledWorker):
-            n_died = error.allowed_failures + 1
-            problem = f'its worker died {n_died} times at it: too little memory?'
-        else:
-            problem = f'{type(error).__name__}: {" ".join(str(error).split())}'
-    row = empty_row(
-        name=unit.name,
-        serial=unit.name.rpartition('/')[2],
-        lot=unit.lot,
-        verdict=FAILED,
-        problem=problem,
-        n_bags=len(unit.bags),
-        n_bytes=sum(bag.n_bytes for bag in unit.bags),
-        tool_version=__version__,
-    )
+    error = future.exception() if future.status == 'error' else None
+    if error is None:
+        problem = 'the scheduler was lost'
+    elif isinstance(error, KilledWorker):
+        n_died = error.allowed_failures + 1
+        problem = f'its worker died {n_died} times at it: too little memory?'
+    else:
+        problem = f'{type(error).__name__}: {" ".join(str(error).split())}'
+    row = started_row(unit, verdict=FAILED, problem=problem)
     return UnitOutcome(row, {}, is_final=False)

@@ -27,18 +27,17 @@ def render_fleet(
 ) -> str:
     """Write the page; `certificate_of` gives a certificate's path beside it, or nothing."""
     fitted = [row for row in rows if is_fitted(row)]
-    level = 'good' if all(map(is_valid, rows)) else 'reserved' if fitted else 'poor'
     return render(
         'fleet.html',
         title='Fleet report',
         most=_MOST_ROWS,
-        level=level,
+        level='good' if all(map(is_valid, rows)) else 'reserved' if fitted else 'poor',
         rows=rows,
         summary=summary,
         n_fitted=len(fitted),
         refused=[row for row in rows if not is_fitted(row)],
         can_tell=np.isfinite(summary.limit),
-        figures=_figures(fitted, summary),
+        figures=_figures(fitted, summary) if fitted else [],
         links={row['name']: quote(certificate_of(row)) for row in fitted},
         now=f'{dt.datetime.now(dt.timezone.utc):%Y-%m-%d %H:%M}',
         version=__version__,
@@ -46,8 +45,6 @@ def render_fleet(
 
 
 def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnFigure]:
-    if not fitted:
-        return []
     curves = {
         section: np.array([v for row in fitted if isinstance(v := row[f'{section}_ug'], float)])
         for section in ('raw', 'static', 'dynamic')
@@ -64,16 +61,19 @@ def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnFigure]:
     ]
     # Of few units nobody knows what is usual.
     if np.isfinite(summary.limit):
-        labels, z, names = zip(
-            *((one.quantity.label, one.z, one.names) for one in summary.spreads), strict=True
-        )
         found.append(
             ReportFigure(
                 'distances',
                 'Which units stand out, and in what?',
                 'Each stroke is a unit: its distance from the fleet’s median in robust standard '
                 'deviations. Diamonds beyond the dashed lines are the units listed above.',
-                partial(draw_distances, labels, z, names, summary.limit),
+                partial(
+                    draw_distances,
+                    [one.quantity.label for one in summary.spreads],
+                    [one.z for one in summary.spreads],
+                    [one.names for one in summary.spreads],
+                    summary.limit,
+                ),
             )
         )
     return drawn_figures(found)

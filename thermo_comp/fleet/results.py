@@ -12,16 +12,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
+from .. import files
 from ..errors import FleetError
-from ..files import CALIBRATION as CALIBRATION_FILE
-from ..files import PAGE, RECORD, write_atomically
-from .discovery import FoundUnit
-from .table import Row, empty_row, is_fitted
+from .table import Row, is_fitted, row_of
 from .unit import FleetOptions, UnitOutcome
+from .units import FoundUnit
 
 _FORMAT = 2
 _LONGEST_NAME = 100
@@ -43,28 +42,20 @@ class Results:
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 
-    def files_of(self, row: Row) -> tuple[Path, Path]:
-        """Return where calibration and certificate of a row lie, or would lie."""
-        folder = self.folder_of(str(row['name']), row['prior'])
-        return folder / CALIBRATION, folder / CERTIFICATE
-
     def look_up(self, unit: FoundUnit, options: FleetOptions) -> Row | None:
         """Find the row of an earlier run; None where something changed, or was never finished."""
         folder = self.folder_of(unit.name, options.fit.prior)
         try:
             said = json.loads((folder / RESULT).read_bytes())
-            row = empty_row(**said['row'])
-            if (said['format'], said['options']) != (_FORMAT, options.digest()):
-                return None
-            if not said['is_final'] or said['files'] != _files(unit):
+            row = row_of(**said.pop('row'))
+            if not said['is_final'] or said != said | _key(unit, options):
                 return None
             if is_fitted(row):
                 content = (folder / CALIBRATION).read_bytes()
-                if hashlib.sha256(content).hexdigest() != row['calibration_sha256']:
+                is_there = (folder / CERTIFICATE).is_file() or not options.certificates
+                if not is_there or _sha256(content) != row['calibration_sha256']:
                     return None
-                if options.certificates and not (folder / CERTIFICATE).is_file():
-                    return None
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
         return row
 
@@ -78,35 +69,32 @@ class Results:
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):
             kept = f'{folder / CALIBRATION} of an earlier run stays'
-            problem = '; '.join(str(part) for part in (row['problem'], kept) if part)
-            return empty_row(**{**row, 'problem': problem})
+            return row_of(
+                **{**row, 'problem': '; '.join(filter(None, (str(row['problem']), kept)))}
+            )
         if outcome.calibration:
             # Until the record is written its hash is not the file's: the unit is not done.
             content = outcome.calibration.encode()
-            write_atomically(folder / CALIBRATION, content, CALIBRATION_FILE)
+            files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             if outcome.certificate:
-                write_atomically(folder / CERTIFICATE, outcome.certificate.encode(), PAGE)
+                content = outcome.certificate.encode()
+                files.write_atomically(folder / CERTIFICATE, content, files.PAGE)
             else:
                 (folder / CERTIFICATE).unlink(missing_ok=True)
-        said = {
-            name: None if isinstance(cell, float) and not math.isfinite(cell) else cell
-            for name, cell in row.items()
-        }
-        record = {
-            'format': _FORMAT,
-            'options': options.digest(),
-            'is_final': outcome.is_final,
-            'files': _files(unit),
-            'bags': outcome.hashes,
-            'row': said,
-        }
-        content = (json.dumps(record, indent=1) + '\n').encode()
-        write_atomically(folder / RESULT, content, RECORD)
-        return said
+        said = {'is_final': outcome.is_final, 'bags': outcome.hashes, 'row': row}
+        content = (json.dumps(_key(unit, options) | said, indent=1) + '\n').encode()
+        files.write_atomically(folder / RESULT, content, files.RECORD)
+        return row
 
 
-def _files(unit: FoundUnit) -> list[list[str | int]]:
-    return [[file.name, file.size, file.stamp] for bag in unit.bags for file in bag.files]
+def _key(unit: FoundUnit, options: FleetOptions) -> dict[str, Any]:
+    """Give what a result depends on, as JSON has it."""
+    found = [list(file) for bag in unit.bags.values() for file in bag]
+    return {'format': _FORMAT, 'options': options.digest(), 'files': found}
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _safe(part: str) -> str:
@@ -114,6 +102,8 @@ def _safe(part: str) -> str:
     name = quote(part, safe=" +,=@()'") or '%'
     if not name.strip('.'):
         name = name.replace('.', '%2E')
-    if len(name) > _LONGEST_NAME:
-        name = f'{name[:_LONGEST_NAME]}-{hashlib.sha256(part.encode()).hexdigest()[:16]}'
-    return name
+    return (
+        name
+        if len(name) <= _LONGEST_NAME
+        else f'{name[:_LONGEST_NAME]}-{_sha256(part.encode())[:16]}'
+    )

@@ -10,22 +10,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import FitError, FleetError
-from ..files import PAGE as PAGE_FILE
-from ..files import write_atomically
+from .. import files
+from ..errors import FitError
 from ..fitting.priors import UNITS_NEEDED, population
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import load_calibration, save_calibration
 from .cluster import connected, require_libraries, run
-from .discovery import FoundUnit, find_units
-from .results import Results
-from .storage import Storage
+from .results import CALIBRATION, CERTIFICATE, Results
 from .summary import Summary, summarise
 from .table import FAILED, Row, is_fitted, is_valid, write_tables
 from .unit import FleetOptions
+from .units import FoundUnit, Storage, find_units
 
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
-Tell = Callable[[int, int, Row], None]
 
 
 @dataclass(frozen=True)
@@ -53,9 +50,7 @@ class FleetResult:
     @property
     def is_whole(self) -> bool:
         """Whether every unit has a calibration that is valid on its bags, on all of them."""
-        return all(is_valid(row) for row in self.rows) and not any(
-            row['n_left_out'] or row['n_torn'] for row in self.rows
-        )
+        return all(is_valid(row) and not (row['n_left_out'] or row['n_torn']) for row in self.rows)
 
 
 def fit_fleet(
@@ -68,7 +63,7 @@ def fit_fleet(
     n_workers: int | None = None,
     client: Any = None,
     earlier: Sequence[Row] = (),
-    tell: Tell | None = None,
+    tell: Callable[[int, int, Row], None] | None = None,
 ) -> FleetResult:
     """
     Fit all units whose results are not there yet.
@@ -80,14 +75,12 @@ def fit_fleet(
     storage = Storage(url)
     units = find_units(storage)
     results = Results(Path(output))
-    _refuse_alike(units, results)
     n_done = 0
     with ExitStack() as stack:
 
         def fitted(some: Sequence[FoundUnit], how: FleetOptions) -> dict[str, Row]:
             nonlocal client, n_done
-            known = {unit.name: results.look_up(unit, how) for unit in some}
-            rows = {name: row for name, row in known.items() if row is not None}
+            rows = {one.name: row for one in some if (row := results.look_up(one, how))}
             missing = [unit for unit in some if unit.name not in rows]
             if missing and client is None:
                 client = stack.enter_context(connected(scheduler, n_workers, len(some)))
@@ -101,11 +94,16 @@ def fit_fleet(
         rows = fitted(units, options)
         prior, no_prior = _common(list(rows.values()), results)
         if with_prior and prior is not None:
-            rest = [unit for unit in units if not _speaks(rows[unit.name])]
-            others = [unit for unit in rest if rows[unit.name]['verdict'] != FAILED]
-            again = fitted(others, replace(options, fit=replace(options.fit, prior=prior)))
+            rest = [
+                one
+                for one in units
+                if not _speaks(row := rows[one.name]) and row['verdict'] != FAILED
+            ]
+            again = fitted(rest, replace(options, fit=replace(options.fit, prior=prior)))
             for name, row in again.items():
-                rows[name] = row if is_fitted(row) else _unhelped(rows[name], row)
+                said = f'not fitted with the prior: {row["problem"]}'
+                said = '; '.join(filter(None, (str(rows[name]['reservations']), said)))
+                rows[name] = row if is_fitted(row) else {**rows[name], 'reservations': said}
     ordered = tuple(rows[unit.name] for unit in units)
     summary = summarise(ordered, earlier)
     parquet, csv = write_tables(ordered, results.folder)
@@ -114,35 +112,19 @@ def fit_fleet(
     return FleetResult(ordered, summary, n_done, parquet, csv, page, prior_path, no_prior)
 
 
-def _refuse_alike(units: Sequence[FoundUnit], results: Results) -> None:
-    """Refuse two units whose results would lie in one folder."""
-    seen: dict[Path, str] = {}
-    for unit in units:
-        folder = results.folder_of(unit.name)
-        if folder in seen:
-            raise FleetError(f'{unit.name} and {seen[folder]} are too much alike: rename one')
-        seen[folder] = unit.name
-
-
 def _speaks(row: Row) -> bool:
     """Whether a unit may speak for its type: all of it was seen, and holds."""
     return is_valid(row) and row['is_whole'] == 1
-
-
-def _unhelped(row: Row, again: Row) -> Row:
-    """Say that a unit stays as it was fitted by itself."""
-    said = f'not fitted with the prior: {again["problem"]}'
-    return {**row, 'reservations': '; '.join(str(s) for s in (row['reservations'], said) if s)}
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
     """Write what the units that hold have in common; else say why there is nothing."""
     # A unit that was tested twice is one unit: the later test speaks.
     tests = sorted((row for row in rows if _speaks(row)), key=lambda row: str(row['start']))
-    latest = {row['serial']: row for row in tests}
+    latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
         return None, f'{len(latest)} units whose own bags tell all of them, need {UNITS_NEEDED}'
-    units = [load_calibration(results.files_of(row)[0]) for row in latest.values()]
+    units = [load_calibration(results.folder_of(name) / CALIBRATION) for name in latest.values()]
     try:
         prior = population(sorted(units, key=lambda one: one.unit.serial))
     except FitError as error:
@@ -155,9 +137,10 @@ def _write_page(rows: Sequence[Row], summary: Summary, results: Results) -> Path
     from .page import render_fleet
 
     def certificate_of(row: Row) -> str:
-        path = results.files_of(row)[1]
+        path = results.folder_of(str(row['name']), row['prior']) / CERTIFICATE
         return path.relative_to(results.folder).as_posix() if path.is_file() else ''
 
     page = results.folder / PAGE
-    write_atomically(page, render_fleet(rows, summary, certificate_of).encode(), PAGE_FILE)
+    content = render_fleet(rows, summary, certificate_of).encode()
+    files.write_atomically(page, content, files.PAGE)
     return page

@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns where a fleet's bags lie: on any file system that fsspec knows, which files make a bag, and
+which bags a unit.
+
+``DIR/[LOT/]UNIT/BAG``: the bags of one folder are one thermal test of one unit, so a unit that was
+tested twice has two folders and comes out twice. Bags that lie in DIR itself are sorted by the
+serial in their metadata.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import FleetError, RecordingError
+from ..recording import open_recording
+from ..text import one_line
+
+# What a file system may say of a file that changes with its content, the surest first.
+_STAMPS = (
+    *('ETag', 'etag', 'md5Hash', 'content_md5', 'generation', 'version_id'),
+    *('mtime', 'LastModified', 'last_modified', 'updated', 'created'),
+)
+
+
+class StoredFile(NamedTuple):
+    """One file as its listing has it; `stamp` (ETag or time) changes with its content."""
+
+    name: str
+    size: int
+    stamp: str
+
+
+#: The files of each bag, by its name below the fleet's folder; several for a directory.
+Bags = dict[str, list[StoredFile]]
+
+
+@dataclass(frozen=True)
+class FoundUnit:
+    """The bags of one thermal test; the name is a folder or serial, the lot the folder above."""
+
+    name: str
+    lot: str
+    bags: Bags
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of its bags."""
+        return sum(file.size for files in self.bags.values() for file in files)
+
+
+class Storage:
+    """
+    A folder here or at a URL like ``s3://bucket/bags``; FleetError for a strange protocol.
+
+    `address` is what another process must be told to find it, wherever that was started.
+    """
+
+    def __init__(self, url: str) -> None:
+        import fsspec
+
+        self.url = url
+        try:
+            self._fs, root = fsspec.core.url_to_fs(url)
+        except (ImportError, ValueError) as error:
+            raise FleetError(f'{url}: {_words(error)}') from error
+        self._root = str(root).rstrip('/')
+        self._is_local = 'file' in self._fs.protocol
+        self.address = self._root if self._is_local else url
+        self.name = self._root.rpartition('/')[2]
+
+    def files(self) -> list[StoredFile]:
+        """List all files below the folder but hidden ones, sorted by name."""
+        try:
+            if self._is_local:
+                found = {path: self._fs.info(path) for path in _walk(self._root)}
+            else:
+                found = self._fs.find(self._root, detail=True)
+            if not found and not self._fs.isdir(self._root):
+                raise NotADirectoryError(errno.ENOTDIR, 'no such directory')
+        except Exception as error:  # each file system has exceptions of its own
+            raise FleetError(f'{self.url}: cannot be listed: {_words(error)}') from error
+        files = []
+        for path, facts in found.items():
+            name = path.removeprefix(f'{self._root}/')
+            if facts['type'] == 'file' and not any(p.startswith('.') for p in name.split('/')):
+                stamp = next((str(facts[key]) for key in _STAMPS if facts.get(key)), '')
+                files.append(StoredFile(name, int(facts.get('size') or 0), stamp))
+        return sorted(files)
+
+    @contextmanager
+    def here(self, name: str, files: Sequence[StoredFile]) -> Iterator[Path]:
+        """Give the path of a bag on this machine, a copy if it lies elsewhere; raises OSError."""
+        if self._is_local:
+            yield Path(self._root, name)
+            return
+        with tempfile.TemporaryDirectory(prefix='thermo_comp-') as scratch:
+            there, copies = (
+                [f'{root}/{one.name}' for one in files] for root in (self._root, scratch)
+            )
+            try:
+                self._fs.get(there, copies)
+            except Exception as error:  # as above
+                raise OSError(errno.EIO, _words(error)) from error
+            yield Path(scratch, name)
+
+
+def _walk(root: str) -> Iterator[str]:
+    """Give the files of a local tree, which may be of links: fsspec does not follow them."""
+    for folder, folders, names in os.walk(root, followlinks=True):
+        here = Path(folder).resolve()
+        # A link to a folder that contains it would never end.
+        folders[:] = [n for n in folders if Path(folder, n).resolve() not in (here, *here.parents)]
+        yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
+
+
+def _words(error: Exception) -> str:
+    """Say in one line what went wrong."""
+    said = getattr(error, 'strerror', None) or ' '.join(str(error).split())
+    return said or type(error).__name__
+
+
+def find_units(storage: Storage) -> list[FoundUnit]:
+    """Find the units by name; raises FleetError where nothing can be listed or there is no bag."""
+    bags = group_files(storage.files())
+    if not bags:
+        raise FleetError(
+            f'{storage.url}: no bag in it; expected DIR/UNIT/BAG or DIR/LOT/UNIT/BAG, where BAG '
+            'is .mcap, .db3, .bag or a rosbag2 directory'
+        )
+    folders = {_folder(name) for name in bags}
+    found: dict[tuple[str, str], Bags] = defaultdict(dict)
+    for name, files in bags.items():
+        unit = _folder(name)
+        lot = unit.partition('/')[0] if '/' in unit else ''
+        if not unit:
+            serial = _serial(storage, name, files)
+            unit = f'{serial} (in {storage.name})' if serial in folders else serial
+        found[one_line(unit), one_line(lot)][name] = files
+    return [FoundUnit(unit, lot, found[unit, lot]) for unit, lot in sorted(found)]
+
+
+def group_files(files: Sequence[StoredFile]) -> Bags:
+    """Put the files of a fleet together to bags, in the order of their names."""
+    by_folder: dict[str, list[StoredFile]] = defaultdict(list)
+    for file in files:
+        by_folder[_folder(file.name)].append(file)
+    bags: Bags = {}
+    for folder, inside in by_folder.items():
+        stored = [one for one in inside if one.name.endswith(('.mcap', '.db3', '.bag'))]
+        if stored and folder and _is_bag(folder, inside, stored):
+            bags[folder] = inside
+        else:
+            bags |= {one.name: [one] for one in stored}
+    return dict(sorted(bags.items()))
+
+
+def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
+    """Whether a folder is a rosbag2 directory; one whose recorder was killed has no metadata."""
+    stems = [one.name.rpartition('.')[0].rpartition('_') for one in stored]
+    own = f'{folder}/{folder.rpartition("/")[2]}'
+    return any(one.name == f'{folder}/metadata.yaml' for one in inside) or all(
+        stem == own and number.isdigit() for stem, _, number in stems
+    )
+
+
+def _folder(name: str) -> str:
+    return name.rpartition('/')[0]
+
+
+def _serial(storage: Storage, name: str, files: Sequence[StoredFile]) -> str:
+    """Ask a bag that lies in the fleet's folder itself whose it is."""
+    try:
+        with storage.here(name, files) as path, open_recording(path, require=()) as reader:
+            return reader.info.metadata.get('serial') or storage.name
+    except (RecordingError, OSError):
+        # Nobody knows whose it is: it becomes a unit of its own, which says what is wrong.
+        return name
