@@ -152,4 +152,4 @@ def test_command(tmp_path, rng, cli):
     table = tmp_path / 'table.csv'
     table.write_text('1,2,3\n')
     wrong = cli('convert', table, '--unit', 'g', '-o', tmp_path / 'two.mcap', code=2)
-    assert 'are for bags' in wrong.stderr
+    assert 'a table needs no --unit; it has --columns, --rate-hz' in wrong.stderr

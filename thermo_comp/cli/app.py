@@ -18,23 +18,8 @@ import typer
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import (
-    convert,
-    demo,
-    evaluate,
-    exchange,
-    fit,
-    fleet,
-    info,
-    output,
-    play,
-    prior,
-    record,
-    replay,
-    report,
-    simulate,
-    view,
-)
+from . import convert, demo, evaluate, fit, fleet, info, output, record, replay, report, simulate
+from .options import expanded
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
@@ -72,21 +57,13 @@ def _top(
     """Thermal-drift compensation of a three-axis accelerometer."""
 
 
-app.command()(record.record)
-app.command()(fit.fit)
-app.command()(prior.prior)
+for _command in (
+    *(record.record, fit.fit, fit.prior, evaluate.evaluate, replay.replay, replay.play, info.info),
+    *(report.report, report.view, convert.convert, convert.export, convert.import_),
+    *(simulate.simulate, demo.demo),
+):
+    app.command(_command.__name__.rstrip('_'))(expanded(_command))
 app.add_typer(fleet.app)
-app.command()(evaluate.evaluate)
-app.command()(replay.replay)
-app.command()(play.play)
-app.command()(info.info)
-app.command()(report.report)
-app.command()(view.view)
-app.command()(convert.convert)
-app.command()(exchange.export)
-app.command('import')(exchange.import_)
-app.command()(simulate.simulate)
-app.command()(demo.demo)
 
 
 def main(arguments: list[str] | None = None) -> None:

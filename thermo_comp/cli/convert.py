@@ -1,29 +1,52 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``thermo_comp convert``: other people's logs into bags."""
+"""
+Owns what goes to and fro between other tools and ours: ``thermo_comp convert``, their logs into
+bags; ``export`` and ``import``, a calibration into their files and back.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ..errors import CalibrationError
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from . import options
 from .output import Output
 
 if TYPE_CHECKING:
     from ..convert import ConversionReport, ForeignLog
-    from ..convert.log import Finding
 
-_BAGS = {'.mcap', '.db3', '.bag'}
+Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
+
+#: What may be said of each kind of input.
+_OPTIONS = {
+    'table': ('--columns', '--rate-hz'),
+    'log': ('--imu', '--baro', '--allow-compensated'),
+    'bag': ('--topic', '--unit'),
+}
+#: What rows of a log have in common, by the findings of its conversion.
+_FINDINGS = {
+    'short_rows': 'rows left out, too short',
+    'non_numeric': 'rows left out, no number',
+    'out_of_range': 'rows left out, stamp before 1970 or after 2038',
+    'clipped': 'rows clipped, kept',
+    'backwards': 'rows whose time goes back, kept',
+    'repeated': 'rows whose time stands still, kept',
+}
+# Bytes; all parameters of a vehicle are some 60 kB.
+_LIMIT = 4 << 20
 
 
 def convert(
+    *,
     log: Annotated[
         Path,
         typer.Argument(
@@ -46,14 +69,12 @@ def convert(
     allow_compensated: Annotated[
         bool, typer.Option(help='Take a log that INS_TCAL or TC_A has corrected.')
     ] = False,
-    topic: options.Topic = None,
-    topics: options.TopicsFile = None,
+    names: options.TopicNames,
     unit: Annotated[
         Literal['m/s^2', 'g', 'mg'], typer.Option(help='What the Imu topic of a bag is in.')
     ] = 'm/s^2',
     force: options.Force = False,
-    as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    out: options.Out,
 ) -> None:
     """
     Make a bag of a table of numbers or of an autopilot's log.
@@ -69,39 +90,33 @@ def convert(
       thermo_comp convert log.csv --columns map.yaml -o unit42
       thermo_comp convert flight.ulg --imu 1 -o unit43
     """
-    from ..convert import bag_log, write_log
+    from ..convert import write_log
     from ..files import bag_kind, check_output
 
-    out = Output(as_json, quiet)
     read_too = [] if columns is None else [columns]
     check_output(output, bag_kind(output), overwrite=force, others=[log, *read_too])
-    names = options.named_topics(topic, topics)
-    if _is_bag(log):
-        if not names.keys() <= {'imu', 'board', 'case'}:
-            raise options.usage('--topic: of a bag, imu, board and case are converted')
-        for_logs = (columns, rate_hz, imu, baro, allow_compensated or None)
-        if any(one is not None for one in for_logs):
-            raise options.usage(
-                '--columns and --rate-hz are for tables, --imu, --baro and --allow-compensated '
-                'for logs; a bag has --topic'
-            )
-        read: Callable[[], ForeignLog] = partial(
-            bag_log, log, names.get('imu'), names.get('board'), names.get('case'), unit
-        )
-    else:
-        if names or unit != 'm/s^2':
-            raise options.usage('--topic and --unit are for bags')
-        read = _reader(out, log, columns, rate_hz, imu, baro, allow_compensated)
-    with out.progress('converting', total=1.0) as done:
+    given = {
+        '--columns': columns,
+        '--rate-hz': rate_hz,
+        '--imu': imu,
+        '--baro': baro,
+        '--allow-compensated': allow_compensated or None,
+        '--topic': names or None,
+        '--unit': None if unit == 'm/s^2' else unit,
+    }
+    read = _reader(out, log, given)
+    with out.progress('converting') as done:
         report = write_log(read(), output, force, done)
-    say(out, report)
-    if report.missing:
-        out.note(f'{log}: {report.missing}')
-    out.end(is_torn=bool(report.missing))
+    _say(out, report)
+    out.told([(log, None, report.missing)])
+    out.end()
 
 
-def _is_bag(path: Path) -> bool:
-    return path.is_dir() or path.suffix.lower() in _BAGS
+def _kind_of(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if path.is_dir() or suffix in ('.mcap', '.db3', '.bag'):
+        return 'bag'
+    return 'log' if suffix in ('.ulg', '.bin') else 'table'
 
 
 @contextmanager
@@ -111,7 +126,7 @@ def as_bags(
     """Let tables and logs take part as bags, for as long as it lasts."""
     from ..convert import write_log
 
-    others = [path for path in paths if path.is_file() and not _is_bag(path)]
+    others = [path for path in paths if path.is_file() and _kind_of(path) != 'bag']
     if (columns or rate_hz) and not others:
         raise options.usage('--columns and --rate-hz are for tables, and there is none')
     with TemporaryDirectory(prefix='thermo_comp-') as folder:
@@ -119,53 +134,42 @@ def as_bags(
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
             bags[path].parent.mkdir()
-            write_log(_reader(out, path, columns, rate_hz)(), bags[path])
+            read = _reader(out, path, {'--columns': columns, '--rate-hz': rate_hz})
+            write_log(read(), bags[path])
         yield [bags.get(path, path) for path in paths]
 
 
-def _reader(
-    out: Output,
-    log: Path,
-    columns: Path | None = None,
-    rate_hz: float | None = None,
-    imu: int | None = None,
-    baro: int | None = None,
-    allow_compensated: bool = False,
-) -> Callable[[], ForeignLog]:
-    """Tell the format of a table or log by its name, and refuse options that it has no use for."""
-    from ..convert import (
-        foreign_log,
-        guess_columns,
-        load_column_map,
-        read_dataflash,
-        read_ulog,
-        spoken_columns,
-        table_log,
-    )
+def _reader(out: Output, path: Path, given: Mapping[str, Any]) -> Callable[[], ForeignLog]:
+    """Choose what reads an input, by its name; refuse options that it has no use for."""
+    from .. import convert
 
-    suffix = log.suffix.lower()
-    is_log = suffix in ('.ulg', '.bin')
-    if is_log and (columns is not None or rate_hz is not None):
-        raise options.usage(f'a {suffix} log needs no --columns and no --rate-hz')
-    if allow_compensated and not is_log:
-        raise options.usage('--allow-compensated is for PX4 and ArduPilot logs (.ulg, .bin)')
-    if is_log:
-        read = read_ulog if suffix == '.ulg' else read_dataflash
-        return lambda: foreign_log(read(log), imu, baro, allow_compensated)
-    if imu is not None or baro is not None:
-        raise options.usage('--imu and --baro are for PX4 and ArduPilot logs (.ulg, .bin)')
+    kind = _kind_of(path)
+    said = {option: value for option, value in given.items() if value is not None}
+    for option in said:
+        if option not in _OPTIONS[kind]:
+            raise options.usage(f'a {kind} needs no {option}; it has {", ".join(_OPTIONS[kind])}')
+    if kind == 'bag':
+        names = said.get('--topic', {})
+        if not names.keys() <= {'imu', 'board', 'case'}:
+            raise options.usage('--topic: of a bag, imu, board and case are converted')
+        return partial(convert.bag_log, path, **names, unit=said.get('--unit', 'm/s^2'))
+    if kind == 'log':
+        read = convert.read_ulog if path.suffix.lower() == '.ulg' else convert.read_dataflash
+        imu, baro, is_allowed = (said.get(option) for option in _OPTIONS['log'])
+        return lambda: convert.foreign_log(read(path), imu, baro, bool(is_allowed))
+    columns, rate_hz = said.get('--columns'), said.get('--rate-hz')
     if columns is not None and rate_hz is not None:
         raise options.usage('--rate-hz: a column map says that')
-    if columns is None and suffix in ('.parquet', '.pq'):
-        raise options.usage('a Parquet table needs --columns MAP')
     if columns is not None:
-        return partial(table_log, log, load_column_map(columns))
-    guessed = guess_columns(log, rate_hz)
-    out.line(f'{log}: taken as {spoken_columns(guessed)}; --columns says otherwise')
-    return partial(table_log, log, guessed)
+        return partial(convert.table_log, path, convert.load_column_map(columns))
+    if path.suffix.lower() in ('.parquet', '.pq'):
+        raise options.usage('a Parquet table needs --columns MAP')
+    guessed = convert.guess_columns(path, rate_hz)
+    out.line(f'{path}: taken as {convert.spoken_columns(guessed)}; --columns says otherwise')
+    return partial(convert.table_log, path, guessed)
 
 
-def say(out: Output, report: ConversionReport) -> None:
+def _say(out: Output, report: ConversionReport) -> None:
     """Print the account of a conversion."""
     from ..convert.log import SLOW_HZ
 
@@ -173,13 +177,15 @@ def say(out: Output, report: ConversionReport) -> None:
         f'{report.source}: {report.rows} rows, {report.duration_s:.1f} s '
         f'at {report.rate_hz:.4g} Hz'
     )
-    topic = 'accel/counts' if report.input == 'counts' else 'imu/uncompensated'
     out.line(f'{report.output}:')
-    out.line(f'  {report.accel_messages:8} {topic}')
-    out.line(f'  {report.board_messages:8} temperature/board')
-    out.line(f'  {report.case_messages:8} temperature/case')
-    for name, count in report.further_messages.items():
-        out.line(f'  {count:8} temperature/{name}')
+    counts = {
+        'accel/counts' if report.input == 'counts' else 'imu/uncompensated': report.accel_messages,
+        'temperature/board': report.board_messages,
+        'temperature/case': report.case_messages,
+        **{f'temperature/{name}': count for name, count in report.further_messages.items()},
+    }
+    for topic, count in counts.items():
+        out.line(f'  {count:8} {topic}')
     out.line(f'unit: {report.unit}; {report.believed}')
     if report.rate_hz < SLOW_HZ:
         out.line(
@@ -188,22 +194,141 @@ def say(out: Output, report: ConversionReport) -> None:
         )
     if report.hint:
         out.line(report.hint)
-    _say_finding(out, 'rows left out, too short', report.short_rows)
-    _say_finding(out, 'rows left out, no number', report.non_numeric)
-    _say_finding(out, 'rows left out, stamp before 1970 or after 2038', report.out_of_range)
-    _say_finding(out, 'rows clipped, kept', report.clipped)
-    _say_finding(out, 'rows whose time goes back, kept', report.backwards)
-    _say_finding(out, 'rows whose time stands still, kept', report.repeated)
+    for name, what in _FINDINGS.items():
+        finding = getattr(report, name)
+        if finding.count:
+            more = ', ...' if finding.count > len(finding.lines) else ''
+            where = f' (line {", ".join(map(str, finding.lines))}{more})' if finding.lines else ''
+            out.line(f'{what}: {finding.count}{where}')
     if report.stillness.moving_ns:
         out.line('moved or shaken, not at rest:')
-        for first, last in report.stillness.moving_ns:
-            begin, end = ((t - report.start_ns) * 1e-9 for t in (first, last))
+        for stretch in report.stillness.moving_ns:
+            begin, end = ((stamp_ns - report.start_ns) * 1e-9 for stamp_ns in stretch)
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
-    out.json({name: getattr(report, name) for name in report.__dataclass_fields__})
+    out.json(vars(report))
 
 
-def _say_finding(out: Output, what: str, finding: Finding) -> None:
-    if finding.count:
-        lines = ', '.join(map(str, finding.lines))
-        more = ', ...' if finding.count > len(finding.lines) else ''
-        out.line(f'{what}: {finding.count}' + (f' (line {lines}{more})' if lines else ''))
+def export(
+    *,
+    path: Annotated[Path, typer.Argument(help='Calibration of the unit.', metavar='YAML')],
+    to: Annotated[Tool, typer.Option(help='Whose file to write.')],
+    output: Annotated[Path, typer.Option('--output', '-o', help='File to write.')],
+    number: Annotated[
+        int | None,
+        typer.Option(
+            help='Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
+            'Kalibr (0).',
+            min=0,
+        ),
+    ] = None,
+    device_id: Annotated[
+        int, typer.Option(help="PX4's id of the sensor (TC_An_ID), which it matches by.")
+    ] = 0,
+    up: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help='Direction of +g in the sensor frame, at which the drift of the scale is folded '
+            'into the offset.',
+            metavar='X Y Z',
+        ),
+    ] = None,
+    force: options.Force = False,
+    out: options.Out,
+) -> None:
+    """
+    Write a calibration as a file of another tool.
+
+    PX4 and ArduPilot keep a cubic of temperature per axis' offset; imu_tk
+    (.calib), imu_calib and Kalibr (YAML) keep bias, scale and misalignment at
+    one temperature, the reference. What the calibration holds beyond that is
+    lost, and said with what it costs.
+
+    Example:
+      thermo_comp export unit42.yaml --to px4 -o unit42.params
+      thermo_comp export unit42.yaml --to ardupilot --up 0 0 1 -o unit42.parm
+      thermo_comp export unit42.yaml --to imu_tk -o unit42.calib
+    """
+    from ..convert.exchange import export_calibration
+    from ..files import PARAMETERS, check_output, write_atomically
+    from ..unit.calibration_file import load_calibration
+
+    if device_id and to != 'px4':
+        raise options.usage('--device-id is for PX4')
+    if up is not None and to not in ('px4', 'ardupilot'):
+        raise options.usage('--up is for PX4 and ArduPilot')
+    check_output(output, PARAMETERS, overwrite=force, others=[path])
+    calibration = load_calibration(path)
+    with options.usage_of():
+        result = export_calibration(calibration, to, number=number, device_id=device_id, up=up)
+    write_atomically(output, result.text.encode(), PARAMETERS, overwrite=force)
+    out.line(f'{output}: parameters of {to} for unit {calibration.unit.serial}')
+    for note in result.notes:
+        out.line(f'- {note}')
+    out.json(
+        {'output': output, 'to': to, 'serial': calibration.unit.serial, 'notes': result.notes}
+    )
+
+
+def import_(
+    *,
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help='Parameters of PX4 or ArduPilot, .calib of imu_tk, YAML of imu_calib or Kalibr.',
+            metavar='FILE',
+        ),
+    ],
+    output: options.NewCalibration,
+    serial: Annotated[
+        str, typer.Option(help='Serial to give the unit.', callback=options.check_serial)
+    ],
+    number: Annotated[
+        int | None,
+        typer.Option(help='Which set, where there are several (TC_A0, INS_TCAL1, imu0).'),
+    ] = None,
+    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = STANDARD_GRAVITY,
+    rate_hz: Annotated[float, typer.Option(help='Samples per second of the unit.', min=0.1)] = 200,
+    full_scale_g: Annotated[float, typer.Option(help='Full scale in g.', min=0.1)] = 16.0,
+    noise_ug: Annotated[
+        float, typer.Option(help='Noise density in ug/sqrt(Hz); it sets the covariance.', min=0.01)
+    ] = 200.0,
+    force: options.Force = False,
+    out: options.Out,
+) -> None:
+    """
+    Make a calibration of a file of another tool.
+
+    Thermal parameters of PX4 and ArduPilot give the bias over temperature;
+    the files of imu_tk, imu_calib and Kalibr give bias, scale and
+    misalignment. One set stands for both regimes. It is for the readings that
+    the file is for: m/s^2 (node: input:=imu), or counts. Fit bags of a
+    thermal test to get the rest.
+
+    Example:
+      thermo_comp import autopilot.params --serial 42 -o unit42.yaml
+      thermo_comp import xsens_acc.calib --serial 42 -o unit42.yaml
+    """
+    from ..convert.exchange import import_calibration
+    from ..files import CALIBRATION, check_output, read_bounded
+    from ..unit.calibration_file import save_calibration
+
+    check_output(output, CALIBRATION, overwrite=force, others=[path])
+    try:
+        calibration = import_calibration(
+            read_bounded(path, _LIMIT).decode('utf-8', errors='replace'),
+            serial=serial,
+            number=number,
+            gravity=gravity,
+            cycle_time_s=1.0 / rate_hz,
+            full_scale=full_scale_g * 1e6 * MICRO_G,
+            noise_density=noise_ug * MICRO_G,
+        )
+    except (CalibrationError, ValueError) as failure:
+        raise CalibrationError(str(failure), path=path) from failure
+    save_calibration(calibration, output, overwrite=force)
+    lower, upper = calibration.static.temperature_range_c
+    source = calibration.provenance.model
+    out.line(f'{output}: unit {serial}, {source}, {lower:g} .. {upper:g} degC')
+    for note in calibration.provenance.notes:
+        out.line(f'- {note}')
+    out.json({'output': output, 'calibration': calibration})

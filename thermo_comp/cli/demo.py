@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -20,7 +21,6 @@ from ..errors import ThermoCompError
 from ..unit.gravity import STANDARD_GRAVITY
 from . import options
 from .output import Cell, Output, micro_g
-from .play import require_ros
 
 if TYPE_CHECKING:
     from ..judging import Evaluation
@@ -40,14 +40,14 @@ _MODELS: dict[str, dict[str, Any]] = {
 
 
 def demo(
+    *,
     bags: Annotated[
         Path | None, typer.Option(help='Folder of the sample bags.', metavar='DIR')
     ] = None,
     output: Annotated[
         Path, typer.Option('--out', '-o', help='Folder for what the demo makes.', metavar='DIR')
     ] = Path('out'),
-    as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    out: options.Out,
 ) -> None:
     """
     Run the main job on the sample bags, end to end.
@@ -58,7 +58,7 @@ def demo(
     Example:
       thermo_comp demo --out out
     """
-    require_ros()
+    options.require_ros()
     # Before the first import of ROS: on this machine only.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     from ..judging import evaluate, open_bag
@@ -66,7 +66,6 @@ def demo(
     from ..report import evidence_of_bags, write_report
     from ..ros.round_trip import round_trip
 
-    out = Output(as_json, quiet)
     folder = _sample_bags(bags)
     output.mkdir(parents=True, exist_ok=True)
     held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'
@@ -76,7 +75,7 @@ def demo(
     out.line(f'fitted {unit} from {len(fit_bags)} bags of {folder / "fit"}')
     info = inspect_recording(held_out)
     bag_s = (info.end_ns - info.start_ns) * 1e-9
-    with out.progress('playing', total=1.0) as done:
+    with out.progress('playing') as done:
         trip = round_trip(
             held_out, unit, recorded, rate=_RATE, overwrite=recorded.exists(), progress=done
         )
@@ -100,7 +99,7 @@ def demo(
     out.line()
     _say(out, result)
     page, figures = output / 'report.html', output / 'figures'
-    with out.progress('drawing'):
+    with out.progress('drawing', total=None):
         evidence = evidence_of_bags(
             [open_bag(held_out)], calibrations['node'], gravity=STANDARD_GRAVITY
         )
@@ -137,17 +136,14 @@ def _sample_bags(given: Path | None) -> Path:
 
 def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
     """Fit the three calibrations that are compared, and write the one for the node."""
-    from ..fitting import FitOptions, fit
-    from ..fitting.fit_sources import fit_sources
+    from ..arrays import fit
     from ..unit.calibration_file import save_calibration
 
-    sources, _ = fit_sources(bags)
     calibrations = {}
     with out.progress('fitting', total=len(_MODELS)) as done:
-        for before, (name, chosen) in enumerate(_MODELS.items()):
-            result = fit(sources, FitOptions(gravity=STANDARD_GRAVITY, **chosen))
-            calibrations[name] = result.calibration
-            done(before + 1)
+        for name, chosen in _MODELS.items():
+            calibrations[name] = fit(bags, gravity=STANDARD_GRAVITY, **chosen)
+            done(len(calibrations))
     for name, file in (('node', 'unit.yaml'), ('one set', 'one_set.yaml')):
         save_calibration(calibrations[name], output / file)
     return calibrations
@@ -157,45 +153,42 @@ def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool
     """Compare the node's recorded output with the offline run, bit for bit."""
     import numpy as np
 
-    from ..online.compensator import Compensator
-    from ..recording import Topics, open_recording, read_recording
-    from ..replay import corrected_blocks
+    from ..recording import Topics, read_recording
+    from ..replay import replay
 
-    live = read_recording(recorded, Topics(imu=_OUTPUT), 'imu', require=['accel']).columns
-    with open_recording(bag) as reader:
-        items = [
-            item.corrected for item in corrected_blocks(Compensator(calibration), reader.blocks())
-        ]
+    with TemporaryDirectory(prefix='thermo_comp-') as folder:
+        offline = replay(bag, calibration, Path(folder) / 'offline.mcap').output
+        live, own = (
+            read_recording(path, Topics(imu=_OUTPUT), 'imu', require=['accel']).columns
+            for path in (recorded, offline)
+        )
     return (
         live.imu is not None
-        and np.array_equal(np.concatenate([i.stamp_ns for i in items]), live.accel_stamp_ns)
-        and np.array_equal(np.concatenate([i.specific_force for i in items]), live.accel)
+        and own.imu is not None
+        and np.array_equal(own.accel_stamp_ns, live.accel_stamp_ns)
+        and np.array_equal(own.accel, live.accel)
         and np.array_equal(
-            np.concatenate([i.covariance for i in items]), live.imu.linear_acceleration_covariance
+            own.imu.linear_acceleration_covariance, live.imu.linear_acceleration_covariance
         )
     )
 
 
 def _say(out: Output, result: Evaluation) -> None:
     from ..judging import SECTIONS
-    from ..unit.gravity import MICRO_G
 
     rows: list[tuple[Cell, ...]] = []
     for section in SECTIONS:
         parts = [result.judgements[name].sections[section] for name in _MODELS]
-        if not parts[0].n:
-            continue
-        raw = result.judgements['node'].sections[section]
-        pairs = [(raw.raw_rms, raw.raw_peak), *((one.rms, one.peak) for one in parts)]
-        cells = [
-            f'{micro_g(rms / MICRO_G):>4} / {micro_g(peak / MICRO_G):>4}' for rms, peak in pairs
-        ]
-        rows.append((section, parts[0].n, *cells))
+        if parts[0].n:
+            raw = result.judgements['node'].sections[section]
+            pairs = [(raw.raw_rms, raw.raw_peak), *((one.rms, one.peak) for one in parts)]
+            cells = [f'{micro_g(rms):>4} / {micro_g(peak):>4}' for rms, peak in pairs]
+            rows.append((section, parts[0].n, *cells))
     window_s = result.judgements['node'].windows.window_s
     out.table(
         ('section', 'windows', 'raw', *_MODELS),
         rows,
-        title=f'|g| error in ug over {window_s:g} s, RMS / max',
+        title=f'|f| error in ug over {window_s:g} s, RMS / max',
     )
     out.line('one set: one cubic for all; two sets: another one in the dynamic regime, as in the')
     out.line('paper; node: two sets and the thermal response that the evidence wants')

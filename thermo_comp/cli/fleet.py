@@ -11,10 +11,10 @@ import typer
 
 from ..text import one_line
 from . import options
-from .output import Output, micro_g
+from .output import Output, micro
 
 if TYPE_CHECKING:
-    from ..fleet import FleetResult, Row
+    from ..fleet import FleetResult
 
 app = typer.Typer(
     name='fleet',
@@ -29,16 +29,16 @@ def _fleet() -> None:
 
 
 @app.command()
+@options.expanded
 def fit(
+    *,
     folder: Annotated[
         str, typer.Argument(help='DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR')
     ],
     output: Annotated[
         Path, typer.Option('--output', '-o', help='Folder of the results; goes on where it was.')
     ],
-    gravity: options.Gravity = None,
-    latitude: options.Latitude = None,
-    height: options.Height = None,
+    settings: options.FittingOptions,
     scheduler: Annotated[
         str | None,
         typer.Option(help='Dask scheduler (tcp://HOST:PORT), instead of this machine alone.'),
@@ -57,17 +57,8 @@ def fit(
         list[Path] | None,
         typer.Option(help='fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
     ] = None,
-    model: options.Model = 'response',
-    full_scale: options.FullScale = None,
-    reference_temperature: options.ReferenceTemperature = 20.0,
-    min_rest: options.MinRest = None,
-    still_sd: options.StillSd = '50mg',
-    allow: options.Allow = None,
-    input_: options.InputOption = 'auto',
-    topic: options.Topic = None,
-    topics: options.TopicsFile = None,
-    as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    reading: options.ReadingOptions,
+    out: options.Out,
 ) -> None:
     """
     Fit every unit below a folder.
@@ -85,29 +76,14 @@ def fit(
     from ..fitting import FitOptions
     from ..fleet import FleetOptions, fit_fleet, read_parquet
 
-    out = Output(as_json, quiet)
-    gravity = options.needed_place(gravity, latitude, height)
     with options.usage_of():
-        settings = FleetOptions(
-            fit=FitOptions(
-                gravity=gravity,
-                model=model,
-                full_scale=full_scale,
-                reference_temperature=reference_temperature,
-                min_rest_s=min_rest,
-                still_sd=options.acceleration(still_sd, '--still-sd') or 0.0,
-                allow=tuple(allow or ()),
-            ),
-            topics=options.topics_of(topic, topics),
-            input=input_,
-            certificates=certificates,
-        )
+        wanted = FleetOptions(fit=FitOptions(**settings), **reading, certificates=certificates)
     before = [row for path in earlier or () for row in read_parquet(path)]
-    with out.progress('fitting', total=1.0) as done:
+    with out.progress('fitting') as done:
         result = fit_fleet(
             folder,
             output,
-            settings,
+            wanted,
             with_prior=with_prior,
             scheduler=scheduler,
             n_workers=workers,
@@ -115,8 +91,7 @@ def fit(
             tell=lambda n, total, _row: done(n / total),
         )
     _say(out, result, with_prior)
-    if not result.is_whole:
-        raise typer.Exit(1)
+    out.end(int(not result.is_whole))
 
 
 def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
@@ -128,8 +103,7 @@ def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
                 _short(str(row['name'])),
                 _short(str(row['serial'])),
                 row['verdict'],
-                _micro_g(row, 'static_ug'),
-                _micro_g(row, 'dynamic_ug'),
+                *(_micro(row[name]) for name in ('static_ug', 'dynamic_ug')),
                 f'{row["n_bags"]}-{row["n_left_out"]}' if row['n_left_out'] else row['n_bags'],
             )
             for row in result.rows
@@ -178,9 +152,8 @@ def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
     )
 
 
-def _micro_g(row: Row, name: str) -> str:
-    value = row[name]
-    return micro_g(value) if isinstance(value, float) else '-'
+def _micro(value: object) -> str | None:
+    return micro(value) if isinstance(value, float) else None
 
 
 def _short(name: str, limit: int = 22) -> str:

@@ -11,21 +11,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..text import counted
 from . import options
-from .output import Cell, Output, micro_g
+from .output import Output, micro_g
 
 if TYPE_CHECKING:
     from ..recording import Topics
 
 
 def info(
+    *,
     path: Annotated[Path, typer.Argument(help='Bag or calibration file.', metavar='BAG|YAML')],
-    topic: options.Topic = None,
-    topics: options.TopicsFile = None,
-    begin: options.Begin = None,
-    end: options.End = None,
-    as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    topics: options.TopicsPart,
+    out: options.Out,
 ) -> None:
     """
     Say what is in a bag or a calibration.
@@ -36,19 +34,18 @@ def info(
     Example:
       thermo_comp info chamber.mcap
     """
-    out = Output(as_json, quiet)
     if path.suffix in ('.yaml', '.yml'):
         _calibration(out, path)
     else:
-        _bag(out, path, options.topics_of(topic, topics, begin, end))
+        _bag(out, path, topics)
 
 
 def _bag(out: Output, path: Path, topics: Topics) -> None:
     from ..recording.overview import survey_recording
 
-    with out.progress(f'reading {path.name}', total=1.0) as done:
+    with out.progress(f'reading {path.name}') as done:
         survey = survey_recording(path, topics, done)
-    found = survey.info
+    found, thermometers = survey.info, survey.thermometers
     out.line(f'{path}: {found.storage}, {found.n_messages} messages')
     for key, value in found.metadata.items():
         if key in ('serial', 'converted_from', 'corrected_from', 'simulated_by'):
@@ -58,27 +55,24 @@ def _bag(out: Output, path: Path, topics: Topics) -> None:
         [(name, kind, count) for name, (kind, count) in sorted(found.topics.items())],
     )
     if survey.n:
-        intervals = 'interval' if survey.n_still == 1 else 'intervals'
         out.line(
             f'{survey.n} samples of {found.input}, {survey.rate_hz:.4g} Hz, '
-            f'{survey.duration_s:.1f} s; '
-            f'{survey.n_still} still {intervals}, {survey.still_s:.1f} s'
+            f'{survey.duration_s:.1f} s; {counted(survey.n_still, "still interval")}, '
+            f'{survey.still_s:.1f} s'
         )
-    rows: list[tuple[Cell, ...]] = [
-        (
-            name,
-            sensor.rate_hz,
-            sensor.lowest,
-            sensor.highest,
-            sensor.steepest_heating_k_min,
-            sensor.steepest_cooling_k_min,
-        )
-        for name, sensor in survey.thermometers.items()
-    ]
     if found.chosen:
         out.line(found.chosen)
-    if rows:
-        out.table(('sensor', 'Hz', 'min degC', 'max degC', 'max K/min', 'min K/min'), rows)
+    if thermometers:
+        out.table(
+            ('sensor', 'Hz', 'min degC', 'max degC', 'max K/min', 'min K/min'),
+            [
+                (
+                    *(name, one.rate_hz, one.lowest, one.highest),
+                    *(one.steepest_heating_k_min, one.steepest_cooling_k_min),
+                )
+                for name, one in thermometers.items()
+            ],
+        )
     for finding in survey.findings:
         out.line(f'- {finding}')
     if not survey.findings:
@@ -100,21 +94,20 @@ def _bag(out: Output, path: Path, topics: Topics) -> None:
             'duration_s': survey.duration_s,
             'still_intervals': survey.n_still,
             'still_s': survey.still_s,
-            'board': survey.thermometers.get('board'),
-            'case': survey.thermometers.get('case'),
-            'thermometers': survey.thermometers,
+            'board': thermometers.get('board'),
+            'case': thermometers.get('case'),
+            'thermometers': thermometers,
             'findings': survey.findings,
         }
     )
-    out.end(is_torn=bool(found.truncated))
+    out.end(int(bool(found.truncated)))
 
 
 def _calibration(out: Output, path: Path) -> None:
     from ..unit.calibration_file import load_calibration
-    from ..unit.gravity import MICRO_G
 
     calibration = load_calibration(path)
-    unit, provenance = calibration.unit, calibration.provenance
+    unit, provenance, axes = calibration.unit, calibration.provenance, calibration.axes
     out.line(f'{path}: unit {unit.serial}, {unit.input} up to {unit.full_scale:g}')
     out.line(
         f'  fitted {provenance.created or "at an unknown time"} by thermo_comp '
@@ -129,14 +122,10 @@ def _calibration(out: Output, path: Path) -> None:
         ('axis', 'scale factor', 'bias', 'bias ug'),
         [
             (
-                name,
-                f'{axis.scale_factor:.8g}',
-                f'{axis.bias:.6g}',
-                micro_g(axis.bias / axis.scale_factor / MICRO_G),
+                *(name, f'{axis.scale_factor:.8g}', f'{axis.bias:.6g}'),
+                micro_g(axis.bias / axis.scale_factor),
             )
-            for name, axis in zip(
-                'xyz', (calibration.axes.x, calibration.axes.y, calibration.axes.z), strict=True
-            )
+            for name, axis in zip('xyz', (axes.x, axes.y, axes.z), strict=True)
         ],
     )
     out.table(
@@ -144,14 +133,12 @@ def _calibration(out: Output, path: Path) -> None:
         [
             (
                 name,
-                '{:.1f} .. {:.1f}'.format(*regime_set.temperature_range_c),
-                '{:.2f} .. {:.2f}'.format(*regime_set.rate_range_k_min),
-                regime_set.x.bias_function.kind,
-                regime_set.x.scale_function.kind,
+                '{:.1f} .. {:.1f}'.format(*one.temperature_range_c),
+                '{:.2f} .. {:.2f}'.format(*one.rate_range_k_min),
+                one.x.bias_function.kind,
+                one.x.scale_function.kind,
             )
-            for name, regime_set in zip(
-                ('static', 'dynamic'), calibration.regime_sets(), strict=True
-            )
+            for name, one in zip(('static', 'dynamic'), calibration.regime_sets(), strict=True)
         ],
     )
     if provenance.residuals:
@@ -159,11 +146,8 @@ def _calibration(out: Output, path: Path) -> None:
             ('section', 'windows', 'raw ug RMS', 'ug RMS', 'ug max'),
             [
                 (
-                    row.section,
-                    row.n_windows,
-                    micro_g(row.raw_rms_m_s2 / MICRO_G),
-                    micro_g(row.rms_m_s2 / MICRO_G),
-                    micro_g(row.max_m_s2 / MICRO_G),
+                    *(row.section, row.n_windows),
+                    *map(micro_g, (row.raw_rms_m_s2, row.rms_m_s2, row.max_m_s2)),
                 )
                 for row in provenance.residuals
             ],

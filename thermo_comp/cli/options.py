@@ -1,27 +1,44 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the options that several commands share, each with one meaning everywhere."""
+"""
+Owns the options that several commands share, and what the library takes made of them.
+
+An alias is one option, or, with `Given`, a value that a function makes of several: a command says
+what it wants, and `expanded` offers typer the options.
+"""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+import inspect
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import wraps
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict, get_type_hints
 
 import typer
 
 from ..errors import ThermoCompError
 from ..text import valid_serial
+from .output import Output
 
 if TYPE_CHECKING:
     from ..recording import Topics
 
+#: A mistake in the command line, to be raised: exit code 2.
+usage = typer.BadParameter
 
-InputChoice = Literal['auto', 'counts', 'imu']
-ModelChoice = Literal['response', 'golovach']
-CurveChoice = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
+
+@contextmanager
+def usage_of(what: str = '') -> Iterator[None]:
+    """Take a ValueError of the block for a mistake in the command line."""
+    try:
+        yield
+    except ValueError as mistake:
+        raise usage(f'{what}{mistake}') from mistake
 
 
 def check_serial(serial: str | None) -> str | None:
@@ -32,80 +49,30 @@ def check_serial(serial: str | None) -> str | None:
     return serial
 
 
-TableRate = Annotated[
-    float | None,
-    typer.Option(help='Samples per second of a table without times.', min=0.01, max=1e6),
-]
-Model = Annotated[
-    ModelChoice, typer.Option(help="The thermal response, or the paper's two sets alone.")
-]
-StaticCurve = Annotated[
-    CurveChoice | None,
-    typer.Option(help="Bias and scale over temperature; else the model's own.", metavar='CURVE'),
-]
-DynamicCurve = Annotated[
-    CurveChoice | None,
-    typer.Option(help='The same of the dynamic set, by itself.', metavar='CURVE'),
-]
-Json = Annotated[bool, typer.Option('--json', help='Print the result as one JSON object.')]
-Quiet = Annotated[bool, typer.Option('--quiet', '-q', help='Print nothing but errors.')]
 Force = Annotated[bool, typer.Option('--force', '-f', help='Overwrite one of the same kind.')]
-CalibrationFile = Annotated[
-    Path, typer.Option('--calibration', '-c', help='Calibration of the unit (YAML).')
+Quiet = Annotated[bool, typer.Option('--quiet', '-q', help='Print nothing but errors.')]
+NewCalibration = Annotated[
+    Path, typer.Option('--output', '-o', help='Calibration to write (YAML).')
 ]
 Bag = Annotated[
     Path, typer.Argument(help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
 ]
-Topic = Annotated[
-    list[str] | None,
-    typer.Option(
-        help='Where an input stands: counts, imu, board, case, temperature/NAME.',
-        metavar='INPUT=TOPIC',
-    ),
+JudgedBags = Annotated[
+    list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
 ]
-TopicsFile = Annotated[
-    Path | None, typer.Option(help='The same from a file, INPUT: TOPIC a line.', metavar='YAML')
+CertificateInfo = Annotated[
+    Path | None, typer.Option(help='What the laboratory states: number, customer, ... (YAML).')
 ]
-Begin = Annotated[
+TableRate = Annotated[
     float | None,
-    typer.Option(
-        '--from',
-        help='Read each bag from there on: seconds from its first sample, or a stamp.',
-        metavar='S',
-    ),
+    typer.Option(help='Samples per second of a table without times.', min=0.01, max=1e6),
 ]
-End = Annotated[float | None, typer.Option('--to', help='Read to there.', metavar='S')]
-InputOption = Annotated[InputChoice, typer.Option('--input', help='What is read from the bag.')]
-Gravity = Annotated[
-    float | None, typer.Option('--gravity', help='Local gravity in m/s^2.', metavar='G')
-]
-Latitude = Annotated[
-    float | None, typer.Option('--latitude', help='Latitude in degrees, with --height.')
-]
-Height = Annotated[float | None, typer.Option('--height', help='Height above the ellipsoid in m.')]
 Serial = Annotated[
     str | None,
     typer.Option(
-        '--serial',
         help="Serial of the unit, instead of the bag's; '' accepts any calibration.",
         callback=check_serial,
     ),
-]
-NewSerial = Annotated[
-    str | None,
-    typer.Option('--serial', help="Serial, instead of the bags'.", callback=check_serial),
-]
-FullScale = Annotated[
-    float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
-]
-ReferenceTemperature = Annotated[
-    float, typer.Option(help='Reference temperature in degC.', min=-273.15, max=1000.0)
-]
-Allow = Annotated[
-    list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
-]
-JudgedBags = Annotated[
-    list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
 ]
 Offset = Annotated[
     float | None,
@@ -114,37 +81,226 @@ Offset = Annotated[
         metavar='WORD',
     ),
 ]
-Window = Annotated[
-    float, typer.Option('--window', help='Length of a window at rest, in s.', metavar='S')
-]
-CertificateInfo = Annotated[
-    Path | None, typer.Option(help='What the laboratory states: number, customer, ... (YAML).')
-]
-Tolerance = Annotated[
-    str | None,
-    typer.Option(
-        '--tolerance', help='Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'
-    ),
-]
-AgeingBias = Annotated[
-    str | None,
-    typer.Option(help="What the biases may have changed by since the prior's: 50ug, 0.1mg."),
-]
-
-MinRest = Annotated[
-    float | None,
-    typer.Option(
-        help='Shortest rest used, in s; else 3, or less where short ones tell more.',
-        metavar='S',
-        show_default=False,
-    ),
-]
-StillSd = Annotated[
-    str, typer.Option(help="Largest scatter of samples at rest: a few times the sensor's noise.")
+InputOption = Annotated[
+    Literal['auto', 'counts', 'imu'], typer.Option('--input', help='What is read from the bag.')
 ]
 
 
-def acceleration(text: str | None, name: str = '--tolerance') -> float | None:
+@dataclass(frozen=True)
+class Given:
+    """Marks a parameter that is made of the options which `make` takes."""
+
+    make: Callable[..., Any]
+
+
+def expanded(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a function of options alone, as typer takes it, of one of what is made of them."""
+    makers: dict[str, Callable[..., Any]] = {}
+    options: list[inspect.Parameter] = []
+    # No option has a type that is imported for a checker alone.
+    hints = get_type_hints(command, localns={'Topics': Any}, include_extras=True)
+    for name, parameter in inspect.signature(command).parameters.items():
+        marks = getattr(hints[name], '__metadata__', ())
+        given = next((mark for mark in marks if isinstance(mark, Given)), None)
+        if given is None:
+            kind = inspect.Parameter.KEYWORD_ONLY
+            options.append(parameter.replace(annotation=hints[name], kind=kind))
+        else:
+            makers[name] = expanded(given.make)
+            options += inspect.signature(makers[name]).parameters.values()
+
+    @wraps(command)
+    def run(**values: Any) -> Any:
+        for name, make in makers.items():
+            keys = inspect.signature(make).parameters
+            values[name] = make(**{key: values.pop(key) for key in keys})
+        return command(**values)
+
+    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in options}
+    return run
+
+
+def _output(
+    as_json: Annotated[
+        bool, typer.Option('--json', help='Print the result as one JSON object.')
+    ] = False,
+    quiet: Quiet = False,
+) -> Output:
+    return Output(as_json, quiet)
+
+
+def _names(
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='Where an input stands: counts, imu, board, case, temperature/NAME.',
+            metavar='INPUT=TOPIC',
+        ),
+    ] = None,
+    topics: Annotated[
+        Path | None,
+        typer.Option(help='The same from a file, INPUT: TOPIC a line.', metavar='YAML'),
+    ] = None,
+) -> dict[str, str]:
+    """Collect what `--topic` says, and what of the file it does not."""
+    from ..plain_yaml import read_plain_yaml
+
+    names: Any = {} if topics is None else read_plain_yaml(topics)
+    if not isinstance(names, dict) or not all(isinstance(one, str) for one in names.values()):
+        raise ThermoCompError(f'{topics}: expected INPUT: TOPIC, one a line')
+    for one in topic or ():
+        name, equals, where = one.partition('=')
+        if not equals:
+            raise usage(f'--topic: expected INPUT=TOPIC, got {one}')
+        names[name] = where
+    return names
+
+
+TopicNames = Annotated[dict[str, str], Given(_names)]
+
+
+def _topics(
+    names: TopicNames,
+    begin: Annotated[
+        float | None,
+        typer.Option(
+            '--from',
+            help='Read each bag from there on: seconds from its first sample, or a stamp.',
+            metavar='S',
+        ),
+    ] = None,
+    end: Annotated[float | None, typer.Option('--to', help='Read to there.', metavar='S')] = None,
+) -> Topics:
+    from ..recording import Part, Topics
+
+    with usage_of('--from, --to: '):
+        part = Part(begin, end)
+    with usage_of('--topic: '):
+        return Topics.named(names, part)
+
+
+class Reading(TypedDict):
+    """What is read of a bag, as the library takes it."""
+
+    topics: Topics
+    input: Literal['auto', 'counts', 'imu']
+
+
+def _reading(*, input_: InputOption = 'auto', names: TopicNames) -> Reading:
+    return {'topics': _topics(names), 'input': input_}
+
+
+TopicsPart = Annotated['Topics', Given(_topics)]
+
+
+def _reading_part(*, input_: InputOption = 'auto', topics: TopicsPart) -> Reading:
+    return {'topics': topics, 'input': input_}
+
+
+def _place(
+    gravity: Annotated[
+        float | None, typer.Option(help='Local gravity in m/s^2.', metavar='G')
+    ] = None,
+    latitude: Annotated[
+        float | None, typer.Option(help='Latitude in degrees, with --height.')
+    ] = None,
+    height: Annotated[float | None, typer.Option(help='Height above the ellipsoid in m.')] = None,
+) -> float | None:
+    """Give local gravity, None where nothing was said; latitude and height go together."""
+    if gravity is not None or (latitude is None and height is None):
+        return gravity
+    if latitude is None or height is None:
+        raise usage('give --gravity, or --latitude and --height')
+    from ..fitting import normal_gravity
+
+    with usage_of():
+        return normal_gravity(latitude, height)
+
+
+Place = Annotated[float | None, Given(_place)]
+
+
+class Judging(TypedDict):
+    """What a calibration is judged by, as the library takes it."""
+
+    gravity: float | None
+    window_s: float
+    tolerance: float | None
+    serial: str | None
+
+
+def _judging(
+    gravity: Place,
+    window: Annotated[
+        float, typer.Option(help='Length of a window at rest, in s.', metavar='S')
+    ] = 60.0,
+    tolerance: Annotated[
+        str | None,
+        typer.Option(help='Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'),
+    ] = None,
+    serial: Serial = None,
+) -> Judging:
+    return {
+        'gravity': gravity,
+        'window_s': positive(window, '--window'),
+        'tolerance': acceleration(tolerance, '--tolerance'),
+        'serial': serial,
+    }
+
+
+def _fitting(
+    gravity: Place,
+    model: Annotated[
+        Literal['response', 'golovach'],
+        typer.Option(help="The thermal response, or the paper's two sets alone."),
+    ] = 'response',
+    full_scale: Annotated[
+        float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
+    ] = None,
+    reference_temperature: Annotated[
+        float, typer.Option(help='Reference temperature in degC.', min=-273.15, max=1000.0)
+    ] = 20.0,
+    min_rest: Annotated[
+        float | None,
+        typer.Option(
+            help='Shortest rest used, in s; else 3, or less where short ones tell more.',
+            metavar='S',
+            show_default=False,
+        ),
+    ] = None,
+    still_sd: Annotated[
+        str,
+        typer.Option(help="Largest scatter of samples at rest: a few times the sensor's noise."),
+    ] = '50mg',
+    allow: Annotated[
+        list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
+    ] = None,
+) -> dict[str, Any]:
+    """Give keywords of FitOptions; FitError where gravity is none that is found on Earth."""
+    from ..fitting import resolve_gravity
+
+    if gravity is None:
+        raise usage('give --gravity, or --latitude and --height')
+    return {
+        'gravity': resolve_gravity(gravity, None, None),
+        'model': model,
+        'full_scale': full_scale,
+        'reference_temperature': reference_temperature,
+        'min_rest_s': min_rest,
+        'still_sd': acceleration(still_sd, '--still-sd'),
+        'allow': tuple(allow or ()),
+    }
+
+
+Out = Annotated[Output, Given(_output)]
+ReadingOptions = Annotated[Reading, Given(_reading)]
+ReadingPart = Annotated[Reading, Given(_reading_part)]
+JudgingOptions = Annotated[Judging, Given(_judging)]
+FittingOptions = Annotated[dict[str, Any], Given(_fitting)]
+
+
+def acceleration(text: str | None, name: str) -> float | None:
     """Read an acceleration with its unit [m/s^2]; None where none is given."""
     from ..unit.gravity import parse_acceleration
 
@@ -159,80 +315,10 @@ def positive(value: float, name: str) -> float:
     return value
 
 
-def duration(text: str, name: str) -> float:
-    """Read a duration with its unit, like ``45min``, ``1.5h`` or ``30s`` [s]."""
-    found = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
-    if found is None:
-        raise usage(f'{name}: expected a duration like 45min, 1.5h or 30s, got {text!r}')
-    return positive(float(found[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[found[2]], name)
-
-
-def named_topics(given: list[str] | None, profile: Path | None) -> dict[str, str]:
-    """Collect what `--topic` says, and what of the profile it does not."""
-    names = {} if profile is None else _read_profile(profile)
-    for one in given or ():
-        name, equals, topic = one.partition('=')
-        if not equals:
-            raise usage(f'--topic: expected INPUT=TOPIC, got {one}')
-        names[name] = topic
-    return names
-
-
-def _read_profile(path: Path) -> dict[str, str]:
-    from ..plain_yaml import read_plain_yaml
-
-    names = read_plain_yaml(path)
-    if not isinstance(names, dict) or not all(isinstance(one, str) for one in names.values()):
-        raise ThermoCompError(f'{path}: expected INPUT: TOPIC, one a line')
-    return names
-
-
-def topics_of(
-    given: list[str] | None,
-    profile: Path | None,
-    begin: float | None = None,
-    end: float | None = None,
-) -> Topics:
-    """Read where the inputs stand in a bag, and what part of it is meant."""
-    from ..recording import Part, Topics
-
-    with usage_of('--from, --to: '):
-        part = Part(begin, end)
-    with usage_of('--topic: '):
-        return Topics.named(named_topics(given, profile), part)
-
-
-def place(gravity: float | None, latitude: float | None, height: float | None) -> float | None:
-    """Return local gravity, None where nothing was given; latitude and height go together."""
-    if gravity is not None or (latitude is None and height is None):
-        return gravity
-    if latitude is None or height is None:
-        raise usage('give --gravity, or --latitude and --height')
-    from ..fitting import normal_gravity
-
-    with usage_of():
-        return normal_gravity(latitude, height)
-
-
-def needed_place(gravity: float | None, latitude: float | None, height: float | None) -> float:
-    """Return local gravity where a command cannot do without; FitError where it is none."""
-    from ..fitting import resolve_gravity
-
-    known = place(gravity, latitude, height)
-    if known is None:
-        raise usage('give --gravity, or --latitude and --height')
-    return resolve_gravity(known, None, None)
-
-
-def usage(message: str, **context: Any) -> typer.BadParameter:
-    """Return a mistake in the command line, to be raised: exit code 2."""
-    return typer.BadParameter(message, **context)
-
-
-@contextmanager
-def usage_of(what: str = '') -> Iterator[None]:
-    """Take a ValueError of the block for a mistake in the command line."""
-    try:
-        yield
-    except ValueError as mistake:
-        raise usage(f'{what}{mistake}') from mistake
+def require_ros() -> None:
+    """Raise ThermoCompError, which says what to do, where there is no ROS."""
+    if find_spec('rclpy') is None:
+        raise ThermoCompError(
+            f'this command needs ROS 2 for {sys.executable}: source its setup file, or '
+            "pip install 'thermo_comp[ros]'"
+        )

@@ -17,15 +17,12 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 import typer
 
 from ..text import one_line
-
-if TYPE_CHECKING:
-    from ..recording import RecordingInfo
+from ..unit.gravity import MICRO_G
 
 Cell = str | int | float | None
 
@@ -36,8 +33,8 @@ class Output:
     """
 
     def __init__(self, as_json: bool = False, quiet: bool = False) -> None:
-        self.as_json = as_json
-        self.quiet = quiet
+        self.as_json, self.quiet = as_json, quiet
+        self._is_torn = False
 
     def line(self, text: str = '') -> None:
         """Print one sentence of the result."""
@@ -49,30 +46,28 @@ class Output:
         if not self.quiet:
             _print(f'thermo_comp: {text}', sys.stderr)
 
-    def told(self, infos: Iterable[RecordingInfo]) -> bool:
-        """Say what was chosen in each bag, and where it was cut off; tell whether one was."""
-        found = list(infos)
-        self.chosen((info.path, info.chosen) for info in found)
-        torn = [info for info in found if info.truncated]
-        for info in torn:
-            self.note(f'{info.path}: {info.truncated}')
-        return bool(torn)
-
-    def chosen(self, bags: Iterable[tuple[object, str | None]]) -> None:
-        """Say which topics were taken by their type, once for all bags that are alike."""
+    def told(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
+        """
+        Say of bags what was chosen in them, once for those that are alike, and what is missing.
+        """
         alike: dict[str, list[object]] = {}
-        for bag, said in bags:
-            if said:
-                alike.setdefault(said, []).append(bag)
+        torn = []
+        for bag, chosen, missing in bags:
+            if chosen:
+                alike.setdefault(chosen, []).append(bag)
+            if missing:
+                torn.append(f'{bag}: {missing}')
         for said, names in alike.items():
             more = f' and {len(names) - 1} more' if len(names) > 1 else ''
             self.note(f'{names[0]}{more}: {said}')
+        for one in torn:
+            self.note(one)
+        self._is_torn |= bool(torn)
 
-    @staticmethod
-    def end(*, is_torn: bool) -> None:
+    def end(self, code: int = 0) -> None:
         """End a command that has done its work; what it read was not whole, if a bag was torn."""
-        if is_torn:
-            raise typer.Exit(1)
+        if code or self._is_torn:
+            raise typer.Exit(code or 1)
 
     def json(self, data: Mapping[str, Any]) -> None:
         """Print the result for machines, in ASCII; numbers that JSON does not know become null."""
@@ -80,25 +75,12 @@ class Output:
             print(json.dumps(plain(data), indent=2, allow_nan=False))
 
     def table(
-        self, columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = ''
+        self, columns: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
     ) -> None:
-        """
-        Print a table: with rules and colour on a terminal, as plain aligned columns in a pipe.
-
-        Columns of numbers are set flush right, None is a dash.
-        """
-        if self.as_json or self.quiet:
-            return
-        cells = [[_shown(text(cell), sys.stdout) for cell in row] for row in rows]
-        right = [all(_is_number(row[i]) for row in cells) for i in range(len(columns))]
-        if sys.stdout.isatty():
-            from rich.console import Console
-
-            table = _rich_table(columns, cells, right, title)
-            Console(highlight=False, markup=False).print(table)
-            return
-        for text_line in aligned(columns, cells, right, title):
-            _print(text_line)
+        """Print a table of aligned columns, numbers flush right; None is a dash."""
+        if not (self.as_json or self.quiet):
+            for line in aligned(columns, rows, title):
+                _print(line)
 
     @contextmanager
     def live(self) -> Iterator[Callable[..., None] | None]:
@@ -109,7 +91,7 @@ class Output:
         if self.quiet or not sys.stderr.isatty():
             yield None
             return
-        from rich.console import Console, Group
+        from rich.console import Console
         from rich.live import Live
         from rich.text import Text
 
@@ -120,39 +102,30 @@ class Output:
                 columns: Sequence[str], rows: Sequence[Sequence[Cell]], lines: Sequence[str]
             ) -> None:
                 # The lines are what it is looked at for, and then the newest rows.
-                newest = rows[-max(1, console.height - len(lines) - 5) :]
-                cells = [[_shown(text(cell), sys.stderr) for cell in row] for row in newest]
-                table = _rich_table(columns, cells, [False] * len(columns), '')
-                below = [Text(_shown(line, sys.stderr)) for line in lines]
-                view.update(Group(table, *below), refresh=True)
+                newest = rows[-max(1, console.height - len(lines) - 3) :]
+                shown = [*aligned(columns, newest), '', *lines]
+                view.update(Text('\n'.join(_shown(x, sys.stderr) for x in shown)), refresh=True)
 
             yield show
 
     @contextmanager
-    def progress(self, what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
+    def progress(self, what: str, total: float | None = 1.0) -> Iterator[Callable[[float], None]]:
         """
         Show a progress bar on a terminal; yields what is to be called with the amount done so far,
         of a total that is None where nobody knows it.
         """
         if self.quiet or not sys.stderr.isatty():
-            yield _ignore
+            yield lambda _done: None
             return
+        from rich import progress
         from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            Progress,
-            TaskProgressColumn,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
 
-        with Progress(
-            TextColumn('{task.description}', markup=False),
-            BarColumn(),
-            TaskProgressColumn(show_speed=True),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
+        with progress.Progress(
+            progress.TextColumn('{task.description}', markup=False),
+            progress.BarColumn(),
+            progress.TaskProgressColumn(show_speed=True),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
             console=Console(stderr=True),
             transient=True,
         ) as bar:
@@ -160,29 +133,9 @@ class Output:
             yield lambda done: bar.update(task, completed=done)
 
 
-def _rich_table(
-    columns: Sequence[str], cells: Sequence[Sequence[str]], right: Sequence[bool], title: str
-) -> Any:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=title or None, title_justify='left', box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading, is_right in zip(columns, right, strict=True):
-        table.add_column(heading, justify='right' if is_right else 'left')
-    for row in cells:
-        table.add_row(*map(Text, row))
-    return table
-
-
-def _ignore(_done: float) -> None:
-    return
-
-
 def error(message: str) -> None:
     """Print the one line that a failed command leaves behind."""
-    line = ' '.join(message.split())
-    _print(f'thermo_comp: error: {line}', sys.stderr)
+    _print(f'thermo_comp: error: {" ".join(message.split())}', sys.stderr)
 
 
 def _print(text: str, file: TextIO | None = None) -> None:
@@ -205,13 +158,40 @@ def text(cell: Cell) -> str:
         if cell == 0.0 or abs(cell) >= 999.5:
             return f'{cell:.0f}'
         return f'{cell:.{min(3 - math.floor(math.log10(abs(cell))), 6)}f}'
-    return str(cell)
+    return one_line(str(cell))
 
 
-def micro_g(value: float) -> str:
-    """Return a residual in micro-g as the tables show it."""
+def micro(value: float) -> str:
+    """Return a number of millionths as the tables show it."""
     # Not -0.0.
     return f'{round(value, 1) + 0.0:.1f}' if abs(value) < 99.95 else f'{value:.0f}'
+
+
+def micro_g(value: float) -> str | None:
+    """Return a residual [m/s^2] in micro-g as the tables show it, None where it is no number."""
+    return micro(value / MICRO_G) if math.isfinite(value) else None
+
+
+def millidegrees(value: float) -> str | None:
+    """Return an angular rate [rad/s] in mdeg/s, None where it is no number."""
+    return f'{1e3 * math.degrees(value):.3g}' if math.isfinite(value) else None
+
+
+def aligned(
+    columns: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
+) -> Iterator[str]:
+    """Yield the lines of a table, two blanks between columns."""
+    cells = [[text(cell) for cell in row] for row in rows]
+    if title:
+        yield title
+    right = [all(_is_number(row[i]) for row in cells) for i in range(len(columns))]
+    lines = [list(columns), *cells]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for row in lines:
+        yield '  '.join(
+            cell.rjust(width) if is_right else cell.ljust(width)
+            for cell, width, is_right in zip(row, widths, right, strict=True)
+        ).rstrip()
 
 
 def _is_number(cell: str) -> bool:
@@ -222,23 +202,6 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def aligned(
-    columns: Sequence[str], cells: Sequence[Sequence[str]], right: Sequence[bool], title: str = ''
-) -> Iterator[str]:
-    """Yield the lines of a table as plain text, two blanks between columns."""
-    widths = [
-        max(len(column), *(len(row[i]) for row in cells)) if cells else len(column)
-        for i, column in enumerate(columns)
-    ]
-    if title:
-        yield title
-    for row in [columns, *cells]:
-        yield '  '.join(
-            cell.rjust(width) if is_right else cell.ljust(width)
-            for cell, width, is_right in zip(row, widths, right, strict=True)
-        ).rstrip()
-
-
 def plain(value: Any) -> Any:
     """Return a value in JSON's types: arrays as lists, dataclasses as objects, NaN as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -247,14 +210,12 @@ def plain(value: Any) -> Any:
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
         return [plain(item) for item in value]
-    if isinstance(value, (str, bool, type(None))):
+    if isinstance(value, (bool, type(None))):
         return value
     if isinstance(value, os.PathLike):
-        return str(Path(value))
+        return os.fspath(value)
     if hasattr(value, 'tolist'):  # numpy arrays and scalars, without importing numpy
         return plain(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, int):
-        return int(value)
-    return str(value)
+    return int(value) if isinstance(value, int) else str(value)

@@ -4,12 +4,11 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,14 +16,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import ThermoCompError
+from ..text import counted
 from ..unit.gravity import STANDARD_GRAVITY, spoken
 from . import options
-from .output import Cell, Output, micro_g
-from .play import require_ros
+from .output import Cell, Output, micro
 
 if TYPE_CHECKING:
-    from ..fitting.acquisition import Account, Acquisition
-    from ..recording import Input, Topics
+    from ..fitting.acquisition import Account, Acquisition, Position
     from ..recording.growing import News
     from ..recording.position_bags import PositionBags
     from ..typing import Floats
@@ -33,6 +31,7 @@ _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 
 
 def record(
+    *,
     context: typer.Context,
     output: Annotated[
         Path,
@@ -53,11 +52,8 @@ def record(
         typer.Option(help='Serial of the unit, for the bags.', callback=options.check_serial),
     ] = None,
     offset: options.Offset = None,
-    input_: options.InputOption = 'auto',
-    topic: options.Topic = None,
-    topics: options.TopicsFile = None,
-    as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    reading: options.ReadingOptions,
+    out: options.Out,
 ) -> None:
     """
     Record a test, a bag per position, and say what is still missing.
@@ -74,35 +70,34 @@ def record(
     from ..fitting.acquisition import Acquisition
     from ..recording.growing import growing_blocks
     from ..recording.position_bags import PositionBags, numbered_bags
+    from ..ros.signals import SignalWatch
 
-    out = Output(as_json, quiet)
-    test = Acquisition(positions, options.duration(soak, '--soak'), offset or 0.0)
-    chosen = options.topics_of(topic, topics)
+    test = Acquisition(positions, _duration(soak), offset or 0.0)
     known = numbered_bags(output)
     bags = PositionBags(output, _take_known(out, test, known, serial))
+    over = threading.Event()
     try:
-        with _until_signal() as over:
+        # A second signal ends the process at once.
+        with SignalWatch() as signals:
+            signals.on_signal(over.set)
             if bag is None:
-                _listen(out, test, bags, chosen, input_, context.obj or (), over)
+                _listen(out, test, bags, reading, context.obj or (), over)
             else:
-                news = growing_blocks(bag, chosen, input_, over.wait)
-                _take(out, test, bags, news, lambda: ())
+                _take(out, test, bags, growing_blocks(bag, **reading, wait=over.wait), tuple)
     finally:
         bags.close()
     account = test.account()
     _say(out, account, output, [*known, *bags.written], offset)
-    out.end(is_torn=not account.is_complete and not over.is_set())
+    out.end(int(not account.is_complete and not over.is_set()))
 
 
-@contextmanager
-def _until_signal() -> Iterator[threading.Event]:
-    """Give what is set by SIGINT or SIGTERM; a second one ends the process at once."""
-    from ..ros.signals import SignalWatch
-
-    over = threading.Event()
-    with SignalWatch() as signals:
-        signals.on_signal(over.set)
-        yield over
+def _duration(text: str) -> float:
+    """Read a duration with its unit, like ``45min``, ``1.5h`` or ``30s`` [s]."""
+    found = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
+    if found is None:
+        raise options.usage(f'--soak: expected a duration like 45min, 1.5h or 30s, got {text!r}')
+    seconds = float(found[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[found[2]]
+    return options.positive(seconds, '--soak')
 
 
 def _take_known(
@@ -129,16 +124,15 @@ def _listen(
     out: Output,
     test: Acquisition,
     bags: PositionBags,
-    topics: Topics,
-    kind: Input,
+    reading: options.Reading,
     ros_args: Sequence[str],
     over: threading.Event,
 ) -> None:
     """Record live topics."""
-    require_ros()
+    options.require_ros()
     from ..ros.live import LiveTopics
 
-    with LiveTopics(topics, kind, ros_args) as live:
+    with LiveTopics(**reading, ros_args=ros_args) as live:
         out.line('listening; Ctrl-C ends it with whole bags')
         sys.stdout.flush()  # whoever reads this through a pipe waits for it
         _take(out, test, bags, live.blocks(over.wait), lambda: live.problems)
@@ -155,12 +149,13 @@ def _take(
 ) -> None:
     """Record until all is there or nothing more comes, and show how far it is."""
     told: dict[str, str] = {}
+    chosen: str | None = None
     with out.live() as show:
         for new in news:
             if new is not None:
-                if new.info is not None and new.info.chosen and 'chosen' not in told:
-                    told['chosen'] = new.info.chosen
-                    out.note(f'{new.info.path}: {new.info.chosen}')
+                if new.info is not None and new.info.chosen != chosen:
+                    chosen = new.info.chosen
+                    out.told([(new.info.path, chosen, None)])
                 bags.add(new)
                 for begin_ns in test.add(new.block):
                     bags.cut(begin_ns)
@@ -168,7 +163,8 @@ def _take(
                 continue
             account = test.account()
             if show is not None:
-                show(_COLUMNS, _rows(account), [*problems(), _now(account), *_lines(account)])
+                lines = [*problems(), _now(account), *_lines(account)]
+                show(_COLUMNS, _rows(account.positions), lines)
             else:
                 _tell(out, account, problems(), told)
             if account.is_complete:
@@ -197,22 +193,20 @@ def _reading(up: Floats) -> str:
     return ', '.join(f'{axis} {value:+.2f} g' for axis, value in zip('xyz', up, strict=True))
 
 
-def _rows(account: Account) -> list[tuple[Cell, ...]]:
+def _rows(positions: Sequence[Position]) -> list[tuple[Cell, ...]]:
     rows: list[tuple[Cell, ...]] = []
-    for number, one in enumerate(account.positions, 1):
+    for number, one in enumerate(positions, 1):
         board = one.thermometers.get('board')
-        spans = ('', '')
+        spans: tuple[Cell, ...] = ('', '')
         if board is not None:
-            heating, cooling = board.steepest_heating_k_min, board.steepest_cooling_k_min
             spans = (
                 f'{board.lowest:.1f} .. {board.highest:.1f}',
-                f'{cooling:.2f} .. {heating:.2f}',
+                f'{board.steepest_cooling_k_min:.2f} .. {board.steepest_heating_k_min:.2f}',
             )
         up = [f'{value:+.2f}' for value in one.up] if one.n_rests else [''] * 3
-        state = one.reason or 'good'
-        if one.n_rests > 1:
-            state += f', {one.n_rests} rests'
-        rows.append((number, *up, f'{one.still_s / 60.0:.1f}', *spans, state))
+        more = f', {one.n_rests} rests' if one.n_rests > 1 else ''
+        still = f'{one.still_s / 60.0:.1f}'
+        rows.append((number, *up, still, *spans, (one.reason or 'good') + more))
     return rows
 
 
@@ -234,8 +228,8 @@ def _worth(account: Account) -> str:
     parts = (
         f'{spoken(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
         f'bias {" ".join(spoken(value * STANDARD_GRAVITY) for value in bias)}',
-        f'scale {" ".join(micro_g(1e6 * value) for value in scale)} ppm',
-        f'misalignment {" ".join(micro_g(1e6 * value) for value in skew)} urad',
+        f'scale {" ".join(micro(1e6 * value) for value in scale)} ppm',
+        f'misalignment {" ".join(micro(1e6 * value) for value in skew)} urad',
     )
     return f'known to {", ".join(parts)}'
 
@@ -262,13 +256,13 @@ def _say(
     out: Output, account: Account, output: Path, bags: Sequence[Path], offset: float | None
 ) -> None:
     positions = [one for one in account.positions if one.n_rests]
-    out.table(_COLUMNS, _rows(replace(account, positions=tuple(positions))))
+    out.table(_COLUMNS, _rows(positions))
     for line in _lines(account):
         out.line(line)
     command = f'thermo_comp fit {shlex.quote(str(output))}/*.mcap -o unit.yaml --gravity G'
     if offset is not None:
         command += f' --offset {offset:g}'
-    out.line(f'{len(bags)} bag{"s" * (len(bags) != 1)} in {output}')
+    out.line(f'{counted(len(bags), "bag")} in {output}')
     if bags:
         out.line('now fit them, with the local gravity in m/s^2:')
         out.line(f'  {command}')

@@ -1,25 +1,26 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``thermo_comp replay``: a whole bag through the compensator, offline."""
+"""Owns ``thermo_comp replay`` and ``play``: a whole bag offline, or onto the live topics."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from . import options
-from .output import Output
 
-if TYPE_CHECKING:
-    from ..replay import ReplayResult
+_AS_THE_NODE = 'As the parameter of the node, in s.'
 
 
 def replay(
+    *,
     bag: options.Bag,
-    calibration: options.CalibrationFile,
+    calibration: Annotated[
+        Path, typer.Option('--calibration', '-c', help='Calibration of the unit (YAML).')
+    ],
     output: Annotated[
         Path, typer.Option('--output', '-o', help='*.mcap, a folder, *.csv or *.parquet.')
     ],
@@ -33,21 +34,12 @@ def replay(
     frame_id: Annotated[
         str, typer.Option(help="Frame of the output; empty keeps the input's.")
     ] = '',
-    transition_time: Annotated[
-        float | None, typer.Option(help='As the parameter of the node, in s.', min=0.0)
-    ] = None,
-    temperature_timeout: Annotated[
-        float | None, typer.Option(help='As the parameter of the node, in s.')
-    ] = None,
-    case_timeout: Annotated[
-        float | None, typer.Option(help='As the parameter of the node, in s.')
-    ] = None,
-    input_: options.InputOption = 'auto',
-    topic: options.Topic = None,
-    topics: options.TopicsFile = None,
+    transition_time: Annotated[float | None, typer.Option(help=_AS_THE_NODE, min=0.0)] = None,
+    temperature_timeout: Annotated[float | None, typer.Option(help=_AS_THE_NODE)] = None,
+    case_timeout: Annotated[float | None, typer.Option(help=_AS_THE_NODE)] = None,
+    reading: options.ReadingOptions,
     force: options.Force = False,
-    as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    out: options.Out,
 ) -> None:
     """
     Correct a whole bag offline, with the values of the live node.
@@ -61,12 +53,11 @@ def replay(
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
     """
     from ..files import bag_kind, check_output
-    from ..online.status import CompensatorConfig
+    from ..online.status import DROPPED, CompensatorConfig
     from ..recording.table_out import TABLES
     from ..replay import replay as run
     from ..unit.calibration_file import load_calibration
 
-    out = Output(as_json, quiet)
     given = {
         'transition_time_s': transition_time,
         'temperature_timeout_s': temperature_timeout,
@@ -78,14 +69,13 @@ def replay(
     if output.suffix in TABLES and (keep_inputs or all_topics):
         raise options.usage('--keep-inputs and --all-topics are for bags')
     check_output(output, kind, overwrite=force, others=[bag, calibration])
-    with out.progress('replaying', total=1.0) as done:
+    with out.progress('replaying') as done:
         result = run(
             bag,
             load_calibration(calibration),
             output,
             config=config,
-            topics=options.topics_of(topic, topics),
-            input=input_,
+            **reading,
             serial=serial,
             frame_id=frame_id,
             keep_inputs=keep_inputs,
@@ -93,39 +83,83 @@ def replay(
             overwrite=force,
             progress=done,
         )
-    _say(out, result)
-
-
-def _say(out: Output, result: ReplayResult) -> None:
-    from ..online.status import DROPPED
-
-    counters = result.counters
-    is_bad = out.told([result.info]) or not counters.n_out
-    dropped = {
-        name.removeprefix('n_').replace('_', ' '): n
-        for name, n in asdict(counters).items()
-        if name in DROPPED and n
-    }
-    out.line(f'{result.output}: {counters.n_out} of {counters.n_in} samples corrected')
-    for reason, n in dropped.items():
-        out.line(f'  left out, {reason}: {n}')
-    start_ns = result.info.start_ns
+    info, counters = result.info, result.counters
+    out.told([(info.path, info.chosen, info.truncated)])
+    counts = asdict(counters)
+    out.line(f'{output}: {counters.n_out} of {counters.n_in} samples corrected')
+    for name in counts:
+        if name in DROPPED and counts[name]:
+            reason = name.removeprefix('n_').replace('_', ' ')
+            out.line(f'  left out, {reason}: {counts[name]}')
     out.line(f'  regime flags: {result.n_flags}, switches: {max(len(result.switches) - 1, 0)}')
     for stamp_ns, is_dynamic in result.switches:
         name = 'dynamic' if is_dynamic else 'static'
-        out.line(f'    {(stamp_ns - start_ns) * 1e-9:10.1f} s  {name}')
+        out.line(f'    {(stamp_ns - info.start_ns) * 1e-9:10.1f} s  {name}')
     out.json(
         {
-            'output': result.output,
+            'output': output,
             'samples_in': counters.n_in,
             'samples_out': counters.n_out,
-            'counters': asdict(counters),
+            'counters': counts,
             'flags': result.n_flags,
             'switches': [
                 {'stamp_ns': stamp_ns, 'dynamic': is_dynamic}
                 for stamp_ns, is_dynamic in result.switches
             ],
-            'truncated': result.info.truncated,
+            'truncated': info.truncated,
         }
     )
-    out.end(is_torn=is_bad)
+    out.end(int(not counters.n_out))
+
+
+def play(
+    *,
+    context: typer.Context,
+    bag: options.Bag,
+    rate: Annotated[
+        float,
+        typer.Option(help='Seconds of the bag per second; 0 = as fast as it is taken.', min=0.0),
+    ] = 1.0,
+    wait: Annotated[
+        float, typer.Option(help='Longest wait for a subscriber on every topic, in s.', min=0.0)
+    ] = 10.0,
+    reading: options.ReadingOptions,
+    out: options.Out,
+) -> None:
+    """
+    Play a bag onto the live topics of the node, with /clock.
+
+    Whatever the topics are called in the bag, they go out as accel/counts
+    (or imu/uncompensated), temperature/board and temperature/case; remap
+    them after --ros-args. It ends when every reliable subscriber has got
+    everything. For other topics, pauses and loops there is ros2 bag play.
+
+    Example:
+      thermo_comp play chamber.mcap --rate 20
+      thermo_comp play chamber.mcap --ros-args -r __ns:=/imu0
+    """
+    if not rate < float('inf'):
+        raise options.usage('--rate must be finite; 0 is as fast as it is taken')
+    options.require_ros()
+    from ..ros.player import play as run
+
+    with out.progress('playing') as done:
+        report = run(
+            bag, rate=rate, wait_s=wait, **reading, ros_args=context.obj or (), progress=done
+        )
+    for name in report.unheard:
+        out.note(f'nobody listened to {name}')
+    for name in report.lossy:
+        out.note(f'{name} has a best-effort subscriber, which can lose messages')
+    out.told([(bag, report.chosen, report.missing)])
+    out.table(('topic', 'messages'), sorted(report.n_messages.items()))
+    out.line(f'played in {report.duration_s:.1f} s')
+    out.json(
+        {
+            'messages': report.n_messages,
+            'duration_s': report.duration_s,
+            'unheard': report.unheard,
+            'lossy': report.lossy,
+        }
+    )
+    out.end()

@@ -1,21 +1,25 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``thermo_comp report``: a certificate of a calibration, from bags."""
+"""Owns ``thermo_comp report`` and ``view``: a calibration's certificate, in a file and live."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import sys
+import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..errors import ThermoCompError
 from . import options
-from .output import Output
+
+if TYPE_CHECKING:
+    from ..judging import OpenedBag
 
 
 def report(
+    *,
     output: Annotated[Path, typer.Option('--output', '-o', help='Page to write (HTML).')],
     bags: options.JudgedBags = None,
     calibration: Annotated[
@@ -28,20 +32,10 @@ def report(
         Path | None, typer.Option(help='Folder for the figures as PNG files.', metavar='DIR')
     ] = None,
     certificate_info: options.CertificateInfo = None,
-    gravity: options.Gravity = None,
-    latitude: options.Latitude = None,
-    height: options.Height = None,
-    window: options.Window = 60.0,
-    tolerance: options.Tolerance = None,
-    serial: options.Serial = None,
-    input_: options.InputOption = 'auto',
-    topic: options.Topic = None,
-    topics: options.TopicsFile = None,
-    begin: options.Begin = None,
-    end: options.End = None,
+    judging: options.JudgingOptions,
+    reading: options.ReadingPart,
     force: options.Force = False,
-    as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    out: options.Out,
 ) -> None:
     """
     Write the certificate of a unit: one HTML page, no network needed.
@@ -60,49 +54,32 @@ def report(
     from ..report import evidence_of_bags, load_certificate_info, write_report
     from ..unit.calibration_file import load_calibration
 
-    out = Output(as_json, quiet)
-    if not bags and not calibration:
-        raise options.usage('give bags, a calibration, or both')
-    gravity = options.place(gravity, latitude, height)
-    read = [*(bags or []), *(calibration or [])]
-    check_output(output, PAGE, overwrite=force, others=read)
-    limit = options.acceleration(tolerance)
-    options.positive(window, '--window')
-    where = options.topics_of(topic, topics, begin, end)
     paths = bags or []
+    if not paths and not calibration:
+        raise options.usage('give bags, a calibration, or both')
+    check_output(output, PAGE, overwrite=force, others=[*paths, *(calibration or [])])
     known = [load_calibration(path) for path in calibration or []]
     loaded = known[0] if known else None
     info = None
     if certificate_info is not None:
-        info = load_certificate_info(
-            certificate_info, None if loaded is None else loaded.unit.serial
-        )
-    opened = []
+        info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
+    opened: list[OpenedBag] = []
     with out.progress('reading', total=max(len(paths), 1)) as done:
-        for number, path in enumerate(paths):
+        for path in paths:
             opened.append(
                 open_bag(
                     path,
-                    where,
-                    input_,
-                    number=number,
-                    window_s=window,
+                    **reading,
+                    number=len(opened),
+                    window_s=judging['window_s'],
                     calibration=loaded,
                     require=('board',) if loaded is None else needed_roles(loaded),
-                    progress=partial(_tell, done, number),
+                    progress=lambda part: done(len(opened) + part),
                 )
             )
     with options.usage_of():
-        evidence = evidence_of_bags(
-            opened,
-            loaded,
-            gravity=gravity,
-            window_s=window,
-            tolerance=limit,
-            serial=serial,
-            others=known[1:],
-        )
-    is_torn = out.told(bag.info for bag in opened)
+        evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
+    out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in opened)
     write_report(evidence, output, info=info, figures=figures, overwrite=force)
     for finding in evidence.findings:
         out.line(f'- {finding}')
@@ -117,10 +94,63 @@ def report(
             **({} if judgement is None else judgement.facts()),
         }
     )
-    if judgement is not None and judgement.exit_code:
-        raise typer.Exit(judgement.exit_code)
-    out.end(is_torn=is_torn)
+    out.end(0 if judgement is None else judgement.exit_code)
 
 
-def _tell(done: Callable[[float], None], before: int, part: float) -> None:
-    done(before + part)
+def view(
+    *,
+    calibration: Annotated[
+        Path, typer.Argument(help='Calibration of the unit (YAML).', metavar='YAML')
+    ],
+    bags: options.JudgedBags = None,
+    port: Annotated[
+        int, typer.Option(help='Port on this machine; 0 takes any free one.', min=0, max=65535)
+    ] = 8042,
+    browser: Annotated[
+        bool, typer.Option('--browser', help='Open it in the default browser, too.')
+    ] = False,
+    gravity: options.Place,
+    serial: options.Serial = None,
+    reading: options.ReadingOptions,
+    quiet: options.Quiet = False,
+) -> None:
+    """
+    Look at a calibration in the browser while you work on it.
+
+    Serves the certificate on this machine only, until Ctrl-C. The page
+    reloads itself whenever the calibration or a bag changes, as when fit
+    runs again.
+
+    Example:
+      thermo_comp view unit42.yaml held_out.mcap
+    """
+    from ..report.live import LiveReport, LiveServer
+    from .output import Output
+
+    for path in (calibration, *(bags or [])):
+        if not path.exists():
+            raise ThermoCompError(f'{path}: no such file or directory')
+    out = Output(quiet=quiet)
+    live = LiveReport(
+        calibration,
+        bags or [],
+        **reading,
+        read=lambda info: out.told([(info.path, info.chosen, info.truncated)]),
+        gravity=gravity,
+        serial=serial,
+    )
+    try:
+        server = LiveServer(live, port)
+    except OSError as failure:
+        raise ThermoCompError(
+            f'port {port}: {failure.strerror}; give another one with --port'
+        ) from failure
+    with server:
+        try:
+            out.line(f'{server.url}  (Ctrl-C ends it)')
+            sys.stdout.flush()  # whoever reads this through a pipe waits for the address
+            if browser:
+                webbrowser.open(server.url)
+            server.serve_forever()
+        except KeyboardInterrupt:
+            out.note('ended')

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,17 +13,15 @@ import typer
 
 from ..unit.gravity import STANDARD_GRAVITY
 from . import options
-from .output import Output
 
 if TYPE_CHECKING:
-    from ..recording import ImuColumns
-    from ..simulation import Cyclogram, SimulatedRun, UnitModel
+    from ..recording import BagWriter, ImuColumns
+    from ..simulation import SimulatedRun, UnitModel
     from ..typing import Bools
-
-_BLOCK = 65536
 
 
 def simulate(
+    *,
     output: Annotated[
         Path,
         typer.Option(
@@ -73,8 +71,7 @@ def simulate(
     ] = False,
     level: Annotated[int, typer.Option(help='zstd level, 1 fast to 19 small.', min=1, max=19)] = 3,
     force: options.Force = False,
-    as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    out: options.Out,
 ) -> None:
     """
     Make bags of a thermal test whose truth is known.
@@ -86,10 +83,10 @@ def simulate(
     Example:
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
     """
-    from .. import simulation
+    from .. import __version__, simulation
     from ..files import bag_kind, check_output
+    from ..recording import BagWriter
 
-    out = Output(as_json, quiet)
     with options.usage_of():
         specimen = simulation.unit_preset(unit, unit_seed)
         if plan is None:
@@ -107,100 +104,74 @@ def simulate(
     written: list[dict[str, Any]] = []
     with out.progress('simulating', total=n) as done:
         for i, (name, station) in enumerate(zip(names, stations, strict=True)):
-            cyclogram = station.program
-            facts = {
+            settings: dict[str, Any] = {'seed': seed + i, 'rate_hz': rate_hz, 'gravity': gravity}
+            truth = {
                 'unit': unit,
                 'unit_seed': unit_seed,
                 'profile': profile if plan is None else plan,
                 'position': i + 1,
                 'positions': n,
                 'position_seed': position_seed,
-                'seed': seed + i,
-                'rate_hz': rate_hz,
-                'gravity': gravity,
+                **settings,
                 'up': station.up.tolist(),
+                'scale_factor': list(specimen.scale_factor),
+                'bias_at_reference': list(specimen.bias_at_reference),
+                'misalignment': [list(row) for row in specimen.M],
+            }
+            metadata = {
+                'serial': specimen.serial,
+                'simulated_by': f'thermo_comp {__version__}',
+                'truth': json.dumps(truth),
             }
             runs = simulation.simulate_blocks(
                 specimen,
-                cyclogram,
+                station.program,
                 station.up,
-                block_size=_BLOCK,
-                rate_hz=rate_hz,
                 temperature_rate_hz=temperature_rate_hz,
-                seed=seed + i,
-                gravity=gravity,
                 warm=not cold_start,
+                **settings,
             )
-            count = _write(
-                name, runs, specimen, facts, imu, level, force, _part(done, i, cyclogram, rate_hz)
-            )
+            n_cycles = station.program.duration_s * rate_hz
+            count = {'counts': 0, 'board': 0, 'case': 0}
+            with BagWriter(name, metadata=metadata, level=level, overwrite=force) as writer:
+                for more in _write(writer, runs, specimen, imu):
+                    count = {key: count[key] + more[key] for key in count}
+                    done(i + count['counts'] / n_cycles)
             written.append({'bag': str(name), **count})
-    out.table(
-        ('bag', 'counts', 'board', 'case'),
-        [(row['bag'], row['counts'], row['board'], row['case']) for row in written],
-    )
+    out.table(('bag', 'counts', 'board', 'case'), [tuple(row.values()) for row in written])
     seconds = max(station.program.duration_s for station in stations)
     out.json({'serial': specimen.serial, 'duration_s': seconds, 'bags': written})
 
 
-def _part(
-    done: Callable[[float], None], before: int, cyclogram: Cyclogram, rate_hz: float
-) -> Callable[[int], None]:
-    total = cyclogram.duration_s * rate_hz
-    return lambda n: done(before + n / total)
-
-
 def _write(
-    path: Path,
-    runs: Any,
-    unit: UnitModel,
-    facts: dict[str, Any],
-    is_imu: bool,
-    level: int,
-    force: bool,
-    tell: Callable[[int], None],
-) -> dict[str, int]:
-    """Write one run; the recording starts with the first temperatures, as a recorder would."""
+    writer: BagWriter, runs: Iterator[SimulatedRun], unit: UnitModel, is_imu: bool
+) -> Iterator[dict[str, int]]:
+    """
+    Write a run block by block, from its first temperatures on, as a recorder would; count them.
+    """
     import numpy as np
 
-    from .. import __version__
-    from ..recording import BagWriter, Topics
+    from ..recording import Topics
 
     topics = Topics()
-    truth = {
-        **facts,
-        'scale_factor': list(unit.scale_factor),
-        'bias_at_reference': list(unit.bias_at_reference),
-        'misalignment': [list(row) for row in unit.M],
-    }
-    metadata = {
-        'serial': unit.serial,
-        'simulated_by': f'thermo_comp {__version__}',
-        'truth': json.dumps(truth),
-    }
-    count = {'counts': 0, 'board': 0, 'case': 0}
     start_ns: int | None = None
-    with BagWriter(path, metadata=metadata, level=level, overwrite=force) as writer:
-        for run in runs:
-            if start_ns is None:
-                start_ns = _first_stamp(run)
-            keep = run.accel_stamp_ns >= start_ns
-            # Temperatures first: of equal stamps the reading comes before the sample.
-            writer.write_temperature(topics.board, run.board_stamp_ns, run.board)
-            writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
-            stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]
-            if is_imu:
-                # As a driver reports it: scaled by what the data sheet says.
-                force, rest = counts / np.mean(unit.scale_factor), _beside(run, keep)
-                writer.write_imu(topics.imu, stamp_ns, force, np.zeros(9), 'imu_link', rest)
-            else:
-                writer.write_counts(topics.counts, stamp_ns, counts, 'imu_link')
-            writer.flush()
-            count['counts'] += int(keep.sum())
-            count['board'] += len(run.board)
-            count['case'] += len(run.case)
-            tell(count['counts'])
-    return count
+    for run in runs:
+        if start_ns is None:
+            first = [one[0] for one in (run.board_stamp_ns, run.case_stamp_ns) if len(one)]
+            start_ns = max(first) if len(first) == 2 else 0
+        keep = run.accel_stamp_ns >= start_ns
+        # Temperatures first: of equal stamps the reading comes before the sample.
+        writer.write_temperature(topics.board, run.board_stamp_ns, run.board)
+        writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
+        stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]
+        if is_imu:
+            # As a driver reports it: scaled by what the data sheet says.
+            force, rest = counts / np.mean(unit.scale_factor), _beside(run, keep)
+            writer.write_imu(topics.imu, stamp_ns, force, np.zeros(9), 'imu_link', rest)
+        else:
+            writer.write_counts(topics.counts, stamp_ns, counts, 'imu_link')
+        writer.flush()
+        yield {'counts': len(stamp_ns), 'board': len(run.board), 'case': len(run.case)}
 
 
 def _beside(run: SimulatedRun, keep: Bools) -> ImuColumns | None:
@@ -216,9 +187,3 @@ def _beside(run: SimulatedRun, keep: Bools) -> ImuColumns | None:
     unknown[:, 0] = -1.0
     level = np.tile((0.0, 0.0, 0.0, 1.0), (n, 1))
     return ImuColumns(level, unknown, run.angular_rate[keep], nothing, nothing)
-
-
-def _first_stamp(run: SimulatedRun) -> int:
-    if not len(run.board_stamp_ns) or not len(run.case_stamp_ns):
-        return 0
-    return int(max(run.board_stamp_ns[0], run.case_stamp_ns[0]))

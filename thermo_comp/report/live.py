@@ -15,7 +15,7 @@ import hashlib
 import secrets
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -23,7 +23,7 @@ from typing import Any
 
 from ..errors import ThermoCompError
 from ..judging import OpenedBag, open_bag
-from ..recording import Input, Topics
+from ..recording import Input, RecordingInfo, Topics
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence
 from .figures import DrawnFigure, drawn_figures, figures_of
@@ -50,7 +50,9 @@ setInterval(async () => {
 
 
 class LiveReport:
-    """The page of a calibration and bags, as the files are; a bag is read when it changes."""
+    """
+    The page of a calibration and bags, as the files are; a bag is read when it changes, and told.
+    """
 
     def __init__(
         self,
@@ -58,11 +60,12 @@ class LiveReport:
         bags: Sequence[Path] = (),
         topics: Topics | None = None,
         input: Input = 'auto',  # noqa: A002 - as everywhere
+        read: Callable[[RecordingInfo], None] | None = None,
         **judging: Any,
     ) -> None:
         self._calibration = calibration
         self._bags = list(bags)
-        self._topics, self._input = topics, input
+        self._topics, self._input, self._read = topics, input, read
         self._judging = judging  # of `evidence_of_bags`
         self._lock = threading.Lock()
         self._opened: dict[Path, tuple[str, OpenedBag]] = {}
@@ -109,6 +112,8 @@ class LiveReport:
                 bag = open_bag(
                     path, self._topics, self._input, number=number, calibration=calibration
                 )
+                if self._read is not None:
+                    self._read(bag.info)
                 known = (signature, bag)
                 self._opened[path] = known
             bags.append(known[1])
