@@ -70,7 +70,7 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
 def run_task(task: str, paths: list[Path]) -> dict[str, float]:
     """Read the bags, or fit them, and say what it took."""
     from thermo_comp.fitting import FitOptions, fit
-    from thermo_comp.fitting.fit_sources import fit_sources
+    from thermo_comp.fitting.sources import fit_sources
 
     sources, _ = fit_sources(paths)
     began = time.process_time()

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from thermo_comp.errors import FleetError
-from thermo_comp.fitting.fit_sources import digest
+from thermo_comp.fitting.sources import digest
 from thermo_comp.fleet.unit import process_unit
 from thermo_comp.fleet.units import FoundUnit, Storage, StoredFile, find_units, group_files
 from thermo_comp.unit.calibration_file import parse_calibration

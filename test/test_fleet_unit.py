@@ -12,7 +12,7 @@ import pytest
 from fleet_helpers import OPTIONS, damage, write_unit
 
 from thermo_comp.fitting import fit
-from thermo_comp.fitting.fit_sources import fit_sources
+from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.fleet.table import COLUMNS
 from thermo_comp.fleet.unit import UnitOutcome, process_unit
 from thermo_comp.fleet.units import FoundUnit, Storage, find_units

@@ -250,9 +250,6 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted):
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR
-    # The Earth's rate and the turn-on, 4.2e-5 and 3.5e-5 of nine numbers; raw the bias, too.
-    assert 2e-5 < rate.level_rms < 1e-4
-    assert rate.raw_level_rms > 1e-3
     assert judged.facts()['angular_rate']['reason'] == rate.reason
     assert 'angular rate: valid: 0.' in str(rate)
     # A gyroscope of another unit is found out, and so is one that claims nothing.

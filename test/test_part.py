@@ -13,7 +13,7 @@ from position_helpers import GRAVITY, MG, START_NS, Rest
 
 from thermo_comp.errors import FitError, RecordingError
 from thermo_comp.fitting import FitOptions, fit
-from thermo_comp.fitting.fit_sources import fit_sources
+from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.recording import BagWriter, Part, Topics, open_recording, read_recording
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')

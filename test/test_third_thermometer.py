@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from thermo_comp.fitting import FitOptions, fit
-from thermo_comp.fitting.fit_sources import fit_sources
+from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.judging import evaluate
 from thermo_comp.recording import BagWriter, Topics, read_recording
 from thermo_comp.replay import replay

@@ -256,7 +256,7 @@ def fit(
     """
     from .fitting import FitOptions
     from .fitting import fit as run
-    from .fitting.fit_sources import fit_sources
+    from .fitting.sources import fit_sources
 
     items = [recordings] if isinstance(recordings, (str, Path, Columns)) else list(recordings)
     paths = [item for item in items if not isinstance(item, Columns)]

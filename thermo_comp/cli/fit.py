@@ -98,8 +98,8 @@ def fit(
     from ..files import CALIBRATION, PAGE, check_output
     from ..fitting import FitOptions
     from ..fitting import fit as run
-    from ..fitting.fit_sources import fit_sources
     from ..fitting.options import Ageing
+    from ..fitting.sources import fit_sources
     from ..unit.calibration_file import load_calibration, save_calibration
 
     inputs = bags if prior is None else [*bags, prior]
@@ -133,7 +133,7 @@ def fit(
         )
     with out.progress('fitting') as done:
         result = run(sources, wanted, lambda _stage, part: done(part))
-    out.told((source.name, source.chosen, source.missing()) for source in sources)
+    out.told((bag.source.name, bag.info.chosen, bag.truncated) for bag in result.bags if bag.info)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
         from ..report import write_report

@@ -18,7 +18,7 @@ import numpy as np
 from .. import __version__
 from ..errors import RecordingError
 from ..files import shown_name
-from ..fitting.fit_sources import digest
+from ..fitting.sources import digest
 from ..recording import STAMP_END_NS, BagWriter, ImuColumns, Topics
 from ..text import valid_serial
 from ..typing import Bools, Floats, Ints

@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 
+from ..recording import RecordingInfo
 from ..recording.stillness import (
     STILL_SD,
     VARIANCE_RATIO,
@@ -103,7 +104,7 @@ class ReducedBag:
     is_integer: whether all samples were whole numbers
     middle: the word of no force where the words have no sign, else 0
     reach: how far the readings go, handling included, but for single glitches
-    since_s: where the part of the bag that was read begins
+    info, since_s: what a recording says of itself, now that it is read; where its part begins [s]
     restless: what speaks against rests, where there is none
     angular_rate: how much of the bag has one, of finite numbers
     """
@@ -123,9 +124,20 @@ class ReducedBag:
     is_integer: bool
     middle: float = 0.0
     reach: float = 0.0
+    info: RecordingInfo | None = None
     since_s: float = 0.0
     restless: str = ''
     angular_rate: Literal['none', 'part', 'whole'] = 'none'
+
+    @property
+    def metadata(self) -> Mapping[str, str]:
+        """What the bag's writer left in it."""
+        return self.info.metadata if self.info else {}
+
+    @property
+    def truncated(self) -> str | None:
+        """What of the bag is missing."""
+        return self.info.truncated if self.info else None
 
     @property
     def board(self) -> Readings:
@@ -168,7 +180,7 @@ def reduce_source(
         for name, (reading_ns, celsius, _) in block.temperatures.items():
             collectors.setdefault(name, _ReadingCollector()).add(reading_ns, celsius)
         n_samples += len(block.accel_stamp_ns)
-    found = cells.finish()
+    found, reader = cells.finish(), source.reader()
     ranges = _rests(found, min_rest_s, still_sd)
     per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
     return ReducedBag(
@@ -198,7 +210,8 @@ def reduce_source(
         is_integer=found.is_integer,
         middle=found.middle,
         reach=_reach(found),
-        since_s=source.since_s(),
+        info=reader.info if reader else None,
+        since_s=reader.since_s if reader else 0.0,
         restless='' if ranges else _why_restless(found, n_samples, still_sd),
         angular_rate='whole' if has_rate else 'part' if found.rate.any() else 'none',
     )

@@ -8,26 +8,25 @@ Bags, tables and simulated runs provide the same blocks as to the compensator.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+import hashlib
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
+from ..errors import FitError
+from ..files import shown_name
 from ..online.blocks import AccelBlock, Readings
+from ..recording import Block, Input, RecordingInfo, RecordingReader, Role, Topics, open_recording
 from ..typing import Floats, Ints
+
+_SAMPLES: tuple[Role, ...] = ('accel',)
 
 
 @dataclass(frozen=True)
 class ArrayBlock:
-    """
-    A block made of arrays at hand: a simulated run, or a whole recording in memory.
-
-    accel_stamp_ns: stamps of the samples, shape (n,)
-    accel: counts, or m/s^2, shape (n, 3)
-    board_stamp_ns, case_stamp_ns: stamps of the temperature readings, shape (m,)
-    board, case: temperatures, shape (m,)
-    others: stamps and temperatures of further thermometers
-    """
+    """A block of arrays at hand: stamps and samples, then those of each thermometer."""
 
     accel_stamp_ns: Ints
     accel: Floats
@@ -40,14 +39,10 @@ class ArrayBlock:
     @property
     def temperatures(self) -> Mapping[str, Readings]:
         """Stamps, readings and how many samples came before, by the name of the thermometer."""
-        own = {
-            'board': (self.board_stamp_ns, self.board),
-            'case': (self.case_stamp_ns, self.case),
-            **self.others,
-        }
+        board, case = (self.board_stamp_ns, self.board), (self.case_stamp_ns, self.case)
         return {
             name: (stamp_ns, celsius, np.searchsorted(self.accel_stamp_ns, stamp_ns))
-            for name, (stamp_ns, celsius) in own.items()
+            for name, (stamp_ns, celsius) in {'board': board, 'case': case, **self.others}.items()
         }
 
 
@@ -60,12 +55,8 @@ def angular_velocity(block: object) -> Floats | None:
     return rate if rate.any() else None
 
 
-def _nothing() -> str | None:
+def _no_recording() -> RecordingReader | None:
     return None
-
-
-def _at_once() -> float:
-    return 0.0
 
 
 @dataclass(frozen=True)
@@ -77,17 +68,89 @@ class FitSource:
     blocks: gives a fresh iterable of blocks; called once per pass
     sha256: hash of the content, for the provenance
     serial: unit serial found in the source's metadata
-    chosen: which of its topics were taken by their type
-    missing: tells what of the bag is missing, as far as it has been read; None where nothing is
-    since_s: tells, once it is read, where the part that is read begins [s]
-    metadata: what the recording says of itself
+    reader: gives what read it last, which knows what was missing; None for arrays
     """
 
     name: str
     blocks: Callable[[], Iterable[AccelBlock]]
     sha256: str | None = None
     serial: str | None = None
-    chosen: str | None = None
-    missing: Callable[[], str | None] = _nothing
-    since_s: Callable[[], float] = _at_once
-    metadata: Mapping[str, str] = field(default_factory=dict)
+    reader: Callable[[], RecordingReader | None] = _no_recording
+
+
+def fit_sources(
+    paths: Sequence[str | Path],
+    topics: Topics | None = None,
+    input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    serial: str | None = None,
+) -> tuple[list[FitSource], Input]:
+    """
+    Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
+
+    Raises RecordingError if one cannot be read or lacks a topic. Raises FitError if some hold
+    counts and some Imu messages, or they are of different units.
+    """
+    sources: list[FitSource] = []
+    kinds: dict[str, str] = {}
+    serials: dict[str, str] = {}
+    for path in map(Path, paths):
+        source, info = recording_source(path, topics, input)
+        kinds[info.input or 'counts'] = str(path)
+        if source.serial:
+            serials[source.serial] = str(path)
+        sources.append(replace(source, sha256=digest(path)))
+    if len(kinds) > 1:
+        raise FitError(
+            f'{kinds["counts"]} holds counts, {kinds["imu"]} Imu messages: leave one kind out, or '
+            'choose with --input where a bag has both'
+        )
+    if serial is None and len(serials) > 1:
+        found = ', '.join(f'{path} of {unit}' for unit, path in sorted(serials.items()))
+        raise FitError(f'the bags are of different units: {found}')
+    return sources, 'imu' if 'imu' in kinds else 'counts'
+
+
+def recording_source(
+    path: str | Path,
+    topics: Topics | None = None,
+    input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    *,
+    require: Collection[Role] = _SAMPLES,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[FitSource, RecordingInfo]:
+    """
+    Make a source of a recording: looked at now, and opened anew for each pass.
+
+    Raises RecordingError if it cannot be read or lacks a topic.
+    """
+    path = Path(path)
+    with open_recording(path, topics, input, require=require) as reader:
+        info, topic = reader.info, reader.topics.get('accel')
+    latest, total = reader, info.topics[topic][1] if topic else 0
+
+    def blocks() -> Iterator[Block]:
+        nonlocal latest
+        n_read = 0
+        with open_recording(path, topics, input, require=require) as latest:
+            for block in latest.blocks_on_one_clock():
+                yield block
+                n_read += len(block)
+                if progress is not None and total:
+                    progress(min(n_read / total, 1.0))
+
+    name = f'{shown_name(path)}{topics.part if topics else ""}'
+    serial = info.metadata.get('serial')
+    return FitSource(name, blocks, serial=serial, reader=lambda: latest), info
+
+
+def digest(path: Path) -> str:
+    """
+    Return the SHA-256 of a bag: of the file, or of a directory's files in the order of names.
+    """
+    total = hashlib.sha256()
+    files = [path] if path.is_file() else sorted(p for p in path.rglob('*') if p.is_file())
+    for name in files:
+        with name.open('rb') as file:
+            for chunk in iter(lambda: file.read(1 << 20), b''):
+                total.update(chunk)
+    return total.hexdigest()

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from .. import __version__
 from ..errors import FitError, RecordingError, ThermoCompError
 from ..fitting import FitOptions, ReducedBag, fit_bags, reduce_bag
-from ..fitting.fit_sources import digest, recording_source
+from ..fitting.sources import digest, recording_source
 from ..recording import Input, Topics
 from ..text import one_line
 from ..unit.calibration_file import dump_calibration
@@ -101,16 +101,15 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
             is_final = False
         except FitError as error:
             problems.append(str(error))
-    sources = [bag.source for bag in bags]
-    serials = sorted({source.serial for source in sources if source.serial})
-    lots = [lot for source in sources if (lot := source.metadata.get('lot'))]
+    serials = sorted({bag.source.serial for bag in bags if bag.source.serial})
+    lots = [lot for bag in bags if (lot := bag.metadata.get('lot'))]
     serial = serials[0] if serials else unit.name.rpartition('/')[2]
     row = started_row(
         unit,
         serial=serial,
         lot=lots[0] if lots else unit.lot,
         n_left_out=len(problems),
-        n_torn=sum(bool(source.missing()) for source in sources),
+        n_torn=sum(bool(bag.truncated) for bag in bags),
         left_out='; '.join(problems),
         prior=options.prior_sha256,
     )
@@ -141,7 +140,7 @@ def _fitted(
     row = outcome.row
     result = fit_bags(bags, how)
     calibration = dump_calibration(result.calibration)
-    lost = [f'{bag.source.name}: {torn}' for bag in bags if (torn := bag.source.missing())]
+    lost = [f'{bag.source.name}: {bag.truncated}' for bag in bags if bag.truncated]
     if row['n_left_out']:
         lost.append(f'{row["n_left_out"]} of {row["n_bags"]} bags are left out: {row["left_out"]}')
     evidence = evidence_of_fit(result, is_brief=not has_page)

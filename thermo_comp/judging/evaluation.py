@@ -9,20 +9,18 @@ the calibration has changed, reads it once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import RecordingError
-from ..files import shown_name
-from ..fitting.fit_sources import digest
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
-from ..fitting.sources import FitSource
+from ..fitting.sources import digest, recording_source
 from ..online.status import CompensatorConfig
-from ..recording import Block, Input, RecordingInfo, Role, Topics, open_recording
+from ..recording import Input, RecordingInfo, Role, Topics
 from ..recording.stillness import STILL_SD
 from ..replay import check_unit, input_for, needed_roles
 from ..unit.calibration import Calibration
@@ -63,47 +61,38 @@ def open_bag(
     window_s: float = WINDOW_S,
     calibration: Calibration | None = None,
     require: Collection[Role] = _BOARD,
-    is_hashed: bool = True,
     progress: Progress | None = None,
 ) -> OpenedBag:
     """
     Read one bag, in bounded memory, for windows of `window_s` seconds.
 
     `number` is its place among several. What is read, what is saturated and what a rest scatters
-    by is as the `calibration` says, else the usual; the hash takes reading it once more.
+    by is as the `calibration` says, else the usual.
 
     Raises RecordingError if it cannot be read or has no board temperature; ValueError if
     `window_s` is not positive.
     """
-    path = Path(path)
     sum_s = sum_length(window_s)
     if calibration is not None:
         input = input_for(calibration, input)  # noqa: A001 - as above
-    with open_recording(path, topics, input, require=require) as reader:
-        info = reader.info
-        full_scale = COUNTS_FULL_SCALE if info.input != 'imu' else None
-        still_sd = STILL_SD
-        if calibration is not None:
-            full_scale = calibration.unit.full_scale
-            density = max(calibration.noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
-            still_sd = max(still_sd, _NOISES / np.sqrt(calibration.unit.cycle_time_s) * density)
-        name = reader.topics.get('accel')
-        total = info.topics[name][1] if name else 0
-        source = FitSource(
-            name=f'{shown_name(path)}{topics.part if topics else ""}',
-            blocks=lambda: _told(reader.blocks_on_one_clock(), total, progress),
-            sha256=digest(path) if is_hashed else None,
-            serial=info.metadata.get('serial'),
-            missing=lambda: reader.info.truncated,
-            metadata=info.metadata,
-        )
-        reduced = reduce_source(
-            source, number, window_s=sum_s, cell_s=min(_CELL_S, sum_s), full_scale=full_scale
-        )
-        info = reader.info
+    source, info = recording_source(path, topics, input, require=require, progress=progress)
+    full_scale = COUNTS_FULL_SCALE if info.input != 'imu' else None
+    still_sd = STILL_SD
+    if calibration is not None:
+        full_scale = calibration.unit.full_scale
+        density = max(calibration.noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
+        still_sd = max(still_sd, _NOISES / np.sqrt(calibration.unit.cycle_time_s) * density)
+    reduced = reduce_source(
+        replace(source, sha256=digest(Path(path))),
+        number,
+        window_s=sum_s,
+        cell_s=min(_CELL_S, sum_s),
+        still_sd=still_sd,
+        full_scale=full_scale,
+    )
     if 'board' in require and not len(reduced.board.value):
         raise RecordingError('no board temperature in it', path=str(path))
-    return OpenedBag(info, reduced)
+    return OpenedBag(reduced.info or info, reduced)
 
 
 def judge_bags(
@@ -151,12 +140,6 @@ def evaluate(
         raise ValueError('`paths` and `calibrations` must hold at least one each')
     _, first = calibrations[0]
     gravity = first.gravity_m_s2 if gravity is None else gravity
-    tell = progress or (lambda _part: None)
-    # A bag with as many samples as one of the fit may be that one, a part of one always may: its
-    # hash is worth reading.
-    fitted = [one for _, by in calibrations for one in by.provenance.sources if one.sha256]
-    seen = {one.n_samples for one in fitted}
-    has_parts = any(one.name.endswith(']') for one in fitted) or bool(topics and str(topics.part))
     bags = []
     for number, path in enumerate(paths):
         bag = open_bag(
@@ -167,20 +150,15 @@ def evaluate(
             window_s=window_s,
             calibration=first,
             require=needed_roles(*(one for _, one in calibrations)),
-            is_hashed=False,
-            progress=_part_of(tell, number, len(paths)),
+            progress=progress and _part_of(progress, number, len(paths)),
         )
         for _, calibration in calibrations:
             check_unit(calibration, bag.info, serial)
-        if bag.reduced.n_samples in seen or has_parts:
-            source = replace(bag.reduced.source, sha256=digest(Path(path)))
-            bag = replace(bag, reduced=replace(bag.reduced, source=source))
         bags.append(bag)
-    reduced = [bag.reduced for bag in bags]
     judgements = {}
     for name, calibration in calibrations:
         judgement = judge_bags(
-            reduced,
+            [bag.reduced for bag in bags],
             calibration,
             gravity=gravity,
             window_s=window_s,
@@ -200,15 +178,6 @@ def evaluate(
         if number not in judged
     )
     return Evaluation(tuple(bags), judgements, notes)
-
-
-def _told(blocks: Iterator[Block], total: int, progress: Progress | None) -> Iterator[Block]:
-    n_read = 0
-    for block in blocks:
-        yield block
-        n_read += len(block)
-        if progress is not None and total:
-            progress(min(n_read / total, 1.0))
 
 
 def _part_of(tell: Progress, before: int, total: int) -> Progress:

@@ -10,19 +10,18 @@ outside the calibrated ranges is told apart and decides nothing.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..text import counted
-from ..typing import Bools, Floats
+from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G, spoken
-from ..unit.metrics import residual_statistics
 from .rates import RateJudgement, judge_rates
 from .shifts import AxisShift, axis_shifts, distinct_positions, rms_by_axis, what_moved
-from .verdicts import FEWEST, LARGEST_RATIO, SECTIONS, WIDE_PART, Section, Verdict
+from .verdicts import LARGEST_RATIO, WIDE_PART, Section, Sections, Verdict, sections_of
 from .windows import Windows
 
 # Nor is it one above 1 mg.
@@ -34,16 +33,15 @@ class Judgement:
     """
     What recordings tell of a calibration: the verdict, and one sentence of its numbers.
 
-    Sections are ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside``
-    them. `left_out_rms` is, of windows that the fit has seen, what it left on positions left out,
-    else NaN; `tolerance` the user's limit [m/s^2]. Shifts are per axis, none with fewer than six
+    `left_out_rms` is, of windows that the fit has seen, what it left on positions left out, else
+    NaN; `tolerance` the user's limit [m/s^2]. Shifts are per axis, none with fewer than six
     distinct positions; `moved` says those that are sure. For `axis_rms` see `rms_by_axis`. The
     gyroscope is judged apart, where there is one.
     """
 
     kind: Verdict
     reason: str
-    sections: dict[str, Section]
+    sections: Sections
     left_out_rms: float
     tolerance: float | None
     shifts: tuple[AxisShift, ...]
@@ -90,9 +88,7 @@ class Judgement:
             'window_s': self.windows.window_s,
             'tolerance_m_s2': self.tolerance,
             'left_out_rms_m_s2': self.left_out_rms,
-            'sections_m_s2': {
-                name: {**asdict(one), 'ratio': one.ratio} for name, one in self.sections.items()
-            },
+            'sections_m_s2': self.sections.facts(),
             'n_positions': self.n_positions,
             'moved': self.moved,
             'shifts': self.shifts,
@@ -118,16 +114,11 @@ def judge(
         raise ValueError('`windows` must hold at least one')
     if tolerance is not None and not 0.0 < tolerance < np.inf:
         raise ValueError(f'`tolerance` must be positive, got {tolerance:g}')
-    inside, dynamic = windows.is_inside, windows.is_dynamic
     claims = calibration.has_uncertainty
-    sections = {
-        name: _section(windows, rows, claims)
-        for name, rows in zip(
-            SECTIONS, (inside & ~dynamic, inside & dynamic, inside, ~inside), strict=True
-        )
-    }
+    claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
+    sections = sections_of(windows, windows.raw_residual, windows.residual, claimed)
     left_out = calibration.provenance.left_out_rms if is_seen else np.nan
-    shifts = axis_shifts(windows.select(inside), calibration.misalignment_sd)
+    shifts = axis_shifts(windows.select(windows.is_inside), calibration.misalignment_sd)
     moved = what_moved(shifts) if claims else ()
     is_thermal = calibration.needs_temperature
     kind, reason = _verdict(windows, sections, left_out, tolerance, moved, claims, is_thermal)
@@ -146,18 +137,9 @@ def judge(
     )
 
 
-def _section(windows: Windows, rows: Bools, claims: bool) -> Section:
-    raw = residual_statistics(windows.raw_residual[rows])
-    corrected = residual_statistics(windows.residual[rows])
-    claimed = residual_statistics(windows.claimed_sd[rows]).rms if claims else np.nan
-    return Section(
-        corrected.n, raw.rms, raw.peak, corrected.rms, corrected.mean, corrected.peak, claimed
-    )
-
-
 def _verdict(
     windows: Windows,
-    sections: dict[str, Section],
+    sections: Sections,
     left_out: float,
     tolerance: float | None,
     moved: tuple[str, ...],
@@ -170,10 +152,8 @@ def _verdict(
             f'all {_windows(outside.n, windows)} lie there, {_span(windows)}; {_numbers(outside)}'
         )
         return Verdict.OUTSIDE, reason
-    judged = [s for s in (sections['static'], sections['dynamic']) if s.n >= FEWEST] or [one]
-    headline = _headline(left_out, one)
-    worst = max(*(s.rms for s in judged), headline)
-    ratio = max(s.ratio for s in (*judged, one))
+    worst = max([s.rms for s in sections.regimes or [one]] + [_headline(left_out, one)])
+    ratio = sections.worst_ratio
     # A NaN of no claim compares false.
     is_wide = one.claimed_rms > (tolerance or min(WIDE_PART * one.raw_rms, _WIDE_CLAIM))
     if one.rms >= one.raw_rms and is_thermal:

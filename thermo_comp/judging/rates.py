@@ -10,37 +10,29 @@ very same changes: what is uncertain of the bias there, less what it has in comm
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..typing import Bools, Floats, Ints
+from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction
 from ..unit.gyroscope import MILLIDEGREE
-from ..unit.metrics import residual_statistics
 from ..unit.rate_triad import rate_triad
 from ..unit.uncertainty import SlowUncertainty
-from .verdicts import FEWEST, LARGEST_RATIO, SECTIONS, WIDE_PART, Section, Verdict
-from .windows import Windows
+from .verdicts import LARGEST_RATIO, WIDE_PART, Sections, Verdict, sections_of
+from .windows import Windows, means_by
 
 
 @dataclass(frozen=True)
 class RateJudgement:
-    """
-    What recordings tell of a gyroscope: sections as of `Judgement`, of all axes, in rad/s.
-
-    `level_rms` is the RMS over rests and axes of their corrected means, which hold the Earth's
-    rate (4.2e-5 on an axis) and the turn-on, `raw_level_rms` that of the raw ones: they decide
-    nothing.
-    """
+    """What recordings tell of a gyroscope: sections of the changes of all axes, in rad/s."""
 
     kind: Verdict
     reason: str
-    sections: dict[str, Section]
-    raw_level_rms: float
-    level_rms: float
+    sections: Sections
 
     @property
     def is_wrong(self) -> bool:
@@ -57,11 +49,7 @@ class RateJudgement:
             'verdict': self.kind.value,
             'reason': self.reason,
             'is_valid': self.kind.is_valid,
-            'sections_rad_s': {
-                name: {**asdict(one), 'ratio': one.ratio} for name, one in self.sections.items()
-            },
-            'raw_level_rms_rad_s': self.raw_level_rms,
-            'level_rms_rad_s': self.level_rms,
+            'sections_rad_s': self.sections.facts(),
         }
 
 
@@ -71,82 +59,58 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     if not windows.gyro.size:
         return None
     raw, corrected, variance = (windows.gyro[:, k : k + 3] for k in (0, 3, 6))
-    # What lies outside the ranges is held against the rest's mean inside them.
-    reference = _Means(windows.position, windows.is_inside)
-    counts = reference.counts
-    is_judged = counts > 1
+    # What lies outside the ranges is held against the rest's mean inside them, if there is one.
+    _, place = np.unique(windows.position, return_inverse=True)
+    has_inside = np.bincount(place, windows.is_inside) > 0.0
+    weight = np.where(has_inside[place], windows.is_inside, 1.0)
+    counts = np.bincount(place, weight).astype(np.float64)[place]
+
+    def mean_of(rows: Floats) -> Floats:
+        return means_by(place, rows, weight)[place]
+
     claims = rate_triad(calibration).has_uncertainty
     claimed = np.full_like(corrected, np.nan)
     if claims:
-        claimed = np.sqrt(_variance(windows, calibration, variance, reference))
-    inside, dynamic = windows.is_inside & is_judged, windows.is_dynamic
-    rows_of = (inside & ~dynamic, inside & dynamic, inside, ~windows.is_inside & is_judged)
-    changes = raw - reference.of(raw), corrected - reference.of(corrected)
-    sections = {
-        name: _section(*(change[rows].ravel() for change in (*changes, claimed)))
-        for name, rows in zip(SECTIONS, rows_of, strict=True)
-    }
+        claimed = np.sqrt(_variance(windows, calibration, variance, counts, mean_of))
+    changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))
+    is_judged = counts > 1
+    sections = sections_of(windows.select(is_judged), *changes[:, is_judged])
     kind, reason = _verdict(sections, windows.window_s, claims)
-    _, first = np.unique(windows.position, return_index=True)
-    levels = [reference.of(rate)[first] for rate in (raw, corrected)]
-    raw_level, level = (float(np.sqrt(np.mean(one**2))) for one in levels)
-    return RateJudgement(kind, reason, sections, raw_level, level)
-
-
-class _Means:
-    """Means over the rests: of their windows inside the ranges, where there are any."""
-
-    def __init__(self, position: Ints, is_inside: Bools) -> None:
-        _, self._where = np.unique(position, return_inverse=True)
-        n = int(self._where.max()) + 1
-        has_inside = np.bincount(self._where, is_inside, n) > 0.0
-        self._weight = np.where(has_inside[self._where], is_inside, 1.0)
-        self._counts = np.bincount(self._where, self._weight, n)
-        #: Windows that went into the mean of each window's rest.
-        self.counts = self._counts[self._where]
-
-    def of(self, rows: Floats) -> Floats:
-        """Give each window the mean of its rest."""
-        total = np.zeros((len(self._counts), rows.shape[1]))
-        np.add.at(total, self._where, rows * self._weight[:, None])
-        return np.asarray((total / self._counts[:, None])[self._where])
+    return RateJudgement(kind, reason, sections)
 
 
 def _variance(
-    windows: Windows, calibration: Calibration, variance: Floats, reference: _Means
+    windows: Windows,
+    calibration: Calibration,
+    variance: Floats,
+    counts: Floats,
+    mean_of: Callable[[Floats], Floats],
 ) -> Floats:
     """Say what is claimed for the changes, from what is for the rate of one message."""
     triad = rate_triad(calibration)
     correction = Correction(triad, Correction(calibration).memory)
-    whole, away = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], reference.of)
+    whole, away = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
     slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
     # Of the thermometers' noise, and of lags that started unseen, a rest's mean has little.
     rest = np.maximum(variance - np.array(correction.noise) - slow - whole, 0.0)
     white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
-    noise = white * (1.0 - 1.0 / np.maximum(reference.counts, 1.0))[:, None]
-    hours = reference.counts[:, None] * windows.window_s / 3600.0
+    noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
+    hours = counts[:, None] * windows.window_s / 3600.0
     # A walk strays from its mean over a time by a sixth of what it gains in that time.
     walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
     return np.asarray(rest + away + noise + walk)
 
 
-def _section(raw: Floats, corrected: Floats, claimed: Floats) -> Section:
-    before, after = residual_statistics(raw), residual_statistics(corrected)
-    rms = residual_statistics(claimed).rms
-    return Section(after.n // 3, before.rms, before.peak, after.rms, after.mean, after.peak, rms)
-
-
-def _verdict(sections: dict[str, Section], window_s: float, claims: bool) -> tuple[Verdict, str]:
+def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict, str]:
     one, outside = sections['all'], sections['outside']
     if not one.n:
         return Verdict.OUTSIDE, f'{outside.n} windows of {window_s:g} s lie there'
-    judged = [s for s in (sections['static'], sections['dynamic']) if s.n >= FEWEST]
-    ratio = max(s.ratio for s in (*judged, one))
     said = f'{_mdeg(one.rms)} RMS of its changes at rest, {_mdeg(one.raw_rms)} raw'
     over = f'over {one.n} windows of {window_s:g} s'
     if not claims:
         kind = Verdict.NO_BETTER if one.rms > one.raw_rms else Verdict.NO_CLAIM
         return kind, f'{said} {over}; the calibration says nothing of its uncertainty'
+    ratio = sections.worst_ratio
     said = (
         f'{said}, {_mdeg(one.claimed_rms)} claimed {over}; '
         f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'

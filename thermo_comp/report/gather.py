@@ -107,7 +107,7 @@ def evidence_of_fit(result: FitResult, *, is_brief: bool = False) -> Evidence:
 
 
 def _is_simulated(bags: Sequence[ReducedBag]) -> bool:
-    return any(_SIMULATED in bag.source.metadata for bag in bags)
+    return any(_SIMULATED in bag.metadata for bag in bags)
 
 
 def _is_reservation(finding: Finding) -> bool:
@@ -145,8 +145,7 @@ def _span_ns(bag: ReducedBag) -> tuple[int, int]:
 
 def _facts(bag: ReducedBag) -> BagFacts:
     start_ns, end_ns = _span_ns(bag)
-    truncated = bag.source.missing()
-    remarks = [truncated] if truncated else []
+    remarks = [bag.truncated] if bag.truncated else []
     if bag.n_saturated:
         remarks.append(f'{bag.n_saturated} samples saturated, left out')
     if bag.n_dropped:
