@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -92,47 +92,14 @@ class Account:
 
 @dataclass(frozen=True)
 class _Rest:
-    """What the still cells of one position say, in input units."""
+    """What the still cells of one position say, in input units, and its thermometers."""
 
-    mean: Floats
-    noise: float
-    n: int
-    still_s: float
-    n_rests: int
-
-
-_NO_REST = _Rest(np.full(3, np.nan), math.nan, 0, 0.0, 0)
-
-
-class _Open:
-    """The samples of one position while they come, and the newest of them once more."""
-
-    def __init__(self) -> None:
-        self._cells = CellAccumulator(_CELL_S, None)
-        self._n = 0
-        self.recent: list[tuple[Ints, Floats]] = []
-        #: Mean of its first rest, which a quieter one later may hide.
-        self.first: Floats | None = None
-        self.n_looked = 0
-
-    def add(self, stamp_ns: Ints, samples: Floats) -> None:
-        """Take samples, shape (n, 3), or (n, 6) with angular rates."""
-        self.recent.append((stamp_ns, samples))
-        n_before, self._n = self._n, self._n + len(stamp_ns)
-        if self._n < _SAMPLES_TO_BEGIN:
-            return
-        # The length of a cell follows from the first samples: there must be some.
-        pieces = self.recent if n_before < _SAMPLES_TO_BEGIN else self.recent[-1:]
-        stamp_ns, samples = (np.concatenate(column) for column in zip(*pieces, strict=True))
-        rates = samples[:, 3:] if samples.shape[1] > 3 else None
-        self._cells.add(stamp_ns, samples[:, :3], rates)
-
-    def forget(self, stamp_ns: int) -> None:
-        if self._n >= _SAMPLES_TO_BEGIN:
-            self.recent = [one for one in self.recent if len(one[0]) and one[0][-1] >= stamp_ns]
-
-    def cells(self) -> Cells:
-        return self._cells.finish()
+    surveys: Surveys
+    mean: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    noise: float = math.nan
+    n: int = 0
+    still_s: float = 0.0
+    n_rests: int = 0
 
 
 class Acquisition:
@@ -145,53 +112,68 @@ class Acquisition:
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset
         self._rest_s = min(_REST_S, soak_s)
-        self._open = _Open()
         self._rests: list[_Rest] = []
-        self._surveys: list[Surveys] = []
-        self._readings: dict[str, Readings] = {}
         self._centre = np.zeros(3)
+        self._start()
+
+    def _start(self) -> None:
+        """Begin with another clock."""
+        self._accumulator = CellAccumulator(_CELL_S, None)
+        # The length of a cell follows from the first samples: there must be some.
+        self._held: list[tuple[Ints, Floats]] | None = []
+        self._readings: dict[str, list[Readings]] = {}
         #: Before this stamp no position begins any more.
-        self.settled_ns = _EVER_NS
-        self._newest_ns = _EVER_NS
+        self.settled_ns = self._newest_ns = self._begin_ns = _EVER_NS
+        self._n_looked = 0
+        # Mean of the position's first rest, which a quieter one later may hide.
+        self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
         """Take what came; return the stamps [ns] at which further positions begin."""
         for name, one in block.temperatures.items():
-            if len(one.stamp_ns):
-                known = self._readings.get(name)
-                self._readings[name] = one if known is None else _joined(known, one)
+            self._readings.setdefault(name, []).append(one)
         if not len(block):
             return []
         begins: list[int] = []
-        first_ns, newest_ns = int(block.accel_stamp_ns[0]), self._newest_ns
-        if newest_ns - first_ns > _STEP_BACK_NS:
+        stamp_ns, samples = block.accel_stamp_ns, block.accel - self._offset
+        if self._newest_ns - int(stamp_ns[0]) > _STEP_BACK_NS:
             # A driver that began anew, with another clock.
             self.begin()
-            begins.append(first_ns)
-        self._newest_ns = int(block.accel_stamp_ns[-1])
-        samples = block.accel - self._offset
+            begins.append(int(stamp_ns[0]))
+        self._newest_ns = int(stamp_ns[-1])
         if block.imu is not None:
             samples = np.hstack([samples, block.imu.angular_velocity])
-        self._open.add(block.accel_stamp_ns, samples)
-        cells = self._open.cells()
+        if self._held is not None:
+            self._held.append((stamp_ns, samples))
+            stamp_ns, samples = (np.concatenate(one) for one in zip(*self._held, strict=True))
+        if len(stamp_ns) >= _SAMPLES_TO_BEGIN or self._held is None:
+            self._held = None
+            rates = samples[:, 3:] if samples.shape[1] > 3 else None
+            self._accumulator.add(stamp_ns, samples[:, :3], rates)
+        cells = self._cells()
         while (begin_ns := self._turn(cells)) is not None:
             begins.append(max(begin_ns, self.settled_ns))
             self._close(begins[-1])
-            cells = self._open.cells()
+            cells = self._cells()
         margin_ns = round((self._rest_s + 3.0 * max(cells.cell_s, _CELL_S)) * 1e9)
         self.settled_ns = max(self.settled_ns, self._newest_ns - margin_ns)
-        self._open.forget(self.settled_ns)
         return begins
 
     def begin(self) -> None:
         """End the position; what comes next may have another clock."""
         self._close(-_EVER_NS)
-        self.settled_ns = self._newest_ns = _EVER_NS
+        self._start()
+
+    def _cells(self) -> Cells:
+        """Give the cells of the position."""
+        cells = self._accumulator.finish()
+        begin_s = (self._begin_ns - cells.start_ns) * 1e-9
+        return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 
     def _turn(self, cells: Cells) -> int | None:
         """Find where the sensor first rests in another direction than before [ns]."""
         # What was looked at before is over, but for its end.
-        n_looked, self._open.n_looked = self._open.n_looked, len(cells.count)
+        n_looked, self._n_looked = self._n_looked, len(cells.count)
         cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
@@ -205,10 +187,10 @@ class Acquisition:
             if _noise(behind, [(lower, upper)]) < _LOUDEST * _noise(cells, ranges)
         ]
         means = np.array([_mean(cells, [one]) for one in ranges])
-        if self._open.first is None:
-            self._open.first = means[0]
+        if self._first is None:
+            self._first = means[0]
         ups = self._directions(means)
-        up = self._directions(self._open.first[None])[0]
+        up = self._directions(self._first[None])[0]
         other = ups @ up < math.cos(math.radians(SAME_DIRECTION_DEG))
         if not other.any():
             return None
@@ -217,18 +199,35 @@ class Acquisition:
 
     def _close(self, end_ns: int) -> None:
         """End the position; what came since belongs to the next one."""
-        before, self._open = self._open, _Open()
-        self._rests.append(_rest(before.cells(), end_ns, self._rest_s))
-        self._surveys.append(_surveys(self._readings, end_ns))
+        self._rests.append(self._rest(self._cells(), end_ns))
         self._readings = {
-            name: _part(one, end_ns, -_EVER_NS) for name, one in self._readings.items()
+            name: [part for one in own if len((part := _part(one, end_ns, -_EVER_NS)).stamp_ns)]
+            for name, own in self._readings.items()
         }
-        for stamp_ns, samples in before.recent:
-            use = stamp_ns >= end_ns
-            if use.any():
-                self._open.add(stamp_ns[use], samples[use])
+        self._begin_ns, self._n_looked, self._first = end_ns, 0, None
         means = np.array([one.mean for one in self._rests if one.n_rests]).reshape(-1, 3)
         self._centre = rough_centre(means)
+
+    def _rest(self, cells: Cells, end_ns: int) -> _Rest:
+        """Put the rests of the position together, up to where the next one begins."""
+        found = {
+            name: survey_thermometer([_part(one, _EVER_NS, end_ns) for one in own])
+            for name, own in self._readings.items()
+        }
+        surveys = {name: one for name, one in found.items() if one is not None}
+        end_s = (end_ns - cells.start_ns) * 1e-9 - 0.5 * cells.cell_s
+        cells = cells.part(slice(int(np.searchsorted(cells.time, end_s))))
+        ranges = still_intervals(cells, self._rest_s)
+        if not ranges:
+            return _Rest(surveys)
+        return _Rest(
+            surveys,
+            mean=_mean(cells, ranges),
+            noise=_noise(cells, ranges),
+            n=int(sum(cells.count[a:b].sum() for a, b in ranges)),
+            still_s=cells.cell_s * sum(b - a for a, b in ranges),
+            n_rests=len(ranges),
+        )
 
     def _directions(self, means: Floats) -> Floats:
         """Give unit vectors of raw means, about the centre that they have so far."""
@@ -238,9 +237,8 @@ class Acquisition:
 
     def account(self) -> Account:
         """Say what there is and what is missing."""
-        cells = self._open.cells()
-        rests = [*self._rests, _rest(cells, -_EVER_NS, self._rest_s)]
-        surveys = [*self._surveys, _surveys(self._readings, -_EVER_NS)]
+        cells = self._cells()
+        rests = [*self._rests, self._rest(cells, -_EVER_NS)]
         means = np.array([one.mean for one in rests])
         ups = self._directions(means)
         one_g = np.sum((means - self._centre) * ups, axis=1)
@@ -248,9 +246,11 @@ class Acquisition:
         usual = float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 1.0
         sds = np.hypot(noise / np.sqrt([max(one.n, 1) for one in rests]), _FLOOR_SD)
         positions: list[Position] = []
-        for up, rest, one, sd, survey in zip(ups, rests, noise, sds, surveys, strict=True):
+        for up, rest, one, sd in zip(ups, rests, noise, sds, strict=True):
             reason = self._reason(rest, up, one / usual, positions)
-            positions.append(Position(up, rest.still_s, rest.n_rests, float(sd), survey, reason))
+            positions.append(
+                Position(up, rest.still_s, rest.n_rests, float(sd), rest.surveys, reason)
+            )
         found = [one for one in positions if np.isfinite(one.up).all()]
         seen = np.array([one.up for one in found]).reshape(-1, 3)
         covariance = constants_covariance(seen, np.array([one.sd_g for one in found]))
@@ -258,7 +258,7 @@ class Acquisition:
         now, is_still = self._now(cells)
         hole, hole_deg = farthest(seen)
         n_good = sum(not one.reason for one in positions)
-        thermometers = _together(surveys)
+        thermometers = _together([one.surveys for one in rests])
         return Account(
             tuple(positions),
             n_good,
@@ -320,22 +320,6 @@ class Acquisition:
         return tuple(found)
 
 
-def _rest(cells: Cells, end_ns: int, rest_s: float) -> _Rest:
-    """Put the rests of one position together, up to where the next one begins."""
-    end_s = (end_ns - cells.start_ns) * 1e-9 - 0.5 * cells.cell_s
-    cells = cells.part(slice(int(np.searchsorted(cells.time, end_s))))
-    ranges = still_intervals(cells, rest_s)
-    if not ranges:
-        return _NO_REST
-    return _Rest(
-        mean=_mean(cells, ranges),
-        noise=_noise(cells, ranges),
-        n=int(sum(cells.count[a:b].sum() for a, b in ranges)),
-        still_s=cells.cell_s * sum(b - a for a, b in ranges),
-        n_rests=len(ranges),
-    )
-
-
 def _noise(cells: Cells, ranges: Sequence[tuple[int, int]]) -> float:
     variance = np.median(np.concatenate([cells.variance[a:b] for a, b in ranges]), axis=0)
     return float(np.sqrt(variance.mean()))
@@ -344,22 +328,6 @@ def _noise(cells: Cells, ranges: Sequence[tuple[int, int]]) -> float:
 def _mean(cells: Cells, ranges: Sequence[tuple[int, int]]) -> Floats:
     rows = np.concatenate([np.arange(a, b) for a, b in ranges])
     return np.asarray(np.average(cells.mean[rows], axis=0, weights=cells.count[rows]))
-
-
-def _surveys(readings: Mapping[str, Readings], end_ns: int) -> Surveys:
-    """Describe what each thermometer read before a stamp."""
-    surveys = {
-        name: survey_thermometer([_part(one, _EVER_NS, end_ns)]) for name, one in readings.items()
-    }
-    return {name: one for name, one in surveys.items() if one is not None}
-
-
-def _joined(one: Readings, other: Readings) -> Readings:
-    return Readings(
-        np.concatenate([one.stamp_ns, other.stamp_ns]),
-        np.concatenate([one.celsius, other.celsius]),
-        np.concatenate([one.after, other.after]),
-    )
 
 
 def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
