@@ -179,7 +179,7 @@ def test_nothing_in_is_nothing_out() -> None:
         ({'time_s': [0.0, np.nan, 2.0]}, r'must be finite seconds, or datetime64, got nan at 1'),
         ({'time_s': [0, 10**18, 2 * 10**18]}, r'must be finite seconds, .* got 1e\+18 at 1'),
         ({'time_s': ['a', 'b', 'c']}, r'`time_s` must be numbers: could not convert'),
-        ({'time_s': np.array(['2026-01-01', 'NaT', '2026-01-03'], 'M8[ns]')}, 'got one at 1'),
+        ({'time_s': np.array(['2026-01-01', 'NaT', '2026-01-03'], 'M8[ns]')}, 'got NaT at 1'),
         ({'counts': np.zeros((2, 3))}, r'`counts` must have the shape \(3, 3\), .* got \(2, 3\)'),
         ({'counts': np.zeros((3, 2))}, r'`counts` must have the shape \(3, 3\), .* got \(3, 2\)'),
         ({'board': [20.0, 20.0]}, r'`board` must have a value for each of the 3 times'),
@@ -227,7 +227,7 @@ def test_a_further_thermometer_goes_in_by_its_name(arrays: dict[str, np.ndarray]
 
 def test_arrays_that_cannot_be_fitted_are_refused() -> None:
     columns = tc.Columns(np.arange(5.0), np.zeros((4, 3)), {})
-    with pytest.raises(ValueError, match=r'`counts` must have the shape \(5, 3\), got \(4, 3\)'):
+    with pytest.raises(ValueError, match=r'must have the shape \(5, 3\), .* got \(4, 3\)'):
         tc.fit(columns, gravity=9.8)
     with pytest.raises(ValueError, match='`gravity` must be positive'):
         tc.fit([], gravity=0.0)

@@ -280,17 +280,6 @@ def test_a_folder_of_bags_is_no_bag(tmp_path: Path) -> None:
         BagWriter(tmp_path / 'fit', overwrite=True)
 
 
-def test_directories_are_exchanged_without_the_system_call_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small(tmp_path / 'bag', 1.0)
-    monkeypatch.setattr('thermo_comp.files._exchange', lambda *_: False)
-    small(tmp_path / 'bag', 2.0, overwrite=True)
-    assert [p.name for p in tmp_path.iterdir()] == ['bag']
-    columns = read_recording(tmp_path / 'bag', require=()).columns
-    assert float(columns.accel[0, 0]) == 2.0
-
-
 @contextmanager
 def limited_file_size(n_bytes: int) -> Iterator[None]:
     """Let no file of this process grow beyond a size: what a full disk does to a writer."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -20,26 +20,22 @@ import numpy.typing as npt
 
 from .files import shown_name
 from .online.batch import process_block
+from .online.blocks import Readings, said_anew
 from .online.compensator import Compensator
 from .online.status import CompensatorConfig, Counters
 from .typing import Bools, Floats, Ints
 from .unit.calibration import Calibration
 
 if TYPE_CHECKING:
-    from .fitting import FitSource
     from .recording import Topics
 
 #: A temperature: one value for each sample, or (time_s, value) of readings of their own.
 Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
 
-#: What a fit reads of a thermometer that is not there.
-_NOTHING: dict[str, Temperature] = {'board': ([], []), 'case': ([], [])}
 #: `Columns.start_ns` is a multiple of this, so that times count from a whole minute.
-MINUTE_NS = 60_000_000_000
-#: A temperature that is given for each sample, and stays, is a reading again after this.
-REPEAT_NS = 10_000_000_000
+_MINUTE_NS = 60_000_000_000
 #: Farther from their origin than this times are not in seconds [s].
-LONGEST_S = 4e9
+_LONGEST_S = 4e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,15 +92,6 @@ class Corrected:
     counters: Counters = field(default_factory=Counters)
 
 
-@dataclass(frozen=True)
-class _Block:
-    """What `process_block` takes, and a fit."""
-
-    accel_stamp_ns: Ints
-    accel: Floats
-    temperatures: dict[str, tuple[Ints, Floats, Ints]]
-
-
 def correct(
     calibration: Calibration,
     time_s: npt.ArrayLike,
@@ -145,23 +132,14 @@ def correct(
         If shapes do not fit, times do not rise, or the calibration has no such thermometer.
 
     """
-    stamps = _stamps('time_s', time_s)
-    samples = _numbers('counts', counts)
-    if samples.shape != (len(stamps), 3):
-        raise ValueError(
-            f'`counts` must have the shape ({len(stamps)}, 3), a row for each time, '
-            f'got {samples.shape}'
-        )
     unknown = sorted(set(sensors) - set(calibration.sensors))
     if unknown:
         known = ', '.join(('board', *calibration.sensors))
         raise ValueError(f'`{unknown[0]}` is no thermometer of this calibration: it has {known}')
-    readings = {
-        name: _readings(name, value, stamps, _is_date(time_s))
-        for name, value in {'board': board, **sensors}.items()
-    }
+    given = _Block.of(time_s, counts, {'board': board, **sensors})
     compensator = Compensator(calibration, config)
-    block = process_block(compensator, _Block(stamps, samples, readings))
+    block = process_block(compensator, given)
+    stamps = given.accel_stamp_ns
     force = np.full((len(stamps), 3), np.nan)
     covariance = np.full((len(stamps), 3, 3), np.nan)
     force[block.index] = block.specific_force
@@ -202,7 +180,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
     readings = {name: one for name, one in block.temperatures.items() if len(one[0])}
     stamps = [block.accel_stamp_ns, *(one[0] for one in readings.values())]
     first_ns = min((int(one.min()) for one in stamps if len(one)), default=0)
-    start_ns = first_ns // MINUTE_NS * MINUTE_NS
+    start_ns = first_ns // _MINUTE_NS * _MINUTE_NS
     return Columns(
         time_s=_seconds(block.accel_stamp_ns, start_ns),
         counts=block.accel,
@@ -254,7 +232,7 @@ def fit(
         If the data cannot carry a fit.
 
     """
-    from .fitting import FitOptions
+    from .fitting import FitOptions, FitSource
     from .fitting import fit as run
     from .fitting.sources import fit_sources
 
@@ -263,28 +241,45 @@ def fit(
     sources, kind = fit_sources(paths, serial=options.get('serial'))
     if paths:
         options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
-    sources += [_source(item) for item in items if isinstance(item, Columns)]
+    for one in items:
+        if isinstance(one, Columns):
+            # What a fit reads of a thermometer that is not there.
+            nothing: Temperature = ([], [])
+            readings = {'board': nothing, 'case': nothing, **one.temperatures}
+            block = _Block.of(one.time_s, one.counts, readings, one.start_ns)
+            sources.append(FitSource(one.name, partial(list, [block]), serial=one.serial))
     return run(sources, FitOptions(gravity=gravity, **options)).calibration
 
 
-def _source(columns: Columns) -> FitSource:
-    from .fitting import FitSource
+@dataclass(frozen=True)
+class _Block:
+    """What `process_block` takes, and a fit."""
 
-    stamps = _stamps('time_s', columns.time_s)
-    samples = _numbers('counts', columns.counts)
-    if samples.shape != (len(stamps), 3):
-        raise ValueError(f'`counts` must have the shape ({len(stamps)}, 3), got {samples.shape}')
-    readings = {
-        name: _readings(name, value, stamps, _is_date(columns.time_s))
-        for name, value in {**_NOTHING, **columns.temperatures}.items()
-    }
-    start = columns.start_ns
-    block = _Block(
-        stamps + start,
-        samples,
-        {name: (own + start, value, place) for name, (own, value, place) in readings.items()},
-    )
-    return FitSource(columns.name, lambda: [block], serial=columns.serial)
+    accel_stamp_ns: Ints
+    accel: Floats
+    temperatures: dict[str, Readings]
+
+    @classmethod
+    def of(
+        cls,
+        time_s: npt.ArrayLike,
+        counts: npt.ArrayLike,
+        temperatures: Mapping[str, Temperature],
+        start_ns: int = 0,
+    ) -> _Block:
+        """Check arrays of a caller's; a reading waits for its sample."""
+        stamps = _stamps('time_s', time_s)
+        samples = _numbers('counts', counts)
+        if samples.shape != (len(stamps), 3):
+            raise ValueError(
+                f'`counts` must have the shape ({len(stamps)}, 3), a row for each time, '
+                f'got {samples.shape}'
+            )
+        readings = {}
+        for name, value in temperatures.items():
+            own, celsius = _readings(name, value, stamps, _is_date(time_s))
+            readings[name] = (own + start_ns, celsius, np.zeros(len(own), dtype=np.int64))
+        return cls(stamps + start_ns, samples, readings)
 
 
 def _is_date(value: object) -> bool:
@@ -303,20 +298,19 @@ def _stamps(name: str, value: npt.ArrayLike) -> Ints:
     given = np.asarray(value)
     if given.ndim != 1:
         raise ValueError(f'`{name}` must have one dimension, got the shape {given.shape}')
-    if given.dtype.kind in 'Mm':
-        if np.isnat(given).any():
-            raise ValueError(f'`{name}` must not hold NaT, got one at {np.isnat(given).argmax()}')
-        unit = 'datetime64[ns]' if given.dtype.kind == 'M' else 'timedelta64[ns]'
-        stamps: Ints = given.astype(unit).astype(np.int64)
+    if _is_date(given):
+        wrong = np.isnat(given)
+        nanoseconds = given.astype(f'{given.dtype.kind}8[ns]')
     else:
-        seconds = _numbers(name, given)
-        wrong = ~(np.abs(seconds) <= LONGEST_S)
-        if wrong.any():
-            raise ValueError(
-                f'`{name}` must be finite seconds, or datetime64, got {seconds[wrong][0]} '
-                f'at {wrong.argmax()}'
-            )
-        stamps = np.rint(seconds * 1e9).astype(np.int64)
+        given = _numbers(name, given)
+        wrong = ~(np.abs(given) <= _LONGEST_S)
+        nanoseconds = np.rint(np.where(wrong, 0.0, given) * 1e9)
+    if wrong.any():
+        raise ValueError(
+            f'`{name}` must be finite seconds, or datetime64, got {given[wrong][0]} '
+            f'at {wrong.argmax()}'
+        )
+    stamps: Ints = nanoseconds.astype(np.int64)
     falls = np.flatnonzero(np.diff(stamps) <= 0)
     if len(falls):
         at = int(falls[0])
@@ -324,10 +318,8 @@ def _stamps(name: str, value: npt.ArrayLike) -> Ints:
     return stamps
 
 
-def _readings(
-    name: str, value: Temperature, stamps: Ints, is_date: bool
-) -> tuple[Ints, Floats, Ints]:
-    """Give stamps and values of a thermometer's readings; a reading waits for its sample."""
+def _readings(name: str, value: Temperature, stamps: Ints, is_date: bool) -> tuple[Ints, Floats]:
+    """Give stamps and values of a thermometer's readings."""
     if isinstance(value, tuple) and len(value) == 2:
         if np.size(value[0]) and _is_date(value[0]) != is_date:
             raise ValueError(f'the times of `{name}` must be of the kind of `time_s`')
@@ -337,32 +329,12 @@ def _readings(
             raise ValueError(
                 f'`{name}` must have as many values as times, {len(own)}, got {values.shape}'
             )
-    else:
-        values = _numbers(name, cast('npt.ArrayLike', value))
-        if values.shape != stamps.shape:
-            raise ValueError(
-                f'`{name}` must have a value for each of the {len(stamps)} times, or be a pair '
-                f'(time_s, value), got {values.shape}'
-            )
-        own, values = _as_read(stamps, values)
-    return own, values, np.zeros(len(own), dtype=np.int64)
-
-
-def _as_read(stamps: Ints, values: Floats) -> tuple[Ints, Floats]:
-    """
-    Take a column beside the samples apart into readings: NaN is none, nor is a repetition.
-
-    What is filled up to the rate of the samples would look like a thermometer that stands still.
-    """
-    here = ~np.isnan(values)
-    stamps, values = stamps[here], values[here]
-    is_new = np.ones(len(values), dtype=bool)
-    is_new[1:] = values[1:] != values[:-1]
-    kept: list[int] = []
-    edges = [*np.flatnonzero(is_new).tolist(), len(values)]
-    for begin, end in pairwise(edges):
-        at = begin
-        while at < end:
-            kept.append(at)
-            at += int(np.searchsorted(stamps[at:end], stamps[at] + REPEAT_NS))
-    return stamps[kept], values[kept]
+        return own, values
+    values = _numbers(name, cast('npt.ArrayLike', value))
+    if values.shape != stamps.shape:
+        raise ValueError(
+            f'`{name}` must have a value for each of the {len(stamps)} times, or be a pair '
+            f'(time_s, value), got {values.shape}'
+        )
+    read = said_anew(stamps, values)
+    return stamps[read], values[read]

@@ -38,10 +38,8 @@ class CalibrationError(ThermoCompError):
         key: str | None = None,
         rule: str | None = None,
     ) -> None:
-        self.message = message
+        self.message, self.key, self.rule = message, key, rule
         self.path = None if path is None else str(path)
-        self.key = key
-        self.rule = rule
         super().__init__(self.path, key, message)
 
 
@@ -51,9 +49,8 @@ class RecordingError(ThermoCompError):
     def __init__(
         self, message: str, path: str | Path | None = None, topic: str | None = None
     ) -> None:
-        self.message = message
+        self.message, self.topic = message, topic
         self.path = None if path is None else str(path)
-        self.topic = topic
         super().__init__(self.path, topic, message)
 
 
@@ -61,8 +58,7 @@ class OutputError(ThermoCompError):
     """An output that may not or cannot be written, with its name."""
 
     def __init__(self, message: str, path: str | Path) -> None:
-        self.message = message
-        self.path = str(path)
+        self.message, self.path = message, str(path)
         super().__init__(self.path, message)
 
 

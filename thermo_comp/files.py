@@ -24,8 +24,6 @@ from typing import BinaryIO
 
 from .errors import OutputError
 
-_AT_FDCWD = -100
-_RENAME_EXCHANGE = 2
 _HEAD_BYTES = 4096
 _INDEX = 'metadata.yaml'
 
@@ -176,11 +174,11 @@ class Draft:
         """Give the finished output its name; OutputError if somebody else was first."""
         with _told(self._path):
             if self.partial.is_dir():
-                sync_directory(self.partial)
+                _sync_directory(self.partial)
                 self._publish_folder()
             else:
                 self._publish_file()
-            sync_directory(self._target.parent)
+            _sync_directory(self._target.parent)
 
     def drop(self) -> None:
         """Remove what was written so far."""
@@ -209,15 +207,8 @@ class Draft:
 
     def _publish_folder(self) -> None:
         if not (self._is_replacing and self._target.exists()):
-            try:
-                # Of folders the system replaces none but an empty one.
-                self.partial.rename(self._target)
-            except OSError as error:
-                if error.errno in (errno.ENOTEMPTY, errno.ENOTDIR):
-                    raise FileExistsError(error.errno, error.strerror) from error
-                raise
-        elif _exchange(self.partial, self._target):
-            shutil.rmtree(self.partial)
+            # Of folders the system replaces none but an empty one.
+            self.partial.rename(self._target)
         else:
             old = _hidden_sibling(self._target)
             self._target.rename(old)
@@ -256,7 +247,7 @@ def write_atomically(
         partial.write_bytes(content)
 
 
-def sync_directory(path: Path) -> None:
+def _sync_directory(path: Path) -> None:
     """Flush a directory's entries to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
@@ -270,10 +261,11 @@ def _told(path: str | Path) -> Iterator[None]:
     """Say which output failed, and not the hidden name, which nobody knows of."""
     try:
         yield
-    except FileExistsError as error:
-        raise OutputError('exists already; --force overwrites it', path) from error
     except OSError as error:
-        raise OutputError(f'cannot be written: {error.strerror or error}', path) from error
+        said = f'cannot be written: {error.strerror or error}'
+        if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
+            said = 'exists already; --force overwrites it'
+        raise OutputError(said, path) from error
 
 
 def _hidden_sibling(path: Path) -> Path:
@@ -283,9 +275,8 @@ def _hidden_sibling(path: Path) -> Path:
 
 def _overlaps(target: Path, other: Path) -> bool:
     """Say whether a target is, holds or lies in another file, by whatever names and links."""
-    if target == other or other in target.parents or target in other.parents:
-        return True
-    return not _identities(target).isdisjoint(_identities(other))
+    is_within = other in (target, *target.parents) or target in other.parents
+    return is_within or not _identities(target).isdisjoint(_identities(other))
 
 
 def _identities(path: Path) -> set[tuple[int, int]]:
@@ -296,16 +287,3 @@ def _identities(path: Path) -> set[tuple[int, int]]:
             status = one.stat()
             found.add((status.st_dev, status.st_ino))
     return found
-
-
-def _exchange(one: Path, other: Path) -> bool:
-    """Let two folders swap names in one step, where the system can."""
-    import ctypes
-
-    rename = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
-    if rename is None:
-        return False
-    done: int = rename(
-        _AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE
-    )
-    return done == 0

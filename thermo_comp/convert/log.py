@@ -19,6 +19,7 @@ from .. import __version__
 from ..errors import RecordingError
 from ..files import shown_name
 from ..fitting.sources import digest
+from ..online.blocks import said_anew
 from ..recording import STAMP_END_NS, BagWriter, ImuColumns, Topics
 from ..text import valid_serial
 from ..typing import Bools, Floats, Ints
@@ -27,8 +28,6 @@ from .units import Stillness, believed_unit, contradiction, find_stillness
 
 # No sensor on a circuit board is read outside this range; kelvins and raw counts are.
 _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
-# A thermometer that stands still says so this often, so that nobody takes it for lost.
-_HEARTBEAT_NS = 10 * 10**9
 # Messages are written in runs of this many rows: bounded memory in the writer.
 _RUN_ROWS = 100_000
 _EXAMPLES = 5
@@ -132,16 +131,8 @@ NO_READINGS = Readings(np.empty(0, dtype=np.int64), np.empty(0))
 
 def thin(readings: Readings) -> Readings:
     """Keep the finite readings that say something new: a change, or ten seconds without one."""
-    finite = np.isfinite(readings.celsius)
-    stamp_ns, celsius = readings.stamp_ns[finite], readings.celsius[finite]
-    kept: list[int] = []
-    last_ns, last = 0, float('nan')
-    for i, (now_ns, value) in enumerate(zip(stamp_ns.tolist(), celsius.tolist(), strict=True)):
-        # A stamp before the last one is a restart of the log's clock, and worth a message.
-        if value != last or now_ns - last_ns >= _HEARTBEAT_NS or now_ns < last_ns:
-            kept.append(i)
-            last_ns, last = now_ns, value
-    return Readings(stamp_ns[kept], celsius[kept])
+    read = said_anew(readings.stamp_ns, readings.celsius)
+    return Readings(readings.stamp_ns[read], readings.celsius[read])
 
 
 def origin(path: str | Path, serial: str | None) -> dict[str, str]:
