@@ -159,18 +159,18 @@ def test_bag_says_whether_its_fit_has_seen_it(bag):
 def test_bag_alone_shows_temperatures_derivatives_and_flag(bag, tmp_path):
     found = evidence_of_bags([open_bag(bag)])
     shown = found.shown
-    trace, truth = shown.trace, run(0).truth
+    truth = run(0).truth
     # In the middle of the first ramp the case heats at the chamber's 1.5 K/min or a little less.
-    ramp = (trace.time > 17 * 60) & (trace.time < 21 * 60)
-    assert 1.0 < np.mean(trace.case_rate[ramp]) * 60.0 < 1.6
+    ramp = (shown.time > 17 * 60) & (shown.time < 21 * 60)
+    assert 1.0 < np.mean(shown.case_rate[ramp]) * 60.0 < 1.6
     dynamic = np.zeros(len(truth.grid_s), bool)
-    for stretch in trace.stretches:
+    for stretch in shown.stretches:
         inside = (truth.grid_s >= stretch.start) & (truth.grid_s < stretch.stop)
         dynamic[inside] = stretch.regime == Regime.DYNAMIC
     ideal = ideal_regime(run(0), 0.1)
     known = truth.grid_s > 10 * 60
     assert np.mean(dynamic[known] == ideal[known]) > 0.9
-    directions = [s.direction for s in trace.stretches if s.direction]
+    directions = [s.direction for s in shown.stretches if s.direction]
     assert directions[0] == 1
     assert directions[-1] == -1
     page = page_of(found, tmp_path)

@@ -18,9 +18,18 @@ from report_helpers import evidence, fitted
 
 from thermo_comp.judging.history import history_of
 from thermo_comp.report.figures import figures_of
-from thermo_comp.report.figures_position import draw_every_position, draw_positions, equal_area
-from thermo_comp.report.figures_residual import draw_gravity, draw_histograms, draw_residuals
-from thermo_comp.report.figures_thermal import draw_dynamics, draw_temperatures
+from thermo_comp.report.figures_position import (
+    draw_every_position,
+    draw_histograms,
+    draw_positions,
+    equal_area,
+)
+from thermo_comp.report.figures_time import (
+    draw_dynamics,
+    draw_gravity,
+    draw_residuals,
+    draw_temperatures,
+)
 from thermo_comp.report.figures_unit import (
     curves,
     draw_functions,
@@ -32,10 +41,10 @@ from thermo_comp.report.figures_unit import (
     soak_measurements,
     step_answer,
 )
+from thermo_comp.report.gather import shown_bag
 from thermo_comp.report.page import position_error, schuler_peak
-from thermo_comp.report.style import NARROW, WIDE, drawing, svg
+from thermo_comp.report.style import drawing, svg
 from thermo_comp.report.text import label_text, number
-from thermo_comp.report.trace import thermal_trace
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.gravity import MICRO_G
@@ -113,12 +122,10 @@ def test_map_of_the_sphere_keeps_areas():
 
 def test_trace_covers_the_bag_without_a_gap():
     bag = fitted().bags[0]
-    span = bag.start_ns, bag.end_ns
-    trace = thermal_trace(bag, span, DetectorSettings())
-    stretches = trace.stretches
+    stretches = shown_bag(bag, 0, DetectorSettings()).stretches
     assert stretches[0].regime == Regime.UNKNOWN
     assert stretches[0].start == 0.0
-    assert stretches[-1].stop == pytest.approx((span[1] - span[0]) * 1e-9)
+    assert stretches[-1].stop == pytest.approx((bag.end_ns - bag.start_ns) * 1e-9)
     for before, after in pairwise(stretches):
         assert before.stop == after.start
         assert (before.regime, before.direction) != (after.regime, after.direction)
@@ -127,10 +134,10 @@ def test_trace_covers_the_bag_without_a_gap():
 def test_trace_without_a_case_sensor_follows_the_board():
     bag = fitted().bags[0]
     bag = replace(bag, temperatures={'board': bag.board})
-    trace = thermal_trace(bag, (bag.start_ns, bag.end_ns), DetectorSettings())
-    assert not trace.is_case_leading
-    assert not np.isfinite(trace.case_rate).any()
-    assert any(stretch.regime == Regime.DYNAMIC for stretch in trace.stretches)
+    shown = shown_bag(bag, 0, DetectorSettings())
+    assert shown.leader == 'board'
+    assert not np.isfinite(shown.case_rate).any()
+    assert any(stretch.regime == Regime.DYNAMIC for stretch in shown.stretches)
 
 
 def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
@@ -146,7 +153,6 @@ def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
     return str(dashes), marker, darkness
 
 
-@pytest.mark.parametrize('sheet', [WIDE, NARROW], ids=['wide', 'narrow'])
 @pytest.mark.parametrize(
     'draw',
     [
@@ -163,11 +169,11 @@ def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
         draw_history,
     ],
 )
-def test_figures_are_legible_in_black_and_white(draw, sheet):
+def test_figures_are_legible_in_black_and_white(draw):
     known = evidence().calibration
     older = replace(known, provenance=replace(known.provenance, created='2020', sources=()))
     with drawing():
-        figure = draw(replace(evidence(), history=history_of([known, older])), sheet)
+        figure = draw(replace(evidence(), history=history_of([known, older])))
         figure.draw_without_rendering()
         for axes in figure.axes:
             looks = [look(line) for line in axes.get_legend_handles_labels()[0]]
@@ -203,7 +209,7 @@ def test_every_figure_asks_a_question():
 
 def test_label_of_a_drawing_is_escaped():
     with drawing():
-        text = svg(draw_temperatures(evidence(), NARROW), 'x', '"><script>')
+        text = svg(draw_temperatures(evidence()), 'x', '"><script>')
     assert '<script>' not in text
     assert 'aria-label="&quot;&gt;&lt;script&gt;"' in text
 
@@ -211,7 +217,7 @@ def test_label_of_a_drawing_is_escaped():
 def test_rates_are_those_of_the_gyroscope():
     unit = rich_calibration()
     with drawing():
-        figure = draw_rates(replace(evidence(), calibration=unit), WIDE)
+        figure = draw_rates(replace(evidence(), calibration=unit))
     own = unit.gyroscope
     for axes, curve in zip(figure.axes, own.static.axes(), strict=True):
         soak = axes.get_lines()[0]

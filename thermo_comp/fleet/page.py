@@ -12,7 +12,7 @@ from urllib.parse import quote
 import numpy as np
 
 from .. import __version__
-from ..report.figures import DrawnFigure, ReportFigure, drawn_figures
+from ..report.figures import ReportFigure, drawn_figures
 from ..report.figures_fleet import draw_distances, draw_shares
 from ..report.html import render
 from .summary import Summary
@@ -44,7 +44,7 @@ def render_fleet(
     )
 
 
-def _figures(fitted: Sequence[Row], summary: Summary) -> list[DrawnFigure]:
+def _figures(fitted: Sequence[Row], summary: Summary) -> list[tuple[ReportFigure, str]]:
     curves = {
         section: np.array([v for row in fitted if isinstance(v := row[f'{section}_ug'], float)])
         for section in ('raw', 'static', 'dynamic')

@@ -19,10 +19,10 @@ from ..fitting.coverage import LeastKnown, least_known
 from ..fitting.reduction import Readings
 from ..judging import Judgement, Verdict, Windows
 from ..judging.history import Epoch
+from ..thermal.regime import Regime
 from ..typing import Floats
 from ..unit.calibration import Calibration, Source
 from ..unit.metrics import norm_residual
-from .trace import ThermalTrace
 
 _T = TypeVar('_T')
 
@@ -48,14 +48,38 @@ class BagFacts:
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """A run of one regime and direction (-1 cooling, +1 heating, 0 neither) [s since start]."""
+
+    start: float
+    stop: float
+    regime: Regime
+    direction: int
+
+
+@dataclass(frozen=True)
 class ShownBag:
-    """The bag that the time figures show: `index` of `Evidence.bags`, times from `start_ns`."""
+    """
+    The bag that the time figures show, and what the node's own tracker makes of its readings.
+
+    `index` of `Evidence.bags`; `time` since `start_ns`; rates [K/s], and the acceleration of the
+    sensor that leads [K/s^2], after a reading each, NaN where not known yet.
+    """
 
     index: int
     start_ns: int
     board: Readings
     case: Readings
-    trace: ThermalTrace
+    time: Floats
+    board_rate: Floats
+    case_rate: Floats
+    acceleration: Floats
+    stretches: tuple[Stretch, ...]
+
+    @property
+    def leader(self) -> str:
+        """The sensor that leads: the case's, where there is one."""
+        return 'case' if len(self.case.value) else 'board'
 
 
 @dataclass(frozen=True)

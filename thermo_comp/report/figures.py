@@ -4,18 +4,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from .evidence import Evidence
-from .figures_position import draw_every_position, draw_positions
-from .figures_residual import draw_gravity, draw_histograms, draw_residuals
-from .figures_thermal import draw_dynamics, draw_temperatures
+from .figures_position import draw_every_position, draw_histograms, draw_positions
+from .figures_time import draw_dynamics, draw_gravity, draw_residuals, draw_temperatures
 from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_rates, draw_step
-from .style import NARROW, WIDE, Sheet, drawing, png, svg
+from .style import drawing, png, svg
 from .text import label_text
 
 
@@ -26,31 +26,14 @@ class ReportFigure:
     name: str
     question: str
     reading: str
-    draw: Callable[[Sheet], Figure]
+    draw: Callable[[], Figure]
 
 
-@dataclass(frozen=True)
-class DrawnFigure:
-    """A figure ready for the page: as SVG for paper and desk, and narrow for a phone."""
-
-    number: int
-    question: str
-    reading: str
-    wide: str
-    narrow: str
-
-
-def drawn_figures(figures: Sequence[ReportFigure]) -> list[DrawnFigure]:
-    """Draw figures for a page, and number them."""
+def drawn_figures(figures: Sequence[ReportFigure]) -> list[tuple[ReportFigure, str]]:
+    """Draw figures for a page, as SVG."""
     with drawing():
         return [
-            DrawnFigure(
-                number,
-                one.question,
-                one.reading,
-                wide=svg(one.draw(WIDE), f'f{number}w', one.question),
-                narrow=svg(one.draw(NARROW), f'f{number}n', one.question),
-            )
+            (one, svg(one.draw(), f'f{number}', one.question))
             for number, one in enumerate(figures, 1)
         ]
 
@@ -59,90 +42,49 @@ def png_files(evidence: Evidence) -> dict[str, bytes]:
     """Draw all figures as PNG: their content by file name, like ``1_temperatures.png``."""
     with drawing():
         return {
-            f'{number}_{one.name}.png': png(one.draw(WIDE))
+            f'{number}_{one.name}.png': png(one.draw())
             for number, one in enumerate(figures_of(evidence), 1)
         }
 
 
 def figures_of(evidence: Evidence) -> list[ReportFigure]:
     """List the figures that the evidence allows, in order."""
-    found: list[ReportFigure] = []
-
-    def add(
-        name: str, question: str, draw: Callable[[Evidence, Sheet], Figure], *reading: str
-    ) -> None:
-        text = ' '.join(part for part in reading if part)
-        found.append(ReportFigure(name, question, text, partial(draw, evidence)))
-
-    _add_of_time(evidence, add)
-    _add_of_unit(evidence, add)
-    if evidence.residuals and evidence.positions:
-        add(
-            'histograms',
-            'Is what is left noise, or is there something to model?',
-            draw_histograms,
-            '|f| − g over all windows of all positions, by regime, with the normal distribution '
-            'of the same mean and spread. Where the bars follow the line, what is left is noise.',
-        )
-        if len(evidence.positions) > 1:
-            add(
-                'every_position',
-                'Does the correction hold in every position?',
-                draw_every_position,
-                'A row for each position: |f| − g after the correction, over the time since the '
-                'position began; all rows have the scale that is written above. Black and wide in '
-                'the static, red and thin in the dynamic regime. On the right the RMS.',
-            )
-    if evidence.positions:
-        add(
-            'positions',
-            'Are the positions well spread, and does one stand out?',
-            draw_positions,
-            'Direction of the specific force in the output frame, position by position, in an '
-            'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
-            'of elevation. Where gravity is known, what is left in each position stands beside '
-            'it: one that stands out was moved, or is not of this unit.',
-            'Red rings and diamonds: what is left of it by a fit of the other positions alone, '
-            'which is what a new attitude will see; the area of a ring is in proportion.'
-            if evidence.left_out
-            else '',
-            'Red cross: the direction of which the calibration knows least, and the standard '
-            'deviation of |f| there: a position would tell most.'
-            if evidence.least_known
-            else '',
-        )
-    return found
+    parts = (_of_time, _of_unit, _of_positions)
+    return [
+        ReportFigure(name, question, ' '.join(filter(None, reading)), partial(draw, evidence))
+        for part in parts
+        for name, question, draw, *reading in part(evidence)
+    ]
 
 
-def _add_of_time(evidence: Evidence, add: Callable[..., None]) -> None:
-    """Add the figures of the bag that is shown."""
+def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
+    """Give the figures of the bag that is shown."""
     shown, windows = evidence.shown, evidence.windows
     if shown is None:
         return
     bag = f'Bag {label_text(evidence.bags[shown.index].name, 60)}.'
     read = f'Grey: the time in which the flag says dynamic. {bag} After Fig.'
-    add(
+    yield (
         'temperatures',
         'How did the unit follow the chamber?',
         draw_temperatures,
         'Readings of both thermometers. The board lags behind the case, so the case '
         f'is the first to tell that a ramp has begun. {read} 3 of the paper.',
     )
-    sensor = 'case' if shown.trace.is_case_leading else 'board'
     window_s = 0.0 if windows is None else windows.window_s
-    add(
+    yield (
         'dynamics',
         'When do the readings drift, and does the flag mark it?',
         draw_dynamics,
         f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
-        f'rates of the temperatures and, below, the second derivative of the {sensor} '
+        f'rates of the temperatures and, below, the second derivative of the {shown.leader} '
         'temperature, whose pulses open and close the dynamic state; (c) the state that follows, '
         'with its direction; before the detector has seen enough it is unknown. '
         f'{read} 4 of the paper.',
     )
     if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
         return
-    add(
+    yield (
         'residuals',
         'What does the correction leave on each axis?',
         draw_residuals,
@@ -150,7 +92,7 @@ def _add_of_time(evidence: Evidence, add: Callable[..., None]) -> None:
         'the mean direction seen there stands for it. Each panel has a scale of its own. '
         f'{read} 6 of the paper.',
     )
-    add(
+    yield (
         'gravity',
         'Does |f| stay constant over the whole program?',
         draw_gravity,
@@ -161,13 +103,13 @@ def _add_of_time(evidence: Evidence, add: Callable[..., None]) -> None:
     )
 
 
-def _add_of_unit(evidence: Evidence, add: Callable[..., None]) -> None:
-    """Add the figures of the calibration."""
+def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
+    """Give the figures of the calibration."""
     calibration = evidence.calibration
     if calibration is None:
         return
     has_band = calibration.posterior is not None
-    add(
+    yield (
         'functions',
         'What is corrected, and how well is it known?',
         draw_functions,
@@ -186,7 +128,7 @@ def _add_of_unit(evidence: Evidence, add: Callable[..., None]) -> None:
     )
     if calibration.gyroscope is not None:
         judged = None if evidence.judgement is None else evidence.judgement.rate
-        add(
+        yield (
             'rates',
             'What is corrected of the angular rate?',
             draw_rates,
@@ -197,7 +139,7 @@ def _add_of_unit(evidence: Evidence, add: Callable[..., None]) -> None:
             '' if judged is None else f'Judged on these bags, {judged}.',
         )
     if any(term.lag for term in calibration.response):
-        add(
+        yield (
             'step',
             'For how long does the unit remember a change of temperature?',
             draw_step,
@@ -205,7 +147,7 @@ def _add_of_unit(evidence: Evidence, add: Callable[..., None]) -> None:
             'will settle. Where a line meets zero, the unit has settled.',
         )
     if any(term.kind == 'play' for term in calibration.response):
-        add(
+        yield (
             'hysteresis',
             'Does the bias come back on another way than it went?',
             draw_hysteresis,
@@ -214,10 +156,49 @@ def _add_of_unit(evidence: Evidence, add: Callable[..., None]) -> None:
             'loop.',
         )
     if len(evidence.history) > 1:
-        add(
+        yield (
             'history',
             'What has drifted between the calibrations of this unit?',
             draw_history,
             'Bias and scale in a soak at the reference temperature, by the date of each '
             'calibration, less those of the first; bars: 95 % of what each leaves open.',
+        )
+
+
+def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
+    """Give the figures of all positions."""
+    if evidence.residuals and evidence.positions:
+        yield (
+            'histograms',
+            'Is what is left noise, or is there something to model?',
+            draw_histograms,
+            '|f| − g over all windows of all positions, by regime, with the normal distribution '
+            'of the same mean and spread. Where the bars follow the line, what is left is noise.',
+        )
+    if evidence.residuals and len(evidence.positions) > 1:
+        yield (
+            'every_position',
+            'Does the correction hold in every position?',
+            draw_every_position,
+            'A row for each position: |f| − g after the correction, over the time since the '
+            'position began; all rows have the scale that is written above. Black and wide in '
+            'the static, red and thin in the dynamic regime. On the right the RMS.',
+        )
+    if evidence.positions:
+        yield (
+            'positions',
+            'Are the positions well spread, and does one stand out?',
+            draw_positions,
+            'Direction of the specific force in the output frame, position by position, in an '
+            'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
+            'of elevation. Where gravity is known, what is left in each position stands beside '
+            'it: one that stands out was moved, or is not of this unit.',
+            'Red rings and diamonds: what is left of it by a fit of the other positions alone, '
+            'which is what a new attitude will see; the area of a ring is in proportion.'
+            if evidence.left_out
+            else '',
+            'Red cross: the direction of which the calibration knows least, and the standard '
+            'deviation of |f| there: a position would tell most.'
+            if evidence.least_known
+            else '',
         )

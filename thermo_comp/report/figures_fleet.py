@@ -18,7 +18,6 @@ from .style import (
     RUNG_LINES,
     STATIC_LINE,
     Line,
-    Sheet,
     legend_above,
     log_axis,
     new_figure,
@@ -34,9 +33,9 @@ _SECTION_LINES: dict[str, Line] = {
 }
 
 
-def draw_shares(curves: Mapping[str, Floats], sheet: Sheet) -> Figure:
+def draw_shares(curves: Mapping[str, Floats]) -> Figure:
     """Draw the share of units below each residual [micro-g], by section."""
-    figure = new_figure(sheet, 2.6)
+    figure = new_figure(2.6)
     axes = figure.subplots()
     drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}
     drawn = {name: values for name, values in drawn.items() if len(values)}
@@ -49,7 +48,7 @@ def draw_shares(curves: Mapping[str, Floats], sheet: Sheet) -> Figure:
     axes.set_ylim(0.0, 103.0)
     axes.set_xlabel('|f| − g of a unit, RMS, µg')
     axes.set_ylabel('units, %')
-    legend_above(axes, sheet)
+    legend_above(axes)
     return figure
 
 
@@ -58,10 +57,9 @@ def draw_distances(
     distances: Sequence[Floats],
     names: Sequence[Sequence[str]],
     limit: float,
-    sheet: Sheet,
 ) -> Figure:
     """Draw each unit's distance from the middle, by quantity; beyond `limit` with its name."""
-    figure = new_figure(sheet, 0.6 + 0.19 * len(labels))
+    figure = new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
     shown = min(max(1.15 * limit, 4.0), 12.0)
     n_named = 0

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from ..judging.windows import means_by
 from ..thermal.state import Layout as StateLayout
@@ -28,7 +27,7 @@ from .style import (
     GREY,
     STATIC_LINE,
     Line,
-    Sheet,
+    few_ticks,
     legend_above,
     log_axis,
     new_figure,
@@ -44,12 +43,11 @@ _STEP_MINUTES = (0.2, 500.0)
 _POINT: Line = {'color': BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
 
 
-def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
+def draw_functions(evidence: Evidence) -> Figure:
     """Draw bias and scale over temperature, less a line, with bands and measurements."""
     calibration = given(evidence.calibration)
-    rows, columns = (6, 1) if sheet.is_narrow else (2, 3)
-    figure = new_figure(sheet, 10.2 if sheet.is_narrow else 4.4)
-    panels = np.array(figure.subplots(rows, columns, sharex=True)).reshape(2, 3)
+    figure = new_figure(4.4)
+    panels = figure.subplots(2, 3, sharex=True)
     drawn = curves(calibration)
     soak = drawn[0]
     measured = soak_measurements(evidence)
@@ -60,32 +58,35 @@ def draw_functions(evidence: Evidence, sheet: Sheet) -> Figure:
             if np.isfinite(error).any():
                 level = np.interp(temperature, soak.temperature, getattr(soak, name)[:, i])
                 line = slope * (temperature - calibration.reference_temperature_c)
-                axes.plot(
-                    temperature, level - line + error, 'o', label='measured in a soak', **_POINT
-                )
-            if sheet.is_narrow or not i:
-                axes.set_ylabel(f'{name} less the line, {unit}')
-            if part and (i == 2 or not sheet.is_narrow):
-                axes.set_xlabel('T board, °C')
-    shared_legend(figure, panels[0, 0], 1 if sheet.is_narrow else 4)
+                left = level - line + error
+                axes.plot(temperature, left, 'o', label='measured in a soak', **_POINT)
+        panels[part, 0].set_ylabel(f'{name} less the line, {unit}')
+    for axes in panels[1]:
+        axes.set_xlabel('T board, °C')
+    shared_legend(figure, panels[0, 0], 4)
     return figure
 
 
-def draw_rates(evidence: Evidence, sheet: Sheet) -> Figure:
+def draw_rates(evidence: Evidence) -> Figure:
     """Draw the bias of the angular rate over temperature, less a line, with bands."""
     triad = rate_triad(given(evidence.calibration))
-    figure = new_figure(sheet, 5.6 if sheet.is_narrow else 2.5)
-    panels = figure.subplots(*((3, 1) if sheet.is_narrow else (1, 3)), sharex=True)
+    figure, panels = _axis_panels('bias less the line, mdeg/s')
     drawn = curves(triad)
     for i, axes in enumerate(panels):
         # What is said in m/s^2 of a triad is rad/s of this one.
         _draw_less_line(axes, triad, drawn, ('bias', i), 'mdeg/s', MICRO_G / MILLIDEGREE)
-        if sheet.is_narrow or not i:
-            axes.set_ylabel('bias less the line, mdeg/s')
-        if i == 2 or not sheet.is_narrow:
-            axes.set_xlabel('T board, °C')
-    shared_legend(figure, panels[0], 1 if sheet.is_narrow else 3)
+    shared_legend(figure, panels[0], 3)
     return figure
+
+
+def _axis_panels(name: str, *, sharey: bool = False) -> tuple[Figure, list[Axes]]:
+    """Make a panel for each axis, over the board temperature."""
+    figure = new_figure(2.5)
+    panels = list(figure.subplots(1, 3, sharex=True, sharey=sharey))
+    panels[0].set_ylabel(name)
+    for axes in panels:
+        axes.set_xlabel('T board, °C')
+    return figure, panels
 
 
 def _draw_less_line(
@@ -104,27 +105,20 @@ def _draw_less_line(
     slope = float(np.polyfit(drawn[0].temperature, soak, 1)[0])
     widest = 0.0
     for curve in drawn:
-        value = factor * getattr(curve, name)[:, i] - slope * (curve.temperature - reference)
+        at, color = curve.temperature, curve.line['color']
+        value = factor * getattr(curve, name)[:, i] - slope * (at - reference)
         if calibration.posterior is not None:
             half = BAND_SDS * factor * getattr(curve, f'sd_{name}')[:, i]
-            axes.fill_between(
-                curve.temperature,
-                value - half,
-                value + half,
-                facecolor=curve.line['color'],
-                edgecolor=curve.line['color'],
-                alpha=0.25,
-                hatch=curve.hatch,
-                linewidth=0,
-            )
+            look: Line = {'facecolor': color, 'edgecolor': color, 'hatch': curve.hatch}
+            axes.fill_between(at, value - half, value + half, alpha=0.25, linewidth=0, **look)
             widest = max(widest, float(half.max()))
         # The ends of the valid range are marked; a range of a few K stays visible so.
-        look: Line = {'marker': curve.marker, 'markersize': 3.5, 'markevery': [0, -1]}
-        axes.plot(curve.temperature, value, label=curve.name, **look, **curve.line)
+        look = {'marker': curve.marker, 'markersize': 3.5, 'markevery': [0, -1]}
+        axes.plot(at, value, label=curve.name, **look, **curve.line)
     title = f'{AXES[i]}: {minus(f"{slope:+.3g}")} {unit}/K'
     axes.set_title(f'{title}, ±{number(widest, 2)} {unit}' if widest else title)
     axes.axvline(reference, color=GREY, linewidth=0.8)
-    axes.yaxis.set_major_locator(MaxNLocator(5))
+    few_ticks(axes)
     return slope
 
 
@@ -199,37 +193,26 @@ def curves(calibration: Calibration) -> list[Curve]:
         states = ramp_states(calibration, temperature, rate, lasted_s)
         bias, scale = bias_and_scale(calibration, states)
         sd = sd_of_states(calibration, states)
-        found.append(
-            Curve(
-                name,
-                line,
-                hatch,
-                marker,
-                temperature,
-                (bias - bias_0) / MICRO_G,
-                sd.bias / MICRO_G,
-                (scale / scale_0 - 1.0) * 1e6,
-                sd.scale * 1e6,
-            )
-        )
+        bias, sd_bias = (bias - bias_0) / MICRO_G, sd.bias / MICRO_G
+        look, scale = (line, hatch, marker), (scale / scale_0 - 1.0) * 1e6
+        found.append(Curve(name, *look, temperature, bias, sd_bias, scale, sd.scale * 1e6))
     return found
 
 
-def draw_step(evidence: Evidence, sheet: Sheet) -> Figure:
+def draw_step(evidence: Evidence) -> Figure:
     """Draw what a step of the temperature does to each axis over time."""
-    calibration = given(evidence.calibration)
-    minutes, bias, scale = step_answer(calibration)
-    figure = new_figure(sheet, 4.4 if sheet.is_narrow else 2.5)
-    panels = figure.subplots(*((2, 1) if sheet.is_narrow else (1, 2)))
-    for axes, value, unit in ((panels[0], bias, 'µg'), (panels[1], scale, 'ppm')):
+    minutes, bias, scale = step_answer(given(evidence.calibration))
+    figure = new_figure(2.5)
+    for axes, title, value, unit in zip(
+        figure.subplots(1, 2), ('bias', 'scale'), (bias, scale), ('µg', 'ppm'), strict=True
+    ):
         for i, axis in enumerate(AXES):
             axes.plot(minutes, value[:, i], label=axis, **AXIS_LINES[i])
         axes.axhline(0.0, color='black', linewidth=0.5)
         log_axis(axes, float(minutes[0]), float(minutes[-1]))
         axes.set_ylabel(f'still to come, {unit}/K')
         axes.set_xlabel('time since the step, min')
-        title = 'bias' if axes is panels[0] else 'scale'
-        legend_above(axes, sheet, share=0.5, title=title, alignment='left')
+        legend_above(axes, share=0.5, title=title, alignment='left')
     return figure
 
 
@@ -246,27 +229,20 @@ def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     return minutes, (bias[:-1] - bias[-1]) / MICRO_G, (scale[:-1] / scale[-1] - 1.0) * 1e6
 
 
-def draw_hysteresis(evidence: Evidence, sheet: Sheet) -> Figure:
+def draw_hysteresis(evidence: Evidence) -> Figure:
     """Draw the loop of each axis' bias in a slow run through the range and back."""
     temperature, heating, cooling = hysteresis_loop(given(evidence.calibration))
-    figure = new_figure(sheet, 5.6 if sheet.is_narrow else 2.5)
-    panels = figure.subplots(*((3, 1) if sheet.is_narrow else (1, 3)), sharex=True, sharey=True)
+    figure, panels = _axis_panels('loop, µg', sharey=True)
     for i, axes in enumerate(panels):
         middle = (heating[:, i] + cooling[:, i]) / 2.0
         for name, bias, line, marker in (
             ('heating', heating, DYNAMIC_LINE, '^'),
             ('cooling', cooling, AXIS_LINES[2], 'v'),
         ):
-            loop = bias[:, i] - middle
-            axes.plot(
-                temperature, loop, label=name, marker=marker, markevery=12, markersize=3.5, **line
-            )
+            look: Line = {'marker': marker, 'markevery': 12, 'markersize': 3.5}
+            axes.plot(temperature, bias[:, i] - middle, label=name, **look, **line)
         axes.set_title(f'bias {AXES[i]}')
         axes.axhline(0.0, color='black', linewidth=0.5)
-        if sheet.is_narrow or not i:
-            axes.set_ylabel('loop, µg')
-        if i == 2 or not sheet.is_narrow:
-            axes.set_xlabel('T board, °C')
     shared_legend(figure, panels[0], 2)
     return figure
 
@@ -289,29 +265,23 @@ def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     return temperature, ways[0], ways[1]
 
 
-def draw_history(evidence: Evidence, sheet: Sheet) -> Figure:
+def draw_history(evidence: Evidence) -> Figure:
     """Draw bias and scale of each calibration of the unit against the first one, by date."""
     history = evidence.history
-    figure = new_figure(sheet, 4.8 if sheet.is_narrow else 2.6)
-    panels = figure.subplots(*((2, 1) if sheet.is_narrow else (1, 2)))
+    figure = new_figure(2.6)
     places = np.arange(len(history))
-    for axes, name, unit in ((panels[0], 'bias', 'µg'), (panels[1], 'scale', 'ppm')):
+    for axes, name, unit in zip(
+        figure.subplots(1, 2), ('bias', 'scale'), ('µg', 'ppm'), strict=True
+    ):
         value, sd = (
             np.array([getattr(one, key) for one in history]) for key in (name, f'{name}_sd')
         )
         for i, (axis, marker) in enumerate(zip(AXES, 'os^', strict=True)):
-            axes.errorbar(
-                places + 0.08 * (i - 1),
-                value[:, i] - value[0, i],
-                yerr=BAND_SDS * np.nan_to_num(sd[:, i]),
-                marker=marker,
-                markersize=3.5,
-                capsize=2.0,
-                label=axis,
-                **AXIS_LINES[i],
-            )
+            change, half = value[:, i] - value[0, i], BAND_SDS * np.nan_to_num(sd[:, i])
+            look: Line = {'marker': marker, 'markersize': 3.5, 'capsize': 2.0, **AXIS_LINES[i]}
+            axes.errorbar(places + 0.08 * (i - 1), change, yerr=half, label=axis, **look)
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_xticks(places, [label_text(one.created[:10]) for one in history])
         axes.set_ylabel(f'change, {unit}')
-        legend_above(axes, sheet, share=0.5, title=name, alignment='left')
+        legend_above(axes, share=0.5, title=name, alignment='left')
     return figure

@@ -5,10 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 
 from ..fitting import FitResult
+from ..fitting.history import readings_in_order
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector
 from ..fitting.verdict import Finding
@@ -16,15 +19,21 @@ from ..judging import WINDOW_S, OpenedBag, judge_bags
 from ..judging.history import history_of
 from ..judging.windows import raw_windows, usual_window
 from ..replay import check_unit
+from ..thermal.memory import BOARD_INPUT
+from ..thermal.regime import Regime
+from ..thermal.settings import DetectorSettings
+from ..thermal.tracker import ThermalTracker
+from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import spoken
-from .evidence import BagFacts, Evidence, ShownBag
-from .trace import thermal_trace
+from .evidence import BagFacts, Evidence, ShownBag, Stretch
 
 # A ramp slower than this says nothing of its direction.
 _SLOWEST_RAMP_K_MIN = 0.05
 #: The key of a bag's metadata under which our simulator tells what it simulated.
 _SIMULATED = 'truth'
+# A line in a figure has fewer pixels.
+_MOST_POINTS = 4000
 
 
 def evidence_of_bags(
@@ -179,8 +188,50 @@ def _shown(bags: Sequence[ReducedBag], calibration: Calibration | None) -> Shown
     # Spans within 5 % are equal, and so are lengths within a minute; the first of equals.
     wide = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
     index = max(wide, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
-    bag = bags[index]
-    span_ns = _span_ns(bag)
     detector = learn_detector(bags) if calibration is None else calibration.detector
-    trace = thermal_trace(bag, span_ns, detector)
-    return ShownBag(index, span_ns[0], bag.board, bag.case, trace)
+    return shown_bag(bags[index], index, detector)
+
+
+def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownBag:
+    """Run thermometers and detector over a bag's readings, as the node would."""
+    tracker = ThermalTracker(detector)
+    start_ns, end_ns = _span_ns(bag)
+    names, stamps, values = readings_in_order(bag, (BOARD_INPUT, 'case'))
+    rows, flags = [], []
+    for reading in zip(names, stamps.tolist(), values.tolist(), strict=True):
+        tracker.read(*reading)
+        b, c = tracker.board, tracker.case
+        lead = b if c.stamp_ns is None else c
+        curve = (lead.acceleration, lead.var_acceleration)
+        rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *curve))
+        flags.append((tracker.detector.regime, tracker.detector.direction))
+    end = (end_ns - start_ns) * 1e-9
+    time: Floats = np.asarray((stamps - start_ns) * 1e-9, dtype=np.float64)
+    # Of several at once the last one holds, and equal ones after each other are one stretch.
+    state_at = {
+        0.0: (Regime.UNKNOWN, 0),
+        **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),
+    }
+    changes = [next(run) for _, run in groupby(state_at.items(), key=itemgetter(1))]
+    begins = [begin for begin, _ in changes]
+    stretches = (
+        Stretch(begin, stop, *state)
+        for (begin, state), stop in zip(changes, [*begins[1:], end], strict=True)
+        if stop > begin
+    )
+    every = slice(None, None, len(time) // _MOST_POINTS + 1)
+    columns = np.array(rows).reshape(-1, 6)[every].T
+    board, case, bend = (_settled(*pair) for pair in columns.reshape(3, 2, -1))
+    return ShownBag(
+        index, start_ns, bag.board, bag.case, time[every], board, case, bend, tuple(stretches)
+    )
+
+
+def _settled(value: Floats, variance: Floats) -> Floats:
+    """Leave out an estimate until it has settled: its sd has come down to thrice the usual."""
+    known = np.isfinite(value) & np.isfinite(variance)
+    if not known.any():
+        return np.full(len(value), np.nan)
+    usual = float(np.median(variance[known]))
+    first = int(np.argmax(known & (variance <= 9.0 * usual)))
+    return np.where(known & (np.arange(len(value)) >= first), value, np.nan)

@@ -26,7 +26,7 @@ from ..judging import OpenedBag, open_bag
 from ..recording import Input, RecordingInfo, Topics
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence
-from .figures import DrawnFigure, drawn_figures, figures_of
+from .figures import ReportFigure, drawn_figures, figures_of
 from .gather import evidence_of_bags
 from .page import render_page
 
@@ -70,7 +70,7 @@ class LiveReport:
         self._lock = threading.Lock()
         self._opened: dict[Path, tuple[str, OpenedBag]] = {}
         self._version = ''
-        self._made: tuple[Evidence, list[DrawnFigure]] | None = None
+        self._made: tuple[Evidence, list[tuple[ReportFigure, str]]] | None = None
         self._notice = ''
 
     def version(self) -> str:

@@ -19,7 +19,7 @@ from ..thermal.regime import Regime
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .certificate import CertificateInfo, budget, combined, conformity_rule, results
 from .evidence import LEFT_OUT, Evidence
-from .figures import DrawnFigure, drawn_figures, figures_of, png_files
+from .figures import ReportFigure, drawn_figures, figures_of, png_files
 from .gather import evidence_of_fit
 from .html import render, utc
 from .text import spelt
@@ -62,7 +62,7 @@ def render_report(evidence: Evidence, info: CertificateInfo | None = None) -> st
 
 def render_page(
     evidence: Evidence,
-    figures: Sequence[DrawnFigure],
+    figures: Sequence[tuple[ReportFigure, str]],
     *,
     info: CertificateInfo | None = None,
     script: str = '',
@@ -133,7 +133,7 @@ def _seen(evidence: Evidence) -> list[str]:
             f'{np.min(board):.1f} to {np.max(board):.1f} °C.'
         )
     shown = evidence.shown
-    known = [] if shown is None else [s for s in shown.trace.stretches if s.regime >= 0]
+    known = [] if shown is None else [s for s in shown.stretches if s.regime >= 0]
     if shown is not None and not known:
         said.append('The regime was never known: the bag is too short for the detector.')
     elif shown is not None:

@@ -14,7 +14,6 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -83,18 +82,7 @@ _RC: dict[str, Any] = {
     'path.simplify_threshold': 0.5,
 }
 _PNG_DPI = 160
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """The paper of a figure: its width in inches."""
-
-    width: float
-    is_narrow: bool  # a phone's screen: panels stand below each other
-
-
-WIDE = Sheet(7.1, False)
-NARROW = Sheet(3.75, True)
+_WIDTH = 7.1
 
 
 @contextmanager
@@ -107,9 +95,9 @@ def drawing() -> Iterator[None]:
         yield
 
 
-def new_figure(sheet: Sheet, height: float) -> Figure:
-    """Make an empty figure as wide as the sheet."""
-    return Figure(figsize=(sheet.width, height), layout='constrained')
+def new_figure(height: float) -> Figure:
+    """Make an empty figure as wide as a printed page, so many inches high."""
+    return Figure(figsize=(_WIDTH, height), layout='constrained')
 
 
 def svg(figure: Figure, name: str, label: str) -> str:
@@ -165,14 +153,13 @@ def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]
     return np.insert(time, at, time[at - 1]), np.insert(value, at, np.nan)
 
 
-def legend_above(axes: Axes, sheet: Sheet, *, share: float = 1.0, **keys: Any) -> None:
+def legend_above(axes: Axes, *, share: float = 1.0, **keys: Any) -> None:
     """Put the legend above axes with a `share` of the width, in as many columns as fit."""
     labels = axes.get_legend_handles_labels()[1]
     if not labels:
         return
     # An entry takes its label and a handle as wide as some eight letters.
-    letters = 8 + max(len(label) for label in labels)
-    columns = max(1, int(share * (50 if sheet.is_narrow else 100) / letters))
+    columns = max(1, int(share * 100 / (8 + max(map(len, labels)))))
     axes.legend(
         loc='lower left', bbox_to_anchor=(0.0, 1.01), ncols=min(columns, len(labels)), **keys
     )

@@ -1,0 +1,220 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns the figures over the time of a bag: the paper's Fig. 3, 4, 6 and 7 from the user's data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
+
+from ..thermal.regime import Regime
+from ..typing import Bools, Floats
+from ..unit.calibration import AXES
+from ..unit.gravity import MICRO_G
+from .evidence import RAW, Evidence, ShownBag, given
+from .style import (
+    AXIS_LINES,
+    BOARD_LINE,
+    CASE_LINE,
+    RUNG_LINES,
+    broken,
+    few_ticks,
+    legend_above,
+    new_figure,
+    time_unit,
+)
+from .text import number
+
+# Where the drift's zero is taken: long enough for the windows' noise, short against any ramp.
+_ZERO_S = 120.0
+_SHADE = '#E9E9E9'
+
+
+def draw_temperatures(evidence: Evidence) -> Figure:
+    """Draw the readings of both sensors (the paper's Fig. 3)."""
+    figure, (axes,), shown, unit = _panels(evidence, [2.5])
+    for label, readings, line in (
+        ('T case', shown.case, CASE_LINE),
+        ('T board', shown.board, BOARD_LINE),
+    ):
+        if len(readings.value):
+            seconds = (readings.stamp_ns - shown.start_ns) * 1e-9
+            axes.plot(seconds / unit, readings.value, label=label, **line)
+    axes.set_ylabel('temperature, °C')
+    legend_above(axes)
+    return figure
+
+
+def draw_dynamics(evidence: Evidence) -> Figure:
+    """Draw the readings' drift, the temperatures' derivatives and the flag (Fig. 4 a, b, c)."""
+    drift, name = _drift(evidence)
+    heights = [1.725] * bool(len(drift)) + [1.495, 1.15, 0.8625]
+    figure, panels, shown, unit = _panels(evidence, heights, is_flagged=True)
+    if len(drift):
+        for i, axis in enumerate(AXES):
+            _plot(panels[0], evidence, drift[:, i], unit, label=axis, **AXIS_LINES[i])
+        panels[0].set_ylabel(name)
+        title = 'a  drift of the readings since the start'
+        legend_above(panels[0], title=title, alignment='left')
+    rates, bend, flag = panels[-3:]
+    for label, rate, line in (
+        ('dT case/dt', shown.case_rate, CASE_LINE),
+        ('dT board/dt', shown.board_rate, BOARD_LINE),
+    ):
+        if np.isfinite(rate).any():
+            rates.plot(shown.time / unit, rate * 60.0, label=label, **line)
+    rates.set_ylabel('K/min')
+    legend_above(rates, title='b  first derivatives', alignment='left')
+    line = CASE_LINE if shown.leader == 'case' else BOARD_LINE
+    bend.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
+    bend.set_ylabel('K/min²')
+    bend.set_title(f'second derivative of T {shown.leader}')
+    few_ticks(bend, 4)
+    _draw_flag(flag, shown, unit)
+    figure.align_ylabels(panels[:-1])
+    return figure
+
+
+def draw_residuals(evidence: Evidence) -> Figure:
+    """Draw the residual of each axis, without and with the calibration (the paper's Fig. 6)."""
+    residuals = evidence.axis_residuals()
+    rows = _rows(evidence)
+    dynamic = given(evidence.windows).is_dynamic[rows]
+    figure, panels, _, unit = _panels(evidence, [1.05] * len(residuals), more=0.5)
+    for axes, (rung, residual) in zip(panels, residuals.items(), strict=True):
+        for i, axis in enumerate(AXES):
+            _plot(axes, evidence, residual[:, i] / MICRO_G, unit, label=axis, **AXIS_LINES[i])
+        axes.set_ylabel('µg')
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        few_ticks(axes)
+        if rung != RAW:
+            _symmetric(axes, residual[rows])
+        parts = [
+            f'{name} {number(float(np.sqrt(np.mean(residual[rows][part] ** 2))) / MICRO_G)}'
+            for name, part in (('static', ~dynamic), ('dynamic', dynamic))
+            if part.any()
+        ]
+        title = f'{rung}: RMS {", ".join(parts)} µg'
+        if axes is panels[0]:
+            legend_above(axes, title=title, alignment='left')
+        else:
+            axes.set_title(title)
+    figure.align_ylabels(panels)
+    return figure
+
+
+def draw_gravity(evidence: Evidence) -> Figure:
+    """Draw |f| over time, before and after, and after in detail (the paper's Fig. 7)."""
+    gravity, residuals = given(evidence.gravity), evidence.residuals
+    corrected = [rung for rung in residuals if rung != RAW]
+    sets = [list(residuals), *([corrected] if corrected else [])]
+    figure, panels, _, unit = _panels(evidence, [1.6] * len(sets), more=0.4)
+    for axes, drawn in zip(panels, sets, strict=True):
+        for rung in drawn:
+            value = residuals[rung] / MICRO_G
+            _plot(axes, evidence, value, unit, label=rung, **RUNG_LINES[rung])
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        axes.set_ylabel('|f| − g, µg')
+        right = axes.secondary_yaxis(
+            'right',
+            functions=(
+                lambda micro_g: np.asarray(micro_g) * MICRO_G + gravity,
+                lambda value: (np.asarray(value) - gravity) / MICRO_G,
+            ),
+        )
+        right.set_ylabel('|f|, m/s²')
+        right.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
+        legend_above(axes)
+    for rung in corrected:
+        _symmetric(panels[-1], residuals[rung][_rows(evidence)])
+    return figure
+
+
+def _panels(
+    evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
+) -> tuple[Figure, list[Axes], ShownBag, float]:
+    """
+    Make panels over the time of the bag that is shown, shaded where the flag says dynamic.
+
+    Returns the bag, and the seconds in the unit of the time axis, as well.
+    """
+    shown = given(evidence.shown)
+    duration_s = evidence.bags[shown.index].duration_s
+    unit, name = time_unit(duration_s)
+    figure = new_figure(more + sum(heights))
+    panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
+    spans: list[tuple[float, float]] = []
+    for one in shown.stretches:
+        if one.regime == Regime.DYNAMIC:
+            # Heating into cooling is one span: no bright seam between two of them.
+            start = spans.pop()[0] if spans and spans[-1][1] == one.start else one.start
+            spans.append((start, one.stop))
+    for axes in panels[:-1] if is_flagged else panels:
+        for start, stop in spans:
+            axes.axvspan(start / unit, stop / unit, color=_SHADE, lw=0, zorder=0)
+    panels[-1].set_xlabel(name)
+    panels[-1].set_xlim(0.0, duration_s / unit)
+    return figure, list(panels), shown, unit
+
+
+def _rows(evidence: Evidence) -> Bools:
+    """Tell which windows are of the bag that is shown."""
+    rows: Bools = given(evidence.windows).bag == given(evidence.shown).index
+    return rows
+
+
+def _plot(axes: Axes, evidence: Evidence, value: Floats, unit: float, **line: Any) -> None:
+    """Draw a value of the windows over time, with a gap between positions."""
+    windows, rows = given(evidence.windows), _rows(evidence)
+    time, value = broken(windows.time[rows], value[rows], windows.position[rows])
+    axes.plot(time / unit, value, **line)
+
+
+def _drift(evidence: Evidence) -> tuple[Floats, str]:
+    """Give what the readings change by in each position, shape (n, 3), and its unit."""
+    windows = evidence.windows
+    if windows is None or not _rows(evidence).any():
+        return np.zeros((0, 3)), ''
+    drift = windows.mean.copy()
+    for p in np.unique(windows.position):
+        rows = windows.position == p
+        begin = windows.time[rows] <= windows.time[rows][0] + _ZERO_S
+        drift[rows] -= windows.mean[rows][begin].mean(axis=0)
+    if evidence.calibration is not None:
+        axes = evidence.calibration.axes
+        return drift / [one.scale_factor for one in (axes.x, axes.y, axes.z)] / MICRO_G, 'µg'
+    return (drift / MICRO_G, 'µg') if evidence.unit == 'm/s^2' else (drift, 'counts')
+
+
+def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:
+    times: list[float] = []
+    levels: list[float] = []
+    for one in shown.stretches:
+        span = [one.start / unit, one.stop / unit]
+        if one.regime == Regime.UNKNOWN:
+            axes.axvspan(*span, fill=False, hatch='---', edgecolor='#999999', lw=0)
+            continue
+        level = float(one.direction if one.regime == Regime.DYNAMIC else 0)
+        times += span
+        levels += [level, level]
+        if one.regime == Regime.DYNAMIC:
+            hatch = {1: '////', -1: '\\\\\\\\', 0: 'xxxx'}[one.direction]
+            look: Any = {'facecolor': _SHADE, 'edgecolor': '#777777', 'hatch': hatch, 'lw': 0}
+            axes.fill_between(span, [one.direction or 1.0] * 2, **look)
+    axes.plot(times, levels, color='black', linewidth=1.3)
+    axes.set_ylim(-1.35, 1.35)
+    axes.set_yticks([-1, 0, 1], ['S = 1, cooling', 'S = 0, static', 'S = 1, heating'])
+    axes.set_title('c  regime flag S')
+    axes.grid(visible=False, axis='x')
+
+
+def _symmetric(axes: Axes, residual: Floats) -> None:
+    """Put zero into the middle of a panel; single spikes may leave it."""
+    limit = 1.15 * float(np.quantile(np.abs(residual), 0.998)) / MICRO_G
+    if limit > 0.0:
+        axes.set_ylim(-limit, limit)
