@@ -29,8 +29,7 @@ from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation import (
     MICRO_G,
     STANDARD_GRAVITY,
-    Record,
-    UnitModel,
+    SimulatedRun,
     arrays,
     plan,
     unit_preset,
@@ -76,13 +75,16 @@ PLAN_GOALS = {
 }
 
 
-def block(record: Record) -> ArrayBlock:
+def block(record: SimulatedRun) -> ArrayBlock:
     """Return one record as a block."""
-    accel, board, case = (
-        np.rint(1e9 * time_s).astype(np.int64)
-        for time_s in (record.time_s, record.board_time_s, record.case_time_s)
+    return ArrayBlock(
+        record.accel_stamp_ns,
+        record.counts.astype(np.float64),
+        record.board_stamp_ns,
+        record.board,
+        record.case_stamp_ns,
+        record.case,
     )
-    return ArrayBlock(accel, record.counts, board, record.board, case, record.case)
 
 
 @dataclass(frozen=True)
@@ -108,14 +110,14 @@ class Corrected:
     fit_s: float
 
 
-def fitted(records: Sequence[Record], **options: Any) -> Calibration:
+def fitted(records: Sequence[SimulatedRun], **options: Any) -> Calibration:
     """Fit one test."""
     sources = [FitSource(record.name, lambda record=record: [block(record)]) for record in records]
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, **options)).calibration
 
 
 def fit_and_correct(
-    records: Sequence[Record], test_records: Sequence[Record], **options: Any
+    records: Sequence[SimulatedRun], test_records: Sequence[SimulatedRun], **options: Any
 ) -> Corrected:
     """Fit on one test and apply to another."""
     began = time.perf_counter()
@@ -126,7 +128,7 @@ def fit_and_correct(
     for record in test_records:
         compensator = Compensator(calibration)
         found = process_block(compensator, block(record))
-        slots = found.index // round(WINDOW_S / record.time_s[0])
+        slots = found.index // round(WINDOW_S * 1e9 / record.accel_stamp_ns[0])
         first = np.flatnonzero(np.diff(slots, prepend=-1))
         columns = np.column_stack((found.specific_force, found.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
@@ -157,9 +159,9 @@ class Errors:
     claimed: float
 
 
-def errors(found: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[Record]) -> Errors:
+def errors(found: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[SimulatedRun]) -> Errors:
     """Compare with the truth."""
-    vector = [one - record.specific_force for one, record in zip(found, tests, strict=True)]
+    vector = [one - record.truth.specific_force for one, record in zip(found, tests, strict=True)]
     norm = np.concatenate([np.linalg.norm(one, axis=1) for one in found]) - STANDARD_GRAVITY
     ratio = np.concatenate([e / s for e, s in zip(vector, sd, strict=True)])
     return Errors(
@@ -170,9 +172,9 @@ def errors(found: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[Record
     )
 
 
-def floor(unit: UnitModel, tests: Sequence[Record]) -> Errors:
+def floor(tests: Sequence[SimulatedRun]) -> Errors:
     """Return what the true model leaves on the same noise."""
-    found = [record.corrected_by_truth(unit) for record in tests]
+    found = [record.corrected_by_truth() for record in tests]
     return errors(found, [np.ones_like(one) for one in found], tests)
 
 
@@ -203,7 +205,7 @@ def part_kinds(options: argparse.Namespace) -> None:
             unit = unit_preset(kind, seed)
             records = arrays(unit, plan(goal.plan, seed), seed, rate_hz=options.rate_hz)
             tests = arrays(unit, plan('held-out', seed), seed + 500, rate_hz=options.rate_hz)
-            least = floor(unit, tests)
+            least = floor(tests)
             paper, ours = (
                 fit_and_correct(records, tests, model=m) for m in ('golovach', 'response')
             )
@@ -226,7 +228,7 @@ def part_plans(options: argparse.Namespace) -> None:
         for seed in range(1, options.seeds + 1):
             unit = unit_preset(kind, seed)
             tests = arrays(unit, plan('held-out', seed), seed + 500, rate_hz=options.rate_hz)
-            least = floor(unit, tests)
+            least = floor(tests)
             siblings = population([
                 fitted(
                     arrays(

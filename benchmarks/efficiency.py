@@ -20,12 +20,12 @@ from thermo_comp.simulation import (
     Position,
     UnitModel,
     arrays,
-    cyclogram_preset,
+    parse_cyclogram,
     positions,
     simulate,
     unit_preset,
 )
-from thermo_comp.simulation.drift import DriftModel, PartEffect
+from thermo_comp.simulation.drift import PartEffect
 from thermo_comp.typing import Floats
 
 
@@ -41,7 +41,7 @@ def exact_unit(seed: int) -> UnitModel:
         'board', bias=axes(5.0), bias_curvature=axes(0.05), scale=axes(40.0),
         scale_curvature=axes(0.2),
     )  # fmt: skip
-    return replace(unit_preset('thermostatted', seed), drift=DriftModel((drift,)))
+    return replace(unit_preset('thermostatted', seed), drift=(drift,))
 
 
 def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) -> Floats:
@@ -51,7 +51,7 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
     Written on its own: window means of counts with white noise, unknown attitudes (two angles
     each), M, and a quadratic of the true board temperature per axis; differentiated numerically.
     """
-    run = simulate(unit, cyclogram_preset(program), directions[0], rate_hz=1.0)
+    run = simulate(unit, parse_cyclogram(program), directions[0], rate_hz=1.0)
     truth = run.truth
     time_s = np.arange(window_s / 2.0, truth.grid_s[-1], window_s)
     t = np.interp(time_s, truth.grid_s, truth.temperature('board')) - 20.0
@@ -59,7 +59,7 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
     K = np.array(unit.scale_factor)
     sd = np.array(unit.noise_density) * 1e-6 * STANDARD_GRAVITY * K / np.sqrt(window_s)
     n = len(directions)
-    effect = unit.drift.effects[0]
+    effect = unit.drift[0]
     micro = 1e-6 * STANDARD_GRAVITY * K
     start = np.concatenate(
         (
@@ -110,7 +110,7 @@ def efficiency(n_units: int) -> None:
         for seed in range(1, n_units + 1):
             unit, ups = exact_unit(seed), positions(n_positions, seed)
             stations = [
-                Position(f'position-{i}', cyclogram_preset('demo'), up) for i, up in enumerate(ups)
+                Position(f'position-{i}', parse_cyclogram('demo'), up) for i, up in enumerate(ups)
             ]
             ours = fit_and_correct(arrays(unit, stations, seed, rate_hz=25.0), [])
             truth = np.array([unit.bias_at_reference, np.log(unit.scale_factor)])

@@ -25,7 +25,7 @@ import numpy as np
 
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
-    cyclogram_preset,
+    parse_cyclogram,
     positions,
     simulate_blocks,
     unit_preset,
@@ -41,7 +41,7 @@ def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
     for number, up in enumerate(positions(n_bags, 1)):
         path = folder / f'position-{number:02d}.mcap'
         with BagWriter(path, metadata={'serial': unit.serial}) as bag:
-            program = cyclogram_preset('chamber')
+            program = parse_cyclogram('chamber')
             for run in simulate_blocks(unit, program, up, rate_hz=rate_hz, seed=number):
                 counts = run.counts.astype(np.float64)
                 bag.write_counts('accel/counts', run.accel_stamp_ns, counts, 'accel_link')

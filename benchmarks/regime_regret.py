@@ -24,7 +24,7 @@ from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
     SimulatedRun,
-    cyclogram_preset,
+    parse_cyclogram,
     positions,
     simulate,
     unit_preset,
@@ -104,7 +104,7 @@ def judge_unit(job: tuple[str, int]) -> Unit:
 
     def run(program: str, up: Floats, number: int) -> SimulatedRun:
         return simulate(
-            unit, cyclogram_preset(program), up, rate_hz=RATE_HZ, seed=1000 * seed + number
+            unit, parse_cyclogram(program), up, rate_hz=RATE_HZ, seed=1000 * seed + number
         )
 
     fitted = [run('chamber', up, k) for k, up in enumerate(positions(N_POSITIONS, seed))]

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyBboxPatch, Polygon, Rectangle
 
 import thermo_comp as tc
-from thermo_comp.simulation import cyclogram_preset, positions, simulate, unit_preset
+from thermo_comp.simulation import parse_cyclogram, positions, simulate, unit_preset
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / 'docs' / 'images'
@@ -63,7 +63,7 @@ def draw_chamber(axes: Axes) -> None:
 
 def draw_cyclogram(axes: Axes) -> None:
     """Draw the paper's program, and what two thermometers see of it."""
-    program = cyclogram_preset('chamber')
+    program = parse_cyclogram('chamber')
     run = simulate(unit_preset('thermostatted', 1), program, positions(1, 0)[0], rate_hz=0.2)
     hours = np.array(program.time_s) / 3600.0
     axes.plot(hours, program.temperature_c, color='black', lw=1.0, ls=':', label='chamber')

@@ -18,7 +18,7 @@ from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
     Position,
-    Record,
+    SimulatedRun,
     UnitModel,
     arrays,
     parse_cyclogram,
@@ -36,25 +36,21 @@ PROGRAM = parse_cyclogram('20 20min, 45@1.5 30min, 5@1.5 30min, 20@1.5 20min')
 FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
-def stamps(seconds: Floats) -> np.ndarray:
-    return np.rint(1e9 * np.asarray(seconds)).astype(np.int64)
-
-
-def block_of(record: Record, has_temperature: bool = True) -> ArrayBlock:
+def block_of(record: SimulatedRun, has_temperature: bool = True) -> ArrayBlock:
     n = None if has_temperature else 0
     return ArrayBlock(
-        stamps(record.time_s), record.counts,
-        stamps(record.board_time_s)[:n], record.board[:n],
-        stamps(record.case_time_s)[:n], record.case[:n],
+        record.accel_stamp_ns, record.counts.astype(np.float64),
+        record.board_stamp_ns[:n], record.board[:n],
+        record.case_stamp_ns[:n], record.case[:n],
     )  # fmt: skip
 
 
-def records_of(unit: UnitModel, ups: Floats, seed: int) -> list[Record]:
+def records_of(unit: UnitModel, ups: Floats, seed: int) -> list[SimulatedRun]:
     plan = [Position(f'bag{k}', PROGRAM, up) for k, up in enumerate(ups)]
     return arrays(unit, plan, seed, rate_hz=RATE_HZ)
 
 
-def sources_of(records: Sequence[Record], has_temperature: bool = True) -> list[FitSource]:
+def sources_of(records: Sequence[SimulatedRun], has_temperature: bool = True) -> list[FitSource]:
     blocks = [block_of(record, has_temperature) for record in records]
     return [
         FitSource(record.name, lambda block=block: [block])
@@ -202,7 +198,7 @@ def test_the_compensator_does_what_the_fit_promised(response: FitResult) -> None
     variance = found.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
     # White noise and rounding average down, the rest does not.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
-    error = (force - record.specific_force) / np.sqrt(variance)
+    error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
 
 
@@ -236,11 +232,11 @@ def test_one_position_tells_the_bias_along_gravity_over_temperature() -> None:
 
 def test_no_temperature_gives_nine_parameters() -> None:
     plain = unit_preset('plain', 1)
-    records = records_of(plain.without_drift(), positions(12, 1), 4)
+    records = records_of(replace(plain, drift=()), positions(12, 1), 4)
     result = fit(sources_of(records, False), FitOptions(gravity=STANDARD_GRAVITY))
     assert result.calibration.response == ()
     assert any(one.name == 'temperature' for one in result.findings)
-    assert np.abs(pulls(result, plain.without_drift())).max() < 4.0
+    assert np.abs(pulls(result, replace(plain, drift=()))).max() < 4.0
 
 
 def test_bags_with_and_without_temperature_contradict_themselves() -> None:

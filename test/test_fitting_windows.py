@@ -40,11 +40,9 @@ def sources(n: int, seed: int = 1) -> list[FitSource]:
     plan = [Position(f'bag{k}', PROGRAM, up) for k, up in enumerate(positions(n, seed))]
     result = []
     for record in arrays(unit_preset('own-lags', seed), plan, seed):
-        at = [
-            np.rint(1e9 * x).astype(np.int64)
-            for x in (record.time_s, record.board_time_s, record.case_time_s)
-        ]
-        block = ArrayBlock(at[0], record.counts, at[1], record.board, at[2], record.case)
+        counts = record.counts.astype(np.float64)
+        board, case = (record.board_stamp_ns, record.board), (record.case_stamp_ns, record.case)
+        block = ArrayBlock(record.accel_stamp_ns, counts, *board, *case)
         result.append(FitSource(record.name, lambda block=block: [block]))
     return result
 

@@ -39,8 +39,8 @@ FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 def block_of(record, K, rate=None):
     """Make the block that a recording of Imu messages would be."""
     stamps, board_ns, case_ns = (
-        START_NS + np.rint(time * 1e9).astype(np.int64)
-        for time in (record.time_s, record.board_time_s, record.case_time_s)
+        START_NS + stamp_ns
+        for stamp_ns in (record.accel_stamp_ns, record.board_stamp_ns, record.case_stamp_ns)
     )
     n, nothing = len(stamps), np.zeros((len(stamps), 9))
     rate = record.angular_rate if rate is None else rate
@@ -107,7 +107,7 @@ def test_the_fit_tells_what_other_positions_see(fitted):
 def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     records = arrays(unit, plan('chamber-9', 2)[:2], 2)
     with_rate = fit([source_of(one, unit.scale_factor) for one in records], OPTIONS)
-    silent = [np.zeros((len(one.time_s), 3)) for one in records]
+    silent = [np.zeros((len(one.counts), 3)) for one in records]
     sources = [
         source_of(o, unit.scale_factor, rate) for o, rate in zip(records, silent, strict=True)
     ]

@@ -12,7 +12,7 @@ import pytest
 from builders import SECOND_NS
 from simulation_helpers import rippled
 
-from thermo_comp.simulation import cyclogram_preset, simulate, unit_preset
+from thermo_comp.simulation import parse_cyclogram, simulate, unit_preset
 from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.thermal.plausibility import STILL_READINGS, Fault, still_readings
 from thermo_comp.thermal.regime import Regime
@@ -195,7 +195,7 @@ def test_a_unit_in_its_chamber_is_never_doubted_and_swapped_topics_are(preset, s
     unit = unit_preset(preset, 1).with_thermometers(
         noise_sd=settings.noise_sd_c, quantum=settings.quantum_c
     )
-    run = simulate(unit, rippled(cyclogram_preset('fast')), (0.0, 0.0, 1.0), rate_hz=0.02, seed=1)
+    run = simulate(unit, rippled(parse_cyclogram('fast')), (0.0, 0.0, 1.0), rate_hz=0.02, seed=1)
     tracker = tracker_of(sensor)
     readings = [(int(s), 0, float(v)) for s, v in zip(run.board_stamp_ns, run.board, strict=True)]
     readings += [(int(s), 1, float(v)) for s, v in zip(run.case_stamp_ns, run.case, strict=True)]

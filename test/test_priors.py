@@ -15,9 +15,15 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit
 from thermo_comp.fitting.options import Ageing
 from thermo_comp.fitting.priors import population
-from thermo_comp.simulation import STANDARD_GRAVITY, arrays, positions, unit_preset
-from thermo_comp.simulation.campaign import Position, Record
-from thermo_comp.simulation.cyclogram import parse_cyclogram
+from thermo_comp.simulation import (
+    STANDARD_GRAVITY,
+    Position,
+    SimulatedRun,
+    arrays,
+    parse_cyclogram,
+    positions,
+    unit_preset,
+)
 from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
@@ -25,24 +31,21 @@ PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = unit_preset('products', 1)
 
 
-def source(record: Record) -> FitSource:
-    def stamps(time_s: np.ndarray) -> np.ndarray:
-        return np.rint(np.asarray(time_s) * 1e9).astype(np.int64) + 10**18
-
+def source(record: SimulatedRun) -> FitSource:
     block = ArrayBlock(
-        stamps(record.time_s),
+        record.accel_stamp_ns + 10**18,
         record.counts.astype(np.float64),
         # Every fourth reading of a second: a ramp of 1 K/min is as well seen, four times sooner.
-        stamps(record.board_time_s)[::4],
+        record.board_stamp_ns[::4] + 10**18,
         record.board[::4],
-        stamps(record.case_time_s)[::4],
+        record.case_stamp_ns[::4] + 10**18,
         record.case[::4],
     )
     return FitSource(record.name, lambda: [block])
 
 
 @cache
-def test_of(number: int, first: int, last: int) -> tuple[Record, ...]:
+def test_of(number: int, first: int, last: int) -> tuple[SimulatedRun, ...]:
     """Record some of twelve positions of one sibling."""
     ups = positions(12, number)[first:last]
     stations = [Position(f'p{k}', PROGRAM, up) for k, up in enumerate(ups)]

@@ -20,12 +20,12 @@ from thermo_comp.simulation import (
     UNIT_NAMES,
     Cyclogram,
     UnitModel,
-    cyclogram_preset,
+    parse_cyclogram,
     positions,
     simulate,
     unit_preset,
 )
-from thermo_comp.simulation.drift import PartHistory
+from thermo_comp.simulation.drift import PartHistory, drift_of
 from thermo_comp.typing import Floats
 
 RATE_HZ = 10.0
@@ -39,7 +39,7 @@ def _static(unit: UnitModel, board: Floats) -> tuple[Floats, ...]:
         parts = unit.network.equilibrium(unit.network.air_for('board', float(temperature)))
         deviation = (parts - unit.origin)[None]
         history = PartHistory(unit.network.nodes, deviation, unit.origin, 1.0)
-        still.append(unit.drift.evaluate(history))
+        still.append(drift_of(unit.drift, history))
     bias, scale = zip(*still, strict=True)
     return np.concatenate(bias), np.concatenate(scale)
 
@@ -191,8 +191,8 @@ def test_what_each_description_can_reach() -> None:
     }
     for name, rows in bounds.items():
         unit = unit_preset(name, 1)
-        fitted = _Campaign(unit, cyclogram_preset('paper'), 1)
-        seen = _Campaign(unit, cyclogram_preset('held-out'), 2)
+        fitted = _Campaign(unit, parse_cyclogram('paper'), 1)
+        seen = _Campaign(unit, parse_cyclogram('held-out'), 2)
         for kind, (low, high) in rows.items():
             error = _norm_error(kind, fitted, seen)
             print(f'{name} {kind}: {error:.2f} ug')
@@ -202,8 +202,8 @@ def test_what_each_description_can_reach() -> None:
 
 def test_mems_is_limited_by_its_noise() -> None:
     unit = unit_preset('mems', 1)
-    fitted = _Campaign(unit, cyclogram_preset('paper'), 1)
-    seen = _Campaign(unit, cyclogram_preset('held-out'), 2)
+    fitted = _Campaign(unit, parse_cyclogram('paper'), 1)
+    seen = _Campaign(unit, parse_cyclogram('held-out'), 2)
     floor = np.sqrt(np.mean(np.square(unit.noise_density)) / MINUTE)
     assert _norm_error('raw', fitted, seen) > 500.0
     # Creep of a few ug/K and the converter's rounding stand beside the white noise.

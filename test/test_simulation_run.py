@@ -13,24 +13,24 @@ from simulation_helpers import ideal_regime, rippled
 
 from thermo_comp.simulation import (
     MICRO_G,
+    STANDARD_GRAVITY,
     START_NS,
     Cyclogram,
     SimulatedRun,
     UnitModel,
-    cyclogram_preset,
+    parse_cyclogram,
     positions,
-    ramps_and_soaks,
     simulate,
     simulate_blocks,
     unit_preset,
 )
-from thermo_comp.simulation.drift import DriftModel, PartEffect
-from thermo_comp.simulation.thermometers import ThermometerModel
+from thermo_comp.simulation.drift import PartEffect
+from thermo_comp.simulation.unit import ThermometerModel
 from thermo_comp.typing import Floats
 
 UP = np.array([0.48, -0.6, 0.64])
-DEMO = cyclogram_preset('demo')
-SHORT = ramps_and_soaks(20.0, 4.0, [(26.0, 1.0, 5.0)])
+DEMO = parse_cyclogram('demo')
+SHORT = parse_cyclogram('20 4min, 26@1 5min')
 COLUMNS = ('accel_stamp_ns', 'counts', 'board_stamp_ns', 'board', 'case_stamp_ns', 'case')
 CYCLES = ('cycle_s', 'bias', 'scale')
 
@@ -107,7 +107,7 @@ def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None
     assert np.all(noisy.board != plain.board)
     np.testing.assert_array_equal(noisy.case, plain.case)
     np.testing.assert_array_equal(noisy.counts, plain.counts)
-    still = simulate(unit.without_drift(), SHORT, UP)
+    still = simulate(replace(unit, drift=()), SHORT, UP)
     moved = (plain.truth.bias - still.truth.bias) + (
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
@@ -135,10 +135,10 @@ def test_axes_permute() -> None:
         scale_curvature=turned(effect.scale_curvature),
         bias=turned(effect.bias),
     )
-    a = replace(base, drift=DriftModel((effect,)))
+    a = replace(base, drift=(effect,))
     b = replace(
         base,
-        drift=DriftModel((permuted,)),
+        drift=(permuted,),
         scale_factor=turned(base.scale_factor),
         bias_at_reference=turned(base.bias_at_reference),
     )
@@ -158,7 +158,7 @@ def test_counts_follow_the_truth(unit: UnitModel) -> None:
     charge = truth.bias + np.array(unit.scale_factor) * truth.scale * s
     short = np.cumsum(charge - run.counts, axis=0)
     assert np.ptp(short, axis=0).max() < 1.0 + 1e-6
-    assert np.linalg.norm(truth.specific_force) == pytest.approx(truth.gravity)
+    assert np.linalg.norm(truth.specific_force) == pytest.approx(STANDARD_GRAVITY)
 
 
 def test_white_noise_has_its_density(unit: UnitModel) -> None:
@@ -166,8 +166,8 @@ def test_white_noise_has_its_density(unit: UnitModel) -> None:
     Second route: Welch's spectrum is flat at ``2 density^2`` (one-sided), and the scatter of
     60 s means is ``density / sqrt(60)``.
     """
-    still = unit.without_drift()
-    run = simulate(still, cyclogram_preset('soak'), UP, rate_hz=50.0, seed=3)
+    still = replace(unit, drift=())
+    run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
     # The converter carries its remainder, so its own noise rises with f^2: 1 (ug)^2/Hz at 0.4 Hz.
@@ -218,7 +218,7 @@ def test_chamber_ripple_stays_within_its_amplitude(unit: UnitModel) -> None:
 
 def test_cold_start_warms_itself_up(unit: UnitModel) -> None:
     """Switched on in still air the board drifts by its self-heating; started warm it does not."""
-    soak = cyclogram_preset('soak')
+    soak = parse_cyclogram('soak')
     cold = simulate(unit, soak, UP, rate_hz=1.0, warm=False).truth.temperature('board')
     warm = simulate(unit, soak, UP, rate_hz=1.0).truth.temperature('board')
     assert cold[0] == pytest.approx(20.0)

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from thermo_comp.simulation import UNIT_NAMES, cyclogram_preset, unit_preset
+from thermo_comp.simulation import UNIT_NAMES, parse_cyclogram, unit_preset
 from thermo_comp.simulation.drift import CreepEffect, PartHistory
-from thermo_comp.simulation.network import AIR, Link, ThermalNetwork, Thermostat
-from thermo_comp.simulation.response import ThermalResponse
+from thermo_comp.simulation.network import AIR, Link, ThermalNetwork, ThermalResponse, Thermostat
 
 # Solved in closed form, so only rounding remains; temperatures are tens of degrees.
 ROUNDING = 1e-9
@@ -57,7 +56,7 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
 @pytest.mark.parametrize('is_warm', [True, False])
 def test_presets_agree_with_a_numerical_integrator(name: str, is_warm: bool) -> None:
     unit = unit_preset(name, 3)
-    program = cyclogram_preset('demo')
+    program = parse_cyclogram('demo')
     response = ThermalResponse(
         unit.network, program.time_s, program.temperature_c, is_warm=is_warm
     )
@@ -125,7 +124,7 @@ def test_thermostat_holds_its_part_and_spends_what_leaks() -> None:
             if here == 'oven'
         )
         assert network.heater_power(air) == pytest.approx(leak)
-    program = cyclogram_preset('fast')
+    program = parse_cyclogram('fast')
     response = ThermalResponse(network, program.time_s, program.temperature_c)
     grid = np.arange(0.0, program.duration_s, 30.0)
     # 30 K outside, 3 K/min: an oven of this class keeps the head to better than 0.2 K.

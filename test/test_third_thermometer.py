@@ -29,7 +29,7 @@ from thermo_comp.simulation import (
     simulate,
     unit_preset,
 )
-from thermo_comp.simulation.drift import DriftModel, PartEffect
+from thermo_comp.simulation.drift import PartEffect
 from thermo_comp.simulation.network import AIR, Link, ThermalNetwork
 from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
 from thermo_comp.unit.calibration import Calibration
@@ -47,9 +47,7 @@ def unit_with_a_lid() -> UnitModel:
         {'case': 800.0, 'board': 120.0, 'lid': 60.0},
         (Link(AIR, 'case', 4.0), Link('case', 'board', 0.4), Link('case', 'lid', 0.1)),
     )
-    drift = DriftModel(
-        (PartEffect('board', bias=(6.0, 4.0, -8.0)), PartEffect('lid', bias=LID_UG_K))
-    )
+    drift = (PartEffect('board', bias=(6.0, 4.0, -8.0)), PartEffect('lid', bias=LID_UG_K))
     return replace(
         unit_preset('bare-quartz', 1),
         network=network,

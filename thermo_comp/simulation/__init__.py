@@ -16,18 +16,10 @@ Nothing here is built from a compensator's regressors, reads a file or a clock.
 """
 
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
-from .attitude import positions
-from .campaign import PLAN_NAMES, Position, Record, arrays, plan
-from .cyclogram import (
-    CYCLOGRAM_NAMES,
-    Cyclogram,
-    cyclogram_preset,
-    parse_cyclogram,
-    ramps_and_soaks,
-)
+from .campaign import PLAN_NAMES, Position, arrays, plan, positions
+from .cyclogram import CYCLOGRAM_NAMES, Cyclogram, parse_cyclogram
 from .presets import TRIAD_NAMES, UNIT_NAMES, unit_preset
-from .run import START_NS, simulate, simulate_blocks
-from .truth import SimulatedRun
+from .run import START_NS, SimulatedRun, simulate, simulate_blocks
 from .unit import UnitModel
 
 __all__ = [
@@ -40,15 +32,12 @@ __all__ = [
     'UNIT_NAMES',
     'Cyclogram',
     'Position',
-    'Record',
     'SimulatedRun',
     'UnitModel',
     'arrays',
-    'cyclogram_preset',
     'parse_cyclogram',
     'plan',
     'positions',
-    'ramps_and_soaks',
     'simulate',
     'simulate_blocks',
     'unit_preset',

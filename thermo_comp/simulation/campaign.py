@@ -1,29 +1,82 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a whole test in memory: which positions go through which programs, and what they record.
+Owns a whole test in memory: which attitudes go through which programs, and what they record.
 
 ``arrays(unit_preset('own-lags', 1), plan('chamber-18', 1))`` is 171 h of records in seconds.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..typing import Floats, Ints
+from ..typing import Floats
 from ..unit.gravity import STANDARD_GRAVITY
-from .attitude import positions
-from .cyclogram import Cyclogram, cyclogram_preset
-from .run import Chamber, RunOptions, ThermalTruth
+from .cyclogram import Cyclogram, parse_cyclogram
+from .run import SimulatedRun, Truth, simulate
 from .streams import Stream, generator
 from .unit import UnitModel
 
+_FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+# Edges of the cube: one per pair of axes and adding up to nothing, their opposites, the rest.
+_EDGES = [
+    *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
+    *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
+]
+# Corners: three diagonals with their opposites first.
+_CORNERS = [
+    *[(1, 1, 1), (-1, -1, -1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1), (1, -1, 1)],
+    *[(-1, -1, 1), (1, 1, -1)],
+]
+# Of the small turn about each transverse direction, since nobody levels the block.
+_SPREAD_DEG = 3.0
 # Each axis has both signs, and none sees the same gravity throughout.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 PLAN_NAMES = ('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out')
+
+
+def positions(n: int, seed: int = 0) -> Floats:
+    """
+    Return attitudes of a calibration test as unit vectors of the specific force, shape (n, 3).
+
+    Six are the faces of a cube, nine the corners of a three-capped prism, twelve those of an
+    icosahedron: the sets that tell bias, scale and misalignment apart best for their number. Other
+    sets take the faces of a cube, then its edges, then its corners; beyond 26, an even spiral over
+    the sphere. 6, 9, 12, 18, 24 and 26 are balanced. `seed` turns each by a small random angle.
+
+    Raises ValueError if `n` is below 1.
+    """
+    if n < 1:
+        raise ValueError(f'`n` must be at least 1, got {n}')
+    if n == 9:
+        # Three on the equator, six 44 degrees above and below between them.
+        third = np.arange(3) * 2.0 * math.pi / 3.0
+        ring = np.stack([np.cos(third), np.sin(third)], axis=1)
+        height, radius = 0.7, math.sqrt(1.0 - 0.7**2)
+        levels = ((-1.0, 0.0), (radius, height), (radius, -height))
+        up = np.concatenate([np.insert(size * ring, 2, z, axis=1) for size, z in levels])
+    elif n == 12:
+        golden = (1.0 + math.sqrt(5.0)) / 2.0
+        quad = np.array([(0.0, a, b * golden) for a in (1.0, -1.0) for b in (1.0, -1.0)])
+        up = np.concatenate([np.roll(quad, turn, axis=1) for turn in range(3)])
+    elif n <= 26:
+        up = np.array((_FACES + _EDGES + _CORNERS)[:n], dtype=float)
+    else:
+        k = np.arange(n)
+        z = 1.0 - (2.0 * k + 1.0) / n
+        turn = math.pi * (3.0 - math.sqrt(5.0)) * k
+        across = np.sqrt(1.0 - z * z)
+        up = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    for row in range(n):
+        push = generator(seed, Stream.POSITIONS, row).standard_normal(3)
+        up[row] += math.radians(_SPREAD_DEG) * np.cross(push, up[row])
+    result: Floats = up / np.linalg.norm(up, axis=1, keepdims=True)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,51 +86,6 @@ class Position:
     name: str
     program: Cyclogram
     up: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """
-    What one position recorded, and its truth.
-
-    time_s: ends of the cycles from the start, s, shape (n,)
-    counts: output per cycle, counts, shape (n, 3)
-    board_time_s, board, case_time_s, case: readings of the thermometers: instants [s] and values
-        [degC], shape (m,)
-    specific_force: true specific force in the orthogonal frame, m/s^2, shape (3,)
-    angular_rate: of a unit with a gyroscope, mean of each cycle, rad/s, shape (n, 3)
-    bias, scale: what the unit's temperatures make of bias [counts/cycle] and relative scale, every
-        second from 0; without the walk of the bias, which no model can know, shape (k, 3)
-    """
-
-    name: str
-    time_s: Floats
-    counts: Floats
-    board_time_s: Floats
-    board: Floats
-    case_time_s: Floats
-    case: Floats
-    specific_force: Floats
-    bias: Floats
-    scale: Floats
-    angular_rate: Floats | None = None
-
-    def means(self, window_s: float = 60.0) -> Floats:
-        """Return the means of the counts over whole windows, shape (w, 3)."""
-        per = round(window_s / self.time_s[0])
-        n = len(self.counts) // per
-        result: Floats = self.counts[: n * per].reshape(n, per, 3).mean(axis=1)
-        return result
-
-    def corrected_by_truth(self, unit: UnitModel, window_s: float = 60.0) -> Floats:
-        """
-        Return the specific force that a perfect model makes of the counts, shape (w, 3), m/s^2.
-        """
-        counts, per = self.means(window_s), round(window_s)
-        at = slice(0, len(counts) * per)
-        bias, scale = (x[at].reshape(-1, per, 3).mean(axis=1) for x in (self.bias, self.scale))
-        result: Floats = ((counts - bias) / scale / unit.scale_factor) @ unit.M.T
-        return result
 
 
 def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
@@ -97,10 +105,10 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     if name == 'held-out':
         # Attitudes that no plan has: any direction, but no axis upright.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
-        return _positions(name, cyclogram_preset('held-out'), ups)
+        return _positions(name, parse_cyclogram('held-out'), ups)
     if name.startswith('chamber'):
         n, preset = (18, 'long') if name == 'chamber-18' else (9, 'three-hours')
-        return _positions('chamber', cyclogram_preset(preset), positions(n, seed))
+        return _positions('chamber', parse_cyclogram(preset), positions(n, seed))
     bench: list[Position] = []
     for up in positions(18, seed):
         room = rng.normal(21.5, 0.7)
@@ -109,7 +117,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     if name == 'tumble':
         return tuple(bench)
     ups = _THREE[: int(name[-1])] + rng.normal(0.0, 0.15, (int(name[-1]), 3))
-    return (*bench, *_positions('chamber', cyclogram_preset('three-hours'), ups))
+    return (*bench, *_positions('chamber', parse_cyclogram('three-hours'), ups))
 
 
 def _positions(name: str, program: Cyclogram, ups: Floats) -> tuple[Position, ...]:
@@ -125,35 +133,22 @@ def arrays(
     *,
     rate_hz: float = 4.0,
     gravity: float = STANDARD_GRAVITY,
-) -> list[Record]:
-    """Run a unit through a test in memory; each position has a seed of its own."""
-    solved: dict[Cyclogram, ThermalTruth] = {}
-    records = []
-    for number, station in enumerate(stations):
-        options = RunOptions(
-            rate_hz=rate_hz, seed=1000 * seed + number, gravity=gravity, start_ns=0
+) -> list[SimulatedRun]:
+    """Run a unit through a test in memory; each position has a seed of its own, stamps from 0."""
+    solved: dict[Cyclogram, Truth] = {}
+    runs = []
+    for number, one in enumerate(stations):
+        run = simulate(
+            unit,
+            one.program,
+            one.up,
+            rate_hz=rate_hz,
+            seed=1000 * seed + number,
+            gravity=gravity,
+            start_ns=0,
+            # A load is switched by the seed.
+            like=None if unit.loads else solved.get(one.program),
         )
-        thermal = None if unit.loads else solved.get(station.program)
-        chamber = Chamber(unit, station.program, station.up, options, thermal)
-        solved[station.program] = chamber.thermal
-        (run,) = chamber.blocks(chamber.n_cycles)
-        records.append(
-            Record(
-                station.name,
-                _seconds(run.accel_stamp_ns),
-                run.counts.astype(np.float64),
-                _seconds(chamber.board[0]),
-                chamber.board[1],
-                _seconds(chamber.case[0]),
-                chamber.case[1],
-                gravity * station.up,
-                chamber.thermal.bias,
-                chamber.thermal.scale,
-                run.angular_rate,
-            )
-        )
-    return records
-
-
-def _seconds(stamp_ns: Ints) -> Floats:
-    return stamp_ns.astype(np.float64) * 1e-9
+        solved[one.program] = run.truth
+        runs.append(replace(run, name=one.name))
+    return runs

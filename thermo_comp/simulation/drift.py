@@ -13,6 +13,7 @@ constants.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,16 +43,6 @@ class PartHistory:
         """Return the deviation of one part, shape (m,), K."""
         return self.deviation[:, self.nodes.index(part)]
 
-    def lagged(self, signal: Floats, time_constant: float) -> Floats:
-        """
-        Return the first-order lag of a signal that is straight on the grid, settled at its start.
-        """
-        kept = np.exp(-self.step / time_constant)
-        new = 1.0 - time_constant / self.step * (1.0 - kept)
-        moved = lfilter([new, 1.0 - kept - new], [1.0, -kept], signal - signal[0])
-        result: Floats = moved + signal[0]
-        return result
-
 
 @dataclass(frozen=True, kw_only=True)
 class Effect(ABC):
@@ -67,8 +58,7 @@ class Effect(ABC):
     bias_curvature: Triple = ZERO
 
     @abstractmethod
-    def _signals(self, history: PartHistory) -> tuple[Floats, Floats | float]:
-        """Return the first and the second signal, shape (m,)."""
+    def _signals(self, history: PartHistory) -> tuple[Floats, Floats | float]: ...
 
     def change(self, history: PartHistory) -> tuple[Floats, Floats]:
         """Return the change of the bias [ug] and of the scale [ppm], shape (m, 3)."""
@@ -155,7 +145,11 @@ class CreepEffect(Effect):
 
     def _signals(self, history: PartHistory) -> tuple[Floats, float]:
         d = history.of(self.part)
-        return d - history.lagged(d, self.time_constant), 0.0
+        # The first-order lag of what is straight on the grid, settled at its start.
+        kept = np.exp(-history.step / self.time_constant)
+        new = 1.0 - self.time_constant / history.step * (1.0 - kept)
+        lagged = lfilter([new, 1.0 - kept - new], [1.0, -kept], d - d[0]) + d[0]
+        return d - lagged, 0.0
 
 
 @dataclass(frozen=True)
@@ -186,19 +180,11 @@ class SlipEffect(Effect):
         return stress, 0.0
 
 
-@dataclass(frozen=True)
-class DriftModel:
-    """All effects of a unit."""
-
-    effects: tuple[Effect, ...] = ()
-
-    def evaluate(self, history: PartHistory) -> tuple[Floats, Floats]:
-        """
-        Return the change of the bias [ug] and the relative change of the scale, shape (m, 3).
-        """
-        bias, ppm = np.zeros((2, len(history.deviation), 3))
-        for effect in self.effects:
-            more = effect.change(history)
-            bias += more[0]
-            ppm += more[1]
-        return bias, ppm * 1e-6
+def drift_of(effects: Iterable[Effect], history: PartHistory) -> tuple[Floats, Floats]:
+    """Return the change of the bias [ug] and the relative change of the scale, shape (m, 3)."""
+    bias, ppm = np.zeros((2, len(history.deviation), 3))
+    for effect in effects:
+        more = effect.change(history)
+        bias += more[0]
+        ppm += more[1]
+    return bias, ppm * 1e-6

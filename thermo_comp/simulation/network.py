@@ -1,23 +1,31 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the heat paths: lumped parts joined by conductances, self-heating, the thermostat.
+Owns the heat paths: lumped parts joined by conductances, self-heating, the thermostat; solved.
 
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
 parts, then the thermostat's integral and set point; `u` is the air temperature; `p` holds the
-constant powers.
+constant powers. Where the air is straight between knots the solution is a straight line plus
+decaying modes, so any instant is evaluated without integrating up to it. A network with convection
+has no modes and is integrated, interval by interval.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.integrate import solve_ivp
 
 from ..typing import Floats
 
 AIR = 'air'
+_CHUNK = 65536  # instants evaluated at once; bounds the memory of the mode table
+_MODES_CONDITION = 1e9  # eigenvectors worse than that have no accurate modal solution
 
 
 @dataclass(frozen=True)
@@ -57,10 +65,9 @@ class ThermalNetwork:
     """
     Parts with heat capacities [J/K], the paths between them, and the power [W] they dissipate.
 
-    The keys of `capacity` name the parts and fix their order.
-
-    Raises ValueError if a capacity or conductance is not positive, a link, power or thermostat
-    names an unknown part, or a part has no heat path to the air.
+    The keys of `capacity` name the parts and fix their order. Raises ValueError if a capacity or
+    conductance is not positive, a link, power or thermostat names an unknown part, or a part has
+    no heat path to the air.
     """
 
     capacity: Mapping[str, float]
@@ -73,23 +80,17 @@ class ThermalNetwork:
             if not value > 0.0:
                 raise ValueError(f'`capacity` of {name} must be positive, got {value}')
         heated = () if self.thermostat is None else (self.thermostat.node,)
-        ends = {end for link in self.links for end in (link.a, link.b)} - {AIR}
-        for name in (*ends, *self.power, *heated):
-            if name not in self.capacity:
-                raise ValueError(f'part {name!r} has no `capacity`')
+        ends = [{link.a, link.b} for link in self.links]
+        for name in ({*self.power, *heated}.union(*ends) - {AIR}) - self.capacity.keys():
+            raise ValueError(f'part {name!r} has no `capacity`')
         for link in self.links:
             if not link.conductance > 0.0:
                 raise ValueError(f'`conductance` must be positive, got {link.conductance}')
-        reached, grown = {AIR}, True
-        while grown:
-            grown = False
-            for link in self.links:
-                if (link.a in reached) != (link.b in reached):
-                    reached |= {link.a, link.b}
-                    grown = True
-        for name in self.capacity:
-            if name not in reached:
-                raise ValueError(f'part {name!r} has no heat path to the air')
+        reached = {AIR}
+        for _ in self.capacity:
+            reached.update(*(pair for pair in ends if pair & reached))
+        for name in self.capacity.keys() - reached:
+            raise ValueError(f'part {name!r} has no heat path to the air')
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -102,12 +103,7 @@ class ThermalNetwork:
         return any(link.exponent != 1.0 for link in self.links)
 
     def system(self) -> tuple[Floats, Floats, Floats]:
-        """
-        Return the matrices of ``dx/dt = A x + b u + p``, convection left out.
-
-        Shapes (k, k), (k,) and (k,): the parts first, then the thermostat's integral and set
-        point.
-        """
+        """Return A, b and p, shapes (k, k), (k,) and (k,), convection left out."""
         n = len(self.nodes)
         size = n + (0 if self.thermostat is None else 2)
         A, b, p = np.zeros((size, size)), np.zeros(size), np.zeros(size)
@@ -174,12 +170,15 @@ class ThermalNetwork:
             state = state - np.linalg.solve(A + slope, A @ state + b * air + drive + flow)
         return state
 
-    def equilibrium(self, air: float) -> Floats:
-        """Return the temperatures [degC] of the parts after an endless soak, shape (n_parts,)."""
+    def _still(self, air: float) -> Floats:
         A, b, p = self.system()
         if self.is_convective:
-            return self.settled(air, p)[: len(self.nodes)]
-        return np.asarray(np.linalg.solve(A, -b * air - p)[: len(self.nodes)], dtype=np.float64)
+            return self.settled(air, p)
+        return np.asarray(np.linalg.solve(A, -b * air - p), dtype=np.float64)
+
+    def equilibrium(self, air: float) -> Floats:
+        """Return the temperatures [degC] of the parts after an endless soak, shape (n_parts,)."""
+        return self._still(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:
         """Return the air temperature whose endless soak brings a part to a temperature."""
@@ -191,7 +190,109 @@ class ThermalNetwork:
 
     def heater_power(self, air: float) -> float:
         """Return what the thermostat spends in an endless soak, W; 0 without one."""
-        if self.thermostat is None:
-            return 0.0
-        A, b, p = self.system()
-        return float(np.linalg.solve(A, -b * air - p)[len(self.nodes)])
+        return 0.0 if self.thermostat is None else float(self._still(air)[len(self.nodes)])
+
+
+class ThermalResponse:
+    """
+    Temperatures of a network over a program, at any instant.
+
+    `knot_air` are the air temperatures at the `knot_time` [s], shape (m,); `power` is what the
+    parts dissipate between the knots beside the constant powers, W, shape (m - 1, n_parts). A warm
+    start is in equilibrium with everything on; else the unit is switched on at the first knot,
+    every part at the air's temperature. Raises ValueError if the program drives the thermostat's
+    heater out of its power range, or the network's modes cannot be told apart.
+    """
+
+    def __init__(
+        self,
+        network: ThermalNetwork,
+        knot_time: ArrayLike,
+        knot_air: ArrayLike,
+        *,
+        power: ArrayLike | None = None,
+        is_warm: bool = True,
+    ) -> None:
+        self.network = network
+        self._time = np.asarray(knot_time, dtype=float)
+        air = np.asarray(knot_air, dtype=float)
+        heat = network.thermostat
+        if heat is not None:
+            watts = [network.heater_power(float(a)) for a in (air.max(), air.min())]
+            if watts[0] < 0.0 or watts[1] > heat.max_power:
+                raise ValueError(
+                    f'air of {air.min():g}..{air.max():g} degC needs {watts[0]:.2f}..'
+                    f'{watts[1]:.2f} W of a thermostat that gives 0..{heat.max_power:g} W'
+                )
+        A, b, p = network.system()
+        drive = np.tile(p, (len(self._time) - 1, 1))
+        if power is not None:
+            drive[:, : len(network.nodes)] += np.asarray(power) / list(network.capacity.values())
+        if is_warm:
+            state = network.settled(air[0], drive[0])
+        else:
+            # Parts and set point begin with the air, the integral with nothing.
+            state = np.full(len(p), air[0])
+            state[len(network.nodes) : len(p) - 1] = 0.0
+        self._integrated: list[Any] = []
+        if network.is_convective:
+            self._integrate(air, drive, state)
+            return
+        inverse = np.linalg.inv(A)
+        rate, modes = np.linalg.eig(A)
+        if np.linalg.cond(modes) > _MODES_CONDITION:
+            raise ValueError('the network has modes that cannot be told apart; change a capacity')
+        self._rate, self._modes = rate, modes
+
+        length = np.diff(self._time)
+        slope = np.diff(air) / length
+        # Straight part of each interval: alpha + beta (t - t_knot).
+        self._beta = -slope[:, None] * (inverse @ b)
+        self._alpha = (self._beta - np.outer(air[:-1], b) - drive) @ inverse.T
+        unmix = np.linalg.inv(modes)
+        # Amplitude of each mode at the start of each interval.
+        jump = (self._alpha[1:] - self._alpha[:-1] - self._beta[:-1] * length[:-1, None]) @ unmix.T
+        amplitude = np.empty((len(length), len(rate)), dtype=complex)
+        amplitude[0] = unmix @ (state - self._alpha[0])
+        for k in range(1, len(length)):
+            decayed = np.exp(rate * length[k - 1]) * amplitude[k - 1]
+            amplitude[k] = decayed - jump[k - 1]
+        self._amplitude = amplitude
+
+    def _integrate(self, air: Floats, drive: Floats, state: Floats) -> None:
+        A, b, _ = self.network.system()
+        for k, (begin, end) in enumerate(pairwise(self._time)):
+
+            def flow(t: float, x: Floats, k: int = k) -> Floats:
+                now = float(np.interp(t, self._time, air))
+                return np.asarray(A @ x + b * now + drive[k] + self.network.convection(x, now)[0])
+
+            solved = solve_ivp(
+                flow, (begin, end), state, 'LSODA', dense_output=True, rtol=1e-9, atol=1e-9
+            )
+            state = solved.y[:, -1]
+            self._integrated.append(solved.sol)
+
+    def states(self, time: ArrayLike) -> Floats:
+        """
+        Return the parts' temperatures, the thermostat's integral [W] and set point, shape (m, k).
+        """
+        time = np.atleast_1d(np.asarray(time, dtype=float))
+        k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
+        states = np.empty((len(time), len(self.network.system()[1])))
+        if self._integrated:
+            for interval in np.unique(k):
+                here = k == interval
+                states[here] = self._integrated[interval](time[here]).T
+            return states
+        for first in range(0, len(time), _CHUNK):
+            piece = slice(first, first + _CHUNK)
+            at, since = k[piece], time[piece] - self._time[k[piece]]
+            decaying = np.exp(since[:, None] * self._rate) * self._amplitude[at]
+            straight = self._alpha[at] + self._beta[at] * since[:, None]
+            states[piece] = straight + (decaying @ self._modes.T).real
+        return states
+
+    def temperatures(self, time: ArrayLike) -> Floats:
+        """Return the temperatures [degC] in the order of ``network.nodes``, shape (m, n_parts)."""
+        return self.states(time)[:, : len(self.network.nodes)]

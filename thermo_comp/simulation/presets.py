@@ -13,17 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
-from .converter import Converter
 from .drift import (
     CreepEffect,
     DifferenceEffect,
-    DriftModel,
     Effect,
     FlowEffect,
     LeakageEffect,
@@ -31,11 +28,9 @@ from .drift import (
     SlipEffect,
     Triple,
 )
-from .gyro import GyroModel
 from .network import AIR, Link, ThermalNetwork, Thermostat
 from .streams import Stream, generator
-from .thermometers import ThermometerModel
-from .unit import SwitchedLoad, UnitModel
+from .unit import Converter, GyroModel, SwitchedLoad, ThermometerModel, UnitModel, triple
 
 
 class _Specimen:
@@ -46,30 +41,23 @@ class _Specimen:
         self.serial = f'{name}-{seed:04d}'
         self._rng = generator(seed, Stream.UNIT, UNIT_NAMES.index(name))
 
-    def near(self, value: float, spread: float = 0.05) -> float:
-        return value * (1.0 + spread * self._rng.uniform(-1.0, 1.0))
+    def near(self, value: float) -> float:
+        return value * (1.0 + 0.05 * self._rng.uniform(-1.0, 1.0))
 
     def between(self, low: float, high: float) -> float:
         return float(self._rng.uniform(low, high))
 
     def axes(self, value: float, spread: float) -> Triple:
         # Around one value, the sign kept.
-        x, y, z = value * (1.0 + spread * self._rng.uniform(-1.0, 1.0, 3))
-        return float(x), float(y), float(z)
+        return triple(value * (1.0 + spread * self._rng.uniform(-1.0, 1.0, 3)))
 
     def signed(self, low: float, high: float) -> Triple:
         # Magnitudes even in the logarithm, random signs.
         size = np.exp(self._rng.uniform(math.log(low), math.log(high), 3))
-        x, y, z = size * self._rng.choice((-1.0, 1.0), 3)
-        return float(x), float(y), float(z)
+        return triple(size * self._rng.choice((-1.0, 1.0), 3))
 
     def normal(self, sd: float) -> Triple:
-        x, y, z = sd * self._rng.standard_normal(3)
-        return float(x), float(y), float(z)
-
-    def misalignment(self, sd: float) -> tuple[Triple, Triple, Triple]:
-        a, b, c = self.normal(sd)
-        return (1.0, 0.0, 0.0), (a, 1.0, 0.0), (b, c, 1.0)
+        return triple(sd * self._rng.standard_normal(3))
 
     def heat(self, **capacity: float) -> dict[str, float]:
         return {part: self.near(value) for part, value in capacity.items()}
@@ -77,23 +65,22 @@ class _Specimen:
     def links(self, *paths: tuple[str, str, float]) -> tuple[Link, ...]:
         return tuple(Link(a, b, self.near(conductance)) for a, b, conductance in paths)
 
-    def only(self, axis: int, value: float) -> Triple:
-        x, y, z = (value * (i == axis) for i in range(3))
-        return x, y, z
-
     def unit(
         self,
         network: ThermalNetwork,
-        drift: DriftModel,
+        drift: tuple[Effect, ...],
         *,
         full_scale_g: float,
         bias_ug: float,
         density: float = 5.0,
+        spread: float = 0.01,
+        misalignment_sd: float = 1e-3,
         **others: Any,
     ) -> UnitModel:
         """Return the unit, its constants drawn; a quartz one with a charge-balancing converter."""
-        K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), others.pop('spread', 0.01))
+        K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), spread)
         bx, by, bz = self.normal(bias_ug)
+        yx, zx, zy = self.normal(misalignment_sd)
         parts: dict[str, Any] = {
             'board': ThermometerModel('board', phase=0.5),
             'case': ThermometerModel('case'),
@@ -107,13 +94,17 @@ class _Specimen:
             drift=drift,
             scale_factor=K,
             bias_at_reference=(bx * K[0] * MICRO_G, by * K[1] * MICRO_G, bz * K[2] * MICRO_G),
-            misalignment=self.misalignment(others.pop('misalignment_sd', 1e-3)),
+            misalignment=((1.0, 0.0, 0.0), (yx, 1.0, 0.0), (zx, zy, 1.0)),
             **{**parts, **others},
         )
 
 
-def _thermostatted(seed: int) -> UnitModel:
-    draw = _Specimen('thermostatted', seed)
+def _only(axis: int, value: float) -> Triple:
+    x, y, z = (value * (i == axis) for i in range(3))
+    return x, y, z
+
+
+def _thermostatted(draw: _Specimen) -> UnitModel:
     network = ThermalNetwork(
         capacity=draw.heat(
             case=1500, board=110, cover=65, reference=12, integrator=25, oven=200, head=400
@@ -127,27 +118,22 @@ def _thermostatted(seed: int) -> UnitModel:
         power={'board': 0.8, 'reference': 0.02, 'head': 0.3},
         thermostat=Thermostat('oven', 55.0, 20.0, 0.08, 1800.0, 25.0),
     )  # fmt: skip
-    drift = DriftModel(
-        effects=(
-            # The reference current sets the scale of all axes; its curvature is a bandgap's.
-            PartEffect(
-                'reference', scale=draw.axes(40.0, 0.15), scale_curvature=draw.axes(0.02, 0.5)
-            ),
-            # Dielectric absorption and charge injection of each axis' own, potted integrator;
-            # the leakage of its switches, which bends upwards, sits on the board itself.
-            PartEffect('integrator', scale=draw.normal(3.0), bias=draw.signed(6.0, 14.0)),
-            PartEffect('board', bias=draw.normal(1.0), bias_curvature=draw.normal(0.03)),
-            PartEffect('head', scale=draw.axes(80.0, 0.1), bias=draw.signed(0.3, 5.0)),
-            DifferenceEffect('board', 'reference', bias=draw.normal(3.0)),
-            DifferenceEffect('oven', 'head', bias=draw.normal(2.0)),
-            CreepEffect('reference', 5.0 * 3600.0, bias=draw.normal(0.02)),
-        )
+    drift = (
+        # The reference current sets the scale of all axes; its curvature is a bandgap's.
+        PartEffect('reference', scale=draw.axes(40.0, 0.15), scale_curvature=draw.axes(0.02, 0.5)),
+        # Dielectric absorption and charge injection of each axis' own, potted integrator;
+        # the leakage of its switches, which bends upwards, sits on the board itself.
+        PartEffect('integrator', scale=draw.normal(3.0), bias=draw.signed(6.0, 14.0)),
+        PartEffect('board', bias=draw.normal(1.0), bias_curvature=draw.normal(0.03)),
+        PartEffect('head', scale=draw.axes(80.0, 0.1), bias=draw.signed(0.3, 5.0)),
+        DifferenceEffect('board', 'reference', bias=draw.normal(3.0)),
+        DifferenceEffect('oven', 'head', bias=draw.normal(2.0)),
+        CreepEffect('reference', 5.0 * 3600.0, bias=draw.normal(0.02)),
     )
     return draw.unit(network, drift, full_scale_g=11.0, bias_ug=1500.0)
 
 
-def _bare_quartz(seed: int) -> UnitModel:
-    draw = _Specimen('bare-quartz', seed)
+def _bare_quartz(draw: _Specimen) -> UnitModel:
     network = ThermalNetwork(
         capacity=draw.heat(
             case=900, board=150, cover=45, reference=10, head=120, magnet=25, mount=50, pendulum=3
@@ -160,28 +146,21 @@ def _bare_quartz(seed: int) -> UnitModel:
         ),
         power={'board': 0.6, 'magnet': 0.02},
     )  # fmt: skip
-    drift = DriftModel(
-        effects=(
-            PartEffect(
-                'magnet', scale=draw.axes(48.0, 0.01), scale_curvature=draw.axes(0.31, 0.02)
-            ),
-            PartEffect('reference', scale=draw.axes(29.5, 0.01)),
-            PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
-            # The shunt that offsets the magnet's own tempco, and the coil on the pendulum, are
-            # not at one temperature in a ramp: parts that balance in still air do not then.
-            DifferenceEffect(
-                'head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)
-            ),
-            # Stress through the joint to the mounting ring, heavy and slow, bolted to the case.
-            DifferenceEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
-            CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),
-        )
+    drift = (
+        PartEffect('magnet', scale=draw.axes(48.0, 0.01), scale_curvature=draw.axes(0.31, 0.02)),
+        PartEffect('reference', scale=draw.axes(29.5, 0.01)),
+        PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
+        # The shunt that offsets the magnet's own tempco, and the coil on the pendulum, are
+        # not at one temperature in a ramp: parts that balance in still air do not then.
+        DifferenceEffect('head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)),
+        # Stress through the joint to the mounting ring, heavy and slow, bolted to the case.
+        DifferenceEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
+        CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),
     )
     return draw.unit(network, drift, full_scale_g=11.0, bias_ug=2000.0)
 
 
-def _mems(seed: int) -> UnitModel:
-    draw = _Specimen('mems', seed)
+def _mems(draw: _Specimen) -> UnitModel:
     network = ThermalNetwork(
         capacity=draw.heat(case=60, board=12, package=0.6, die=0.05),
         links=draw.links(
@@ -190,17 +169,15 @@ def _mems(seed: int) -> UnitModel:
         ),
         power={'board': 0.15, 'die': 0.004},
     )  # fmt: skip
-    drift = DriftModel(
-        effects=(
-            PartEffect(
-                'die',
-                scale=draw.normal(150.0),
-                bias=draw.signed(100.0, 500.0),
-                bias_curvature=draw.normal(3.0),
-            ),
-            DifferenceEffect('board', 'package', bias=draw.normal(300.0)),
-            CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),
-        )
+    drift = (
+        PartEffect(
+            'die',
+            scale=draw.normal(150.0),
+            bias=draw.signed(100.0, 500.0),
+            bias_curvature=draw.normal(3.0),
+        ),
+        DifferenceEffect('board', 'package', bias=draw.normal(300.0)),
+        CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),
     )
     unit = draw.unit(
         network,
@@ -214,29 +191,24 @@ def _mems(seed: int) -> UnitModel:
         noise_density=(120.0, 120.0, 150.0),
         converter=Converter(carries_remainder=False),
     )
-    rate = DriftModel(
-        (
-            PartEffect('die', bias=draw.signed(5.0, 20.0), bias_curvature=draw.normal(0.1)),
-            DifferenceEffect('board', 'package', bias=draw.normal(30.0)),
-            CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(0.1)),
-        )
+    rate = (
+        PartEffect('die', bias=draw.signed(5.0, 20.0), bias_curvature=draw.normal(0.1)),
+        DifferenceEffect('board', 'package', bias=draw.normal(30.0)),
+        CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(0.1)),
     )
     gyro = GyroModel(rate, draw.normal(500.0), (5.0, 5.0, 5.0), turn_on=2.0)
     return replace(unit, gyro=gyro)
 
 
-_AXES = ('x', 'y', 'z')
-
-
-def _triad(kind: str, seed: int) -> UnitModel:
+def _triad(draw: _Specimen) -> UnitModel:
     """
     Draw a triad of bare heads on a board whose errors have one kind of physics.
 
     The heads' tempcos lag with the heads; each kind adds its own. The magnitudes are what such
     errors have: some micro-g per kelvin of bias, tens of ppm per kelvin of scale.
     """
-    draw = _Specimen(kind, seed)
-    heads = [f'head-{axis}' for axis in _AXES] if kind in _OWN_HEADS else ['head']
+    kind = draw.name
+    heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
     board_tau, taus = draw.between(400.0, 900.0), [draw.between(500.0, 1500.0) for _ in heads]
     if kind == 'demo':
         # Sample bags are short: their soaks must come to rest.
@@ -255,37 +227,33 @@ def _triad(kind: str, seed: int) -> UnitModel:
         links[1] = Link('case', 'board', 0.15)
         links.append(Link('case', 'board', draw.between(0.15, 0.35), exponent=1.25))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
-    drift = DriftModel(
-        (
-            *_tempcos(draw, ['board'] if kind in _ON_BOARD else heads),
-            *(_EXTRA[kind](draw) if kind in _EXTRA else ()),
-        )
-    )
+    drift = _tempcos(draw, ['board'] if kind in _ON_BOARD else heads)
+    if kind in _EXTRA:
+        drift += _EXTRA[kind](draw)
     others: dict[str, Any] = {}
     if kind == 'switched-load':
         others['loads'] = (SwitchedLoad('board', draw.between(0.3, 0.8)),)
     if kind == 'slow-noise':
         others['bias_walk'] = (3.0, 3.0, 3.0)
-    unit = draw.unit(
-        network, drift, full_scale_g=9.975, bias_ug=1500.0, density=_TRIAD_DENSITY, **others
+    if kind == 'plain':
+        drift = []
+    # With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
+    return draw.unit(
+        network, tuple(drift), full_scale_g=9.975, bias_ug=1500.0, density=3.0, **others
     )
-    return unit.without_drift() if kind == 'plain' else unit
 
 
 def _tempcos(draw: _Specimen, parts: list[str]) -> list[Effect]:
-    bias, bend = draw.signed(2.0, 12.0), draw.normal(0.08)
-    scale, scale_bend = draw.axes(60.0, 0.4), draw.axes(0.2, 0.6)
+    values = {
+        'bias': draw.signed(2.0, 12.0),
+        'bias_curvature': draw.normal(0.08),
+        'scale': draw.axes(60.0, 0.4),
+        'scale_curvature': draw.axes(0.2, 0.6),
+    }
     if len(parts) == 1:
-        return [PartEffect(parts[0], bias=bias, bias_curvature=bend, scale=scale,
-                           scale_curvature=scale_bend)]  # fmt: skip
+        return [PartEffect(parts[0], **values)]
     return [
-        PartEffect(
-            part,
-            bias=draw.only(i, bias[i]),
-            bias_curvature=draw.only(i, bend[i]),
-            scale=draw.only(i, scale[i]),
-            scale_curvature=draw.only(i, scale_bend[i]),
-        )
+        PartEffect(part, **{name: _only(i, value[i]) for name, value in values.items()})
         for i, part in enumerate(parts)
     ]
 
@@ -307,7 +275,7 @@ def _slips(draw: _Specimen) -> list[Effect]:
         for is_gradual in (False, True):
             width = draw.between(0.5, 1.5)
             stress = draw.signed(1.5, 4.0)[i] / width
-            effects.append(SlipEffect('head', width, is_gradual, bias=draw.only(i, stress)))
+            effects.append(SlipEffect('head', width, is_gradual, bias=_only(i, stress)))
     return effects
 
 
@@ -359,19 +327,12 @@ _EXTRA: dict[str, Callable[[_Specimen], list[Effect]]] = {
     'paper': _loads,
     'demo': _sample,
 }
-# With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
-_TRIAD_DENSITY = 3.0
+_INSTRUMENTS = {'thermostatted': _thermostatted, 'bare-quartz': _bare_quartz, 'mems': _mems}
 TRIAD_NAMES = (
     'own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load',
     'paper', 'slow-noise', 'plain', 'demo',
 )  # fmt: skip
-_PRESETS: dict[str, Callable[[int], UnitModel]] = {
-    'thermostatted': _thermostatted,
-    'bare-quartz': _bare_quartz,
-    'mems': _mems,
-    **{kind: partial(_triad, kind) for kind in TRIAD_NAMES},
-}
-UNIT_NAMES = tuple(_PRESETS)
+UNIT_NAMES = (*_INSTRUMENTS, *TRIAD_NAMES)
 
 
 def unit_preset(name: str, seed: int = 0) -> UnitModel:
@@ -389,6 +350,6 @@ def unit_preset(name: str, seed: int = 0) -> UnitModel:
 
     Raises ValueError if there is no such kind.
     """
-    if name not in _PRESETS:
+    if name not in UNIT_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(UNIT_NAMES)}, got {name!r}')
-    return _PRESETS[name](seed)
+    return _INSTRUMENTS.get(name, _triad)(_Specimen(name, seed))

@@ -1,25 +1,25 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a run: a unit in a chamber over a program, whole or block by block."""
+"""Owns a run: a unit in a chamber over a program, whole or block by block, and its truth."""
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..typing import Floats, Ints
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.gyroscope import MILLIDEGREE
 from .cyclogram import Cyclogram
-from .drift import PartHistory
-from .response import ThermalResponse
+from .drift import PartHistory, drift_of
+from .network import AIR, ThermalResponse
 from .streams import Stream, generator
-from .truth import SimulatedRun, Truth, on_cycles
 from .unit import UnitModel
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
@@ -27,47 +27,103 @@ _NS = 1_000_000_000
 _GRID_S = 1.0  # step of the thermal grid; bias and scale are straight between its points
 
 
-@dataclass(frozen=True)
-class RunOptions:
+@dataclass(frozen=True, eq=False)
+class Truth:
     """
-    The keywords of `simulate`, `simulate_blocks` and `arrays`.
+    What really happened, on the thermal grid and at the accelerometer's cycles.
 
-    rate_hz: conversion cycles per second. The elementary charge is sized to the cycle, so K in
-        counts per cycle does not depend on it
-    temperature_rate_hz: readings per second of both thermometers; None takes each one's own
-    seed: seed of everything random in this run; the specimen has its own
-    start_ns: stamp of the start of the run, ns
-    gravity: local gravity, m/s^2
-    warm: true starts in thermal equilibrium; False switches the unit on at the start
-
-    Raises ValueError if rate or gravity is not positive.
+    grid_s, air: instants of the grid from the start of the run, s, and air temperature, degC,
+        shape (m,)
+    temperatures: of the parts, degC, shape (m, n_parts)
+    thermal_bias, scale_grid: their bias [counts/cycle] and relative scale, shape (m, 3)
+    rate_bias: of a gyroscope, rad/s, shape (m, 3)
+    bias_grid: the bias with its walk, which no model can know, shape (m, 3)
+    specific_force: in the orthogonal frame, m/s^2, shape (3,)
+    cycle_s: middles of the accelerometer's cycles from the start of the run, s, shape (n,)
     """
 
-    rate_hz: float = 100.0
-    temperature_rate_hz: float | None = None
-    seed: int = 0
-    start_ns: int = START_NS
-    gravity: float = STANDARD_GRAVITY
-    warm: bool = True
+    unit: UnitModel
+    response: ThermalResponse
+    grid_s: Floats
+    air: Floats
+    temperatures: Floats
+    thermal_bias: Floats
+    scale_grid: Floats
+    rate_bias: Floats
+    bias_grid: Floats
+    specific_force: Floats
+    cycle_s: Floats
 
-    def __post_init__(self) -> None:
-        for name in ('rate_hz', 'gravity'):
-            if not (getattr(self, name) > 0.0 and math.isfinite(getattr(self, name))):
-                raise ValueError(f'`{name}` must be positive, got {getattr(self, name)}')
+    @property
+    def bias(self) -> Floats:
+        """Bias of each cycle, shape (n, 3), counts/cycle."""
+        return self.on_cycles(self.bias_grid)
+
+    @property
+    def scale(self) -> Floats:
+        """Scale of each cycle relative to the one at the reference temperature, shape (n, 3)."""
+        return self.on_cycles(self.scale_grid)
+
+    def on_cycles(self, grid: Floats) -> Floats:
+        """Give what is straight between the points of the grid, at each cycle."""
+        # One arithmetic per cycle, whatever the block: np.interp prepares slopes or not.
+        place = self.cycle_s / self.grid_s[1]
+        left = np.minimum(place.astype(np.int64), len(self.grid_s) - 2)
+        share = (place - left)[:, None]
+        result: Floats = (1.0 - share) * grid[left] + share * grid[left + 1]
+        return result
+
+    def temperature(self, node: str) -> Floats:
+        """
+        Return the temperature [degC] of one part, or the air, on the thermal grid, shape (m,).
+        """
+        nodes = self.unit.network.nodes
+        return self.air if node == AIR else self.temperatures[:, nodes.index(node)]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRun:
+    """
+    What a recorder would have stored, and the truth.
+
+    Ends of the conversion cycles [ns], shape (n,), and their counts, shape (n, 3); instants and
+    values [degC] of the thermometers' readings, shape (m,). Of a unit with a gyroscope also the
+    mean angular rate of each cycle [rad/s], shape (n, 3).
+    """
+
+    accel_stamp_ns: Ints
+    counts: NDArray[np.int32]
+    board_stamp_ns: Ints
+    board: Floats
+    case_stamp_ns: Ints
+    case: Floats
+    truth: Truth
+    angular_rate: Floats | None = None
+    name: str = ''
+
+    def corrected_by_truth(self, window_s: float = 60.0) -> Floats:
+        """
+        Return the specific force that a perfect thermal model makes of the counts, as means over
+        whole windows, shape (w, 3), m/s^2.
+        """
+        unit = self.truth.unit
+        per = round(window_s / (2.0 * self.truth.cycle_s[0]))
+        n = len(self.counts) // per
+        counts, bias, scale = (
+            column[: n * size].reshape(n, size, 3).mean(axis=1)
+            for column, size in (
+                (self.counts, per),
+                (self.truth.thermal_bias, round(window_s)),
+                (self.truth.scale_grid, round(window_s)),
+            )
+        )
+        result: Floats = ((counts - bias) / scale / unit.scale_factor) @ unit.M.T
+        return result
 
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
-    """
-    Run a unit through a program, with `RunOptions` as keywords.
-
-    `up`, shape (3,), is the direction of the specific force in the orthogonal frame of the
-    accelerometer.
-
-    Raises ValueError if the program is shorter than a cycle, or the options, `up` or the
-    thermostat's power do not fit (see `RunOptions` and `ThermalResponse`).
-    """
-    chamber = Chamber(unit, cyclogram, up, RunOptions(**options))
-    return next(chamber.blocks(chamber.n_cycles))
+    """Run a unit through a program as one block, as `simulate_blocks` does."""
+    return next(simulate_blocks(unit, cyclogram, up, block_size=sys.maxsize, **options))
 
 
 def simulate_blocks(
@@ -76,141 +132,129 @@ def simulate_blocks(
     up: ArrayLike,
     *,
     block_size: int = 65536,
-    **options: Any,
+    rate_hz: float = 100.0,
+    temperature_rate_hz: float | None = None,
+    seed: int = 0,
+    start_ns: int = START_NS,
+    gravity: float = STANDARD_GRAVITY,
+    warm: bool = True,
+    like: Truth | None = None,
 ) -> Iterator[SimulatedRun]:
     """
-    Run a unit through a program in bounded memory: the bits of `simulate`, block by block.
+    Run a unit through a program in bounded memory; blocks of any size have the same bits.
 
     A reading of a thermometer is in the block whose cycles it falls among: after the last stamp of
     the block before, up to the last of its own; those after the very last cycle are in the last
     block. Each truth holds the whole thermal grid.
 
-    Raises ValueError if as in `simulate`, or if `block_size` is below 1.
+    up: direction of the specific force in the orthogonal frame of the accelerometer, shape (3,)
+    block_size: conversion cycles in a block
+    rate_hz: conversion cycles per second. The elementary charge is sized to the cycle, so K in
+        counts per cycle does not depend on it
+    temperature_rate_hz: readings per second of both thermometers; None takes each one's own
+    seed: seed of everything random in this run; the specimen has its own
+    start_ns: stamp of the start of the run, ns
+    gravity: local gravity, m/s^2
+    warm: true starts in thermal equilibrium; False switches the unit on at the start
+    like: the truth of another run of this unit through this program: the same heat flow
+
+    Raises ValueError if `block_size` is below 1, rate or gravity is not positive, the program is
+    shorter than a cycle, `up` is no direction, or the thermostat's power does not suffice.
     """
     if block_size < 1:
         raise ValueError(f'`block_size` must be at least 1, got {block_size}')
-    return Chamber(unit, cyclogram, up, RunOptions(**options)).blocks(block_size)
+    for name, value in (('rate_hz', rate_hz), ('gravity', gravity)):
+        if not (value > 0.0 and math.isfinite(value)):
+            raise ValueError(f'`{name}` must be positive, got {value}')
+    duration = cyclogram.duration_s
+    n_cycles = math.floor(duration * rate_hz * (1.0 + 1e-12))
+    if n_cycles < 1:
+        raise ValueError(f'the program of {duration} s is shorter than one cycle')
+    direction = np.asarray(up, dtype=float)
+    length = np.linalg.norm(direction, axis=-1)
+    if direction.shape != (3,) or not length > 0.0:
+        raise ValueError(f'`up` must be a vector other than zero, shape (3,), got {up!r}')
+    if like is None:
+        like = _heat_flow(unit, cyclogram, seed, warm)
+    truth = replace(
+        like,
+        bias_grid=like.thermal_bias + _walk(unit, like.grid_s, seed),
+        specific_force=gravity * (direction / length),
+    )
+    read = unit
+    if temperature_rate_hz is not None:
+        read = unit.with_thermometers(rate_hz=temperature_rate_hz)
+    readings = (
+        read.board.read(truth.response, duration, seed, Stream.BOARD_NOISE),
+        read.case.read(truth.response, duration, seed, Stream.CASE_NOISE),
+    )
 
-
-class ThermalTruth:
-    """The temperatures of a run and what they do to bias and scale, on the thermal grid."""
-
-    def __init__(self, unit: UnitModel, cyclogram: Cyclogram, options: RunOptions) -> None:
-        knots = np.array(cyclogram.time_s)
-        air = np.array(cyclogram.temperature_c)
-        power = None
-        if unit.loads:
-            knots, air, power = _switched(unit, knots, air, options.seed)
-        self.response = ThermalResponse(
-            unit.network, knots, air, power=power, is_warm=options.warm
-        )
-        n_grid = math.ceil(cyclogram.duration_s / _GRID_S) + 1
-        self.grid: Floats = np.arange(n_grid, dtype=float) * _GRID_S
-        self.air = np.interp(self.grid, knots, air)
-        self.temperatures = self.response.temperatures(self.grid)
-        origin = unit.origin
-        history = PartHistory(unit.network.nodes, self.temperatures - origin, origin, _GRID_S)
-        bias_ug, scale = unit.drift.evaluate(history)
-        self.rate_bias = None if unit.gyro is None else unit.gyro.bias(history)
-        self.bias = np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g
-        self.scale = 1.0 + scale
-
-
-class Chamber:
-    """
-    The whole run prepared: thermal truth on its grid, thermometers read; cycles still to come.
-    """
-
-    def __init__(
-        self,
-        unit: UnitModel,
-        cyclogram: Cyclogram,
-        up: ArrayLike,
-        options: RunOptions,
-        thermal: ThermalTruth | None = None,
-    ) -> None:
-        duration = cyclogram.duration_s
-        self.n_cycles = math.floor(duration * options.rate_hz * (1.0 + 1e-12))
-        if self.n_cycles < 1:
-            raise ValueError(f'the program of {duration} s is shorter than one cycle')
-        self._unit, self._options = unit, options
-        direction = np.asarray(up, dtype=float)
-        length = np.linalg.norm(direction, axis=-1)
-        if direction.shape != (3,) or not length > 0.0:
-            raise ValueError(f'`up` must be a vector other than zero, shape (3,), got {up!r}')
-        self._force: Floats = options.gravity * (direction / length)
-        self.thermal = thermal or ThermalTruth(unit, cyclogram, options)
-        self.bias = self.thermal.bias + _walk(unit, self.thermal.grid, options.seed)
-
-        if options.temperature_rate_hz is not None:
-            unit = unit.with_thermometers(rate_hz=options.temperature_rate_hz)
-        response = self.thermal.response
-        self.board = unit.board.read(response, duration, options.seed, Stream.BOARD_NOISE)
-        self.case = unit.case.read(response, duration, options.seed, Stream.CASE_NOISE)
-
-    def blocks(self, block_size: int) -> Iterator[SimulatedRun]:
-        """Return the run in stretches of so many cycles."""
-        unit, options = self._unit, self._options
-        seed, rate = options.seed, options.rate_hz
+    def blocks() -> Iterator[SimulatedRun]:
         K = np.array(unit.scale_factor)
         to_axes = np.linalg.inv(unit.M)
-        s = sum(self._force[j] * to_axes[:, j] for j in range(3))
+        s = sum(truth.specific_force[j] * to_axes[:, j] for j in range(3))
         # A mean over one cycle of white noise: density times the root of the cycle rate.
-        noise_sd = np.array(unit.noise_density) * MICRO_G * K * math.sqrt(rate)
+        root = math.sqrt(rate_hz)
+        noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
         noise = [generator(seed, Stream.ACCEL_NOISE, i) for i in range(3)]
         rate_noise = [generator(seed, Stream.GYRO_NOISE, i) for i in range(3)]
         remainder = unit.converter.start(seed)
         passed = -1
-        for first in range(0, self.n_cycles, block_size):
-            last = min(first + block_size, self.n_cycles)
+        for first in range(0, n_cycles, block_size):
+            last = min(first + block_size, n_cycles)
             cycle = np.arange(first, last)
-            stamp_ns = np.rint((cycle + 1.0) * (_NS / rate)).astype(np.int64)
-            truth = self._truth((cycle + 0.5).astype(np.float64) / rate)
+            stamp_ns = np.rint((cycle + 1.0) * (_NS / rate_hz)).astype(np.int64)
+            part = replace(truth, cycle_s=(cycle + 0.5).astype(np.float64) / rate_hz)
             # Eq. (2), (8) and (9)
-            charge = truth.bias + K * truth.scale * s
+            charge = part.bias + K * part.scale * s
             for i in range(3):
                 charge[:, i] += noise_sd[i] * noise[i].standard_normal(len(cycle))
             counts, remainder = unit.converter.convert(charge, remainder)
-            until = np.iinfo(np.int64).max if last == self.n_cycles else int(stamp_ns[-1])
-            board_ns, board = _between(self.board, passed, until)
-            case_ns, case = _between(self.case, passed, until)
+            rate, gyro = None, unit.gyro
+            if gyro is not None:
+                rate = part.on_cycles(part.rate_bias) + gyro.constant(seed)
+                rate_sd = np.array(gyro.noise_density) * MILLIDEGREE * root
+                for i in range(3):
+                    rate[:, i] += rate_sd[i] * rate_noise[i].standard_normal(len(cycle))
+            until = sys.maxsize if last == n_cycles else int(stamp_ns[-1])
+            (board_ns, board), (case_ns, case) = (
+                (stamps[rows] + start_ns, values[rows])
+                for stamps, values in readings
+                for rows in [slice(*np.searchsorted(stamps, (passed, until), side='right'))]
+            )
             passed = until
-            start = options.start_ns
             yield SimulatedRun(
-                accel_stamp_ns=stamp_ns + start,
-                counts=counts,
-                board_stamp_ns=board_ns + start,
-                board=board,
-                case_stamp_ns=case_ns + start,
-                case=case,
-                truth=truth,
-                angular_rate=self._angular_rate(truth.cycle_s, rate_noise),
+                stamp_ns + start_ns, counts, board_ns, board, case_ns, case, part, rate
             )
 
-    def _angular_rate(self, cycle_s: Floats, noise: list[np.random.Generator]) -> Floats | None:
-        gyro, bias = self._unit.gyro, self.thermal.rate_bias
-        if gyro is None or bias is None:
-            return None
-        rate = on_cycles(bias, self.thermal.grid, cycle_s) + gyro.constant(self._options.seed)
-        sd = np.array(gyro.noise_density) * MILLIDEGREE * math.sqrt(self._options.rate_hz)
-        for i in range(3):
-            rate[:, i] += sd[i] * noise[i].standard_normal(len(cycle_s))
-        return rate
+    return blocks()
 
-    def _truth(self, cycle_s: Floats) -> Truth:
-        thermal = self.thermal
-        return Truth(
-            unit=self._unit,
-            gravity=self._options.gravity,
-            nodes=self._unit.network.nodes,
-            grid_s=thermal.grid,
-            air=thermal.air,
-            temperatures=thermal.temperatures,
-            bias_grid=self.bias,
-            scale_grid=thermal.scale,
-            cycle_s=cycle_s,
-            specific_force=self._force,
-        )
+
+def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int, warm: bool) -> Truth:
+    """Solve what temperature does over a program, whatever the attitude."""
+    knots, air, power = np.array(cyclogram.time_s), np.array(cyclogram.temperature_c), None
+    if unit.loads:
+        knots, air, power = _switched(unit, knots, air, seed)
+    response = ThermalResponse(unit.network, knots, air, power=power, is_warm=warm)
+    grid = np.arange(math.ceil(cyclogram.duration_s / _GRID_S) + 1, dtype=float) * _GRID_S
+    temperatures = response.temperatures(grid)
+    origin = unit.origin
+    history = PartHistory(unit.network.nodes, temperatures - origin, origin, _GRID_S)
+    bias_ug, scale = drift_of(unit.drift, history)
+    none = np.empty(0)
+    return Truth(
+        unit,
+        response,
+        grid,
+        np.interp(grid, knots, air),
+        temperatures,
+        np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g,
+        1.0 + scale,
+        none if unit.gyro is None else unit.gyro.bias(history),
+        bias_grid=none,
+        specific_force=none,
+        cycle_s=none,
+    )
 
 
 def _switched(
@@ -241,8 +285,3 @@ def _walk(unit: UnitModel, grid: Floats, seed: int) -> Floats:
             steps = generator(seed, Stream.BIAS_WALK, i).standard_normal(len(grid) - 1)
             result[1:, i] += density * math.sqrt(step_h) * np.cumsum(steps)
     return result * unit.counts_per_micro_g
-
-
-def _between(readings: tuple[Ints, Floats], after: int, until: int) -> tuple[Ints, Floats]:
-    first, last = np.searchsorted(readings[0], (after, until), side='right')
-    return readings[0][first:last], readings[1][first:last]

@@ -1,22 +1,146 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulated instrument: its parts, its drift, its converter and its thermometers."""
+"""Owns the simulated instrument: its parts, drift, converter, thermometers and gyroscope."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..typing import Floats
-from ..unit.gravity import MICRO_G
-from .converter import Converter
-from .drift import ZERO, DriftModel, Effect, Triple
-from .gyro import GyroModel
-from .network import ThermalNetwork
+from ..typing import Floats, Ints
+from ..unit.gravity import EARTH_RATE, MICRO_G
+from ..unit.gyroscope import MILLIDEGREE
+from .drift import ZERO, Effect, PartHistory, Triple, drift_of
+from .network import ThermalNetwork, ThermalResponse
 from .streams import Stream, generator
-from .thermometers import ThermometerModel
+
+_NS = 1_000_000_000
+# Most negative and most positive output of 16 bits, counts.
+_LOW, _HIGH = -(1 << 15), (1 << 15) - 1
+_FRACTION_BITS = 40
+_ONE = 1 << _FRACTION_BITS
+_ROWS = 1 << 20  # rows summed at once: 2^20 fractions below 2^40 stay far below 2^63
+
+
+@dataclass(frozen=True)
+class Converter:
+    """
+    Signed 16-bit converter of a current into counts per cycle.
+
+    It balances charge: what is left over when a cycle ends stays on the integrator and counts in
+    the next cycle, so the sum of the counts follows the integral of the input to within one count
+    for ever. The carry is kept in fixed point: a long run loses nothing and blocks of any size
+    give the same counts. Or it rounds every cycle by itself, as a sampling converter does.
+    """
+
+    carries_remainder: bool = True
+
+    def start(self, seed: int) -> Ints:
+        """Return the charge on the integrators at power-on, shape (3,), in 2^-40 count."""
+        return np.array(
+            [generator(seed, Stream.CONVERTER_PHASE, axis).integers(_ONE) for axis in range(3)],
+            dtype=np.int64,
+        )
+
+    def convert(self, charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
+        """
+        Convert consecutive cycles: real-valued counts, shape (n, 3), to whole ones.
+
+        `remainder` is the charge left by the cycle before, as `start` or this method returned it.
+        Charge beyond the output range is lost, as in an integrator at its rail; the fraction of a
+        count is carried on even then.
+        """
+        if not self.carries_remainder:
+            return np.clip(np.rint(charge), _LOW, _HIGH).astype(np.int32), remainder
+        counts = np.empty(charge.shape, dtype=np.int32)
+        for first in range(0, len(charge), _ROWS):
+            rows = charge[first : first + _ROWS]
+            # Eq. (1): whole counts; the fraction is carried on.
+            whole = np.floor(rows)
+            fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
+            total = np.cumsum(fraction, axis=0) + remainder
+            carried = total >> _FRACTION_BITS
+            carry = np.diff(carried, axis=0, prepend=0)
+            counts[first : first + _ROWS] = np.clip(whole + carry, _LOW, _HIGH)
+            remainder = total[-1] - (carried[-1] << _FRACTION_BITS)
+        return counts, remainder
+
+
+@dataclass(frozen=True)
+class ThermometerModel:
+    """
+    One thermometer on one part: ``reading = quantum * round((T + offset + noise) / quantum)``.
+
+    White noise, quantum (0 is continuous) and offset in K; `phase` is the instant of the first
+    reading within its period, 0..1. Raises ValueError if the rate is not positive, or noise,
+    quantum or phase is out of range.
+    """
+
+    node: str
+    rate_hz: float = 1.0
+    noise_sd: float = 0.005
+    quantum: float = 0.0
+    offset: float = 0.0
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.rate_hz > 0.0 and math.isfinite(self.rate_hz)):
+            raise ValueError(f'`rate_hz` must be positive, got {self.rate_hz}')
+        for name in ('noise_sd', 'quantum'):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f'`{name}` must not be negative, got {getattr(self, name)}')
+        if not 0.0 <= self.phase < 1.0:
+            raise ValueError(f'`phase` must lie in [0, 1), got {self.phase}')
+
+    def read(
+        self, response: ThermalResponse, duration: float, seed: int, noise: Stream
+    ) -> tuple[Ints, Floats]:
+        """Take the readings [degC] of a run, with their stamps [ns] from its start."""
+        n = math.floor(duration * self.rate_hz * (1.0 + 1e-12) - self.phase) + 1
+        stamp_ns = np.rint((np.arange(max(n, 0)) + self.phase) * (_NS / self.rate_hz))
+        time = stamp_ns / _NS
+        true = response.temperatures(time)[:, response.network.nodes.index(self.node)]
+        white = generator(seed, noise).standard_normal(len(time))
+        reading = true + self.offset + self.noise_sd * white
+        if self.quantum > 0.0:
+            reading = self.quantum * np.rint(reading / self.quantum)
+        return stamp_ns.astype(np.int64), reading
+
+
+@dataclass(frozen=True)
+class GyroModel:
+    """
+    The gyroscope of a unit at rest: a bias driven by the parts' temperatures, of scale 1.
+
+    drift: as of the accelerometer, but with biases in mdeg/s instead of ug
+    bias_at_reference: in still air at the reference temperature, mdeg/s
+    noise_density: white noise per axis, mdeg/s per sqrt(Hz)
+    turn_on: what the bias differs by from run to run, sd, mdeg/s
+    """
+
+    drift: tuple[Effect, ...]
+    bias_at_reference: Triple
+    noise_density: Triple
+    turn_on: float
+
+    def bias(self, history: PartHistory) -> Floats:
+        """Return the bias on the thermal grid, rad/s, shape (m, 3)."""
+        drift, _ = drift_of(self.drift, history)
+        return np.asarray((drift + np.array(self.bias_at_reference)) * MILLIDEGREE)
+
+    def constant(self, seed: int) -> Floats:
+        """
+        Return what a run reads beside the bias: the Earth's rate, in an attitude of its own, and
+        the turn-on; rad/s, shape (3,).
+        """
+        rng = generator(seed, Stream.GYRO_OFFSET)
+        north = rng.standard_normal(3)
+        turn_on = self.turn_on * MILLIDEGREE * rng.standard_normal(3)
+        return np.asarray(EARTH_RATE * north / np.linalg.norm(north) + turn_on)
 
 
 @dataclass(frozen=True)
@@ -51,7 +175,7 @@ class UnitModel:
     name: str
     serial: str
     network: ThermalNetwork
-    drift: DriftModel
+    drift: tuple[Effect, ...]
     board: ThermometerModel
     case: ThermometerModel
     scale_factor: Triple
@@ -116,21 +240,18 @@ class UnitModel:
             self,
             serial=f'{self.serial}-{seed:02d}',
             network=replace(self.network, capacity=capacity),
-            drift=DriftModel(tuple(changed(effect) for effect in self.drift.effects)),
-            scale_factor=_triple(K),
-            bias_at_reference=_triple(bias),
-            misalignment=(_triple(M[0]), _triple(M[1]), _triple(M[2])),
+            drift=tuple(changed(effect) for effect in self.drift),
+            scale_factor=triple(K),
+            bias_at_reference=triple(bias),
+            misalignment=(triple(M[0]), triple(M[1]), triple(M[2])),
         )
 
     def without_noise(self) -> UnitModel:
         """Return the unit with no white noise on the axes and the thermometers."""
         return replace(self.with_thermometers(noise_sd=0.0), noise_density=ZERO)
 
-    def without_drift(self) -> UnitModel:
-        """Return the unit with bias and scale that do not depend on temperature."""
-        return replace(self, drift=DriftModel())
 
-
-def _triple(values: Floats) -> Triple:
+def triple(values: Floats) -> Triple:
+    """Give the values of three axes as plain numbers."""
     x, y, z = values.tolist()
     return x, y, z
