@@ -122,8 +122,8 @@ def test_old_types_are_the_instances(tmp_path, rng):
     for i, name in enumerate(force):
         read = foreign_log(read_dataflash(path), imu=i, baro=i)
         np.testing.assert_array_equal(read.accel, force[name])
-        np.testing.assert_array_equal(read.board.celsius, [30.0 + i])
-        np.testing.assert_array_equal(read.case.celsius, [21.5 + i])
+        np.testing.assert_array_equal(read.temperatures['board'].celsius, [30.0 + i])
+        np.testing.assert_array_equal(read.temperatures['case'].celsius, [21.5 + i])
 
 
 def test_chip_without_a_thermometer(tmp_path, rng):
@@ -134,7 +134,7 @@ def test_chip_without_a_thermometer(tmp_path, rng):
         log.write('IMU', 1000 + k * STEP_US, 0, 0.0, 0.0, 0.0, *force, 0, 0, 0.0, 1, 1, 1000, 1000)
     path = tmp_path / 'none.BIN'
     path.write_bytes(log.body)
-    assert not len(foreign_log(read_dataflash(path)).board.celsius)
+    assert not foreign_log(read_dataflash(path)).temperatures
 
 
 def test_corrected_log_is_refused(tmp_path, rng):
@@ -159,7 +159,7 @@ def test_simulator_is_refused(tmp_path):
         )  # fmt: skip
     path = tmp_path / 'sitl.BIN'
     path.write_bytes(log.body)
-    assert 'SIM_' in read_dataflash(path).metadata['ardupilot_simulated']
+    assert 'SIM_' in read_dataflash(path).imus[0].metadata['ardupilot_simulated']
     with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
         foreign_log(read_dataflash(path))
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert.table import NO_STAMP, exact_ns, read_parquet, read_text, sniff
+from thermo_comp.convert.log import NO_STAMP
+from thermo_comp.convert.table import exact_ns, read_parquet, read_text, sniff
 from thermo_comp.errors import RecordingError
 
 ROWS = [(1000, 0.5, -1.25), (1001, 0.25, 2e-3), (1003, -7.0, 1.5)]

@@ -135,9 +135,9 @@ def test_old_layout_without_sample_time(tmp_path, rng):
     path.write_bytes(log.body)
     read = foreign_log(read_ulog(path))
     np.testing.assert_array_equal(read.accel, force)
-    assert not len(read.case.celsius)
+    assert 'case' not in read.temperatures
     # A chip that stands still is heard of every 10 s; the log is 6 s long.
-    np.testing.assert_array_equal(read.board.celsius, [31.5])
+    np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
 
 
 def test_thermometer_that_is_not_there(tmp_path, rng):
@@ -150,7 +150,7 @@ def test_thermometer_that_is_not_there(tmp_path, rng):
         )
     path = tmp_path / 'cold.ulg'
     path.write_bytes(log.body)
-    assert not len(foreign_log(read_ulog(path)).board.celsius)
+    assert not foreign_log(read_ulog(path)).temperatures
 
 
 def test_torn_log_is_read_up_to_the_tear(flight):
@@ -214,8 +214,8 @@ def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
     # The barometer's is the only thermometer: it is what a fit and the node must have.
-    np.testing.assert_array_equal(read.board.celsius, 40.0 + np.arange(6))
-    assert not len(read.case.celsius)
+    np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
+    assert 'case' not in read.temperatures
     said = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
     assert 'sensor_accel is missing' in said
     assert 'add 4 to SDLOG_PROFILE' in said

@@ -76,9 +76,9 @@ def test_movement_is_found_in_any_unit(rng: np.random.Generator, scale: float) -
     n = 5000
     stamp_ns = np.arange(1, n + 1) * 10_000_000
     found = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
-    # 50 s in windows of 2 s: the middle fifth is 20..30 s, on windows' edges.
+    # 50 s in cells of half a second: the middle fifth is 20..30 s, on cells' edges.
     assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in found.moving_ns] == [
-        (pytest.approx(20.01), pytest.approx(30.0))
+        (pytest.approx(20.01), pytest.approx(30.01))
     ]
     # The mean of 2 s of noise of 0.1 % scatters by 0.1 % / sqrt(200).
     assert found.magnitude == pytest.approx(scale, rel=3e-4)

@@ -6,9 +6,8 @@ Owns the way from other people's logs to bags: tables with a column map, PX4, Ar
 
 from .autopilot import foreign_log
 from .bag import bag_log
-from .columns import ColumnMap, load_column_map, table_log
+from .columns import ColumnMap, guess_columns, load_column_map, spoken_columns, table_log
 from .dataflash import read_dataflash
-from .guess import guess_columns, spoken_columns
 from .log import ConversionReport, ForeignLog, write_log
 from .ulog import read_ulog
 

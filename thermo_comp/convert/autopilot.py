@@ -12,51 +12,35 @@ so nothing can be weighed by it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
-from ..typing import Bools, Floats, Ints
-from .log import NO_READINGS, ForeignLog, Readings, origin, thin
-from .table import NO_STAMP
+from ..typing import Ints
+from .log import NO_STAMP, ForeignLog, Readings, thin
 from .units import find_stillness
 
 T = TypeVar('T')
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
-
-
-@dataclass(frozen=True)
-class ImuRows:
-    """
-    One IMU's rows in an autopilot's log: stamps since its start, m/s^2, rad/s, degC or NaN.
-
-    `serial` tells this sensor from another where the log does, `n_short` counts rows that the file
-    holds in part only.
-    """
-
-    stamp_ns: Ints
-    accel: Floats
-    gyro: Floats | None
-    celsius: Floats
-    serial: str = ''
-    n_short: int = 0
+#: No noise at all, but for the rounding of sums [parts of g].
+_NO_NOISE = 1e-6
 
 
 @dataclass(frozen=True)
 class AutopilotLog:
-    """What an autopilot's log says of its IMUs and barometers, by instance, and of itself."""
+    """
+    What an autopilot's log says of its IMUs and barometers, by instance.
+
+    `compensated` says why the thermal drift of an IMU is gone from its readings already.
+    """
 
     path: str
-    imus: dict[int, ImuRows]
+    imus: dict[int, ForeignLog]
     baros: dict[int, Readings]
-    metadata: dict[str, str] = field(default_factory=dict)
-    #: How a log would hold more.
-    hint: str = ''
-    #: Why the thermal drift of an IMU is gone from its readings already.
     compensated: dict[int, str] = field(default_factory=dict)
 
 
@@ -76,32 +60,22 @@ def foreign_log(
     if why and not allow_compensated:
         raise RecordingError(why, path=log.path)
     rows = _choose(log.imus, imu, 'IMU', log.path)
-    _refuse_noiseless(log.path, rows)
+    stamped = rows.stamp_ns != NO_STAMP
+    rest = find_stillness(rows.stamp_ns[stamped], rows.accel[stamped])
+    if rest.noise <= _NO_NOISE * rest.magnitude:
+        raise RecordingError(
+            'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
+            'from which no calibration of a real sensor can come',
+            path=log.path,
+        )
     baros = {number: _reported(readings) for number, readings in log.baros.items()}
     if baro is None:
         baros = {number: readings for number, readings in baros.items() if len(readings.celsius)}
-    case = NO_READINGS
+    found = [_reported(one) for one in rows.temperatures.values()]
     if baros or baro is not None:
-        case = _choose(baros, baro, 'barometer', log.path)
-    board = _reported(Readings(rows.stamp_ns, rows.celsius))
-    if not len(board.celsius):
-        board, case = case, NO_READINGS
-    return ForeignLog(
-        path=log.path,
-        input='imu',
-        unit='m/s^2',
-        factor=1.0,
-        stamp_ns=rows.stamp_ns,
-        accel=rows.accel,
-        gyro=rows.gyro,
-        board=thin(board),
-        case=thin(case),
-        line=np.arange(1, len(rows.stamp_ns) + 1),
-        serial=rows.serial,
-        n_short=rows.n_short,
-        hint=log.hint,
-        metadata={**log.metadata, **origin(log.path, rows.serial)},
-    )
+        found.append(_choose(baros, baro, 'barometer', log.path))
+    heard = [thin(one) for one in found if len(one.celsius)]
+    return replace(rows, temperatures=dict(zip(('board', 'case'), heard, strict=False)))
 
 
 def stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
@@ -128,19 +102,6 @@ def _choose(found: Mapping[int, T], wanted: int | None, what: str, path: str) ->
 
 def _reported(readings: Readings) -> Readings:
     """Leave out what no thermometer said: NaN, and the zeros of a sensor that has none."""
-    use: Bools = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
-    if not readings.celsius[use].any():
-        use = np.zeros(len(use), dtype=np.bool_)
-    return Readings(readings.stamp_ns[use], readings.celsius[use])
-
-
-def _refuse_noiseless(path: str, rows: ImuRows) -> None:
-    use = np.asarray(np.all(np.isfinite(rows.accel), axis=1))
-    stamp_ns, accel = rows.stamp_ns[use], rows.accel[use]
-    newer = np.concatenate(([True], np.diff(stamp_ns) > 0)) if len(stamp_ns) else use[:0]
-    if find_stillness(stamp_ns[newer], accel[newer]).noise == 0.0:
-        raise RecordingError(
-            'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
-            'from which no calibration of a real sensor can come',
-            path=path,
-        )
+    use = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
+    use &= bool(readings.celsius[use].any())
+    return readings.take(use)

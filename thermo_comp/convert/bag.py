@@ -18,9 +18,8 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..recording import Topics, inspect_recording, read_recording
-from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
-from .log import ForeignLog, Readings, origin
+from .log import ForeignLog, Readings
 from .units import PER_G
 
 _IMU = 'sensor_msgs/msg/Imu'
@@ -54,25 +53,22 @@ def bag_log(
     )
     recording = read_recording(path, topics, 'imu', require=('accel',))
     columns = recording.columns
-    serial = recording.info.metadata.get('serial')
     return ForeignLog(
-        path=str(path),
-        input='imu',
+        str(path),
+        columns.accel_stamp_ns,
+        columns.accel,
+        None if columns.imu is None else columns.imu.angular_velocity,
+        {
+            name: Readings(*one[:2]).take(np.isfinite(one.celsius))
+            for name, one in columns.temperatures.items()
+            if name in found
+        },
         unit=unit,
         factor=STANDARD_GRAVITY / PER_G[unit],
-        stamp_ns=columns.accel_stamp_ns,
-        accel=columns.accel,
-        gyro=None if columns.imu is None else columns.imu.angular_velocity,
-        board=_readings(*columns.temperatures['board'][:2]),
-        case=_readings(*columns.temperatures['case'][:2]),
-        line=np.arange(1, len(columns.accel_stamp_ns) + 1),
         frame_id=columns.frame_id,
-        serial=serial or '',
+        serial=recording.info.metadata.get('serial', ''),
         missing=recording.info.truncated,
-        metadata={
-            **{f'topic_{role}': name for role, name in found.items() if name},
-            **origin(path, serial),
-        },
+        metadata={f'topic_{role}': name for role, name in found.items() if name},
     )
 
 
@@ -132,8 +128,3 @@ def _most(path: Path, names: list[str], what: str) -> str | None:
             path=path,
         )
     return names[0] if names else None
-
-
-def _readings(stamp_ns: Ints, celsius: Floats) -> Readings:
-    use = np.isfinite(celsius)
-    return Readings(stamp_ns[use], celsius[use])

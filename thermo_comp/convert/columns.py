@@ -3,7 +3,10 @@
 """
 Owns tables with a column map: which column is what, in which unit, and how it becomes a message.
 
-A map is a small YAML file beside the log; config/columns/ has examples.
+A map is a small YAML file beside the log; config/columns/ has examples. A table of numbers alone,
+``[t] ax ay az [wx wy wz]`` as for imu_tk, has its map guessed: times rise; what rests reads
+gravity in its unit; and a gyroscope that counts in degrees is faster than any hand in radians.
+What was taken for what is said, and a column map says it otherwise.
 """
 
 from __future__ import annotations
@@ -18,13 +21,23 @@ from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import load_plain_yaml
 from ..recording.topics import is_thermometer
-from ..typing import Floats, Ints
+from ..typing import Floats
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
-from .log import NO_READINGS, ForeignLog, Readings, origin, thin
-from .table import NO_STAMP, STAMP_EXPONENTS, Column, Table, TimeUnit, read_parquet, read_text
-from .units import PER_G
+from .log import NO_STAMP, ForeignLog, Readings, thin
+from .table import STAMP_EXPONENTS, Column, TimeUnit, read_parquet, read_text
+from .units import PER_G, Unit, believed_unit, find_stillness
 
+Triple = tuple[Column, Column, Column]
+
+_DELIMITERS = {'tab': '\t', 'blank': ' '}
+#: Slope and offset from a table's reading to degC.
+_CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
+#: Between two samples lies more than the first [s], and less than the second: so times are told.
+_STEPS_S = (5e-5, 0.5)
+#: No gyroscope is turned by hand faster than this [rad/s].
+_FASTEST_RAD_S = 20.0
+_GIVE_MAP = 'give a column map: --columns MAP'
 #: A map takes some kB.
 _SIZE_LIMIT = 1 << 20
 
@@ -35,12 +48,6 @@ class Format:
 
     delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
     header: bool | None = None
-
-    @property
-    def character(self) -> str | None:
-        """The delimiter as one character."""
-        names = {'tab': '\t', 'blank': ' '}
-        return None if self.delimiter is None else names.get(self.delimiter, self.delimiter)
 
 
 @dataclass(frozen=True)
@@ -62,11 +69,6 @@ class Stamp:
         if self.column is not None and self.unit is None:
             raise ValueError('`unit` must be s, ms, us or ns where there is a column')
 
-    @property
-    def exponent(self) -> int:
-        """Power of ten from the unit to nanoseconds."""
-        return STAMP_EXPONENTS[self.unit or 'ns']
-
 
 @dataclass(frozen=True)
 class Accel:
@@ -79,8 +81,8 @@ class Accel:
     which is taken away.
     """
 
-    columns: tuple[Column, Column, Column]
-    unit: Literal['counts', 'm/s^2', 'g', 'mg']
+    columns: Triple
+    unit: Unit
     output: Literal['counts', 'imu']
     counts_per_g: Positive | None = None
     clip: tuple[float, float] | None = None
@@ -94,19 +96,12 @@ class Accel:
         if self.clip is not None and not self.clip[0] < self.clip[1]:
             raise ValueError('`clip` must be [lowest, highest]')
 
-    @property
-    def factor(self) -> float:
-        """What a reading is multiplied by to become the message's value."""
-        if self.output == 'counts':
-            return 1.0
-        return STANDARD_GRAVITY / PER_G.get(self.unit, self.counts_per_g or 1.0)
-
 
 @dataclass(frozen=True)
 class Gyro:
     """The gyroscope's three columns; they travel in the Imu message."""
 
-    columns: tuple[Column, Column, Column]
+    columns: Triple
     unit: Literal['rad/s', 'deg/s']
 
 
@@ -125,17 +120,9 @@ class Thermometer:
     degc_at_zero: float | None = None
 
     def __post_init__(self) -> None:
-        if (self.unit == 'raw') != (self.degc_per_count is not None):
-            raise ValueError('unit raw needs `degc_per_count`, the other units forbid it')
-        if (self.unit == 'raw') != (self.degc_at_zero is not None):
-            raise ValueError('unit raw needs `degc_at_zero`, the other units forbid it')
-
-    @property
-    def linear(self) -> tuple[float, float]:
-        """Slope and offset from the table's reading to degC."""
-        if self.unit == 'raw':
-            return self.degc_per_count or 0.0, self.degc_at_zero or 0.0
-        return {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}[self.unit]
+        for name in ('degc_per_count', 'degc_at_zero'):
+            if (self.unit == 'raw') != (getattr(self, name) is not None):
+                raise ValueError(f'unit raw needs `{name}`, the other units forbid it')
 
 
 @dataclass(frozen=True)
@@ -203,67 +190,111 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
     Raises RecordingError if the file cannot be read or lacks a column.
     """
     path = Path(path)
-    wanted, stamp = _wanted(columns), columns.stamp
+    accel, gyro, stamp, style = columns.accel, columns.gyro, columns.stamp, columns.format
+    thermometers = {'board': columns.board, 'case': columns.case}
+    thermometers |= {one.name: one for one in columns.further}
+    said = {name: one for name, one in thermometers.items() if one is not None}
+    wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in said.values())]
+    wanted, exponent = list(dict.fromkeys(wanted)), STAMP_EXPONENTS[stamp.unit or 'ns']
     if path.suffix.lower() in ('.parquet', '.pq'):
-        table = read_parquet(path, wanted, stamp.column, stamp.exponent)
+        table = read_parquet(path, wanted, stamp.column, exponent)
     else:
-        separated = columns.format
-        table = read_text(
-            path, wanted, stamp.column, stamp.exponent, separated.character, separated.header
-        )
-    stamp_ns, clip = _stamps(table, columns), columns.accel.clip
-    gyro = None
-    if columns.gyro is not None:
-        gyro = _stack(table, columns.gyro.columns)
-        if columns.gyro.unit == 'deg/s':
-            gyro = np.radians(gyro)
+        delimiter = _DELIMITERS.get(style.delimiter or '', style.delimiter)
+        table = read_text(path, wanted, stamp.column, exponent, delimiter, style.header)
+    stamp_ns = table.stamp_ns
+    if stamp_ns is None:
+        # Each stamp from its own number, so that no rounding adds up.
+        steps = np.rint(np.arange(len(table.line)) * (1e9 / (stamp.rate_hz or 1.0)))
+        stamp_ns = round(stamp.start_s * 1e9) + steps.astype(np.int64)
+    known = stamp_ns != NO_STAMP
+    temperatures = {}
+    for name, one in said.items():
+        raw = one.degc_per_count or 0.0, one.degc_at_zero or 0.0
+        slope, offset = _CELSIUS.get(one.unit, raw)
+        celsius = table.values[one.column][known] * slope + offset
+        temperatures[name] = thin(Readings(stamp_ns[known], celsius))
+    rate = None
+    if gyro is not None:
+        rate = np.column_stack([table.values[name] for name in gyro.columns])
+        rate = np.radians(rate) if gyro.unit == 'deg/s' else rate
+    factor = 1.0
+    if accel.output == 'imu':
+        factor = STANDARD_GRAVITY / PER_G.get(accel.unit, accel.counts_per_g or 1.0)
     return ForeignLog(
-        path=str(path),
-        input=columns.accel.output,
-        unit=columns.accel.unit,
-        factor=columns.accel.factor,
-        stamp_ns=stamp_ns,
-        accel=_stack(table, columns.accel.columns) - columns.accel.offset,
-        gyro=gyro,
-        board=_readings(table, stamp_ns, columns.board),
-        case=_readings(table, stamp_ns, columns.case),
-        further={one.name: _readings(table, stamp_ns, one) for one in columns.further},
-        line=table.line,
-        counts_per_g=columns.accel.counts_per_g,
-        clip=clip and (clip[0] - columns.accel.offset, clip[1] - columns.accel.offset),
+        str(path),
+        stamp_ns,
+        np.column_stack([table.values[name] for name in accel.columns]) - accel.offset,
+        rate,
+        temperatures,
+        table.line,
+        accel.output,
+        accel.unit,
+        factor,
+        counts_per_g=accel.counts_per_g,
+        clip=accel.clip and (accel.clip[0] - accel.offset, accel.clip[1] - accel.offset),
         frame_id=columns.frame_id,
         serial=columns.serial or '',
         n_short=table.n_short,
-        metadata=origin(path, columns.serial),
     )
 
 
-def _wanted(columns: ColumnMap) -> list[Column]:
-    wanted = list(columns.accel.columns)
+def guess_columns(path: str | Path, rate_hz: float | None = None) -> ColumnMap:
+    """
+    Tell the columns of a table without headings; `rate_hz` is for one without times.
+
+    Raises RecordingError if it has headings or another number of columns, its times are none, it
+    has none and no rate is given, or what rests is no gravity.
+    """
+    path = Path(path)
+    table = read_text(path)
+    width = len(table.values)
+    if table.has_headings or width not in (3, 4, 6, 7):
+        raise RecordingError(
+            f'{width} columns, {"with" if table.has_headings else "without"} headings, do not say '
+            f'what they are: {_GIVE_MAP}',
+            path=path,
+        )
+    first = int(width in (4, 7))
+    stamp = _stamp(path, table.values[0] if first else None, rate_hz)
+    x, y, z = first, first + 1, first + 2
+    accel = np.column_stack([table.values[column] for column in (x, y, z)])
+    # Stillness asks for the order of the samples, and hardly for their times.
+    still = find_stillness(np.arange(len(accel)) * 10**7, accel)
+    believed, reason = believed_unit(still.magnitude)
+    if believed == 'unknown':
+        raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
+    gyro = None
+    if width > 4 and believed != 'counts':
+        rates = np.abs([table.values[column + 3] for column in (x, y, z)])
+        is_fast = np.nanquantile(rates, 0.999) > _FASTEST_RAD_S
+        gyro = Gyro((x + 3, y + 3, z + 3), 'deg/s' if is_fast else 'rad/s')
+    accel_map = Accel((x, y, z), believed, 'counts' if believed == 'counts' else 'imu')
+    return ColumnMap(stamp, accel_map, gyro=gyro, format=Format(header=False))
+
+
+def spoken_columns(columns: ColumnMap) -> str:
+    """Say what the columns of a table were taken for."""
+    stamp = columns.stamp
+    said = [f'{stamp.rate_hz:g} Hz' if stamp.column is None else f'time [{stamp.unit}]']
+    said.append(f'x y z [{columns.accel.unit}]')
     if columns.gyro is not None:
-        wanted += columns.gyro.columns
-    wanted += [t.column for t in (columns.board, columns.case, *columns.further) if t]
-    return list(dict.fromkeys(wanted))
+        said.append(f'angular rate x y z [{columns.gyro.unit}]')
+    return ', '.join(said)
 
 
-def _stack(table: Table, names: tuple[Column, Column, Column]) -> Floats:
-    return np.column_stack([table.values[name] for name in names])
-
-
-def _stamps(table: Table, columns: ColumnMap) -> Ints:
-    if table.stamp_ns is not None:
-        return table.stamp_ns
-    rate = columns.stamp.rate_hz or 1.0
-    start_ns = round(columns.stamp.start_s * 1e9)
-    # Each stamp from its own number, so that no rounding adds up.
-    steps = np.rint(np.arange(len(table.line)) * (1e9 / rate))
-    return np.asarray(start_ns + steps.astype(np.int64))
-
-
-def _readings(table: Table, stamp_ns: Ints, thermometer: Thermometer | None) -> Readings:
-    if thermometer is None:
-        return NO_READINGS
-    slope, offset = thermometer.linear
-    known = stamp_ns != NO_STAMP
-    celsius = table.values[thermometer.column][known] * slope + offset
-    return thin(Readings(stamp_ns[known], celsius))
+def _stamp(path: Path, times: Floats | None, rate_hz: float | None) -> Stamp:
+    """Tell the unit of times by how often samples come."""
+    if times is None:
+        if rate_hz is None:
+            raise RecordingError('it has no times: give --rate-hz', path=path)
+        return Stamp(rate_hz=rate_hz)
+    if rate_hz is not None:
+        raise RecordingError('--rate-hz: its first column has the times', path=path)
+    steps = np.diff(times[np.isfinite(times)])
+    step = float(np.median(steps)) if len(steps) else 0.0
+    is_time = len(steps) > 0 and (steps > 0.0).mean() > 0.9
+    # From the largest unit on: a step of 5 is no time in seconds, but one in ms.
+    for unit, exponent in STAMP_EXPONENTS.items():
+        if is_time and _STEPS_S[0] < step * 10.0 ** (exponent - 9) < _STEPS_S[1]:
+            return Stamp(0, unit)
+    raise RecordingError(f'its first column is no time that rises: {_GIVE_MAP}', path=path)

@@ -17,7 +17,9 @@ References
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -27,9 +29,9 @@ import numpy.typing as npt
 
 from ..errors import RecordingError
 from ..files import open_regular
-from ..typing import Bools, Floats, Ints
-from .autopilot import AutopilotLog, ImuRows, stamps_ns
-from .log import Readings
+from ..typing import Bools, Ints
+from .autopilot import AutopilotLog, stamps_ns
+from .log import ForeignLog, Readings
 
 _HEADER_BYTES = 3
 # What struct calls a field -> what numpy calls it; strings and arrays are kept as bytes.
@@ -37,7 +39,9 @@ _TYPES = {
     'b': 'i1', 'B': 'u1', 'h': '<i2', 'H': '<u2', 'i': '<i4', 'I': '<u4', 'q': '<i8', 'Q': '<u8',
     'e': '<f2', 'f': '<f4', 'd': '<f8',
 }  # fmt: skip
-_TEMPERATURES = ('T', 'Temp')
+_VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
+
+_Columns = dict[str, npt.NDArray[Any]]
 
 
 def read_dataflash(path: str | Path) -> AutopilotLog:
@@ -63,14 +67,26 @@ def read_dataflash(path: str | Path) -> AutopilotLog:
             reader = DFReader_binary(str(path))
         except Exception as failure:
             raise RecordingError(f'not a DataFlash log ({failure})', path=path) from failure
+    imus: dict[int, ForeignLog] = {}
+    baros: dict[int, Readings] = {}
     try:
-        imus: dict[int, ImuRows] = {}
-        baros: dict[int, Readings] = {}
         for name in sorted(reader.name_to_id):
-            if re.fullmatch(r'IMU\d?', name):
-                imus.update(_imus(name, *_messages(reader, name, path)))
-            elif re.fullmatch(r'BARO|BAR\d', name):
-                baros.update(_baros(name, _messages(reader, name, path)[0]))
+            if not re.fullmatch(r'IMU\d?|BARO|BAR\d', name):
+                continue
+            columns, n_short = _messages(reader, name, path)
+            is_imu = name.startswith('IMU')
+            for number, stamp_ns, rows in _instances(name, columns):
+                celsius = columns.get('T', columns.get('Temp', np.full(len(rows), np.nan)))
+                readings = Readings(stamp_ns[rows], celsius[rows].astype(np.float64))
+                if not is_imu:
+                    baros[number] = readings
+                elif all(title in columns for title in _VECTORS):
+                    both = np.column_stack([columns[title][rows] for title in _VECTORS])
+                    accel, gyro = both.astype(np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
+                    heat = {'imu': readings}
+                    imus[number] = ForeignLog(
+                        str(path), stamp_ns[rows], accel, gyro, heat, n_short=n_short
+                    )
         parameters = {
             str(key): float(value)
             for key, value in reader.params.items()
@@ -78,19 +94,19 @@ def read_dataflash(path: str | Path) -> AutopilotLog:
         }
     finally:
         reader.close()
-    metadata = {}
     if any(key.startswith('SIM_') for key in parameters):
-        metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
+        said = {'ardupilot_simulated': 'it has SIM_ parameters: a simulator wrote this log'}
+        imus = {number: replace(one, metadata=said) for number, one in imus.items()}
     compensated = {
         number: f'{name} was 1: ArduPilot has already taken the thermal drift out of these '
         'readings; set it to 0 and record again'
         for number in imus
         if parameters.get(name := f'INS_TCAL{number + 1}_ENABLE') == 1.0
     }
-    return AutopilotLog(str(path), imus, baros, metadata, compensated=compensated)
+    return AutopilotLog(str(path), imus, baros, compensated)
 
 
-def _messages(reader: Any, name: str, path: Path) -> tuple[dict[str, npt.NDArray[Any]], int]:
+def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     """
     Gather one message type: its columns, and how many of its messages the file ends inside of.
     """
@@ -98,14 +114,12 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[dict[str, npt.NDArray
     layout = reader.formats[number]
     offsets = np.asarray(reader.offsets[number], dtype=np.int64)
     whole = offsets[offsets + layout.len <= reader.data_len]
-    n_short = len(offsets) - len(whole)
-    columns = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)
     fields = [
         (title, _TYPES.get(code, f'S{size or 1}'))
-        for title, (size, code) in zip(layout.columns, columns, strict=False)
+        for title, (size, code) in zip(layout.columns, codes, strict=False)
     ]
-    titles = [title for title, _ in fields]
-    if len(set(titles)) < len(titles):
+    if len(dict(fields)) < len(fields):
         raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)
     kind = np.dtype(fields)
     if _HEADER_BYTES + kind.itemsize > layout.len:
@@ -113,56 +127,25 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[dict[str, npt.NDArray
     raw = np.memmap(path, dtype=np.uint8, mode='r')
     span = np.arange(_HEADER_BYTES, _HEADER_BYTES + kind.itemsize)
     rows = np.ascontiguousarray(raw[whole[:, None] + span]).view(kind).ravel()
-    scaled: dict[str, npt.NDArray[Any]] = {}
-    for title, factor in zip(layout.columns, layout.msg_mults, strict=False):
-        scaled[title] = rows[title] if factor is None else rows[title] * factor
-    return scaled, n_short
+    columns = {
+        title: rows[title] if factor is None else rows[title] * factor
+        for title, factor in zip(layout.columns, layout.msg_mults, strict=False)
+    }
+    return columns, len(offsets) - len(whole)
 
 
-def _stamps(columns: dict[str, npt.NDArray[Any]]) -> Ints | None:
+def _instances(name: str, columns: _Columns) -> Iterator[tuple[int, Ints, Bools]]:
+    """Give number, stamps and rows of each sensor; of messages without a time, of none."""
     if 'TimeUS' in columns:
-        return stamps_ns(columns['TimeUS'])
-    if 'TimeMS' in columns:
-        return stamps_ns(columns['TimeMS'].astype(np.uint64) * np.uint64(1000))
-    return None
-
-
-def _instances(name: str, columns: dict[str, npt.NDArray[Any]], n: int) -> list[tuple[int, Bools]]:
+        stamp_ns = stamps_ns(columns['TimeUS'])
+    elif 'TimeMS' in columns:
+        stamp_ns = stamps_ns(columns['TimeMS'].astype(np.uint64) * np.uint64(1000))
+    else:
+        return
     if 'I' in columns:
-        return [(int(number), columns['I'] == number) for number in np.unique(columns['I'])]
-    digit = name[-1]
-    # The second IMU's old type is IMU2: counted from 1, the first without its number.
-    return [(int(digit) - 1 if digit.isdigit() else 0, np.ones(n, dtype=np.bool_))]
-
-
-def _temperature(columns: dict[str, npt.NDArray[Any]], n: int) -> Floats:
-    for title in _TEMPERATURES:
-        if title in columns:
-            return columns[title].astype(np.float64)
-    return np.full(n, np.nan)
-
-
-def _imus(name: str, columns: dict[str, npt.NDArray[Any]], n_short: int) -> dict[int, ImuRows]:
-    stamp_ns = _stamps(columns)
-    needed = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
-    if stamp_ns is None or not len(stamp_ns) or not all(title in columns for title in needed):
-        return {}
-    vectors = np.column_stack([columns[title].astype(np.float64) for title in needed])
-    celsius = _temperature(columns, len(stamp_ns))
-    return {
-        number: ImuRows(
-            stamp_ns[rows], vectors[rows, :3], vectors[rows, 3:], celsius[rows], n_short=n_short
-        )
-        for number, rows in _instances(name, columns, len(stamp_ns))
-    }
-
-
-def _baros(name: str, columns: dict[str, npt.NDArray[Any]]) -> dict[int, Readings]:
-    stamp_ns = _stamps(columns)
-    if stamp_ns is None or not len(stamp_ns):
-        return {}
-    celsius = _temperature(columns, len(stamp_ns))
-    return {
-        number: Readings(stamp_ns[rows], celsius[rows])
-        for number, rows in _instances(name, columns, len(stamp_ns))
-    }
+        for number in np.unique(columns['I']):
+            yield int(number), stamp_ns, columns['I'] == number
+    elif len(stamp_ns):
+        # The second IMU's old type is IMU2: counted from 1, the first without its number.
+        number = int(name[-1]) - 1 if name[-1].isdigit() else 0
+        yield number, stamp_ns, np.ones(len(stamp_ns), dtype=np.bool_)

@@ -24,6 +24,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Floats, Ints
+from .log import NO_STAMP
 
 Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns']
@@ -38,6 +39,9 @@ _MOST_ROWS_PER_BYTE = 4
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
+#: Line number and cells of each row.
+_Rows = Iterator[tuple[int, list[str]]]
+
 
 @dataclass(frozen=True)
 class Table:
@@ -48,18 +52,14 @@ class Table:
     values: the columns asked for; NaN where a cell is no number, shape (n,)
     stamp_ns: the stamp column; `NO_STAMP` where a cell is no number, shape (n,)
     n_short: rows with too few cells (the last line of a log that was cut off), left out
-    headings: of all columns, where there are some
+    has_headings: whether its columns have names
     """
 
-    path: str
     line: Ints
     values: dict[Column, Floats]
     stamp_ns: Ints | None
-    n_short: int
-    headings: tuple[str, ...] = ()
-
-
-NO_STAMP = np.iinfo(np.int64).min
+    n_short: int = 0
+    has_headings: bool = True
 
 
 def read_text(
@@ -76,9 +76,7 @@ def read_text(
 
     `stamp_exponent` is the power of ten from the stamp's unit to nanoseconds. The delimiter, a
     blank for any run of white space, and whether there are headings are found out where they are
-    not said.
-
-    Raises RecordingError if the file cannot be read, is empty, or lacks a column.
+    not said. Raises RecordingError if the file cannot be read, is empty, or lacks a column.
     """
     try:
         with TextIOWrapper(
@@ -91,11 +89,11 @@ def read_text(
                 raise RecordingError('not a table of text: it holds zero bytes', path=path)
             file.seek(0)
             delimiter = delimiter or sniff(head)
-            heading, rows = _begin(_rows(file, delimiter), _width(head, delimiter), has_header)
-            return _collect(path, heading, rows, columns, stamp, stamp_exponent)
-    except UnicodeError as failure:
-        raise RecordingError(f'not a table of text ({failure})', path=path) from failure
-    except csv.Error as failure:
+            widths = [_n_cells(row) for _, row in _rows(_sample(head), delimiter)]
+            width = max(set(widths), key=widths.count, default=0)
+            headings, rows = _begin(_rows(file, delimiter), width, has_header)
+            return _collect(path, headings, rows, columns, stamp, stamp_exponent)
+    except (UnicodeError, csv.Error) as failure:
         raise RecordingError(f'not a table of text ({failure})', path=path) from failure
     except OSError as failure:
         raise RecordingError(failure.strerror or str(failure), path=path) from failure
@@ -129,47 +127,11 @@ def _is_comment(cell: str) -> bool:
     return cell.lstrip().startswith(('#', '%', '//'))
 
 
-def _width(head: str, delimiter: str) -> int:
-    """Count the cells of most lines."""
-    widths = [_n_cells(row) for _, row in _rows(_sample(head), delimiter)]
-    return max(set(widths), key=widths.count, default=0)
-
-
 def _n_cells(row: Sequence[str]) -> int:
     return len(row) - (not row[-1].strip())
 
 
-def _begin(
-    rows: Iterator[tuple[int, list[str]]], width: int, has_header: bool | None
-) -> tuple[list[str] | None, Iterator[tuple[int, list[str]]]]:
-    """
-    Skip what stands before a table; return its headings, if it has any, and its rows.
-
-    Its rows are as wide as most, but for a blank last cell. The first of numbers, or a run of such
-    rows right before it, begins the table: then the first of these has the headings.
-    """
-    first = list(islice(rows, _PREAMBLE_ROWS))
-    is_row = [_n_cells(row) == width for _, row in first]
-    begin = next(
-        (
-            k
-            for k, (_, row) in enumerate(first)
-            if is_row[k] and 2 * sum(map(is_number, row)) > width
-        ),
-        None,
-    )
-    if begin is None:
-        begin = is_row.index(True) if any(is_row) else 0
-        has_header = has_header is not False
-    while begin and is_row[begin - 1]:
-        begin -= 1
-    if has_header is None:
-        has_header = not any(map(is_number, first[begin][1]))
-    heading = first[begin][1] if has_header and first else None
-    return heading, chain(first[begin + (heading is not None) :], rows)
-
-
-def _rows(file: Iterable[str], delimiter: str) -> Iterator[tuple[int, list[str]]]:
+def _rows(file: Iterable[str], delimiter: str) -> _Rows:
     """
     Yield (line number, cells) of every line that holds something but a comment.
     """
@@ -182,7 +144,33 @@ def _rows(file: Iterable[str], delimiter: str) -> Iterator[tuple[int, list[str]]
             yield number, row
 
 
-def is_number(cell: str) -> bool:
+def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str], _Rows]:
+    """
+    Skip what stands before a table; return its headings, if it has any, and its rows.
+
+    Its rows are as wide as most, but for a blank last cell. The first of numbers, or a run of such
+    rows right before it, begins the table: then the first of these has the headings.
+    """
+    first = list(islice(rows, _PREAMBLE_ROWS))
+    is_row = [_n_cells(row) == width for _, row in first]
+    of_numbers = (
+        k
+        for k, (_, row) in enumerate(first)
+        if is_row[k] and 2 * sum(map(_is_number, row)) > width
+    )
+    begin = next(of_numbers, None)
+    if begin is None:
+        begin = is_row.index(True) if any(is_row) else 0
+        has_header = has_header is not False
+    while begin and is_row[begin - 1]:
+        begin -= 1
+    if has_header is None:
+        has_header = not any(map(_is_number, first[begin][1]))
+    headings = first[begin][1] if has_header and first else []
+    return [cell.strip() for cell in headings], chain(first[begin + bool(headings) :], rows)
+
+
+def _is_number(cell: str) -> bool:
     """Return whether a cell reads as a number (NaN and infinity count as such)."""
     try:
         float(cell)
@@ -193,81 +181,66 @@ def is_number(cell: str) -> bool:
 
 def _collect(
     path: Path,
-    heading: list[str] | None,
-    rows: Iterator[tuple[int, list[str]]],
+    headings: list[str],
+    rows: _Rows,
     columns: Sequence[Column] | None,
     stamp: Column | None,
     stamp_exponent: int,
 ) -> Table:
-    headings = [cell.strip() for cell in heading or ()]
     first = next(rows, None)
-    if first is None and not headings:
-        raise RecordingError('the table is empty', path=path)
-    rows = rows if first is None else chain([first], rows)
-    width = len(headings) if first is None else len(first[1])
+    if first is None:
+        what = 'has headings but no rows' if headings else 'is empty'
+        raise RecordingError(f'the table {what}', path=path)
+    width = len(first[1])
     wanted = range(width) if columns is None else columns
-    places = {name: place(path, name, headings, width) for name in wanted}
-    stamp_place = None if stamp is None else place(path, stamp, headings, width)
-    needed = 1 + max([*places.values(), -1 if stamp_place is None else stamp_place])
+    places = {name: _place(path, name, headings, width) for name in wanted}
+    at = None if stamp is None else _place(path, stamp, headings, width)
+    needed = 1 + max([*places.values(), -1 if at is None else at])
 
     lines: list[Ints] = []
     blocks: list[Floats] = []
     stamps: list[Ints] = []
     n_short = 0
+    rows = chain([first], rows)
     while chunk := list(islice(rows, _CHUNK_ROWS)):
         whole = [(number, row) for number, row in chunk if len(row) >= needed]
         n_short += len(chunk) - len(whole)
         lines.append(np.array([number for number, _ in whole], dtype=np.int64))
-        blocks.append(
-            np.stack([_floats([row[i] for _, row in whole]) for i in places.values()])
-            if places
-            else np.empty((0, len(whole)))
-        )
-        if stamp_place is not None:
-            stamps.append(exact_ns([row[stamp_place] for _, row in whole], stamp_exponent))
-    if not lines:
-        raise RecordingError('the table has headings but no rows', path=path)
-    values = np.concatenate(blocks, axis=1)
+        block = [_floats([row[i] for _, row in whole]) for i in places.values()]
+        blocks.append(np.reshape(block, (len(places), len(whole))))
+        if at is not None:
+            stamps.append(exact_ns([row[at] for _, row in whole], stamp_exponent))
     return Table(
-        path=str(path),
         line=np.concatenate(lines),
-        values=dict(zip(places, values, strict=True)),
+        values=dict(zip(places, np.concatenate(blocks, axis=1), strict=True)),
         stamp_ns=np.concatenate(stamps) if stamps else None,
         n_short=n_short,
-        headings=tuple(headings),
+        has_headings=bool(headings),
     )
 
 
-def place(path: Path, name: Column, headings: Sequence[str], width: int) -> int:
-    """
-    Return the number of a column, counted from 0.
-
-    Raises RecordingError if there is no such column, or more than one.
-    """
+def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int:
+    """Return the number of a column, counted from 0; RecordingError if it is not there once."""
     if isinstance(name, int):
-        if not 0 <= name < width:
-            raise RecordingError(
-                f'no column {name}: the table has {width}, 0 to {width - 1}', path=path
-            )
-        return name
-    if not headings:
-        raise RecordingError(
-            f'no column {name!r}: the table has no headings, give numbers from 0', path=path
-        )
-    if headings.count(name) > 1:
-        raise RecordingError(f'{headings.count(name)} columns are called {name!r}', path=path)
-    if name not in headings:
-        raise RecordingError(
-            f'no column {name!r}; there are: {", ".join(map(repr, headings))}', path=path
-        )
-    return headings.index(name)
+        if 0 <= name < width:
+            return name
+        why = f'no column {name}: the table has {width}, 0 to {width - 1}'
+    elif not headings:
+        why = f'no column {name!r}: the table has no headings, give numbers from 0'
+    elif headings.count(name) > 1:
+        why = f'{headings.count(name)} columns are called {name!r}'
+    elif name not in headings:
+        why = f'no column {name!r}; there are: {", ".join(map(repr, headings))}'
+    else:
+        return headings.index(name)
+    raise RecordingError(why, path=path)
 
 
 def _floats(cells: Sequence[str]) -> Floats:
     try:
         return np.array(cells, dtype=np.float64)
     except ValueError:
-        return np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
+        return np.array([float(cell) if _is_number(cell) else np.nan for cell in cells])
 
 
 def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
@@ -296,12 +269,11 @@ def read_parquet(
     """
     Read some columns of a Parquet file, as `read_text` does of text.
 
-    A stamp column of Parquet's own timestamp type states its unit itself.
-
-    Raises RecordingError if pyarrow is not installed, the file is no Parquet file, is empty, or
-    lacks a column.
+    A stamp column of Parquet's own timestamp type states its unit itself. Raises RecordingError if
+    pyarrow is not installed, the file is no Parquet file, is empty, or lacks a column.
     """
     try:
+        import pyarrow as pa
         from pyarrow import parquet as pq
     except ImportError as failure:
         raise RecordingError(
@@ -314,7 +286,7 @@ def read_parquet(
                 raise RecordingError(f'it claims {found.metadata.num_rows} rows', path=path)
             headings = list(found.schema_arrow.names)
             names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
-            places = {name: place(path, name, headings, len(headings)) for name in names}
+            places = {name: _place(path, name, headings, len(headings)) for name in names}
             table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
     except RecordingError:
         raise
@@ -323,44 +295,29 @@ def read_parquet(
         raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
     if not table.num_rows:
         raise RecordingError('the table is empty', path=path)
-    column = {name: table.column(headings[i]) for name, i in places.items()}
-    return Table(
-        path=str(path),
-        line=np.arange(1, table.num_rows + 1, dtype=np.int64),
-        values={name: _parquet_floats(path, name, column[name]) for name in columns},
-        stamp_ns=None
-        if stamp is None
-        else _parquet_stamps(path, stamp, column[stamp], stamp_exponent),
-        n_short=0,
-    )
 
+    def floats(name: Column) -> Floats:
+        column = table.column(headings[places[name]])
+        try:
+            values = column.cast(pa.float64(), safe=False).to_numpy()
+        except (pa.ArrowException, ValueError) as failure:
+            raise RecordingError(f'column {name!r} holds {column.type}', path=path) from failure
+        return np.asarray(values, dtype=np.float64)
 
-def _parquet_floats(path: Path, name: Column, column: Any) -> Floats:
-    import pyarrow as pa
-
-    try:
-        values = column.cast(pa.float64(), safe=False).to_numpy()
-    except (pa.ArrowException, ValueError) as failure:
-        raise RecordingError(f'column {name!r} holds {column.type}', path=path) from failure
-    return np.asarray(values, dtype=np.float64)
-
-
-def _parquet_stamps(path: Path, name: Column, column: Any, exponent: int) -> Ints:
-    import pyarrow as pa
-
-    known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)
-    if pa.types.is_timestamp(column.type):
-        exponent = STAMP_EXPONENTS[column.type.unit]
-        column = column.cast(pa.int64())
-    if pa.types.is_integer(column.type):
-        values = column.fill_null(0).to_numpy()
-        limit = (2**63 - 1) // 10**exponent
-        known &= (values <= limit) & (values >= -limit if values.dtype.kind == 'i' else True)
-        factor = 10**exponent
-    else:
-        factor = 1
-        values = np.rint(_parquet_floats(path, name, column) * 10.0**exponent)
-        known &= np.abs(values) < 2.0**63
-    stamps = np.full(len(values), NO_STAMP, dtype=np.int64)
-    stamps[known] = values[known].astype(np.int64) * factor
-    return stamps
+    stamp_ns = None
+    if stamp is not None:
+        column: Any = table.column(headings[places[stamp]])
+        if pa.types.is_timestamp(column.type):
+            stamp_exponent = STAMP_EXPONENTS[column.type.unit]
+            column = column.cast(pa.int64())
+        factor = 10**stamp_exponent
+        if pa.types.is_integer(column.type):
+            steps = column.fill_null(0).to_numpy()
+        else:
+            steps, factor = np.rint(floats(stamp) * factor), 1
+        known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)
+        known &= np.abs(steps.astype(np.float64)) * factor < 2.0**63
+        stamp_ns = np.full(len(steps), NO_STAMP)
+        stamp_ns[known] = steps[known].astype(np.int64) * factor
+    line = np.arange(1, table.num_rows + 1, dtype=np.int64)
+    return Table(line, {name: floats(name) for name in columns}, stamp_ns)

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from ..recording.stillness import CellAccumulator
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 
@@ -27,14 +28,12 @@ _TOLERANCE = 0.2
 # The usual sensitivities, from +-16 g to +-2 g of a 16-bit sensor.
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
-# Windows for the noise: long enough for a standard deviation, short beside a movement.
-_WINDOW_S = 2.0
-_WINDOW_SAMPLES = 12
+_CELL_S, _MIN_SAMPLES = 0.5, 12
 # Noise this many times the quiet level is handling, not noise: the sd of 12 samples stays within
 # a factor of 2 of its mean.
 _MOVING_RATIO = 4.0
 # Two movements with less rest between them than this are one.
-_MERGE_S = 10.0
+_MERGE_NS = 10 * 10**9
 
 
 @dataclass(frozen=True)
@@ -42,9 +41,8 @@ class Stillness:
     """
     Where a recording rests, and what it reads there.
 
-    Median |a| over the quiet windows, NaN where there are none, and their median sd per axis, in
-    the input's unit; how long it rests in all; first and last stamp of each part in which it is
-    moved.
+    Median |a| over the quiet cells, NaN where there are none, and their median sd per axis, in
+    the input's unit; how long it rests in all; begin and end of each part in which it is moved.
     """
 
     magnitude: float
@@ -55,57 +53,47 @@ class Stillness:
 
 def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     """
-    Find where a recording rests, from its noise alone, whatever its unit.
+    Find where a recording rests, from its noise alone, whatever its unit; readings (n, 3).
 
-    Stamps rise, shape (n,); readings are finite, shape (n, 3).
+    Unlike a fit, it takes no threshold in parts of g, and a part counts however short it is.
     """
-    step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
-    length = max(_WINDOW_SAMPLES, round(_WINDOW_S * 1e9 / step)) if step > 0 else _WINDOW_SAMPLES
-    n = len(stamp_ns) // length
-    if n == 0:
+    reduced = CellAccumulator(_CELL_S, None)
+    reduced.add(stamp_ns, accel)
+    cells = reduced.finish()
+    full = cells.count >= _MIN_SAMPLES
+    if full.any():
+        full &= cells.count >= 0.5 * np.median(cells.count)
+    if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
-    windows = accel[: n * length].reshape(n, length, 3)
-    sd = np.sqrt(windows.var(axis=1, ddof=1).mean(axis=1))
-    magnitude = np.linalg.norm(windows.mean(axis=1), axis=1)
-    start = stamp_ns[: n * length : length]
-    end = stamp_ns[length - 1 : n * length : length]
+    sd = np.sqrt(cells.variance[full].mean(axis=1))
     # The quiet level is the lower quartile: a log may be handled for most of its time. A sensor
     # whose noise is below its own step shows none: then a step is the level.
-    steps = np.abs(np.diff(accel, axis=0))
-    quantum = float(np.min(steps[steps > 0.0], initial=np.inf))
-    level = max(float(np.quantile(sd, 0.25)), quantum if np.isfinite(quantum) else 0.0)
-    is_quiet = sd <= _MOVING_RATIO * level
+    is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
+    cell_ns = round(cells.cell_s * 1e9)
+    moving: list[tuple[int, int]] = []
+    for begin in (cells.start_ns + cells.index[full][~is_quiet] * cell_ns).tolist():
+        is_next = moving and begin - moving[-1][1] <= _MERGE_NS
+        moving.append((moving.pop()[0] if is_next else begin, begin + cell_ns))
     return Stillness(
-        magnitude=float(np.median(magnitude[is_quiet])),
+        magnitude=float(np.median(np.linalg.norm(cells.mean[full][is_quiet], axis=1))),
         noise=float(np.median(sd[is_quiet])),
-        still_s=float((end - start)[is_quiet].sum() * 1e-9),
-        moving_ns=_merge(start[~is_quiet], end[~is_quiet]),
+        still_s=float(is_quiet.sum() * cells.cell_s),
+        moving_ns=tuple(moving),
     )
-
-
-def _merge(start: Ints, end: Ints) -> tuple[tuple[int, int], ...]:
-    parts: list[tuple[int, int]] = []
-    for first, last in zip(start.tolist(), end.tolist(), strict=True):
-        if parts and first - parts[-1][1] <= _MERGE_S * 1e9:
-            parts[-1] = (parts[-1][0], last)
-        else:
-            parts.append((first, last))
-    return tuple(parts)
 
 
 def believed_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
     """Say which unit a still |a| speaks for (``counts`` and ``unknown`` among them), and why."""
+    said = f'|a| at rest is {magnitude:.4g}'
     for unit, gravity in PER_G.items():
         if abs(magnitude / gravity - 1.0) <= _TOLERANCE:
-            return unit, f'|a| at rest is {magnitude:.4g}, gravity is {gravity:.4g} {unit}'
+            return unit, f'{said}, gravity is {gravity:.4g} {unit}'
     for sensitivity in _SENSITIVITIES:
         if abs(magnitude / sensitivity - 1.0) <= _TOLERANCE:
-            return 'counts', (
-                f'|a| at rest is {magnitude:.4g}, as of a sensor with {sensitivity} counts per g'
-            )
+            return 'counts', f'{said}, as of a sensor with {sensitivity} counts per g'
     if magnitude > 50.0:
-        return 'counts', f'|a| at rest is {magnitude:.4g}, which is no gravity in g or m/s^2'
-    return 'unknown', f'|a| at rest is {magnitude:.4g}, which is gravity in no unit known here'
+        return 'counts', f'{said}, which is no gravity in g or m/s^2'
+    return 'unknown', f'{said}, which is gravity in no unit known here'
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
@@ -118,6 +106,4 @@ def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> 
     if counts_per_g is not None and abs(magnitude / counts_per_g - 1.0) > _TOLERANCE:
         text = f'|a| at rest is {magnitude:.4g} counts, {counts_per_g:g} per g are stated'
         return f'{text}: is there an `offset`?' if magnitude > 2.0 * counts_per_g else text
-    if magnitude < 50.0:
-        return f'{reason}: that looks like {believed}'
-    return None
+    return f'{reason}: that looks like {believed}' if magnitude < 50.0 else None
