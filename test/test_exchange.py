@@ -16,7 +16,8 @@ import yaml
 from builders import term
 
 from thermo_comp.cli.convert import Tool
-from thermo_comp.convert.exchange import TOOLS, export_calibration, import_calibration
+from thermo_comp.convert.exchange import export_calibration, import_calibration
+from thermo_comp.convert.tools import TOOLS
 from thermo_comp.errors import CalibrationError
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.functions import CubicSpline, Polynomial

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns exchange with other tools: whose files there are, and what lies between one and a calibration.
+Owns exchange with other tools: what lies between one's file and a calibration.
 
 All say ``a = A (N - b)`` of a reading N. Autopilots let b depend on temperature and keep A at 1,
 the tools for tumbles keep both constant. What a calibration holds beyond that is named in the
@@ -10,7 +10,6 @@ notes of an export, with the error that its loss leaves.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,43 +32,13 @@ from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
 from ..unit.gyroscope import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from ..unit.prediction import bias_and_scale, ramp_states
 from ..unit.rate_triad import rate_triad
-from . import parameters, triads
-from .content import Content
+from .tools import TOOLS, Content, Tool, ql, turned
 
 _GRID = 257
 #: White noise of an imported gyroscope, of which nothing is said [rad/s/sqrt(Hz)].
 _RATE_NOISE = 1e-4
 #: Readings in m/s^2 have scale factors near 1; beyond this factor they are something else.
 _NEAR_ONE = 2.0
-
-
-@dataclass(frozen=True)
-class _Tool:
-    """
-    One tool's file: how it is written, and read; None of a text that is no such file.
-
-    `is_thermal`: whether it keeps a bias over temperature, about `reference_c` where that is
-    fixed; the others keep scale and misalignment.
-    """
-
-    write: Callable[[Content, int | None, int], str]
-    read: Callable[[str, int | None], Content | None]
-    is_thermal: bool = False
-    reference_c: float | None = None
-
-
-TOOLS = {
-    'px4': _Tool(parameters.write_px4, parameters.read_px4, True),
-    'ardupilot': _Tool(
-        parameters.write_ardupilot,
-        parameters.read_ardupilot,
-        True,
-        parameters.ARDUPILOT_REFERENCE_C,
-    ),
-    'imu_tk': _Tool(triads.write_imu_tk, triads.read_imu_tk),
-    'imu_calib': _Tool(triads.write_imu_calib, triads.read_imu_calib),
-    'kalibr': _Tool(triads.write_kalibr, triads.read_kalibr),
-}
 
 
 @dataclass(frozen=True)
@@ -106,7 +75,7 @@ def export_calibration(
 
 
 def _content(
-    calibration: Calibration, tool: _Tool, up: tuple[float, float, float] | None
+    calibration: Calibration, tool: Tool, up: tuple[float, float, float] | None
 ) -> Content:
     """Take from a calibration what a tool's file can hold, and note the rest."""
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
@@ -115,16 +84,16 @@ def _content(
     level = np.array([axis.bias + one.delta for axis, one in zip(axes, sets, strict=True)])
     range_c = calibration.static.temperature_range_c
     temperature = np.linspace(*range_c, _GRID)
-    t = temperature - calibration.reference_temperature_c
+    own_reference_c = calibration.reference_temperature_c
+    t = temperature - own_reference_c
     bias = np.array([one.bias_function.value(t) for one in sets]) / K[:, None]
     scale = np.array([one.scale_function.value(t) for one in sets]) - 1.0
-    notes: list[str] = []
-    cubics = np.zeros((3, 4))
-    reference_c = calibration.reference_temperature_c
     scale_drift = float(np.max(np.abs(scale)))
-    matrix = np.array(calibration.misalignment)
+    reference_c = own_reference_c if tool.reference_c is None else tool.reference_c
+    matrix, cubics = np.array(calibration.misalignment), np.zeros((3, 4))
+    notes: list[str] = []
+    rate_notes, rate_bias = [], None
     if tool.is_thermal:
-        reference_c = reference_c if tool.reference_c is None else tool.reference_c
         d = temperature - reference_c
         loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
         offset = (level / K)[:, None] + bias + loads[:, None] * scale
@@ -138,6 +107,14 @@ def _content(
         if worst:
             notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
         matrix = np.eye(3)
+        if calibration.gyroscope is not None:
+            triad = rate_triad(calibration)
+            rate, _ = bias_and_scale(triad, ramp_states(triad, temperature, 0.0, 0.0))
+            rate_bias, misfit = _cubics(d, rate.T)
+            if misfit > 1e-3 * MILLIDEGREE:
+                off = f'{misfit / MILLIDEGREE:.2g} mdeg/s'
+                rate_notes.append(f'replaced by cubics, off by {off}')
+            rate_notes += _losses(triad)
     else:
         matrix /= K
         cubics[:, 0] = level
@@ -148,14 +125,9 @@ def _content(
         if not calibration.needs_temperature:
             drift = 'what temperature does is not known'
         notes.append(f'it holds at {reference_c:g} degC: {drift}')
+        rate_notes = ['is lost'] * (calibration.gyroscope is not None)
     notes += _losses(calibration)
-    rate_bias = None
-    if calibration.gyroscope is not None:
-        if tool.is_thermal:
-            rate_bias, said = _rate_cubics(calibration, temperature, reference_c)
-        else:
-            said = ['is lost']
-        notes += [f'angular rate: {one}' for one in said]
+    notes += [f'angular rate: {one}' for one in rate_notes]
     if calibration.unit.input == 'counts':
         notes.append(
             'offsets are counts divided by K: the driver must scale by these K'
@@ -177,19 +149,6 @@ def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
         fitted = np.polynomial.Polynomial.fit(d, values, 3).convert().coef
         cubics[axis, : len(fitted)] = fitted
     return cubics, float(np.max(np.abs(np.polynomial.polynomial.polyval(d, cubics.T) - offset)))
-
-
-def _rate_cubics(
-    calibration: Calibration, temperature: Floats, reference_c: float
-) -> tuple[Floats, list[str]]:
-    """Give the bias of the angular rate as cubics, and what that loses."""
-    triad = rate_triad(calibration)
-    bias, _ = bias_and_scale(triad, ramp_states(triad, temperature, 0.0, 0.0))
-    cubics, misfit = _cubics(temperature - reference_c, bias.T)
-    notes = []
-    if misfit > 1e-3 * MILLIDEGREE:
-        notes.append(f'replaced by cubics, off by {misfit / MILLIDEGREE:.2g} mdeg/s')
-    return cubics, notes + _losses(triad)
 
 
 def _losses(calibration: Calibration) -> list[str]:
@@ -236,7 +195,7 @@ def import_calibration(
     lower, upper = content.range_c
     if not lower < upper:
         raise CalibrationError(f'temperature range {lower:g}..{upper:g} degC is empty')
-    rotation, matrix = triads.ql(content.matrix)
+    rotation, matrix = ql(content.matrix)
     K = 1.0 / np.diag(matrix)
     is_si = bool((K < _NEAR_ONE).all() and (K > 1.0 / _NEAR_ONE).all())
     if not is_si and float(K.min()) < 10.0 / STANDARD_GRAVITY:
@@ -248,28 +207,30 @@ def import_calibration(
     if not is_si:
         # Of words with an offset, such as 32768, on either side of it.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
-    notes = (*content.notes, *triads.turned(rotation))
     one = Polynomial((1.0,))
-    axes = [AxisSet(Polynomial((0.0, *row[1:])), one) for row in content.bias.tolist()]
-    regime = RegimeSet(content.range_c, (-60.0, 60.0), axes[0], axes[1], axes[2])
+    sets = [AxisSet(curve, one) for curve in _curves(content.bias)]
+    regime = RegimeSet(content.range_c, (-60.0, 60.0), *sets)
+    gyroscope = None
+    if content.rate_bias is not None:
+        rates = RateSet(*map(RateCurve, _curves(content.rate_bias)))
+        x, y, z = content.rate_bias[:, 0].tolist()
+        gyroscope = Gyroscope((x, y, z), rates, rates, (_RATE_NOISE,) * 3)
+    levels = zip(K.tolist(), content.bias[:, 0].tolist(), strict=True)
     return Calibration(
         format_version=FORMAT_VERSION,
         unit=Unit(serial, 'm/s^2' if is_si else 'counts', full_scale, cycle_time_s),
         reference_temperature_c=content.reference_c,
         gravity_m_s2=gravity,
-        axes=Axes(
-            *(AxisReference(float(K[axis]), float(content.bias[axis, 0])) for axis in range(3))
-        ),
+        axes=Axes(*(AxisReference(scale, bias) for scale, bias in levels)),
         static=regime,
         dynamic=regime,
         noise_density_m_s2_sqrt_hz=(noise_density,) * 3,
         misalignment=((1.0, 0.0, 0.0), (yx, 1.0, 0.0), (zx, zy, 1.0)),
-        provenance=Provenance(model=content.source, notes=notes),
-        gyroscope=None if content.rate_bias is None else _gyroscope(content.rate_bias),
+        provenance=Provenance(model=content.source, notes=(*content.notes, *turned(rotation))),
+        gyroscope=gyroscope,
     )
 
 
-def _gyroscope(rate_bias: Floats) -> Gyroscope:
-    x, y, z = rate_bias.tolist()
-    curves = RateSet(*(RateCurve(Polynomial((0.0, *row[1:]))) for row in (x, y, z)))
-    return Gyroscope((x[0], y[0], z[0]), curves, curves, (_RATE_NOISE,) * 3)
+def _curves(bias: Floats) -> list[Polynomial]:
+    """Give each axis' cubic without its level."""
+    return [Polynomial((0.0, *row[1:])) for row in bias.tolist()]

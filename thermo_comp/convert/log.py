@@ -42,7 +42,7 @@ class Readings(NamedTuple):
     stamp_ns: Ints
     celsius: Floats
 
-    def take(self, rows: Bools | list[int]) -> Readings:
+    def take(self, rows: Bools | Ints) -> Readings:
         """Choose some of them."""
         return Readings(self.stamp_ns[rows], self.celsius[rows])
 

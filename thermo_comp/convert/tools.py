@@ -1,0 +1,375 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the files of other tools, `TOOLS`: how each is written and read.
+
+Autopilots correct each axis' bias by a cubic of the sensor's own temperature, held at the edges of
+a range, in m/s^2 or, of a gyroscope, in rad/s, and nothing else; ``raw`` is already in m/s^2
+there, scaled by the driver::
+
+    PX4        a = raw - (X0 + X1 d + X2 d^2 + X3 d^3),        d = T - TREF
+    ArduPilot  a = raw - 1e-6 (p(T) - p(CALTEMP)),  p(T) = ACC1 d + ACC2 d^2 + ACC3 d^3, d = T - 35
+
+A gyroscope's are ``TC_Gn`` in the place of ``TC_An``, and ``GYR`` in that of ``ACC``. Other tools
+calibrate a triad at one temperature; with the reading N and the specific force a::
+
+    imu_tk      a = T K (N - B)      T upper triangular, unit diagonal; K diagonal    (.calib)
+    imu_calib   a = SM N - bias      SM any matrix                                    (YAML)
+    Kalibr      N = M a + b          M lower triangular                               (YAML)
+    here        a = M K^-1 (N - b)   M lower triangular, unit diagonal; K diagonal
+
+A triangle of the other kind, or a full matrix, belongs to a frame that is turned against ours.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import CalibrationError
+from ..plain_yaml import load_plain_yaml
+from ..typing import Floats
+
+_ARDUPILOT_REFERENCE_C = 35.0
+_ARDUPILOT_SCALE = 1e6
+# ArduPilot's value for a temperature of calibration that was never recorded.
+_NO_TEMPERATURE = -273.0
+_AXES = ('X', 'Y', 'Z')
+_THERMAL_NOTE = (
+    'imported: bias over the temperature of the board thermometer only; no scale, misalignment, '
+    'ramp terms or uncertainty'
+)
+_NAME = re.compile(r'\b(TC_[AG]\d_\w+|TC_[AG]_ENABLE|INS_TCAL\d_\w+|INS_(?:ACC|GYR)\d_CALTEMP)\b')
+_NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
+#: What the tools for triads do not say: where their constants were found.
+_REFERENCE_C, _RANGE_C = 20.0, (-60.0, 120.0)
+_TRIAD_NOTE = 'imported: constants of one temperature, taken for all; no uncertainty'
+_HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
+
+
+@dataclass(frozen=True)
+class Content:
+    """
+    What a file says: ``a = matrix (N - bias)``, the bias a cubic of temperature.
+
+    matrix: shape (3, 3); of an autopilot's file the identity
+    bias: coefficients of each axis, in units of N, shape (3, 4)
+    reference_c, range_c: the temperature that the cubics count from, and where they hold
+    notes: what is lost, or lacks
+    source: the tool and the set that was read
+    noise: white [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second, on the way out
+    rate_bias: as `bias`, of the angular rate [rad/s], where it is known and can be said
+    """
+
+    matrix: Floats
+    bias: Floats
+    reference_c: float
+    range_c: tuple[float, float]
+    notes: list[str]
+    source: str = ''
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rate_bias: Floats | None = None
+
+
+def _write_px4(content: Content, number: int | None, device_id: int) -> str:
+    """Write PX4 parameters, in QGroundControl's format; ``TC_An`` has n from 0."""
+    instance = _within(number, 0)
+    values: list[tuple[str, float | int]] = []
+    for letter, bias, known_id in (('A', content.bias, device_id), ('G', content.rate_bias, 0)):
+        if bias is None:
+            continue
+        prefix = f'TC_{letter}{instance}_'
+        values += [(f'TC_{letter}_ENABLE', 1), (f'{prefix}ID', known_id)]
+        for axis, cubic in enumerate(bias):
+            values += [(f'{prefix}X{power}_{axis}', value) for power, value in enumerate(cubic)]
+        edges = zip(('TREF', 'TMIN', 'TMAX'), (content.reference_c, *content.range_c), strict=True)
+        values += [(f'{prefix}{name}', value) for name, value in edges]
+        if not known_id:
+            content.notes.append(
+                f'{prefix}ID is 0: set it to the device id of the sensor, PX4 matches by it'
+            )
+    kinds = [(f'{one}', 6) if isinstance(one, int) else (f'{one:.9g}', 9) for _, one in values]
+    lines = ['# Vehicle-Id Component-Id Name Value Type']
+    for (name, _), (value, kind) in zip(values, kinds, strict=True):
+        lines.append(f'1\t1\t{name}\t{value}\t{kind}')
+    return '\n'.join(lines) + '\n'
+
+
+def _write_ardupilot(content: Content, number: int | None, _device_id: int) -> str:
+    """Write ArduPilot parameters; ``INS_TCALn`` has n from 1."""
+    imu = _within(number, 1)
+    lower, upper = content.range_c
+    content.notes.append(
+        'the offset itself is not written: calibrate the accelerometer as usual afterwards '
+        f'(ArduPilot keeps its temperature in INS_ACC{imu}_CALTEMP)'
+    )
+    values = {'ENABLE': 1.0, 'TMIN': lower, 'TMAX': upper}
+    for sensor, bias in (('ACC', content.bias), ('GYR', content.rate_bias)):
+        if bias is None:
+            continue
+        for power in (1, 2, 3):
+            cubics = zip(_AXES, bias[:, power] * _ARDUPILOT_SCALE, strict=True)
+            values |= {f'{sensor}{power}_{axis}': value for axis, value in cubics}
+    return ''.join(f'INS_TCAL{imu}_{name},{value:.9g}\n' for name, value in values.items())
+
+
+def _within(number: int | None, lowest: int) -> int:
+    if number is not None and not lowest <= number <= 3:
+        raise ValueError(f'`number` must be {lowest}..3, got {number}')
+    return lowest if number is None else number
+
+
+def _read_px4(text: str, number: int | None) -> Content | None:
+    """Read PX4 parameters as QGroundControl saves them, or as ``NAME=VALUE``; None if not one."""
+    values = _Parameters(text)
+    found = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
+    if not found:
+        return None
+    number = _choose(
+        found,
+        number,
+        lambda n: any(values.get(f'TC_A{n}_X{p}_{a}') for p in range(4) for a in range(3)),
+    )
+    if values.get('TC_A_ENABLE', 1.0) != 1.0:
+        raise CalibrationError('is 0: the set is not in use', key='TC_A_ENABLE')
+
+    def cubics(prefix: str) -> tuple[Floats, float, float, float]:
+        bias = [[values[f'{prefix}X{p}_{axis}'] for p in range(4)] for axis in range(3)]
+        edges = values[f'{prefix}TMIN'], values[f'{prefix}TMAX']
+        return np.array(bias), values[f'{prefix}TREF'], *edges
+
+    bias, reference, lower, upper = cubics(f'TC_A{number}_')
+    rate_bias = None
+    if values.get('TC_G_ENABLE', 1.0) == 1.0 and f'TC_G{number}_X1_0' in values:
+        rate_bias, its_own, *edges = cubics(f'TC_G{number}_')
+        # One reference for both, and the range where both hold.
+        moved = np.polynomial.Polynomial((reference - its_own, 1.0))
+        for row in rate_bias:
+            coefficients = np.polynomial.Polynomial(row)(moved).coef
+            row[:] = np.pad(coefficients, (0, 4 - len(coefficients)))
+        lower, upper = max(lower, edges[0]), min(upper, edges[1])
+    source, notes = f'PX4 TC_A{number}_*', [_THERMAL_NOTE]
+    return Content(np.eye(3), bias, reference, (lower, upper), notes, source, rate_bias=rate_bias)
+
+
+def _read_ardupilot(text: str, number: int | None) -> Content | None:
+    """Read ArduPilot parameters as Mission Planner or MAVProxy save them; None if not one."""
+    values = _Parameters(text)
+    found = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
+    if not found:
+        return None
+    number = _choose(found, number, lambda n: values.get(f'INS_TCAL{n}_ENABLE') == 1.0)
+    prefix = f'INS_TCAL{number}_'
+    if values[f'{prefix}ENABLE'] != 1.0:
+        raise CalibrationError('is not 1: the set is not in use', key=f'{prefix}ENABLE')
+
+    def cubics(sensor: str) -> Floats:
+        bias = np.zeros((3, 4))
+        for axis, name in enumerate(_AXES):
+            for power in (1, 2, 3):
+                bias[axis, power] = values[f'{prefix}{sensor}{power}_{name}'] / _ARDUPILOT_SCALE
+        # The correction is relative to the temperature of the offset calibration: no offset there.
+        calibrated = values.get(f'INS_{sensor}{number}_CALTEMP', _NO_TEMPERATURE)
+        held = min(max(calibrated, values[f'{prefix}TMIN']), values[f'{prefix}TMAX'])
+        d = held - _ARDUPILOT_REFERENCE_C
+        bias[:, 0] = -(bias[:, 1] * d + bias[:, 2] * d**2 + bias[:, 3] * d**3)
+        return bias
+
+    # An autopilot that has learnt nothing of its gyroscope lists zeros.
+    has_rate = any(v for name, v in values.items() if name.startswith(f'{prefix}GYR'))
+    return Content(
+        np.eye(3),
+        cubics('ACC'),
+        _ARDUPILOT_REFERENCE_C,
+        (values[f'{prefix}TMIN'], values[f'{prefix}TMAX']),
+        [_THERMAL_NOTE],
+        f'ArduPilot {prefix}*',
+        rate_bias=cubics('GYR') if has_rate else None,
+    )
+
+
+class _Parameters(dict[str, float]):
+    """What a text says of thermal parameters, by name; one that is missing is a mistake."""
+
+    def __init__(self, text: str) -> None:
+        for line in text.splitlines():
+            name = None if line.lstrip().startswith('#') else _NAME.search(line)
+            if name is None:
+                continue
+            value = _NUMBER.search(line, name.end())
+            if value is None:
+                raise CalibrationError(f'{name[0]} has no value', key=name[0])
+            self[name[0]] = float(value[0])
+
+    def __missing__(self, name: str) -> float:
+        raise CalibrationError('is missing', key=name)
+
+
+def _choose(found: set[int], number: int | None, is_in_use: Callable[[int], bool]) -> int:
+    """Choose a set: the one asked for, or the only one in use."""
+    if number is None:
+        live = [n for n in sorted(found) if is_in_use(n)] or sorted(found)
+        if len(live) > 1:
+            raise CalibrationError(f'several sets of parameters {live}: choose one')
+        return live[0]
+    if number not in found:
+        raise CalibrationError(f'no set of parameters {number}, there is {sorted(found)}')
+    return number
+
+
+def ql(matrix: Floats) -> tuple[Floats, Floats]:
+    """Take a matrix apart into a rotation and a lower triangle with a positive diagonal."""
+    flip = np.eye(3)[::-1]
+    rotation, upper = _qr(flip @ matrix @ flip)
+    return flip @ rotation @ flip, flip @ upper @ flip
+
+
+def _qr(matrix: Floats) -> tuple[Floats, Floats]:
+    """Take a matrix apart into a rotation and an upper triangle with a positive diagonal."""
+    rotation, upper = np.linalg.qr(matrix)
+    signs = np.diag(np.sign(np.diag(upper)))
+    return rotation @ signs, signs @ upper
+
+
+def turned(rotation: Floats) -> list[str]:
+    """Say by what our frame is turned in theirs, as tf takes it; nothing where it is not."""
+    if np.abs(rotation - np.eye(3)).max() < 1e-9:
+        return []
+    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+    pitch = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    angles = f'{roll:.6g} {pitch:.6g} {yaw:.6g}'
+    return [f'the frames differ: tf from theirs to ours has roll, pitch, yaw {angles} rad']
+
+
+def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str:
+    """Write the three blocks of imu_tk's ``.calib``; its reader knows no comments."""
+    rotation, upper = _qr(content.matrix)
+    scale = np.diag(upper)
+    content.notes.extend(turned(rotation.T))
+    return ''.join(
+        ''.join(' '.join(map(repr, row)) + '\n' for row in block.tolist()) + '\n'
+        for block in (upper / scale, np.diag(scale), content.bias[:, :1])
+    )
+
+
+def _write_imu_calib(content: Content, _number: int | None, _device_id: int) -> str:
+    """Write imu_calib's YAML: the matrix row by row, the bias behind it."""
+    bias = content.matrix @ content.bias[:, 0]
+    return f'SM: {content.matrix.ravel().tolist()}\nbias: {bias.tolist()}\n'
+
+
+def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
+    """Write the accelerometer's part of an IMU in Kalibr's YAML."""
+    white, walk, rate = content.noise
+    rows = ''.join(f'    - {row}\n' for row in np.linalg.inv(content.matrix).tolist())
+    content.notes.append('Kalibr finds the bias anew each time and overlooks the key `bias`')
+    content.notes.append('topic and gyroscope are yours to add')
+    return (
+        f'imu{number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
+        f'  accelerometer_noise_density: {white!r}\n'
+        f'  accelerometer_random_walk: {walk / 60.0!r}\n'
+        f'  accelerometers:\n    M:\n{rows}    bias: {content.bias[:, 0].tolist()}\n'
+    )
+
+
+def _read_imu_tk(text: str, _number: int | None) -> Content | None:
+    """Read imu_tk's ``.calib``: 21 numbers, perhaps with its headings; None if not one."""
+    lines = (line for line in text.splitlines() if not _HEADING.match(line))
+    try:
+        numbers = np.array([float(cell) for line in lines for cell in line.split()])
+    except ValueError:
+        return None
+    if len(numbers) != 21:
+        return None
+    T, K = numbers[:18].reshape(2, 3, 3)
+    return _triad('imu_tk', _regular(T @ K), numbers[18:])
+
+
+def _read_imu_calib(text: str, _number: int | None) -> Content | None:
+    """Read imu_calib's YAML; None if not one."""
+    data = _mapping(text)
+    if not {'SM', 'bias'} <= data.keys():
+        return None
+    matrix = _regular(_array(data['SM'], 'SM', 9).reshape(3, 3))
+    bias = np.linalg.solve(matrix, _array(data['bias'], 'bias', 3))
+    return _triad('imu_calib', matrix, np.asarray(bias, np.float64))
+
+
+def _read_kalibr(text: str, number: int | None) -> Content | None:
+    """Read one IMU of Kalibr's YAML, by its number; None if there is none with a matrix."""
+    imus = {
+        str(name): _dictionary(_dictionary(part).get('accelerometers'))
+        for name, part in _mapping(text).items()
+    }
+    imus = {name: part for name, part in imus.items() if 'M' in part}
+    if not imus:
+        return None
+    name = next(iter(imus)) if number is None else f'imu{number}'
+    if name not in imus or (number is None and len(imus) > 1):
+        raise CalibrationError(f'choose one of the IMUs: there are {", ".join(imus)}')
+    part = imus[name]
+    matrix = _regular(_array(part['M'], f'{name}.accelerometers.M', 9).reshape(3, 3))
+    bias = _array(part.get('bias', [0, 0, 0]), f'{name}.accelerometers.bias', 3)
+    lacks = '' if 'bias' in part else '; Kalibr keeps no bias: it is 0 here'
+    return _triad(f'Kalibr {name}', np.asarray(np.linalg.inv(matrix), np.float64), bias, lacks)
+
+
+def _regular(matrix: Floats) -> Floats:
+    if not 0.0 < np.linalg.det(matrix) < np.inf:
+        raise CalibrationError('its matrix mirrors or flattens: it is no correction of a triad')
+    return matrix
+
+
+def _triad(source: str, matrix: Floats, bias: Floats, lacks: str = '') -> Content:
+    cubic = np.pad(bias[:, None], ((0, 0), (0, 3)))
+    return Content(matrix, cubic, _REFERENCE_C, _RANGE_C, [_TRIAD_NOTE + lacks], source)
+
+
+def _mapping(text: str) -> dict[str, Any]:
+    try:
+        return _dictionary(load_plain_yaml(text))
+    except ValueError:
+        return {}
+
+
+def _dictionary(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _array(value: object, key: str, size: int) -> Floats:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.size != size or not np.isfinite(array).all():
+        raise CalibrationError(f'must be {size} finite numbers', key=key)
+    return array.ravel()
+
+
+@dataclass(frozen=True)
+class Tool:
+    """
+    One tool's file: how it is written, and read; None of a text that is no such file.
+
+    `is_thermal`: whether it keeps a bias over temperature, about `reference_c` where that is
+    fixed; the others keep scale and misalignment.
+    """
+
+    write: Callable[[Content, int | None, int], str]
+    read: Callable[[str, int | None], Content | None]
+    is_thermal: bool = False
+    reference_c: float | None = None
+
+
+TOOLS = {
+    'px4': Tool(_write_px4, _read_px4, is_thermal=True),
+    'ardupilot': Tool(_write_ardupilot, _read_ardupilot, True, _ARDUPILOT_REFERENCE_C),
+    'imu_tk': Tool(_write_imu_tk, _read_imu_tk),
+    'imu_calib': Tool(_write_imu_calib, _read_imu_calib),
+    'kalibr': Tool(_write_kalibr, _read_kalibr),
+}
