@@ -114,14 +114,14 @@ def test_any_chunked_file_gives_its_messages_in_order_of_log_time(
 
 @settings(max_examples=25, deadline=None)
 @given(messages=bags(), index_types=st.sampled_from([IndexType.ALL, IndexType(0)]))
-def test_a_file_without_chunks_is_read_as_it_stands(
+def test_a_file_without_chunks_is_read_in_order_of_log_time_too(
     messages: list[Message], index_types: IndexType
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         write_mcap(path, messages, use_chunking=False, index_types=index_types)
         recording = read(path)
-        assert_columns(recording.columns, messages)
+        assert_columns(recording.columns, in_reading_order(messages))
         assert recording.info.n_messages == len(messages)
 
 
@@ -237,7 +237,7 @@ def test_overlapping_chunks_of_single_topics_are_merged(tmp_path: Path) -> None:
 def test_too_many_overlapping_chunks_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr('thermo_comp.recording.mcap_source._MAX_HELD_BYTES', 4000)
+    monkeypatch.setattr('thermo_comp.recording.mcap_file._MAX_HELD_BYTES', 4000)
     messages = regular_messages(200)
     # Each chunk holds every 40th message, so all of them span the whole time.
     combed = [message for begin in range(40) for message in messages[begin::40]]

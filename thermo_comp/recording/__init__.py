@@ -9,13 +9,7 @@ The only package that knows `rosbags` and `mcap`.
 from __future__ import annotations
 
 from .columns import ROLES, Block, ImuColumns, Input, RawMessages, Recording, RecordingInfo, Role
-from .reader import (
-    RecordingReader,
-    in_split_order,
-    inspect_recording,
-    open_recording,
-    read_recording,
-)
+from .reader import RecordingReader, inspect_recording, open_recording, read_recording
 from .topics import Part, Topics
 from .writer import STAMP_END_NS, BagWriter
 
@@ -33,7 +27,6 @@ __all__ = [
     'RecordingReader',
     'Role',
     'Topics',
-    'in_split_order',
     'inspect_recording',
     'open_recording',
     'read_recording',

@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..typing import Bytes, Floats, Ints
+from .messages import Topic
 
 Input = Literal['auto', 'counts', 'imu']
 #: ``accel``, or the name of a thermometer.
@@ -56,10 +57,10 @@ class RecordingInfo:
         return sum(count for _, count in self.topics.values())
 
 
-def count_topics(channels: Iterable[tuple[str, str, int]]) -> dict[str, tuple[str, int]]:
-    """Make `RecordingInfo.topics` of topic, type and number of messages of each channel."""
+def count_topics(channels: Iterable[Topic]) -> dict[str, tuple[str, int]]:
+    """Make `RecordingInfo.topics` of what each channel carries."""
     found: dict[str, tuple[str, int]] = {}
-    for topic, kind, count in channels:
+    for topic, kind, _, count in channels:
         known, n_before = found.get(topic, (kind, 0))
         if kind not in known.split(' | '):
             known = f'{known} | {kind}'

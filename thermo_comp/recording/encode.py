@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..typing import Bytes, Floats, Ints
-from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX, Messages
-from .wire import gather, scatter
+from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
+from .messages import Messages, gather, scatter
 
 _NS = 1_000_000_000
 

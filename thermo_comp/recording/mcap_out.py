@@ -38,9 +38,10 @@ from mcap.records import (
 
 from .. import __version__
 from ..typing import Bytes
-from .chunks import MESSAGE_HEAD_BYTES, Messages, join_messages
+from .chunks import MESSAGE_HEAD_BYTES
 from .encode import Merged
 from .mcap_file import MAGIC, METADATA_NAME
+from .messages import Messages, join_messages
 from .rosbag2_metadata import Definition, FileSummary, dump_yaml, information, offered_qos
 
 #: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.

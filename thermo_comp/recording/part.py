@@ -13,8 +13,8 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..typing import Bools, Ints
-from .chunks import pack
 from .columns import Block, RawMessages, Role
+from .messages import pack
 from .topics import Part
 
 

@@ -10,11 +10,9 @@ Reading order
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from ..errors import RecordingError
 from .clock import without_jumps
@@ -30,33 +28,9 @@ from .columns import (
     gathered,
     joined,
 )
-from .expanded import ExpandedSource
-from .foreign import ForeignSource
-from .mcap_source import McapSource
 from .part import Cut
-from .rosbag2_metadata import Description, read_metadata
-from .topics import Topics, select_topics, shown
-
-
-class Source(Protocol):
-    """One opened storage; which topics of `info` are read is chosen above it."""
-
-    info: RecordingInfo
-    definitions: Mapping[str, tuple[str, str]]
-
-    def blocks(
-        self, selection: Mapping[Role, str], names: Collection[str], *, raw: bool
-    ) -> Iterator[Block]:
-        """Decode the topic of each role, in reading order, with these thermometers in all."""
-        ...
-
-    def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
-        """Give the messages of topics as they are."""
-        ...
-
-    def close(self) -> None:
-        """Close the files."""
-        ...
+from .storage import Bag, loss, open_bag
+from .topics import Topics, select_topics
 
 
 class RecordingReader:
@@ -71,19 +45,19 @@ class RecordingReader:
     def __init__(
         self,
         path: Path,
-        source: Source,
+        bag: Bag,
         topics: Topics,
         input: Input,  # noqa: A002 - the parameter's public name
         require: Collection[Role],
     ) -> None:
-        selection = select_topics(path, source.info.topics, topics, input, require)
-        self._source = source
+        selection = select_topics(path, bag.info.topics, topics, input, require)
+        self._bag = bag
         self._names = selection.thermometers
         self.topics: Mapping[Role, str] = dict(selection.topics)
-        self.definitions = source.definitions
+        self.definitions = bag.definitions
         self._cut = Cut(path, topics.part, self.topics)
         self._part = topics.part
-        self.info = replace(source.info, path=path, input=selection.input, chosen=selection.chosen)
+        self.info = replace(bag.info, input=selection.input, chosen=selection.chosen)
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         """
@@ -97,16 +71,16 @@ class RecordingReader:
 
     def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         n_read = dict.fromkeys(self.topics, 0)
-        source = self._source.blocks(self.topics, self._names, raw=raw)
+        source = self._bag.blocks(self.topics, self._names, raw=raw)
         for block in gathered(source, n_messages):
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
             if block.n_messages:
                 yield block
         for role, topic in self.topics.items():
-            loss = _loss(topic, n_read[role], self.info.topics[topic][1])
-            if loss and loss not in (self.info.truncated or ''):
-                told = '; '.join(filter(None, (self.info.truncated, loss)))
+            missing = loss(topic, n_read[role], self.info.topics[topic][1])
+            if missing and missing not in (self.info.truncated or ''):
+                told = '; '.join(filter(None, (self.info.truncated, missing)))
                 self.info = replace(self.info, truncated=told)
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
@@ -136,11 +110,11 @@ class RecordingReader:
 
         Raises RecordingError for damaged data, or messages that are no CDR.
         """
-        yield from self._source.raw(topics)
+        yield from self._bag.raw(topics)
 
     def close(self) -> None:
         """Close the files."""
-        self._source.close()
+        self._bag.close()
 
     def __enter__(self) -> RecordingReader:
         """Give the open reader."""
@@ -167,13 +141,13 @@ def open_recording(
     """
     path = Path(path)
     try:
-        source = _open_source(path)
+        bag = open_bag(path)
     except OSError as error:
         raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
     try:
-        return RecordingReader(path, source, topics or Topics(), input, require)
+        return RecordingReader(path, bag, topics or Topics(), input, require)
     except BaseException:
-        source.close()
+        bag.close()
         raise
 
 
@@ -194,66 +168,3 @@ def inspect_recording(path: str | Path, topics: Topics | None = None) -> Recordi
     """Say what a bag holds without reading its messages; raises as `open_recording` does."""
     with open_recording(path, topics, require=()) as reader:
         return reader.info
-
-
-def _open_source(path: Path) -> Source:
-    if not path.exists():
-        raise RecordingError('no such file or directory', path)
-    if path.is_dir():
-        return _open_directory(path)
-    if not path.is_file():
-        raise RecordingError('not a bag: neither a file nor a directory', path)
-    if path.suffix == '.mcap':
-        return McapSource([path])
-    if path.suffix in {'.db3', '.bag'}:
-        return ForeignSource([path])
-    raise RecordingError('not a bag: expected a directory, .mcap, .db3 or .bag', path)
-
-
-def _open_directory(path: Path) -> Source:
-    description = read_metadata(path)
-    if description is not None:
-        if description.compression == 'file':
-            return ExpandedSource(description.files, partial(_open_files, description))
-        return _open_files(description, description.files, None)
-    for suffix in ('.mcap', '.db3'):
-        files = in_split_order(
-            file for file in path.iterdir() if file.suffix == suffix and file.is_file()
-        )
-        if files:
-            note = 'metadata.yaml is missing, the recording was not finished'
-            return (McapSource if suffix == '.mcap' else ForeignSource)(files, note=note)
-    raise RecordingError('not a bag: the directory has no metadata.yaml', path)
-
-
-def _open_files(description: Description, files: Sequence[Path], note: str | None) -> Source:
-    """Open the files that a metadata.yaml lists, and hold them against what it promises."""
-    is_packed = description.compression == 'message'
-    source: Source
-    if description.storage == 'mcap' and not is_packed:
-        source = McapSource(files, description.custom, note)
-    else:
-        source = ForeignSource(files, description.custom, note, is_packed=is_packed)
-    losses = (
-        _loss(topic, source.info.topics.get(topic, ('', 0))[1], n_promised)
-        for topic, n_promised in description.counts.items()
-    )
-    told = '; '.join(filter(None, (source.info.truncated, *losses))) or None
-    source.info = replace(source.info, truncated=told)
-    return source
-
-
-def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
-    if n_read >= n_promised:
-        return None
-    return f'{shown(topic)}: {n_read} of the {n_promised} messages promised are there'
-
-
-def in_split_order(files: Iterable[Path]) -> list[Path]:
-    """Sort the files of a split bag by the number at the end of their names."""
-
-    def number(file: Path) -> tuple[int, str]:
-        digits = file.stem.rpartition('_')[2]
-        return (int(digits) if digits.isascii() and digits.isdigit() else 0, file.name)
-
-    return sorted(files, key=number)

@@ -48,7 +48,8 @@ class Definition:
 
 
 @lru_cache(maxsize=1)
-def _typestore() -> Any:
+def typestore() -> Any:
+    """Give the message types of ROS 2 Jazzy."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -57,11 +58,11 @@ def _typestore() -> Any:
 @lru_cache(maxsize=64)
 def known_definition(kind: str) -> Definition:
     """Look up a message type of ROS 2 Jazzy; RecordingError for one that it does not have."""
-    typestore = _typestore()
-    if kind not in typestore.fielddefs:
+    store = typestore()
+    if kind not in store.fielddefs:
         raise RecordingError(f'the definition of message type {kind} is not known')
-    text, _ = typestore.generate_msgdef(kind, ros_version=2)
-    return Definition('ros2msg', text, typestore.hash_rihs01(kind))
+    text, _ = store.generate_msgdef(kind, ros_version=2)
+    return Definition('ros2msg', text, store.hash_rihs01(kind))
 
 
 def offered_qos(kind: str) -> dict[str, Any]:

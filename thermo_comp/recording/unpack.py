@@ -12,7 +12,7 @@ from __future__ import annotations
 import bz2
 import zlib
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import lz4.frame
 import numpy as np
 import zstandard
 
+from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Bytes
 
@@ -29,13 +30,31 @@ MAX_CHUNK_BYTES = 1 << 26
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
-_LZ4_MAGIC = b'\x04\x22\x4d\x18'
 #: Up to so much before a damage is lost with it.
 _STEP_BYTES = 1 << 16
+_ERRORS = (zstandard.ZstdError, RuntimeError, EOFError)
 
 
 class DamagedError(Exception):
     """Bytes that are not what they should be; the text says what."""
+
+
+@contextmanager
+def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
+    """Say which file it is that is damaged or cannot be read, whatever another library raises."""
+    try:
+        yield
+    except RecordingError as error:
+        raise RecordingError(error.message, path, error.topic) from error
+    except DamagedError as error:
+        raise RecordingError(f'damaged: {error}', path) from error
+    except OSError as error:
+        raise RecordingError(f'cannot be read: {error.strerror or error}', path) from error
+    except Exception as error:
+        if not is_foreign:
+            raise
+        text = ' '.join(str(error).split()) or type(error).__name__
+        raise RecordingError(f'the bag cannot be read: {text}', path) from error
 
 
 def expand(packed: Path, target: Path) -> str | None:
@@ -49,7 +68,7 @@ def expand(packed: Path, target: Path) -> str | None:
         limit = size * _MAX_GROWTH + _FREE_GROWTH_BYTES
         loss = None
         try:
-            for data in _zstd_pieces(source, _STEP_BYTES):
+            for data in _pieces('zstd', source, _STEP_BYTES):
                 if file.tell() + len(data) > limit:
                     raise DamagedError(f'{size} bytes hold more than {limit}')
                 file.write(data)
@@ -67,7 +86,8 @@ def unpack_message(packed: bytes) -> bytes:
         size = zstandard.frame_content_size(packed)
         if size > _FREE_GROWTH_BYTES:
             raise DamagedError(f'a message of {size} bytes')
-        return _zstd().decompress(packed, max_output_size=_FREE_GROWTH_BYTES)
+        decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
+        return decompressor.decompress(packed, max_output_size=_FREE_GROWTH_BYTES)
     except zstandard.ZstdError as error:
         raise DamagedError(f'zstd: {error}') from error
 
@@ -77,7 +97,7 @@ def unpack_ros1_chunk(packed: bytes) -> bytes:
     engine: Any
     if packed[:3] == b'BZh':
         engine = bz2.BZ2Decompressor()
-    elif packed[:4] == _LZ4_MAGIC:
+    elif packed[:4] == b'\x04\x22\x4d\x18':
         engine = lz4.frame.LZ4FrameDecompressor()
     else:
         return packed
@@ -95,15 +115,15 @@ def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
 
     Raises DamagedError for an unknown compression, damaged bytes, a wrong size or checksum.
     """
-    data = packed if compression == '' else _whole(packed, size) if compression == 'zstd' else None
-    if data is None:
+    data = packed
+    if compression:
         pieces = []
         try:
-            for piece in _pieces(compression, packed, max(size, 1)):
+            for piece in _pieces(compression, packed.data, size + 1):
                 pieces.append(piece)
                 if sum(map(len, pieces)) > size:
                     raise DamagedError(f'more than the {size} bytes that it claims')
-        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        except _ERRORS as error:
             raise DamagedError(f'{compression}: {error}') from error
         data = np.frombuffer(b''.join(pieces), np.uint8)
     if len(data) != size:
@@ -113,48 +133,33 @@ def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
     return data
 
 
-def _whole(packed: Bytes, size: int) -> Bytes | None:
-    """Take one frame that says how long it is, as all usual writers make it, in one go."""
-    with suppress(zstandard.ZstdError):
-        if zstandard.frame_content_size(packed.data) == size:
-            return np.frombuffer(_zstd().decompress(packed.data, allow_extra_data=False), np.uint8)
-    return None
-
-
 def unpack_beginning(compression: str, packed: Bytes) -> Bytes:
     """Decompress a torn chunk as far as its bytes go."""
     if compression == '':
         return packed
     pieces: list[bytes] = []
-    with suppress(zstandard.ZstdError, RuntimeError, EOFError):
-        for piece in _pieces(compression, packed, _STEP_BYTES):
+    with suppress(*_ERRORS):
+        for piece in _pieces(compression, packed.data, _STEP_BYTES):
             pieces.append(piece)
             if len(pieces) * _STEP_BYTES > MAX_CHUNK_BYTES:
                 break
     return np.frombuffer(b''.join(pieces), np.uint8)
 
 
-def _pieces(compression: str, packed: Bytes, step: int) -> Iterator[bytes]:
-    """Decompress so many bytes at a time."""
+def _pieces(compression: str, source: Any, step: int) -> Iterator[bytes]:
+    """Decompress bytes, or with zstd a file, so many at a time."""
     if compression == 'zstd':
-        yield from _zstd_pieces(packed.data, step)
+        decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
+        with decompressor.stream_reader(source, read_across_frames=True) as reader:
+            while piece := reader.read(step):
+                yield piece
         return
     if compression != 'lz4':
         raise DamagedError(f'unknown compression {compression!r}, expected zstd, lz4 or none')
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    piece = decompressor.decompress(packed.data, max_length=step)
+    engine = lz4.frame.LZ4FrameDecompressor()
+    piece = engine.decompress(source, max_length=step)
     while piece:
         yield piece
-        if decompressor.eof or decompressor.needs_input:
+        if engine.eof or engine.needs_input:
             return
-        piece = decompressor.decompress(b'', max_length=step)
-
-
-def _zstd() -> zstandard.ZstdDecompressor:
-    return zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
-
-
-def _zstd_pieces(source: Any, step: int) -> Iterator[bytes]:
-    with _zstd().stream_reader(source, read_across_frames=True) as reader:
-        while piece := reader.read(step):
-            yield piece
+        piece = engine.decompress(b'', max_length=step)

@@ -18,9 +18,9 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 
 from ..recording import ROLES, Block, Input, Role, Topics
-from ..recording.chunks import Messages
 from ..recording.decode import Decoder, Feed
 from ..recording.growing import News
+from ..recording.messages import Messages
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
 from .listener import Listener
 from .waitloop import RawSubscription
@@ -150,16 +150,11 @@ def _blocks(
     """Decode what came, in the order of arrival."""
     numbers = {role: number for number, role in enumerate(feeds)}
     data = [one for _, messages, _ in waiting for one in messages]
-    size = np.fromiter(map(len, data), np.int64, len(data))
-    messages = Messages(
-        np.frombuffer(b''.join(data), np.uint8),
-        np.cumsum(size) - size,
-        size,
-        np.repeat(
-            [numbers[role] for role, _, _ in waiting], [len(one[1]) for one in waiting]
-        ).astype(np.uint16),
+    messages = Messages.of(
+        data,
+        np.repeat([numbers[role] for role, _, _ in waiting], [len(one[1]) for one in waiting]),
         np.concatenate([np.array(received, np.int64) for _, _, received in waiting]),
     )
     names = list(dict.fromkeys((*ROLES[1:], *(role for role in feeds if role != 'accel'))))
     decoder = Decoder(feeds, {number: role for role, number in numbers.items()}, names, True)
-    yield from decoder.blocks(messages.take(np.argsort(messages.log_ns, kind='stable')))
+    yield from decoder.blocks(messages.in_order())
