@@ -19,7 +19,7 @@ from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
 from . import convert, demo, evaluate, fit, fleet, info, output, record, replay, report, simulate
-from .options import expanded
+from .options import expanded, option
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
@@ -48,10 +48,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _top(
     version: Annotated[
-        bool,
-        typer.Option(
-            '--version', help='Print the version.', callback=_print_version, is_eager=True
-        ),
+        bool, option('Print the version.', '--version', callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     """Thermal-drift compensation of a three-axis accelerometer."""

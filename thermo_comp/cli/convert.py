@@ -14,11 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
 from ..errors import CalibrationError
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from . import options
+from .options import argument, option
 from .output import Output
 
 if TYPE_CHECKING:
@@ -49,29 +48,24 @@ def convert(
     *,
     log: Annotated[
         Path,
-        typer.Argument(
-            help='Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin), or bag.',
+        argument(
+            'Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin), or bag.',
             metavar='FILE',
         ),
     ],
-    output: Annotated[
-        Path, typer.Option('--output', '-o', help='Bag to write; *.mcap makes a bare file.')
-    ],
+    output: Annotated[Path, option('Bag to write; *.mcap makes a bare file.', '--output', '-o')],
     columns: Annotated[
-        Path | None,
-        typer.Option(help='Column map of a table (YAML): what is where, in which unit.'),
+        Path | None, option('Column map of a table (YAML): what is where, in which unit.')
     ] = None,
     rate_hz: options.TableRate = None,
-    imu: Annotated[int | None, typer.Option(help='IMU of a log, counted from 0.')] = None,
-    baro: Annotated[
-        int | None, typer.Option(help='Barometer of a log, for the case temperature.')
-    ] = None,
+    imu: Annotated[int | None, option('IMU of a log, counted from 0.')] = None,
+    baro: Annotated[int | None, option('Barometer of a log, for the case temperature.')] = None,
     allow_compensated: Annotated[
-        bool, typer.Option(help='Take a log that INS_TCAL or TC_A has corrected.')
+        bool, option('Take a log that INS_TCAL or TC_A has corrected.')
     ] = False,
     names: options.TopicNames,
     unit: Annotated[
-        Literal['m/s^2', 'g', 'mg'], typer.Option(help='What the Imu topic of a bag is in.')
+        Literal['m/s^2', 'g', 'mg'], option('What the Imu topic of a bag is in.')
     ] = 'm/s^2',
     force: options.Force = False,
     out: options.Out,
@@ -144,10 +138,10 @@ def _reader(out: Output, path: Path, given: Mapping[str, Any]) -> Callable[[], F
     from .. import convert
 
     kind = _kind_of(path)
-    said = {option: value for option, value in given.items() if value is not None}
-    for option in said:
-        if option not in _OPTIONS[kind]:
-            raise options.usage(f'a {kind} needs no {option}; it has {", ".join(_OPTIONS[kind])}')
+    said = {flag: value for flag, value in given.items() if value is not None}
+    for flag in said:
+        if flag not in _OPTIONS[kind]:
+            raise options.usage(f'a {kind} needs no {flag}; it has {", ".join(_OPTIONS[kind])}')
     if kind == 'bag':
         names = said.get('--topic', {})
         if not names.keys() <= {'imu', 'board', 'case'}:
@@ -155,7 +149,7 @@ def _reader(out: Output, path: Path, given: Mapping[str, Any]) -> Callable[[], F
         return partial(convert.bag_log, path, **names, unit=said.get('--unit', 'm/s^2'))
     if kind == 'log':
         read = convert.read_ulog if path.suffix.lower() == '.ulg' else convert.read_dataflash
-        imu, baro, is_allowed = (said.get(option) for option in _OPTIONS['log'])
+        imu, baro, is_allowed = (said.get(flag) for flag in _OPTIONS['log'])
         return lambda: convert.foreign_log(read(path), imu, baro, bool(is_allowed))
     columns, rate_hz = said.get('--columns'), said.get('--rate-hz')
     if columns is not None and rate_hz is not None:
@@ -210,24 +204,24 @@ def _say(out: Output, report: ConversionReport) -> None:
 
 def export(
     *,
-    path: Annotated[Path, typer.Argument(help='Calibration of the unit.', metavar='YAML')],
-    to: Annotated[Tool, typer.Option(help='Whose file to write.')],
-    output: Annotated[Path, typer.Option('--output', '-o', help='File to write.')],
+    path: Annotated[Path, argument('Calibration of the unit.', metavar='YAML')],
+    to: Annotated[Tool, option('Whose file to write.')],
+    output: Annotated[Path, option('File to write.', '--output', '-o')],
     number: Annotated[
         int | None,
-        typer.Option(
-            help='Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
+        option(
+            'Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
             'Kalibr (0).',
             min=0,
         ),
     ] = None,
     device_id: Annotated[
-        int, typer.Option(help="PX4's id of the sensor (TC_An_ID), which it matches by.")
+        int, option("PX4's id of the sensor (TC_An_ID), which it matches by.")
     ] = 0,
     up: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(
-            help='Direction of +g in the sensor frame, at which the drift of the scale is folded '
+        option(
+            'Direction of +g in the sensor frame, at which the drift of the scale is folded '
             'into the offset.',
             metavar='X Y Z',
         ),
@@ -273,24 +267,21 @@ def import_(
     *,
     path: Annotated[
         Path,
-        typer.Argument(
-            help='Parameters of PX4 or ArduPilot, .calib of imu_tk, YAML of imu_calib or Kalibr.',
+        argument(
+            'Parameters of PX4 or ArduPilot, .calib of imu_tk, YAML of imu_calib or Kalibr.',
             metavar='FILE',
         ),
     ],
     output: options.NewCalibration,
-    serial: Annotated[
-        str, typer.Option(help='Serial to give the unit.', callback=options.check_serial)
-    ],
+    serial: Annotated[str, option('Serial to give the unit.', callback=options.check_serial)],
     number: Annotated[
-        int | None,
-        typer.Option(help='Which set, where there are several (TC_A0, INS_TCAL1, imu0).'),
+        int | None, option('Which set, where there are several (TC_A0, INS_TCAL1, imu0).')
     ] = None,
-    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = STANDARD_GRAVITY,
-    rate_hz: Annotated[float, typer.Option(help='Samples per second of the unit.', min=0.1)] = 200,
-    full_scale_g: Annotated[float, typer.Option(help='Full scale in g.', min=0.1)] = 16.0,
+    gravity: Annotated[float, option('Local gravity in m/s^2.')] = STANDARD_GRAVITY,
+    rate_hz: Annotated[float, option('Samples per second of the unit.', min=0.1)] = 200,
+    full_scale_g: Annotated[float, option('Full scale in g.', min=0.1)] = 16.0,
     noise_ug: Annotated[
-        float, typer.Option(help='Noise density in ug/sqrt(Hz); it sets the covariance.', min=0.01)
+        float, option('Noise density in ug/sqrt(Hz); it sets the covariance.', min=0.01)
     ] = 200.0,
     force: options.Force = False,
     out: options.Out,

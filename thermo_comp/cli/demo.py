@@ -15,11 +15,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ..errors import ThermoCompError
 from ..unit.gravity import STANDARD_GRAVITY
 from . import options
+from .options import option
 from .output import Cell, Output, micro_g
 
 if TYPE_CHECKING:
@@ -41,11 +40,9 @@ _MODELS: dict[str, dict[str, Any]] = {
 
 def demo(
     *,
-    bags: Annotated[
-        Path | None, typer.Option(help='Folder of the sample bags.', metavar='DIR')
-    ] = None,
+    bags: Annotated[Path | None, option('Folder of the sample bags.', metavar='DIR')] = None,
     output: Annotated[
-        Path, typer.Option('--out', '-o', help='Folder for what the demo makes.', metavar='DIR')
+        Path, option('Folder for what the demo makes.', '--out', '-o', metavar='DIR')
     ] = Path('out'),
     out: options.Out,
 ) -> None:

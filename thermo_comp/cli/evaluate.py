@@ -9,9 +9,8 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from . import options
+from .options import argument, option
 from .output import Cell, Output, micro, micro_g, millidegrees
 
 if TYPE_CHECKING:
@@ -20,18 +19,14 @@ if TYPE_CHECKING:
 
 def evaluate(
     *,
-    bags: Annotated[
-        list[Path], typer.Argument(help='Bags of one unit, any positions.', metavar='BAG...')
-    ],
+    bags: Annotated[list[Path], argument('Bags of one unit, any positions.', metavar='BAG...')],
     calibration: Annotated[
         list[Path],
-        typer.Option(
-            '--calibration', '-c', help='Calibration; the first is judged, more are compared.'
-        ),
+        option('Calibration; the first is judged, more are compared.', '--calibration', '-c'),
     ],
     judging: options.JudgingOptions,
     csv: Annotated[
-        Path | None, typer.Option(help='File for the windows, one a line.', metavar='FILE')
+        Path | None, option('File for the windows, one a line.', metavar='FILE')
     ] = None,
     reading: options.ReadingPart,
     force: options.Force = False,

@@ -15,7 +15,8 @@ import typer
 
 from . import options
 from .convert import as_bags
-from .output import Cell, Output, micro_g, millidegrees
+from .options import argument, option
+from .output import Cell, Output, micro_g, millidegrees, picked
 
 if TYPE_CHECKING:
     from ..fitting import FitResult
@@ -27,56 +28,47 @@ def fit(
     *,
     context: typer.Context,
     bags: Annotated[
-        list[Path], typer.Argument(help='Bags of one unit, or tables and logs.', metavar='BAG...')
+        list[Path], argument('Bags of one unit, or tables and logs.', metavar='BAG...')
     ],
     output: options.NewCalibration,
     settings: options.FittingOptions,
     static_curve: Annotated[
         Curve | None,
-        typer.Option(
-            help="Bias and scale over temperature; else the model's own.", metavar='CURVE'
-        ),
+        option("Bias and scale over temperature; else the model's own.", metavar='CURVE'),
     ] = None,
     dynamic_curve: Annotated[
-        Curve | None, typer.Option(help='The same of the dynamic set, by itself.', metavar='CURVE')
+        Curve | None, option('The same of the dynamic set, by itself.', metavar='CURVE')
     ] = None,
     groups: Annotated[
-        str | None, typer.Option(help='Groups that may take part, by commas.', metavar='A,B')
+        str | None, option('Groups that may take part, by commas.', metavar='A,B')
     ] = None,
     force_groups: Annotated[
-        str, typer.Option(help='Groups that stay whatever they earn.', metavar='A,B')
+        str, option('Groups that stay whatever they earn.', metavar='A,B')
     ] = '',
     prior: Annotated[
         Path | None,
-        typer.Option(
-            help='Calibration to begin with: of the type, or an old one.', metavar='YAML'
-        ),
+        option('Calibration to begin with: of the type, or an old one.', metavar='YAML'),
     ] = None,
     ageing_bias: Annotated[
-        str | None,
-        typer.Option(help="What the biases may have changed by since the prior's: 50ug, 0.1mg."),
+        str | None, option("What the biases may have changed by since the prior's: 50ug, 0.1mg.")
     ] = None,
     ageing_scale: Annotated[
-        float,
-        typer.Option(help='What the scale may have changed by since, in ppm.', metavar='PPM'),
+        float, option('What the scale may have changed by since, in ppm.', metavar='PPM')
     ] = 0.0,
-    report: Annotated[
-        Path | None, typer.Option(help='Certificate to write (HTML).', metavar='HTML')
-    ] = None,
+    report: Annotated[Path | None, option('Certificate to write (HTML).', metavar='HTML')] = None,
     certificate_info: options.CertificateInfo = None,
     serial: Annotated[
-        str | None,
-        typer.Option(help="Serial, instead of the bags'.", callback=options.check_serial),
+        str | None, option("Serial, instead of the bags'.", callback=options.check_serial)
     ] = None,
     offset: options.Offset = None,
     columns: Annotated[
-        Path | None, typer.Option(help='Column map of the tables, as for convert.', metavar='YAML')
+        Path | None, option('Column map of the tables, as for convert.', metavar='YAML')
     ] = None,
     rate_hz: options.TableRate = None,
     reading: options.ReadingPart,
     force: options.Force = False,
     verbose: Annotated[
-        bool, typer.Option('--verbose', '-v', help='List the positions that were found, too.')
+        bool, option('List the positions that were found, too.', '--verbose', '-v')
     ] = False,
     out: options.Out,
 ) -> None:
@@ -148,10 +140,9 @@ def fit(
 def prior(
     *,
     calibrations: Annotated[
-        list[Path],
-        typer.Argument(help='Calibrations of different units of one type.', metavar='YAML...'),
+        list[Path], argument('Calibrations of different units of one type.', metavar='YAML...')
     ],
-    output: Annotated[Path, typer.Option('--output', '-o', help='Prior to write (YAML).')],
+    output: Annotated[Path, option('Prior to write (YAML).', '--output', '-o')],
     force: options.Force = False,
     out: options.Out,
 ) -> None:
@@ -239,19 +230,16 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
             'gravity': calibration.gravity_m_s2,
             'left_out_rms_m_s2': left_out.rms,
             'residuals_m_s2': result.residuals,
-            'evidence': calibration.evidence,
-            'noise_density_m_s2_sqrt_hz': calibration.noise_density_m_s2_sqrt_hz,
-            'slow_noise_m_s2_sqrt_h': calibration.slow_noise_m_s2_sqrt_h,
+            **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
             'gyroscope': gyroscope
             and {
-                'bias_rad_s': gyroscope.gyroscope.bias_rad_s,
-                'noise_density_rad_s_sqrt_hz': gyroscope.gyroscope.noise_density_rad_s_sqrt_hz,
-                'slow_noise_rad_s_sqrt_h': gyroscope.gyroscope.slow_noise_rad_s_sqrt_h,
+                **picked(
+                    gyroscope.gyroscope,
+                    'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h',
+                ),
                 'residuals_rad_s': gyroscope.residuals,
             },
-            'positions': result.positions,
-            'least_known': result.least_known,
-            'findings': result.findings,
+            **picked(result, 'positions least_known findings'),
         }
     )
 

@@ -11,7 +11,8 @@ import typer
 
 from ..text import one_line
 from . import options
-from .output import Output, micro
+from .options import argument, option
+from .output import Output, micro, picked
 
 if TYPE_CHECKING:
     from ..fleet import FleetResult
@@ -32,30 +33,25 @@ def _fleet() -> None:
 @options.expanded
 def fit(
     *,
-    folder: Annotated[
-        str, typer.Argument(help='DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR')
-    ],
+    folder: Annotated[str, argument('DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR')],
     output: Annotated[
-        Path, typer.Option('--output', '-o', help='Folder of the results; goes on where it was.')
+        Path, option('Folder of the results; goes on where it was.', '--output', '-o')
     ],
     settings: options.FittingOptions,
     scheduler: Annotated[
-        str | None,
-        typer.Option(help='Dask scheduler (tcp://HOST:PORT), instead of this machine alone.'),
+        str | None, option('Dask scheduler (tcp://HOST:PORT), instead of this machine alone.')
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help='Processes on this machine; all processors.', min=1)
+        int | None, option('Processes on this machine; all processors.', min=1)
     ] = None,
-    certificates: Annotated[bool, typer.Option(help='Write a certificate for each unit.')] = True,
+    certificates: Annotated[bool, option('Write a certificate for each unit.')] = True,
     with_prior: Annotated[
         bool,
-        typer.Option(
-            '--with-prior', help='Fit the units that lack data again with what the others share.'
-        ),
+        option('Fit the units that lack data again with what the others share.', '--with-prior'),
     ] = False,
     earlier: Annotated[
         list[Path] | None,
-        typer.Option(help='fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
+        option('fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
     ] = None,
     reading: options.ReadingOptions,
     out: options.Out,
@@ -137,18 +133,8 @@ def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
         f'{result.n_done} of them in this run'
     )
     out.json(
-        {
-            'rows': result.rows,
-            'n_fitted': result.n_fitted,
-            'n_done': result.n_done,
-            'verdicts': summary.verdicts,
-            'outliers': summary.outliers,
-            'drifts': summary.drifts,
-            'parquet': result.parquet,
-            'csv': result.csv,
-            'page': result.page,
-            'prior': result.prior,
-        }
+        picked(result, 'rows n_fitted n_done parquet csv page prior')
+        | picked(summary, 'verdicts outliers drifts')
     )
 
 

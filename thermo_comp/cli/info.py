@@ -9,11 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from ..text import counted
 from . import options
-from .output import Output, micro_g
+from .options import argument
+from .output import Output, micro_g, picked
 
 if TYPE_CHECKING:
     from ..recording import Topics
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 def info(
     *,
-    path: Annotated[Path, typer.Argument(help='Bag or calibration file.', metavar='BAG|YAML')],
+    path: Annotated[Path, argument('Bag or calibration file.', metavar='BAG|YAML')],
     topics: options.TopicsPart,
     out: options.Out,
 ) -> None:
@@ -80,24 +79,16 @@ def _bag(out: Output, path: Path, topics: Topics) -> None:
     out.json(
         {
             'path': path,
-            'storage': found.storage,
-            'truncated': found.truncated,
-            'metadata': found.metadata,
+            **picked(found, 'storage truncated metadata input chosen'),
             'topics': {
                 name: {'type': kind, 'messages': count}
                 for name, (kind, count) in found.topics.items()
             },
-            'input': found.input,
-            'chosen': found.chosen,
             'samples': survey.n,
-            'rate_hz': survey.rate_hz,
-            'duration_s': survey.duration_s,
             'still_intervals': survey.n_still,
-            'still_s': survey.still_s,
             'board': thermometers.get('board'),
             'case': thermometers.get('case'),
-            'thermometers': thermometers,
-            'findings': survey.findings,
+            **picked(survey, 'rate_hz duration_s still_s thermometers findings'),
         }
     )
     out.end(int(bool(found.truncated)))

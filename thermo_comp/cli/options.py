@@ -32,6 +32,16 @@ if TYPE_CHECKING:
 usage = typer.BadParameter
 
 
+def option(text: str, *flags: str, **rules: Any) -> Any:
+    """Describe an option: what it is for, its flags where they are not its name's, its bounds."""
+    return typer.Option(*flags, help=text, **rules)
+
+
+def argument(text: str, **rules: Any) -> Any:
+    """Describe what stands on the command line without a flag."""
+    return typer.Argument(help=text, **rules)
+
+
 @contextmanager
 def usage_of(what: str = '') -> Iterator[None]:
     """Take a ValueError of the block for a mistake in the command line."""
@@ -49,40 +59,33 @@ def check_serial(serial: str | None) -> str | None:
     return serial
 
 
-Force = Annotated[bool, typer.Option('--force', '-f', help='Overwrite one of the same kind.')]
-Quiet = Annotated[bool, typer.Option('--quiet', '-q', help='Print nothing but errors.')]
-NewCalibration = Annotated[
-    Path, typer.Option('--output', '-o', help='Calibration to write (YAML).')
-]
-Bag = Annotated[
-    Path, typer.Argument(help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
-]
-JudgedBags = Annotated[
-    list[Path] | None, typer.Argument(help='Bags to judge it on.', metavar='[BAG]...')
-]
+Force = Annotated[bool, option('Overwrite one of the same kind.', '--force', '-f')]
+Quiet = Annotated[bool, option('Print nothing but errors.', '--quiet', '-q')]
+NewCalibration = Annotated[Path, option('Calibration to write (YAML).', '--output', '-o')]
+Bag = Annotated[Path, argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')]
+JudgedBags = Annotated[list[Path] | None, argument('Bags to judge it on.', metavar='[BAG]...')]
 CertificateInfo = Annotated[
-    Path | None, typer.Option(help='What the laboratory states: number, customer, ... (YAML).')
+    Path | None, option('What the laboratory states: number, customer, ... (YAML).')
 ]
 TableRate = Annotated[
-    float | None,
-    typer.Option(help='Samples per second of a table without times.', min=0.01, max=1e6),
+    float | None, option('Samples per second of a table without times.', min=0.01, max=1e6)
 ]
 Serial = Annotated[
     str | None,
-    typer.Option(
-        help="Serial of the unit, instead of the bag's; '' accepts any calibration.",
+    option(
+        "Serial of the unit, instead of the bag's; '' accepts any calibration.",
         callback=check_serial,
     ),
 ]
 Offset = Annotated[
     float | None,
-    typer.Option(
-        help='What raw words read without a force, as 32768; found out by itself if it can.',
+    option(
+        'What raw words read without a force, as 32768; found out by itself if it can.',
         metavar='WORD',
     ),
 ]
 InputOption = Annotated[
-    Literal['auto', 'counts', 'imu'], typer.Option('--input', help='What is read from the bag.')
+    Literal['auto', 'counts', 'imu'], option('What is read from the bag.', '--input')
 ]
 
 
@@ -122,9 +125,7 @@ def expanded(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _output(
-    as_json: Annotated[
-        bool, typer.Option('--json', help='Print the result as one JSON object.')
-    ] = False,
+    as_json: Annotated[bool, option('Print the result as one JSON object.', '--json')] = False,
     quiet: Quiet = False,
 ) -> Output:
     return Output(as_json, quiet)
@@ -133,14 +134,13 @@ def _output(
 def _names(
     topic: Annotated[
         list[str] | None,
-        typer.Option(
-            help='Where an input stands: counts, imu, board, case, temperature/NAME.',
+        option(
+            'Where an input stands: counts, imu, board, case, temperature/NAME.',
             metavar='INPUT=TOPIC',
         ),
     ] = None,
     topics: Annotated[
-        Path | None,
-        typer.Option(help='The same from a file, INPUT: TOPIC a line.', metavar='YAML'),
+        Path | None, option('The same from a file, INPUT: TOPIC a line.', metavar='YAML')
     ] = None,
 ) -> dict[str, str]:
     """Collect what `--topic` says, and what of the file it does not."""
@@ -164,13 +164,13 @@ def _topics(
     names: TopicNames,
     begin: Annotated[
         float | None,
-        typer.Option(
+        option(
+            'Read each bag from there on: seconds from its first sample, or a stamp.',
             '--from',
-            help='Read each bag from there on: seconds from its first sample, or a stamp.',
             metavar='S',
         ),
     ] = None,
-    end: Annotated[float | None, typer.Option('--to', help='Read to there.', metavar='S')] = None,
+    end: Annotated[float | None, option('Read to there.', '--to', metavar='S')] = None,
 ) -> Topics:
     from ..recording import Part, Topics
 
@@ -199,13 +199,9 @@ def _reading_part(*, input_: InputOption = 'auto', topics: TopicsPart) -> Readin
 
 
 def _place(
-    gravity: Annotated[
-        float | None, typer.Option(help='Local gravity in m/s^2.', metavar='G')
-    ] = None,
-    latitude: Annotated[
-        float | None, typer.Option(help='Latitude in degrees, with --height.')
-    ] = None,
-    height: Annotated[float | None, typer.Option(help='Height above the ellipsoid in m.')] = None,
+    gravity: Annotated[float | None, option('Local gravity in m/s^2.', metavar='G')] = None,
+    latitude: Annotated[float | None, option('Latitude in degrees, with --height.')] = None,
+    height: Annotated[float | None, option('Height above the ellipsoid in m.')] = None,
 ) -> float | None:
     """Give local gravity, None where nothing was said; latitude and height go together."""
     if gravity is not None or (latitude is None and height is None):
@@ -232,12 +228,9 @@ class Judging(TypedDict):
 
 def _judging(
     gravity: Place,
-    window: Annotated[
-        float, typer.Option(help='Length of a window at rest, in s.', metavar='S')
-    ] = 60.0,
+    window: Annotated[float, option('Length of a window at rest, in s.', metavar='S')] = 60.0,
     tolerance: Annotated[
-        str | None,
-        typer.Option(help='Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'),
+        str | None, option('Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.')
     ] = None,
     serial: Serial = None,
 ) -> Judging:
@@ -253,28 +246,27 @@ def _fitting(
     gravity: Place,
     model: Annotated[
         Literal['response', 'golovach'],
-        typer.Option(help="The thermal response, or the paper's two sets alone."),
+        option("The thermal response, or the paper's two sets alone."),
     ] = 'response',
     full_scale: Annotated[
-        float | None, typer.Option(help='Magnitude of a saturated sample, in input units.')
+        float | None, option('Magnitude of a saturated sample, in input units.')
     ] = None,
     reference_temperature: Annotated[
-        float, typer.Option(help='Reference temperature in degC.', min=-273.15, max=1000.0)
+        float, option('Reference temperature in degC.', min=-273.15, max=1000.0)
     ] = 20.0,
     min_rest: Annotated[
         float | None,
-        typer.Option(
-            help='Shortest rest used, in s; else 3, or less where short ones tell more.',
+        option(
+            'Shortest rest used, in s; else 3, or less where short ones tell more.',
             metavar='S',
             show_default=False,
         ),
     ] = None,
     still_sd: Annotated[
-        str,
-        typer.Option(help="Largest scatter of samples at rest: a few times the sensor's noise."),
+        str, option("Largest scatter of samples at rest: a few times the sensor's noise.")
     ] = '50mg',
     allow: Annotated[
-        list[str] | None, typer.Option(help='Refusal to override, as its message names it.')
+        list[str] | None, option('Refusal to override, as its message names it.')
     ] = None,
 ) -> dict[str, Any]:
     """Give keywords of FitOptions; FitError where gravity is none that is found on Earth."""

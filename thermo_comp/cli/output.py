@@ -202,6 +202,11 @@ def _is_number(cell: str) -> bool:
     return True
 
 
+def picked(value: object, names: str) -> dict[str, Any]:
+    """Give attributes by their names, for JSON."""
+    return {name: getattr(value, name) for name in names.split()}
+
+
 def plain(value: Any) -> Any:
     """Return a value in JSON's types: arrays as lists, dataclasses as objects, NaN as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

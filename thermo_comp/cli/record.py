@@ -19,7 +19,8 @@ from ..errors import ThermoCompError
 from ..text import counted
 from ..unit.gravity import STANDARD_GRAVITY, spoken
 from . import options
-from .output import Cell, Output, micro
+from .options import argument, option
+from .output import Cell, Output, micro, picked
 
 if TYPE_CHECKING:
     from ..fitting.acquisition import Account, Acquisition, Position
@@ -34,22 +35,16 @@ def record(
     *,
     context: typer.Context,
     output: Annotated[
-        Path,
-        typer.Option(
-            '--output', '-o', help='Folder of the bags; one that has some is gone on with.'
-        ),
+        Path, option('Folder of the bags; one that has some is gone on with.', '--output', '-o')
     ],
     bag: Annotated[
         Path | None,
-        typer.Argument(
-            help='Bag that another recorder writes, instead of topics.', metavar='[BAG]'
-        ),
+        argument('Bag that another recorder writes, instead of topics.', metavar='[BAG]'),
     ] = None,
-    positions: Annotated[int, typer.Option(help='Positions wanted.', min=1, max=999)] = 18,
-    soak: Annotated[str, typer.Option(help='Rest wanted in each: 45min, 1.5h, 30s.')] = '45min',
+    positions: Annotated[int, option('Positions wanted.', min=1, max=999)] = 18,
+    soak: Annotated[str, option('Rest wanted in each: 45min, 1.5h, 30s.')] = '45min',
     serial: Annotated[
-        str | None,
-        typer.Option(help='Serial of the unit, for the bags.', callback=options.check_serial),
+        str | None, option('Serial of the unit, for the bags.', callback=options.check_serial)
     ] = None,
     offset: options.Offset = None,
     reading: options.ReadingOptions,
@@ -272,14 +267,9 @@ def _say(
             'bags': bags,
             'command': command if bags else None,
             'positions': positions,
-            'n_good': account.n_good,
-            'is_complete': account.is_complete,
-            'worst_sd_g': account.worst_sd_g,
             'bias_sd_g': bias,
             'scale_sd': scale,
             'misalignment_sd_rad': skew,
-            'thermometers': account.thermometers,
-            'next_up': account.next_up,
-            'findings': account.findings,
+            **picked(account, 'n_good is_complete worst_sd_g thermometers next_up findings'),
         }
     )

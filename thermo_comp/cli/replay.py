@@ -11,6 +11,8 @@ from typing import Annotated
 import typer
 
 from . import options
+from .options import option
+from .output import picked
 
 _AS_THE_NODE = 'As the parameter of the node, in s.'
 
@@ -18,25 +20,19 @@ _AS_THE_NODE = 'As the parameter of the node, in s.'
 def replay(
     *,
     bag: options.Bag,
-    calibration: Annotated[
-        Path, typer.Option('--calibration', '-c', help='Calibration of the unit (YAML).')
-    ],
-    output: Annotated[
-        Path, typer.Option('--output', '-o', help='*.mcap, a folder, *.csv or *.parquet.')
-    ],
+    calibration: Annotated[Path, option('Calibration of the unit (YAML).', '--calibration', '-c')],
+    output: Annotated[Path, option('*.mcap, a folder, *.csv or *.parquet.', '--output', '-o')],
     keep_inputs: Annotated[
-        bool, typer.Option('--keep-inputs', help='Copy the input messages beside the output.')
+        bool, option('Copy the input messages beside the output.', '--keep-inputs')
     ] = False,
     all_topics: Annotated[
-        bool, typer.Option('--all-topics', help='Copy all other topics beside the output, too.')
+        bool, option('Copy all other topics beside the output, too.', '--all-topics')
     ] = False,
     serial: options.Serial = None,
-    frame_id: Annotated[
-        str, typer.Option(help="Frame of the output; empty keeps the input's.")
-    ] = '',
-    transition_time: Annotated[float | None, typer.Option(help=_AS_THE_NODE, min=0.0)] = None,
-    temperature_timeout: Annotated[float | None, typer.Option(help=_AS_THE_NODE)] = None,
-    case_timeout: Annotated[float | None, typer.Option(help=_AS_THE_NODE)] = None,
+    frame_id: Annotated[str, option("Frame of the output; empty keeps the input's.")] = '',
+    transition_time: Annotated[float | None, option(_AS_THE_NODE, min=0.0)] = None,
+    temperature_timeout: Annotated[float | None, option(_AS_THE_NODE)] = None,
+    case_timeout: Annotated[float | None, option(_AS_THE_NODE)] = None,
     reading: options.ReadingOptions,
     force: options.Force = False,
     out: options.Out,
@@ -117,11 +113,10 @@ def play(
     context: typer.Context,
     bag: options.Bag,
     rate: Annotated[
-        float,
-        typer.Option(help='Seconds of the bag per second; 0 = as fast as it is taken.', min=0.0),
+        float, option('Seconds of the bag per second; 0 = as fast as it is taken.', min=0.0)
     ] = 1.0,
     wait: Annotated[
-        float, typer.Option(help='Longest wait for a subscriber on every topic, in s.', min=0.0)
+        float, option('Longest wait for a subscriber on every topic, in s.', min=0.0)
     ] = 10.0,
     reading: options.ReadingOptions,
     out: options.Out,
@@ -154,12 +149,5 @@ def play(
     out.told([(bag, report.chosen, report.missing)])
     out.table(('topic', 'messages'), sorted(report.n_messages.items()))
     out.line(f'played in {report.duration_s:.1f} s')
-    out.json(
-        {
-            'messages': report.n_messages,
-            'duration_s': report.duration_s,
-            'unheard': report.unheard,
-            'lossy': report.lossy,
-        }
-    )
+    out.json({'messages': report.n_messages, **picked(report, 'duration_s unheard lossy')})
     out.end()

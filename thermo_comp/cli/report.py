@@ -9,10 +9,9 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from ..errors import ThermoCompError
 from . import options
+from .options import argument, option
 
 if TYPE_CHECKING:
     from ..judging import OpenedBag
@@ -20,16 +19,14 @@ if TYPE_CHECKING:
 
 def report(
     *,
-    output: Annotated[Path, typer.Option('--output', '-o', help='Page to write (HTML).')],
+    output: Annotated[Path, option('Page to write (HTML).', '--output', '-o')],
     bags: options.JudgedBags = None,
     calibration: Annotated[
         list[Path] | None,
-        typer.Option(
-            '--calibration', '-c', help='Calibration of the unit; more make its history (YAML).'
-        ),
+        option('Calibration of the unit; more make its history (YAML).', '--calibration', '-c'),
     ] = None,
     figures: Annotated[
-        Path | None, typer.Option(help='Folder for the figures as PNG files.', metavar='DIR')
+        Path | None, option('Folder for the figures as PNG files.', metavar='DIR')
     ] = None,
     certificate_info: options.CertificateInfo = None,
     judging: options.JudgingOptions,
@@ -99,16 +96,12 @@ def report(
 
 def view(
     *,
-    calibration: Annotated[
-        Path, typer.Argument(help='Calibration of the unit (YAML).', metavar='YAML')
-    ],
+    calibration: Annotated[Path, argument('Calibration of the unit (YAML).', metavar='YAML')],
     bags: options.JudgedBags = None,
     port: Annotated[
-        int, typer.Option(help='Port on this machine; 0 takes any free one.', min=0, max=65535)
+        int, option('Port on this machine; 0 takes any free one.', min=0, max=65535)
     ] = 8042,
-    browser: Annotated[
-        bool, typer.Option('--browser', help='Open it in the default browser, too.')
-    ] = False,
+    browser: Annotated[bool, option('Open it in the default browser, too.', '--browser')] = False,
     gravity: options.Place,
     serial: options.Serial = None,
     reading: options.ReadingOptions,

@@ -9,10 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ..unit.gravity import STANDARD_GRAVITY
 from . import options
+from .options import option
 
 if TYPE_CHECKING:
     from ..recording import BagWriter, ImuColumns
@@ -23,53 +22,46 @@ if TYPE_CHECKING:
 def simulate(
     *,
     output: Annotated[
-        Path,
-        typer.Option(
-            '--output', '-o', help='Bag to write; with several positions a directory of them.'
-        ),
+        Path, option('Bag to write; with several positions a directory of them.', '--output', '-o')
     ],
     unit: Annotated[
         str,
-        typer.Option(
-            help='Kind of unit: thermostatted, bare-quartz, mems; or with one kind of physics: '
+        option(
+            'Kind of unit: thermostatted, bare-quartz, mems; or with one kind of physics: '
             'own-lags, between, products, hysteresis, even, convection, switched-load, paper, '
             'slow-noise, plain, demo.'
         ),
     ] = 'thermostatted',
-    unit_seed: Annotated[int, typer.Option(help='Which specimen of that kind.', min=0)] = 1,
+    unit_seed: Annotated[int, option('Which specimen of that kind.', min=0)] = 1,
     sibling: Annotated[
-        int | None, typer.Option(help='Another unit of its type, +-15 % in everything.', min=0)
+        int | None, option('Another unit of its type, +-15 % in everything.', min=0)
     ] = None,
     plan: Annotated[
         str | None,
-        typer.Option(
-            help='A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
+        option(
+            'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
             'tumble, tumble-3, tumble-1 or held-out.'
         ),
     ] = None,
     profile: Annotated[
-        str, typer.Option(help="Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'.")
+        str, option("Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'.")
     ] = 'chamber',
-    positions: Annotated[
-        int, typer.Option(help='Number of positions, one bag each.', min=1, max=999)
-    ] = 1,
-    position_seed: Annotated[int, typer.Option(help='Which set of positions.', min=0)] = 0,
-    rate_hz: Annotated[float, typer.Option(help='Conversion cycles per second.', min=0.1)] = 100.0,
+    positions: Annotated[int, option('Number of positions, one bag each.', min=1, max=999)] = 1,
+    position_seed: Annotated[int, option('Which set of positions.', min=0)] = 0,
+    rate_hz: Annotated[float, option('Conversion cycles per second.', min=0.1)] = 100.0,
     temperature_rate_hz: Annotated[
-        float | None, typer.Option(help="Temperature readings per second, else the sensors' own.")
+        float | None, option("Temperature readings per second, else the sensors' own.")
     ] = None,
-    seed: Annotated[int, typer.Option(help='Seed of the noise.', min=0)] = 0,
-    gravity: Annotated[float, typer.Option(help='Local gravity in m/s^2.')] = STANDARD_GRAVITY,
+    seed: Annotated[int, option('Seed of the noise.', min=0)] = 0,
+    gravity: Annotated[float, option('Local gravity in m/s^2.')] = STANDARD_GRAVITY,
     cold_start: Annotated[
-        bool, typer.Option('--cold-start', help='Switch the unit on when the recording starts.')
+        bool, option('Switch the unit on when the recording starts.', '--cold-start')
     ] = False,
     imu: Annotated[
         bool,
-        typer.Option(
-            '--imu', help='Write sensor_msgs/Imu, with the angular rate of a unit that has one.'
-        ),
+        option('Write sensor_msgs/Imu, with the angular rate of a unit that has one.', '--imu'),
     ] = False,
-    level: Annotated[int, typer.Option(help='zstd level, 1 fast to 19 small.', min=1, max=19)] = 3,
+    level: Annotated[int, option('zstd level, 1 fast to 19 small.', min=1, max=19)] = 3,
     force: options.Force = False,
     out: options.Out,
 ) -> None:
