@@ -169,7 +169,7 @@ def _floor(arguments: argparse.Namespace) -> None:
     from rclpy.impl.implementation_singleton import rclpy_implementation
     from sensor_msgs.msg import Imu
 
-    from thermo_comp.ros.middleware import use_profile
+    from thermo_comp.ros.process import use_profile
 
     use_profile()
     rclpy.init()

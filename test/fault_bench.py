@@ -61,7 +61,7 @@ PARAMETERS = (
     f'temperature_timeout:={CONFIG.temperature_timeout_s}',
     f'case_timeout:={CONFIG.case_timeout_s}',
     f'gravity_tolerance:={CONFIG.gravity_tolerance_m_s2}',
-    'diagnostics_period:=0.02',
+    'diagnostics_period:=0.01',
 )
 
 

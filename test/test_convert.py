@@ -426,7 +426,7 @@ class TestFreezer:
             axes=Axes(reference, reference, reference),
         )
         save_calibration(unit, tmp_path / 'unit.yaml')
-        live = round_trip(
+        played, recorded = round_trip(
             tmp_path / 'bag',
             tmp_path / 'unit.yaml',
             tmp_path / 'live.mcap',
@@ -434,10 +434,10 @@ class TestFreezer:
         )
         offline = replay(tmp_path / 'bag', unit, tmp_path / 'offline.mcap')
         # Every row is a message, and every message goes out or is counted with its reason.
-        assert sum(n for name, n in live.played.n_messages.items() if 'imu' in name) == 24514
+        assert sum(n for name, n in played.n_messages.items() if 'imu' in name) == 24514
         assert offline.counters.n_in == 24514
-        assert live.recorded['imu/data_raw'] == offline.counters.n_out
-        assert live.recorded['regime/dynamic'] > 0
+        assert recorded['imu/data_raw'] == offline.counters.n_out
+        assert recorded['regime/dynamic'] > 0
         # The clipped rows are among what the node holds back.
         assert offline.counters.n_dropped >= offline.counters.n_saturated >= 7
 

@@ -23,7 +23,7 @@ from builders import calibration
 from ros_helpers import Driver, Peer, stamp_of, standing
 from sensor_msgs.msg import Imu
 
-from thermo_comp.ros.middleware import LOCAL_PROFILE, PROFILE, VARIABLE, use_profile
+from thermo_comp.ros.process import LOCAL_PROFILE, PROFILE, VARIABLE, use_profile
 from thermo_comp.ros.round_trip import NodeProcess, lossless
 from thermo_comp.unit.calibration_file import save_calibration
 

@@ -73,18 +73,18 @@ def demo(
     info = inspect_recording(held_out)
     bag_s = (info.end_ns - info.start_ns) * 1e-9
     with out.progress('playing') as done:
-        trip = round_trip(
+        played, n_recorded = round_trip(
             held_out, unit, recorded, rate=_RATE, overwrite=recorded.exists(), progress=done
         )
-    (n_in,) = (n for name, n in trip.played.n_messages.items() if name.endswith(_SAMPLES))
-    n_out, wall_s = trip.recorded[_OUTPUT], trip.played.duration_s
+    (n_in,) = (n for name, n in played.n_messages.items() if name.endswith(_SAMPLES))
+    n_out, wall_s = n_recorded[_OUTPUT], played.duration_s
     out.line(
         f'played {held_out} through the node: {bag_s / 60.0:.0f} min in {wall_s:.1f} s, '
         f'{bag_s / wall_s:.0f} times real time'
     )
     out.line(
         f'messages in {n_in}, messages out {n_out}; '
-        f'regime flags {trip.recorded["regime/dynamic"]}; recorded {recorded}'
+        f'regime flags {n_recorded["regime/dynamic"]}; recorded {recorded}'
     )
     is_same = _equals_offline(recorded, held_out, calibrations['node'])
     out.line(f'node = offline replay, bit for bit: {"yes" if is_same else "NO"}')

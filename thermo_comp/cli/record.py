@@ -65,7 +65,7 @@ def record(
     from ..fitting.acquisition import Acquisition
     from ..recording.growing import growing_blocks
     from ..recording.position_bags import PositionBags, numbered_bags
-    from ..ros.signals import SignalWatch
+    from ..ros.process import SignalWatch
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
     known = numbered_bags(output)

@@ -42,12 +42,11 @@ from ..text import hold_standard_streams, one_line
 from . import parameters
 from .conversions import SampleConverter, Traffic
 from .diagnostics import Snapshot, build, look_at
-from .middleware import use_profile
 from .parameters import NodeConfig, ParameterError
+from .process import SignalWatch, use_profile
 from .reader import LoadedCalibration, Reader, check, load, read
 from .relay import Relay
 from .requests import ParameterRequests
-from .signals import SignalWatch
 from .waitloop import RawSubscription, WaitLoop, undeclared_overrides
 
 NODE_NAME = 'thermo_comp'

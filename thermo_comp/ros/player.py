@@ -56,21 +56,15 @@ _ACCEL = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompen
 
 @dataclass(frozen=True, slots=True)
 class PlayReport:
-    """
-    What a player did.
-
-    n_messages: messages sent, by the topic's full name
-    duration_s: wall time from the first message to the last acknowledgement [s]
-    unheard: topics to which nobody listened
-    lossy: topics with a best-effort subscriber, which can lose messages
-    chosen: which topics of the bag were taken by their type
-    missing: what of the bag could not be read
-    """
+    """What a player did; topics by their full names."""
 
     n_messages: dict[str, int]
+    #: Wall time from the first message to the last acknowledgement [s].
     duration_s: float
+    #: Topics to which nobody listened, and those with a best-effort subscriber, which can lose.
     unheard: list[str]
     lossy: list[str]
+    #: Which topics of the bag were taken by their type, and what of it could not be read.
     chosen: str | None
     missing: str | None
 
@@ -83,17 +77,18 @@ def play(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     ros_args: Sequence[str] = (),
-    is_found: Callable[[Node, Collection[Role]], bool] | None = None,
-    throttle: Callable[[int], None] | None = None,
-    progress: Callable[[float], None] | None = None,
+    awaited: Collection[Role] | None = None,
+    is_found: Callable[[Node], bool] | None = None,
+    throttle: Callable[[int], None] = lambda _: None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> PlayReport:
     """
     Publish a bag's samples and temperatures.
 
     At `rate` seconds of the bag per second, 0 as fast as they are taken; after at most `wait_s`
-    for subscribers. `is_found` tells whether these have found the topics of some roles: what is
-    sent before can come late. `throttle` gets the number of samples sent after each window and may
-    block. ThermoCompError if a reliable subscriber stops.
+    for subscribers, of all topics or of some roles. `is_found` tells whether these have found the
+    player's node: what is sent before can come late. `throttle` gets the number of samples sent
+    after each window and may block. ThermoCompError if a reliable subscriber stops.
     """
     if not rate >= 0.0:
         raise ValueError(f'`rate` must be zero or positive, got {rate}')
@@ -104,8 +99,15 @@ def play(
             node = rclpy.create_node(NODE_NAME, context=context)
             try:
                 player = _Player(node, reader, rate)
-                player.wait_for_subscribers(wait_s, is_found)
-                return player.run(throttle or (lambda _: None), progress or (lambda _: None))
+                deadline = time.monotonic() + wait_s
+                while player.unheard(awaited) and time.monotonic() < deadline:
+                    time.sleep(LOOK)
+                if is_found is not None:
+                    while not is_found(node) and time.monotonic() < deadline:
+                        time.sleep(LOOK)
+                elif wait_s > 0.0:
+                    time.sleep(SETTLING)
+                return player.run(throttle, progress)
             finally:
                 # Else its publishers stay until the garbage collector comes by.
                 node.destroy_node()
@@ -118,47 +120,33 @@ class _Player:
 
     def __init__(self, node: Node, reader: RecordingReader, rate: float) -> None:
         self._node, self._reader, self._rate = node, reader, rate
-        accel_type, accel_name = _ACCEL[reader.info.input or 'counts']
+        kinds = {role: (Temperature, f'temperature/{role}') for role in reader.topics}
+        kinds['accel'] = _ACCEL[reader.info.input or 'counts']
         self._publishers: dict[Role, Any] = {
             role: node.create_publisher(
-                accel_type if role == 'accel' else Temperature,
-                accel_name if role == 'accel' else f'temperature/{role}',
-                QoSProfile(
-                    depth=WINDOW[role],
-                    reliability=ReliabilityPolicy.RELIABLE,
-                    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-                ),
+                *kinds[role],
+                QoSProfile(depth=WINDOW[role], durability=DurabilityPolicy.TRANSIENT_LOCAL),
             )
             for role in reader.topics
         }
         self._clock = node.create_publisher(Clock, '/clock', 1)
         self._next_clock = 0.0
 
-    def wait_for_subscribers(
-        self, wait_s: float, is_found: Callable[[Node, Collection[Role]], bool] | None
-    ) -> None:
-        """Wait until every topic has a subscriber which knows of it, or for so long."""
-        deadline = time.monotonic() + wait_s
-        while self._unheard() and time.monotonic() < deadline:
-            time.sleep(LOOK)
-        if is_found is not None:
-            while not is_found(self._node, self._publishers) and time.monotonic() < deadline:
-                time.sleep(LOOK)
-        elif wait_s > 0.0:
-            time.sleep(SETTLING)
-
-    def _unheard(self) -> list[str]:
-        found = self._publishers.values()
-        return [one.topic_name for one in found if not one.get_subscription_count()]
+    def unheard(self, awaited: Collection[Role] | None = None) -> list[str]:
+        """Name the topics, of all or of some roles, that have no subscriber."""
+        return [
+            one.topic_name
+            for role, one in self._publishers.items()
+            if not one.get_subscription_count() and (awaited is None or role in awaited)
+        ]
 
     def _lossy(self) -> list[str]:
-        names = [one.topic_name for one in self._publishers.values()]
         return [
-            name
-            for name in names
+            one.topic_name
+            for one in self._publishers.values()
             if any(
                 end.qos_profile.reliability != ReliabilityPolicy.RELIABLE
-                for end in self._node.get_subscriptions_info_by_topic(name)
+                for end in self._node.get_subscriptions_info_by_topic(one.topic_name)
             )
         ]
 
@@ -168,7 +156,7 @@ class _Player:
         """Send the whole bag, wait until everything has arrived, and account for it."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
-        unheard, lossy = self._unheard(), self._lossy()
+        unheard, lossy = self.unheard(), self._lossy()
         started = time.monotonic()
         start_ns: int | None = None
         for block in reader.blocks(raw=True):

@@ -91,7 +91,7 @@ class Recorder:
         with self._changed:
             return dict(self._counts)
 
-    def newest(self, name: str) -> Any | None:
+    def newest(self, name: str) -> Any:
         """Return the newest message of a topic, be it recorded or not; None before any."""
         data = self._newest.get(name)
         return None if data is None else deserialize_message(data, self._topics[name])
@@ -129,29 +129,28 @@ class Recorder:
     def _write(self) -> None:
         new: dict[str, int] = {}
         for name, subscription in self._subscriptions.items():
-            fresh = subscription.drain()[0]
+            fresh, kind = subscription.drain()[0], self._topics[name]
             messages = self._early.pop(name, []) + fresh
-            times = [self._log_time(name, data) for data in messages]
+            if not messages:
+                continue
+            if kind is Imu:
+                stamps = np.array([_STAMP.unpack_from(data, 4) for data in messages], np.int64)
+                log_ns = stamps @ (1_000_000_000, 1)
+                self._newest_ns = int(log_ns[-1])
+            elif self._newest_ns is not None:
+                log_ns = np.full(len(messages), self._newest_ns)
+            new[name] = 0
             if self._newest_ns is None:
                 self._early[name] = messages
-            elif messages:
-                stamps = np.array(times, np.int64)
-                self._writer.write_raw(name, _type_name(self._topics[name]), stamps, messages)
+            else:
+                self._writer.write_raw(name, _type_name(kind), log_ns, messages)
                 new[name] = len(messages)
-            if fresh:
-                self._newest[name] = fresh[-1]
-                new.setdefault(name, 0)
+            self._newest[name] = messages[-1]
         if new:
             with self._changed:
                 for name, n_messages in new.items():
                     self._counts[name] += n_messages
                 self._changed.notify_all()
-
-    def _log_time(self, name: str, data: bytes) -> int | None:
-        if self._topics[name] is Imu:
-            sec, nanosec = _STAMP.unpack_from(data, 4)
-            self._newest_ns = sec * 1_000_000_000 + nanosec
-        return self._newest_ns
 
 
 def _type_name(message_type: Any) -> str:

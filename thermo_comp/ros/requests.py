@@ -11,9 +11,8 @@ came, whatever is wrong with them.
 
 from __future__ import annotations
 
-import queue
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -63,54 +62,43 @@ class ParameterRequests:
         self._loop = loop
         self._prepare = prepare
         self._apply = apply
-        self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(WAITING_LIMIT)
-        self._thread = threading.Thread(target=self._run, name='parameters', daemon=True)
-        self._thread.start()
+        self._n_waiting = 0
+        self._beside = ThreadPoolExecutor(1, 'parameters')
         for service in node.services:
-            if service.srv_type is SetParameters:
-                loop.serve(service, partial(self._take, is_each=True))
-            elif service.srv_type is SetParametersAtomically:
-                loop.serve(service, partial(self._take, is_each=False))
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                loop.serve(service, partial(self._take, service.srv_type))
             elif service.srv_type in _QUESTIONS:
                 loop.serve(service, partial(_reply, service))
 
     def close(self) -> None:
         """Finish what is being prepared; nothing is applied any more."""
-        self._waiting.put(None)
-        self._thread.join()
+        self._beside.shutdown(cancel_futures=True)
 
-    def _take(self, request: Any, answer: Callable[[Any], None], *, is_each: bool) -> None:
+    def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         """Let a request wait for its turn."""
+        is_each, n = kind is SetParameters, len(request.parameters)
         groups = [[one] for one in request.parameters] if is_each else [request.parameters]
 
         def respond(results: list[SetParametersResult]) -> None:
-            if is_each:
-                answer(SetParameters.Response(results=results))
-            else:
-                answer(SetParametersAtomically.Response(result=results[0]))
+            answer(kind.Response(results=results) if is_each else kind.Response(result=results[0]))
 
-        reason = ''
-        if len(request.parameters) > PARAMETERS_LIMIT:
-            reason = f'{len(request.parameters)} parameters at once, at most {PARAMETERS_LIMIT}'
+        if n > PARAMETERS_LIMIT:
+            reason = f'{n} parameters at once, at most {PARAMETERS_LIMIT}'
+        elif self._n_waiting >= WAITING_LIMIT:
+            reason = 'too many requests wait already, try again'
         else:
-            try:
-                self._waiting.put_nowait(partial(self._work, groups, respond))
-            except queue.Full:
-                reason = 'too many requests wait already, try again'
-        if reason:
-            # Not one for each: to write so many would take as long as to read them.
-            respond([_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT))
-
-    def _run(self) -> None:
-        """Prepare one request after the other, in the thread."""
-        while (work := self._waiting.get()) is not None:
-            work()
+            self._n_waiting += 1
+            self._beside.submit(self._work, groups, respond)
+            return
+        # Not one for each: to write so many would take as long as to read them.
+        respond([_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT))
 
     def _work(
         self,
         groups: list[list[ParameterMessage]],
         respond: Callable[[list[SetParametersResult]], None],
     ) -> None:
+        """Prepare one group after the other, in the thread."""
         results: list[SetParametersResult] = []
         for group in groups:
             try:
@@ -119,7 +107,12 @@ class ParameterRequests:
             except Exception as error:  # noqa: BLE001 - whatever it is, it is answered
                 changes, prepared = [], error
             self._loop.call_soon(partial(self._set, changes, prepared, results))
-        self._loop.call_soon(partial(respond, results))
+
+        def end() -> None:
+            self._n_waiting -= 1
+            respond(results)
+
+        self._loop.call_soon(end)
 
     def _set(
         self, changes: list[Parameter], prepared: Any, results: list[SetParametersResult]

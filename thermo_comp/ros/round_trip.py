@@ -16,9 +16,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import rclpy
@@ -29,7 +27,8 @@ from rclpy.node import Node
 
 from ..errors import ThermoCompError
 from ..online.stamped_flag import STAMPED_TOPIC
-from ..recording import ROLES, Role, open_recording
+from ..recording import ROLES
+from ..unit.calibration_file import load_calibration
 from .node import NODE_NAME
 from .player import PlayReport, play
 from .recorder import OUTPUTS, Recorder
@@ -50,18 +49,6 @@ DROPPED_S = 0.5
 IN_FLIGHT = 1000
 
 _TOPICS = {**OUTPUTS, 'diagnostics': DiagnosticArray}
-#: The node's own word for a role.
-_SPOKEN: dict[Role, str] = {'accel': 'sample'}
-_ACCOUNT = ('-p', 'diagnostics_period:=0.1')
-
-
-@dataclass(frozen=True, slots=True)
-class RoundTrip:
-    """What was played, what was recorded by topic, and the node's last diagnostics."""
-
-    played: PlayReport
-    recorded: dict[str, int]
-    account: dict[str, str]
 
 
 class NodeProcess:
@@ -135,22 +122,21 @@ def round_trip(
     rate: float = 0.0,
     node_args: Sequence[str] = (),
     overwrite: bool = False,
-    progress: Callable[[float], None] | None = None,
-) -> RoundTrip:
-    """Play a bag into a node and record what comes out, in a namespace of their own."""
+    progress: Callable[[float], None] = lambda _: None,
+) -> tuple[PlayReport, dict[str, int]]:
+    """
+    Play a bag into a node and record what comes out, in a namespace of their own.
+
+    Returns what was played and how much was recorded, by topic.
+    """
     namespace = f'/round_trip_{os.getpid()}'
     ros_args = ['-r', f'__ns:={namespace}']
-    with open_recording(bag, require=()) as reader:
-        roles = {*ROLES, *reader.topics} - {'accel'}
-    arguments = [
-        *ros_args,
-        *lossless(namespace, sorted(roles)),
-        '-p',
-        f'calibration_file:={calibration}',
-    ]
-    arguments += ['-r', f'/diagnostics:={namespace}/diagnostics', *_ACCOUNT]
+    thermometers = ['board', *load_calibration(calibration).sensors]
+    arguments = [*ros_args, '-r', f'/diagnostics:={namespace}/diagnostics']
+    arguments += [*lossless(namespace, thermometers), '-p', 'diagnostics_period:=0.1']
+    arguments += ['-p', f'calibration_file:={calibration}', *node_args]
     with (
-        NodeProcess(*arguments, *node_args) as node,
+        NodeProcess(*arguments) as node,
         Recorder(output, topics=_TOPICS, ros_args=ros_args, overwrite=overwrite) as recorder,
     ):
         if not (
@@ -162,37 +148,51 @@ def round_trip(
             )
         ):
             raise ThermoCompError(' '.join(node.said.split()) or 'the node was not found')
+        n_dropped = 0
+
+        def throttle(n_sent: int) -> None:
+            """Wait for the recorder; what does not come at all counts as dropped."""
+            nonlocal n_dropped
+            n_out = recorder.counts[SAMPLES]
+            while n_sent - n_dropped - n_out > IN_FLIGHT:
+                # Diagnostics go on coming, whatever becomes of the samples.
+                if not recorder.wait_until(lambda now, n=n_out: now[SAMPLES] > n, DROPPED_S):  # type: ignore[misc]
+                    n_dropped = n_sent - n_out
+                n_out = recorder.counts[SAMPLES]
+
         played = play(
             bag,
             rate=rate,
             wait_s=DISCOVERY_S,
             ros_args=ros_args,
-            is_found=lambda player, roles: _is_found(recorder, player, roles),
-            throttle=_Throttle(recorder),
+            awaited=['accel', *thermometers],
+            is_found=_answers,
+            throttle=throttle,
             progress=progress,
         )
-        account = _wait_for_all(recorder, max(played.n_messages.values()))
+
+        def is_complete(counts: Mapping[str, int]) -> bool:
+            """Tell whether the node has taken all, and the recorder all that it published."""
+            (status,) = recorder.newest('diagnostics').status
+            account = {one.key: one.value for one in status.values}
+            expected = [account[key] for key in ('samples in', 'samples out', 'flags', 'flags')]
+            found = [max(played.n_messages.values()), *(counts[topic] for topic in OUTPUTS)]
+            return expected == [str(count) for count in found]
+
+        recorder.wait_until(is_complete, COMPLETION_S)
         if not node.is_alive:
             raise ThermoCompError(f'the node ended: {" ".join(node.said.split())}')
-        return RoundTrip(played, recorder.counts, account)
+        return played, recorder.counts
 
 
-def _account(recorder: Recorder) -> dict[str, str]:
-    diagnostics = recorder.newest('diagnostics')
-    if diagnostics is None:
-        return {}
-    return {one.key: one.value for one in diagnostics.status[0].values}
+def _answers(player: Node) -> bool:
+    """
+    Tell whether the node answers the player.
 
-
-def _is_found(recorder: Recorder, player: Node, roles: Collection[Role]) -> bool:
-    """Tell whether the node has found the player, by what it says itself, and hears it."""
-    account = _account(recorder)
-    heard = {role: account.get(f'{_SPOKEN.get(role, role)} publishers') for role in roles}
-    # A further thermometer is heard if the node's calibration names it.
-    if any(n == '0' or (n is None and role in ROLES) for role, n in heard.items()):
-        return False
-    # The first thing that one process ever sends to another can get lost on a busy machine, and
-    # would come again behind the samples: so it is a question that is answered.
+    It then knows of the player's publishers, too, which were made before. And the first thing that
+    one process ever sends to another can get lost on a busy machine, and would come again behind
+    the samples: so it is this question.
+    """
     client = player.create_client(GetParameters, f'{NODE_NAME}/get_parameters')
     executor = SingleThreadedExecutor(context=player.context)
     try:
@@ -204,39 +204,3 @@ def _is_found(recorder: Recorder, player: Node, roles: Collection[Role]) -> bool
     finally:
         executor.shutdown()
         player.destroy_client(client)
-
-
-def _wait_for_all(recorder: Recorder, n_sent: int) -> dict[str, str]:
-    """Wait until the node has taken all, and the recorder all that the node published."""
-    account: dict[str, str] = {}
-
-    def is_complete(counts: Mapping[str, int]) -> bool:
-        account.update(_account(recorder))
-        keys = ('samples in', 'samples out', 'flags', 'flags')
-        expected = [account.get(key, '') for key in keys]
-        found = [n_sent, *(counts[topic] for topic in OUTPUTS)]
-        return expected == [str(count) for count in found]
-
-    recorder.wait_until(is_complete, COMPLETION_S)
-    return account
-
-
-class _Throttle:
-    """Makes the player wait for the recorder; what does not come at all counts as dropped."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-        self._n_dropped = 0
-
-    def __call__(self, n_sent: int) -> None:
-        n_out = self._recorder.counts[SAMPLES]
-        while n_sent - self._n_dropped - n_out > IN_FLIGHT:
-            # Diagnostics go on coming, whatever becomes of the samples.
-            is_more = partial(_is_more, n_out)
-            if not self._recorder.wait_until(is_more, DROPPED_S):
-                self._n_dropped = n_sent - n_out
-            n_out = self._recorder.counts[SAMPLES]
-
-
-def _is_more(n_out: int, counts: Mapping[str, int]) -> bool:
-    return counts[SAMPLES] > n_out

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the end by a signal: SIGINT and SIGTERM wake a thread that asks the loop to stop.
+Owns what a process sets up before its first node: its end by a signal, its Fast DDS profile.
 
 The middleware's own handlers shut the context down from a thread of theirs, under whatever is
 using it: seldom, and on a busy machine, that ends in a segmentation fault instead of exit code 0.
-Here the interpreter only notes the signal, whichever thread the system interrupts with it, and
-the loop's thread takes everything down in order.
+Here the interpreter only notes the signal, whichever thread the system interrupts with it; a
+thread asks the loop to stop, whose own thread then takes everything down in order.
 """
 
 from __future__ import annotations
@@ -15,9 +15,26 @@ import os
 import signal
 import threading
 from collections.abc import Callable
-from types import FrameType
+from pathlib import Path
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+#: Where Fast DDS 2 is told of a profile. Other middlewares, and Fast DDS 3, do not look here.
+VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+#: Without that it takes this file of the working directory.
+LOCAL_PROFILE = 'DEFAULT_FASTRTPS_PROFILES.xml'
+PROFILE = Path(__file__).with_name('fastdds_profile.xml')
+
+
+def use_profile() -> None:
+    """
+    Make the node's profile that of this process; a profile of the user's stays.
+
+    To be called before the first context is initialised: Fast DDS reads it once. The profile saves
+    a quarter of the node's CPU time with reliable subscribers (docs/benchmarks.md).
+    """
+    if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
+        os.environ[VARIABLE] = str(PROFILE)
 
 
 class SignalWatch:
@@ -30,15 +47,15 @@ class SignalWatch:
 
     def __init__(self) -> None:
         self._is_over = False
-        self._stop: Callable[[], None] | None = None
-        self._changed = threading.Lock()
+        self._stop: Callable[[], None] = lambda: None
         self._thread = threading.Thread(target=self._watch, name='signals', daemon=True)
 
     def __enter__(self) -> SignalWatch:
         """Take the signals over."""
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
-        self._handlers = {number: signal.signal(number, _noted) for number in SIGNALS}
+        # The interpreter has written the signal's number already.
+        self._handlers = {number: signal.signal(number, lambda *_: None) for number in SIGNALS}
         self._wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         self._thread.start()
         return self
@@ -53,26 +70,16 @@ class SignalWatch:
         os.close(self._reader)
 
     def on_signal(self, stop: Callable[[], None]) -> None:
-        """Say what the watching thread is to call; called at once after a signal."""
-        with self._changed:
-            self._stop = stop
-            is_over = self._is_over
-        if is_over:
+        """Say what is to be called, once or twice; called at once after a signal."""
+        self._stop = stop
+        if self._is_over:
             stop()
 
     def _watch(self) -> None:
-        if not os.read(self._reader, 1):
-            return
-        with self._changed:
+        if os.read(self._reader, 1):
             self._is_over = True
-            stop = self._stop
-        if stop is not None:
-            stop()
-        number = os.read(self._reader, 1)
-        if number:
-            # Whoever asks twice does not want to wait for the order.
-            os._exit(128 + number[0])
-
-
-def _noted(_number: int, _frame: FrameType | None) -> None:
-    """Stand in for the handler: the interpreter has written the signal's number already."""
+            self._stop()
+            number = os.read(self._reader, 1)
+            if number:
+                # Whoever asks twice does not want to wait for the order.
+                os._exit(128 + number[0])
