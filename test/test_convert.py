@@ -418,7 +418,10 @@ class TestFreezer:
         from thermo_comp.ros.round_trip import round_trip
 
         columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
-        write_log(table_log(path, columns), tmp_path / 'bag')
+        # The last three minutes: at rest in the cold, then handled.
+        lines = path.read_text().splitlines()
+        (tmp_path / 'log.csv').write_text('\n'.join([lines[0], *lines[-2400:]]))
+        report = write_log(table_log(tmp_path / 'log.csv', columns), tmp_path / 'bag')
         # A unit that already speaks m/s^2, +-2 g as the map says.
         reference = AxisReference(1.0, 0.0)
         unit = calibration(
@@ -434,12 +437,13 @@ class TestFreezer:
         )
         offline = replay(tmp_path / 'bag', unit, tmp_path / 'offline.mcap')
         # Every row is a message, and every message goes out or is counted with its reason.
-        assert sum(n for name, n in played.n_messages.items() if 'imu' in name) == 24514
-        assert offline.counters.n_in == 24514
+        assert sum(n for name, n in played.n_messages.items() if 'imu' in name) == 2400
+        assert offline.counters.n_in == 2400
         assert recorded['imu/data_raw'] == offline.counters.n_out
         assert recorded['regime/dynamic'] > 0
         # The clipped rows are among what the node holds back.
-        assert offline.counters.n_dropped >= offline.counters.n_saturated >= 7
+        assert offline.counters.n_dropped >= offline.counters.n_saturated
+        assert offline.counters.n_saturated >= report.clipped.count > 0
 
     def test_a_map_with_the_wrong_unit_is_refused(self, path: Path, tmp_path: Path) -> None:
         text = (ROOT / 'config' / 'columns' / 'freezer.yaml').read_text()

@@ -159,10 +159,10 @@ def test_a_limited_flow_is_a_matter_of_on_and_off() -> None:
 def test_a_switched_load_heats_its_part() -> None:
     """By what the heat balance of an endless spell says, and not before it is on."""
     unit = unit_preset('own-lags', 1)
-    spell = 200_000.0
+    spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
     loaded: UnitModel = replace(unit, loads=(load,))
-    program = parse_cyclogram('20 111h')
+    program = parse_cyclogram('20 16h')
     on, off = (
         simulate(one, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
         for one in (loaded, unit)

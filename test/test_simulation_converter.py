@@ -22,7 +22,7 @@ def test_sum_of_counts_is_the_integral_within_one_count(rng: np.random.Generator
     assert short.max() < 1.0 + 1e-6
 
 
-def test_a_day_at_400_hz_of_a_third_of_a_count_loses_nothing() -> None:
+def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing() -> None:
     """
     WHY: a float running sum of 1e9 counts has no digits left for the fraction. WHAT: whole and
     fraction are kept apart, so a day ends on the exact count.
@@ -31,12 +31,12 @@ def test_a_day_at_400_hz_of_a_third_of_a_count_loses_nothing() -> None:
     charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)
     remainder = np.zeros(1, dtype=np.int64)
     total, n_cycles = 0, 0
-    for _ in range(86):  # 24 h at 400 Hz are 34.56 million cycles
+    for _ in range(22):  # 24 h at 100 Hz are 8.64 million cycles
         counts, remainder = converter.convert(charge, remainder)
         total += int(counts.sum())
         n_cycles += len(counts)
     exact = n_cycles * Fraction(8935, 3)
-    # The fraction is kept to 2^-40 count: 3.4e7 of them could be off by 3e-5 count.
+    # The fraction is kept to 2^-40 count: 8.8e6 of them could be off by 8e-6 count.
     assert abs(total - exact) < 1 + 1e-4
 
 
