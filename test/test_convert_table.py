@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from thermo_comp.convert.log import NO_STAMP
-from thermo_comp.convert.table import exact_ns, read_parquet, read_text, sniff
+from thermo_comp.convert.table import exact_ns, layout, read_parquet, read_text
 from thermo_comp.errors import RecordingError
 
 ROWS = [(1000, 0.5, -1.25), (1001, 0.25, 2e-3), (1003, -7.0, 1.5)]
@@ -98,10 +98,10 @@ def test_stamps_are_exact() -> None:
     assert exact_ns(bad, 0).tolist() == [NO_STAMP] * len(bad)
 
 
-def test_sniff_prefers_the_delimiter_that_splits_all_lines_alike() -> None:
-    assert sniff('a;b,c;d\n1,5;2,5;3,5\n') == ';'
-    assert sniff('1 2 3\n4 5 6\n') == ' '
-    assert sniff('a\tb\n1\t2\n') == '\t'
+def test_layout_prefers_the_delimiter_that_splits_all_lines_alike() -> None:
+    assert layout('a;b,c;d\n1,5;2,5;3,5\n') == (';', 3)
+    assert layout('1 2 3\n4 5 6\n') == (' ', 3)
+    assert layout('a\tb\n1\t2\n') == ('\t', 2)
 
 
 @pytest.mark.parametrize(

@@ -10,24 +10,21 @@ barometer (sensor_msgs/FluidPressure) the case's. What rests must read gravity i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
 
 from ..errors import RecordingError
 from ..recording import Topics, inspect_recording, read_recording
+from ..recording.topics import IMU, TEMPERATURE, Present
 from ..unit.gravity import STANDARD_GRAVITY
 from .log import ForeignLog, Readings
 from .units import PER_G
 
-_IMU = 'sensor_msgs/msg/Imu'
-_TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
 
 Unit = Literal['m/s^2', 'g', 'mg']
-Present = Mapping[str, tuple[str, int]]
 
 
 def bag_log(
@@ -41,9 +38,6 @@ def bag_log(
     Read a bag with an Imu topic and its thermometers, whatever they are called.
 
     Topics that are None are found by type and neighbourhood; `unit` is what the driver publishes.
-
-    Raises RecordingError if the bag cannot be read, a topic is not there, or there are several to
-    choose from.
     """
     path = Path(path)
     found = find_topics(path, inspect_recording(path).topics, imu, board, case)
@@ -76,16 +70,13 @@ def find_topics(
     path: Path, present: Present, imu: str | None, board: str | None, case: str | None
 ) -> dict[str, str | None]:
     """
-    Tell ``imu``, ``board`` and ``case`` among a bag's topics; None where there is no such
-    thermometer.
-
-    Raises RecordingError if there is no Imu topic, or several and none was chosen; or more
-    thermometers than neighbourhood can tell apart.
+    Tell ``imu``, ``board`` and ``case`` among a bag's topics, None where there is no such
+    thermometer; RecordingError if there is no Imu, or more than neighbourhood can tell apart.
     """
-    imu = imu or _most(path, _of_type(present, _IMU), 'Imu')
+    imu = imu or _most(path, _of_type(present, IMU), 'Imu')
     if imu is None:
         raise RecordingError('the bag holds no Imu messages', path=path)
-    thermometers = [name for name in _of_type(present, _TEMPERATURE) if name not in (board, case)]
+    thermometers = [name for name in _of_type(present, TEMPERATURE) if name not in (board, case)]
     if case is None:
         baros = _of_type(present, _PRESSURE)
         nearer = [
@@ -110,14 +101,9 @@ def _of_type(present: Present, kind: str) -> list[str]:
 
 
 def _common(one: str, other: str) -> int:
-    """Count the leading name parts that two topics share, their last ones not counted."""
-    shared = 0
-    parts = (name.strip('/').split('/')[:-1] for name in (one, other))
-    for a, b in zip(*parts, strict=False):
-        if a != b:
-            break
-        shared += 1
-    return shared
+    """Count the namespaces that two topics share."""
+    names = (PurePosixPath('/', name.strip('/')) for name in (one, other))
+    return len(set.intersection(*({*name.parents} for name in names)))
 
 
 def _most(path: Path, names: list[str], what: str) -> str | None:

@@ -161,34 +161,23 @@ class ColumnMap:
 
 
 def load_column_map(path: str | Path) -> ColumnMap:
-    """
-    Read and validate a column map.
-
-    Raises RecordingError if the file cannot be read, or a key is unknown, missing or wrong; names
-    the key.
-    """
+    """Read a column map; RecordingError, with the key, if it cannot be read or is none."""
     try:
         data = load_plain_yaml(read_bounded(path, _SIZE_LIMIT).decode())
-    except OSError as failure:
-        raise RecordingError(failure.strerror or str(failure), path=path) from failure
-    except UnicodeDecodeError as failure:
-        raise RecordingError('a column map is YAML text in UTF-8', path=path) from failure
-    except ValueError as failure:
-        raise RecordingError(str(failure), path=path) from failure
-    if not isinstance(data, dict):
-        raise RecordingError('a column map is a mapping of keys (see config/columns)', path=path)
-    try:
+        if not isinstance(data, dict):
+            raise SchemaError('', 'a column map is a mapping of keys (see config/columns)')
         return build(ColumnMap, data)
     except SchemaError as failure:
         raise RecordingError(failure.message, path=path, topic=failure.key or None) from failure
+    except UnicodeDecodeError as failure:
+        raise RecordingError('a column map is YAML text in UTF-8', path=path) from failure
+    except (OSError, ValueError) as failure:
+        reason = getattr(failure, 'strerror', None) or str(failure)
+        raise RecordingError(reason, path=path) from failure
 
 
 def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
-    """
-    Read all rows of a table as its column map says, with the temperatures thinned.
-
-    Raises RecordingError if the file cannot be read or lacks a column.
-    """
+    """Read all rows of a table as its column map says, with the temperatures thinned."""
     path = Path(path)
     accel, gyro, stamp, style = columns.accel, columns.gyro, columns.stamp, columns.format
     thermometers = {'board': columns.board, 'case': columns.case}
@@ -240,10 +229,8 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
 
 def guess_columns(path: str | Path, rate_hz: float | None = None) -> ColumnMap:
     """
-    Tell the columns of a table without headings; `rate_hz` is for one without times.
-
-    Raises RecordingError if it has headings or another number of columns, its times are none, it
-    has none and no rate is given, or what rests is no gravity.
+    Tell the columns of a table without headings; `rate_hz` is for one without times. Raises
+    RecordingError where they do not say what they are.
     """
     path = Path(path)
     table = read_text(path)

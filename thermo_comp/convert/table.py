@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from io import TextIOWrapper
 from itertools import chain, islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -74,9 +75,8 @@ def read_text(
     Read some columns of a table of text, by their headings or numbers counted from 0; None reads
     all, by their numbers.
 
-    `stamp_exponent` is the power of ten from the stamp's unit to nanoseconds. The delimiter, a
-    blank for any run of white space, and whether there are headings are found out where they are
-    not said. Raises RecordingError if the file cannot be read, is empty, or lacks a column.
+    `stamp_exponent` is the power of ten from the stamp's unit to nanoseconds. The delimiter and
+    whether there are headings are found out where they are not said.
     """
     try:
         with TextIOWrapper(
@@ -88,9 +88,7 @@ def read_text(
             if '\0' in head:
                 raise RecordingError('not a table of text: it holds zero bytes', path=path)
             file.seek(0)
-            delimiter = delimiter or sniff(head)
-            widths = [_n_cells(row) for _, row in _rows(_sample(head), delimiter)]
-            width = max(set(widths), key=widths.count, default=0)
+            delimiter, width = layout(head, delimiter)
             headings, rows = _begin(_rows(file, delimiter), width, has_header)
             return _collect(path, headings, rows, columns, stamp, stamp_exponent)
     except (UnicodeError, csv.Error) as failure:
@@ -99,28 +97,21 @@ def read_text(
         raise RecordingError(failure.strerror or str(failure), path=path) from failure
 
 
-def sniff(head: str) -> str:
+def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
-    Return the delimiter of a text table: the one that splits most lines alike.
+    Find the delimiter of a text table, the one that splits most lines alike, and its width.
 
-    One of comma, semicolon, tab, bar, or a blank for any run of white space.
+    One of comma, semicolon, tab, bar, or a blank for any run of white space. The lines are taken
+    from the end of the head, where the preamble of a logger is over; the last one may be cut.
     """
-    lines = _sample(head)
-    best, best_score = ' ', 0
-    for delimiter in (',', ';', '\t', '|'):
-        counts = [line.count(delimiter) for line in lines]
-        typical = max(set(counts), key=counts.count, default=0)
-        score = counts.count(typical) if typical else 0
-        if score > best_score:
-            best, best_score = delimiter, score
-    return best
-
-
-def _sample(head: str) -> list[str]:
-    """Take lines from the end of a head, where the preamble of a logger is over."""
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
-    # The last one may be cut.
-    return (lines[:-1] if len(lines) > 2 else lines)[-50:]
+    lines = (lines[:-1] if len(lines) > 2 else lines)[-50:]
+    found: list[tuple[int, str, int]] = []
+    for one in (',', ';', '\t', '|', ' ') if delimiter is None else (delimiter,):
+        widths = [_n_cells(row) for _, row in _rows(lines, one)]
+        width = max(set(widths), key=widths.count, default=0)
+        found.append((widths.count(width) if width > 1 else 0, one, width))
+    return max(found, key=itemgetter(0))[1:]
 
 
 def _is_comment(cell: str) -> bool:
@@ -132,9 +123,7 @@ def _n_cells(row: Sequence[str]) -> int:
 
 
 def _rows(file: Iterable[str], delimiter: str) -> _Rows:
-    """
-    Yield (line number, cells) of every line that holds something but a comment.
-    """
+    """Yield (line number, cells) of every line that holds something but a comment."""
     if delimiter == ' ':
         cells: Iterable[list[str]] = (line.split() for line in file)
     else:
@@ -245,8 +234,7 @@ def _floats(cells: Sequence[str]) -> Floats:
 
 def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
     """
-    Return stamps in nanoseconds, exact to the last digit, of decimal numbers in 10^`exponent` ns.
-
+    Return stamps in nanoseconds, exact to the last digit, of decimal numbers in 10^`exponent` ns;
     `NO_STAMP` where a cell is no finite number or out of range.
     """
     factor = 10**exponent
@@ -267,10 +255,8 @@ def read_parquet(
     path: Path, columns: Sequence[Column], stamp: Column | None, stamp_exponent: int
 ) -> Table:
     """
-    Read some columns of a Parquet file, as `read_text` does of text.
-
-    A stamp column of Parquet's own timestamp type states its unit itself. Raises RecordingError if
-    pyarrow is not installed, the file is no Parquet file, is empty, or lacks a column.
+    Read some columns of a Parquet file, as `read_text` does of text; a stamp column of Parquet's
+    own timestamp type states its unit itself.
     """
     try:
         import pyarrow as pa
