@@ -38,6 +38,7 @@ def write_unit(
     metadata: dict[str, str] | None = None,
     names: Sequence[str] | None = None,
     is_exchanged: bool = False,
+    counts: str = 'accel/counts',
 ) -> list[Path]:
     """
     Simulate one thermal test of one unit, one bag per position; its thermometers may be exchanged.
@@ -61,8 +62,7 @@ def write_unit(
             board, case = ('case', 'board') if is_exchanged else ('board', 'case')
             bag.write_temperature(f'temperature/{board}', run.board_stamp_ns, run.board)
             bag.write_temperature(f'temperature/{case}', run.case_stamp_ns, run.case)
-            counts = run.counts.astype(np.float64)
-            bag.write_counts('accel/counts', run.accel_stamp_ns, counts, 'imu_link')
+            bag.write_counts(counts, run.accel_stamp_ns, run.counts.astype(np.float64), 'imu_link')
         paths.append(path)
     return paths
 

@@ -147,6 +147,13 @@ def test_command(tmp_path, rng, cli):
     assert 'looks like g' in refused.stderr
     finished = cli('convert', bag, '--unit', 'g', '-o', tmp_path / 'out.mcap')
     assert f'{N:8} imu/uncompensated' in finished.stdout
+    assert finished.stderr == (
+        f'thermo_comp: {bag}: /mpu/data, its only Imu, is taken for imu; /mpu/die, its nearest '
+        'Temperature, is taken for board; /baro/air, its nearest Temperature, is taken for case\n'
+    )
+    named = (f'--topic={x}' for x in ('imu=/mpu/data', 'board=/mpu/die', 'case=/baro/air'))
+    finished = cli('convert', bag, '--unit', 'g', '-o', tmp_path / 'named.mcap', *named)
+    assert 'is taken for' not in finished.stderr
     wrong = cli('convert', bag, '--imu', '1', '-o', tmp_path / 'two.mcap', code=2)
     assert '--topic' in wrong.stderr
     table = tmp_path / 'table.csv'

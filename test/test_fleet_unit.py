@@ -55,7 +55,7 @@ class TestRow:
         assert (row['name'], row['serial'], row['lot']) == ('lot-A/unit1', 'mems-0001', 'lot-A')
         assert row['verdict'].startswith('valid')
         assert row['reason'].startswith(f'{row["all_ug"]:.0f} ug RMS of |f| - g, ')
-        assert (row['problem'], row['left_out']) == ('', '')
+        assert (row['problem'], row['left_out'], row['chosen']) == ('', '', '')
         assert (row['n_bags'], row['n_left_out'], row['n_positions']) == (6, 0, 6)
         calibration = parse_calibration(outcome.calibration.encode())
         # A reading of x at the reference, from the row and from the file.
@@ -120,7 +120,9 @@ class TestRow:
         assert row['verdict'] == 'refused'
         assert row['problem'] == 'the bags are of different units: mems-0001, mems-0002'
 
-    def test_the_lot_of_the_metadata_wins(self, tmp_path: Path) -> None:
-        write_unit(tmp_path / 'shelf' / 'u', 1, 1, serial='', metadata={'lot': 'L7'})
+    def test_the_lot_of_the_metadata_wins_and_a_chosen_topic_is_told(self, tmp_path: Path) -> None:
+        lot = {'lot': 'L7'}
+        write_unit(tmp_path / 'shelf' / 'u', 1, 2, serial='', metadata=lot, counts='/imu/raw')
         row = processed(tmp_path).row
         assert (row['lot'], row['serial']) == ('L7', 'u')
+        assert row['chosen'] == '/imu/raw, its only Vector3Stamped, is taken for counts'

@@ -132,13 +132,15 @@ def test_bag_is_read_once_and_judged_again(tmp_path):
     one = fitted().calibration
     unit = save(tmp_path / 'unit.yaml', 'first note', one)
     bag = write_bag(tmp_path / 'held_out.mcap')
-    report = LiveReport(unit, [bag])
+    told = []
+    report = LiveReport(unit, [bag], read=lambda info: told.append(info.path.name))
     assert report._evidence().bags[0].name == 'held_out.mcap'
     ((_, opened),) = report._opened.values()
     save(unit, 'second note', one)
     assert report._evidence().findings == ('second note',)
     ((_, again),) = report._opened.values()
     assert again is opened
+    assert told == ['held_out.mcap']
     bag.unlink()
     write_bag(bag, 1)
     report._evidence()

@@ -102,7 +102,7 @@ def convert(
     with out.progress('converting') as done:
         report = write_log(read(), output, force, done)
     _say(out, report)
-    out.told([(log, None, report.missing)])
+    out.told([(log, report.chosen, report.missing)])
     out.end()
 
 

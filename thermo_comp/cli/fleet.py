@@ -106,6 +106,7 @@ def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
         ],
         title='|f| - g at rest, RMS',
     )
+    out.told((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
         for said in ('problem', 'left_out'):
             if row[said]:

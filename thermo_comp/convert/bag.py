@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..recording import Topics, inspect_recording, read_recording
-from ..recording.topics import IMU, TEMPERATURE, Present
+from ..recording.topics import IMU, TEMPERATURE, Present, said_choice
 from ..unit.gravity import STANDARD_GRAVITY
 from .log import ForeignLog, Readings
 from .units import PER_G
@@ -40,7 +40,18 @@ def bag_log(
     Topics that are None are found by type and neighbourhood; `unit` is what the driver publishes.
     """
     path = Path(path)
+    given = {'imu': imu, 'board': board, 'case': case}
     found = find_topics(path, inspect_recording(path).topics, imu, board, case)
+    chosen = [
+        said_choice(
+            name,
+            role,
+            given[role] or getattr(Topics(), role),
+            'only' if role == 'imu' else 'nearest',
+        )
+        for role, name in found.items()
+        if name
+    ]
     # A name that no topic has stands for a thermometer that is not there.
     topics = Topics(
         imu=found['imu'] or '', board=found['board'] or '/none', case=found['case'] or '/none'
@@ -62,6 +73,7 @@ def bag_log(
         frame_id=columns.frame_id,
         serial=recording.info.metadata.get('serial', ''),
         missing=recording.info.truncated,
+        chosen='; '.join(filter(None, chosen)) or None,
         metadata={f'topic_{role}': name for role, name in found.items() if name},
     )
 

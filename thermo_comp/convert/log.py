@@ -63,6 +63,7 @@ class ForeignLog:
     counts_per_g, clip: the stated sensitivity; readings at and beyond which the sensor saturates
     n_short: rows that were left out because they are too short
     missing: what of the log could not be read
+    chosen: which topics were taken without being named
     hint: how its recorder would have logged more
     """
 
@@ -82,6 +83,7 @@ class ForeignLog:
     n_short: int = 0
     metadata: Mapping[str, str] = field(default_factory=dict)
     missing: str | None = None
+    chosen: str | None = None
     hint: str = ''
 
 
@@ -124,6 +126,7 @@ class ConversionReport:
     stillness: Stillness
     start_ns: int
     missing: str | None
+    chosen: str | None
     hint: str
 
 
@@ -207,6 +210,7 @@ def write_log(
         stillness=stillness,
         start_ns=int(stamp_ns[0]),
         missing=log.missing,
+        chosen=log.chosen,
         hint=log.hint,
     )
 

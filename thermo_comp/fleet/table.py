@@ -65,6 +65,7 @@ _TABLE = (
     ('problem', 'text', 'why there is no calibration'),
     ('reservations', 'text', 'what the certificate holds against the calibration'),
     ('left_out', 'text', 'bags that were left out, each with its reason'),
+    ('chosen', 'text', 'topics that were taken by their type, for want of the usual name'),
     ('n_bags', 'whole', 'bags found'),
     ('n_left_out', 'whole', 'of them left out'),
     ('n_torn', 'whole', 'bags that were cut off, and are read up to there'),

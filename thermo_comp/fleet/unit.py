@@ -78,7 +78,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
     hashes = dict.fromkeys(unit.bags, '')
     kinds: dict[Literal['counts', 'm/s^2'], str] = {}
     bags: list[ReducedBag] = []
-    problems = []
+    problems, chosen = [], []
     is_final = True
     for name, files in unit.bags.items():
         # Of a bag its sufficient statistics are kept, some kilobytes per hour.
@@ -90,6 +90,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 )
                 source = replace(source, sha256=hashes[name])
                 how = replace(options.fit, input='m/s^2' if info.input == 'imu' else 'counts')
+                chosen.append(info.chosen)
                 bags.append(reduce_bag(source, len(bags), how))
                 kinds[how.input] = name
         except RecordingError as error:  # noqa: PERF203 - no bag stops the others
@@ -111,6 +112,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         n_left_out=len(problems),
         n_torn=sum(bool(bag.truncated) for bag in bags),
         left_out='; '.join(problems),
+        chosen='; '.join(dict.fromkeys(filter(None, chosen))),
         prior=options.prior_sha256,
     )
     outcome = UnitOutcome(row, hashes, is_final)

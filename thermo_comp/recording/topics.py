@@ -129,6 +129,12 @@ def shown(name: str) -> str:
     return ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in short)
 
 
+def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
+    """Say that a topic was taken for an input by its type; nothing where it is the one wanted."""
+    kind = _TYPES[key].rpartition('/')[2]
+    return '' if _fits(name, wanted) else f'{shown(name)}, its {among} {kind}, is taken for {key}'
+
+
 @dataclass(frozen=True, slots=True)
 class Selection:
     """
@@ -174,9 +180,7 @@ def select_topics(
         _check_type(path, present, name, _TYPES[key])
         if present[name][1]:
             found[role] = name
-            if not _fits(name, getattr(topics, key)):
-                kind = _TYPES[key].rpartition('/')[2]
-                chosen.append(f'{shown(name)}, its only {kind}, is taken for {key}')
+            chosen.append(said_choice(name, key, getattr(topics, key)))
         elif role in require:
             raise RecordingError('the topic has no messages', path, shown(name))
     further = _further(path, present, topics, found, is_read=bool(require))
@@ -184,7 +188,7 @@ def select_topics(
         {**found, **further},
         ('board', 'case', *further),
         accel if 'accel' in found else None,
-        '; '.join(chosen) or None,
+        '; '.join(filter(None, chosen)) or None,
     )
 
 
