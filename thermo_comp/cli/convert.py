@@ -150,7 +150,7 @@ def _reader(out: Output, path: Path, given: Mapping[str, Any]) -> Callable[[], F
     if kind == 'log':
         read = convert.read_ulog if path.suffix.lower() == '.ulg' else convert.read_dataflash
         imu, baro, is_allowed = (said.get(flag) for flag in _OPTIONS['log'])
-        return lambda: convert.foreign_log(read(path), imu, baro, bool(is_allowed))
+        return partial(read, path, imu, baro, bool(is_allowed))
     columns, rate_hz = said.get('--columns'), said.get('--rate-hz')
     if columns is not None and rate_hz is not None:
         raise options.usage('--rate-hz: a column map says that')

@@ -4,7 +4,6 @@
 Owns the way from other people's logs to bags: tables with a column map, PX4, ArduPilot, bags.
 """
 
-from .autopilot import foreign_log
 from .bag import bag_log
 from .columns import ColumnMap, guess_columns, load_column_map, spoken_columns, table_log
 from .dataflash import read_dataflash
@@ -16,7 +15,6 @@ __all__ = [
     'ConversionReport',
     'ForeignLog',
     'bag_log',
-    'foreign_log',
     'guess_columns',
     'load_column_map',
     'read_dataflash',

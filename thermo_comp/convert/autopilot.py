@@ -12,7 +12,8 @@ so nothing can be weighed by it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,52 +31,41 @@ _CENTURY_US = 100 * 366 * 86400 * 10**6
 _NO_NOISE = 1e-6
 
 
-@dataclass(frozen=True)
-class AutopilotLog:
-    """
-    What an autopilot's log says of its IMUs and barometers, by instance.
-
-    `compensated` says why the thermal drift of an IMU is gone from its readings already.
-    """
-
-    path: str
-    imus: dict[int, ForeignLog]
-    baros: dict[int, Readings]
-    compensated: dict[int, str] = field(default_factory=dict)
-
-
-def foreign_log(
-    log: AutopilotLog,
-    imu: int | None = None,
-    baro: int | None = None,
-    allow_compensated: bool = False,
+def chosen(
+    path: Path,
+    imus: Mapping[int, ForeignLog],
+    baros: Mapping[int, Readings],
+    compensated: Mapping[int, str],
+    imu: int | None,
+    baro: int | None,
+    allow_compensated: bool,
 ) -> ForeignLog:
     """
-    Take one IMU and one barometer out of an autopilot's log; None takes the lowest instance.
+    Take one IMU and one barometer out of what a log holds; None takes the lowest instance.
 
-    Raises RecordingError if the instance is not there, its drift is already corrected and that is
-    not allowed, or the readings have no noise: a simulator's.
+    Raises RecordingError if the instance is not there, its drift is gone (`compensated` says why)
+    and that is not allowed, or the readings have no noise: a simulator's.
     """
-    why = log.compensated.get(min(log.imus, default=0) if imu is None else imu)
+    why = compensated.get(min(imus, default=0) if imu is None else imu)
     if why and not allow_compensated:
-        raise RecordingError(why, path=log.path)
-    rows = _choose(log.imus, imu, 'IMU', log.path)
+        raise RecordingError(why, path=path)
+    rows = _instance(imus, imu, 'IMU', path)
     stamped = rows.stamp_ns != NO_STAMP
     rest = find_stillness(rows.stamp_ns[stamped], rows.accel[stamped])
     if rest.noise <= _NO_NOISE * rest.magnitude:
         raise RecordingError(
             'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
             'from which no calibration of a real sensor can come',
-            path=log.path,
+            path=path,
         )
-    baros = {number: _reported(readings) for number, readings in log.baros.items()}
+    heard = {number: _reported(readings) for number, readings in baros.items()}
     if baro is None:
-        baros = {number: readings for number, readings in baros.items() if len(readings.celsius)}
+        heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
     found = [_reported(one) for one in rows.temperatures.values()]
-    if baros or baro is not None:
-        found.append(_choose(baros, baro, 'barometer', log.path))
-    heard = [thin(one) for one in found if len(one.celsius)]
-    return replace(rows, temperatures=dict(zip(('board', 'case'), heard, strict=False)))
+    if heard or baro is not None:
+        found.append(_instance(heard, baro, 'barometer', path))
+    named = zip(('board', 'case'), (thin(one) for one in found if len(one.celsius)), strict=False)
+    return replace(rows, temperatures=dict(named))
 
 
 def stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
@@ -90,7 +80,7 @@ def stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
     return np.where(is_time, np.where(is_time, whole, 0).astype(np.int64) * 1000, NO_STAMP)
 
 
-def _choose(found: Mapping[int, T], wanted: int | None, what: str, path: str) -> T:
+def _instance(found: Mapping[int, T], wanted: int | None, what: str, path: Path) -> T:
     if not found:
         raise RecordingError(f'the log holds no {what}', path=path)
     number = min(found) if wanted is None else wanted

@@ -19,7 +19,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ import numpy.typing as npt
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Bools, Ints
-from .autopilot import AutopilotLog, stamps_ns
+from .autopilot import chosen, stamps_ns
 from .log import ForeignLog, Readings
 
 _HEADER_BYTES = 3
@@ -44,11 +43,17 @@ _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 _Columns = dict[str, npt.NDArray[Any]]
 
 
-def read_dataflash(path: str | Path) -> AutopilotLog:
+def read_dataflash(
+    path: str | Path,
+    imu: int | None = None,
+    baro: int | None = None,
+    allow_compensated: bool = False,
+) -> ForeignLog:
     """
-    Read the inertial sensors of an ArduPilot log, counted from 0: the old type ``IMU2`` is 1.
+    Read an IMU of an ArduPilot log, counted from 0: the old type ``IMU2`` is 1.
 
-    Raises RecordingError if pymavlink is not installed, or the file is no DataFlash log.
+    Raises RecordingError as `chosen`, and if pymavlink is not installed, or the file is no
+    DataFlash log.
     """
     try:
         from pymavlink.DFReader import DFReader_binary
@@ -70,6 +75,9 @@ def read_dataflash(path: str | Path) -> AutopilotLog:
     imus: dict[int, ForeignLog] = {}
     baros: dict[int, Readings] = {}
     try:
+        metadata = {}
+        if any(str(key).startswith('SIM_') for key in reader.params):
+            metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d', name):
                 continue
@@ -83,27 +91,24 @@ def read_dataflash(path: str | Path) -> AutopilotLog:
                 elif all(title in columns for title in _VECTORS):
                     both = np.column_stack([columns[title][rows] for title in _VECTORS])
                     accel, gyro = both.astype(np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
-                    heat = {'imu': readings}
                     imus[number] = ForeignLog(
-                        str(path), stamp_ns[rows], accel, gyro, heat, n_short=n_short
+                        str(path),
+                        stamp_ns[rows],
+                        accel,
+                        gyro,
+                        {'imu': readings},
+                        n_short=n_short,
+                        metadata=metadata,
                     )
-        parameters = {
-            str(key): float(value)
-            for key, value in reader.params.items()
-            if isinstance(value, int | float)
-        }
     finally:
         reader.close()
-    if any(key.startswith('SIM_') for key in parameters):
-        said = {'ardupilot_simulated': 'it has SIM_ parameters: a simulator wrote this log'}
-        imus = {number: replace(one, metadata=said) for number, one in imus.items()}
     compensated = {
         number: f'{name} was 1: ArduPilot has already taken the thermal drift out of these '
         'readings; set it to 0 and record again'
         for number in imus
-        if parameters.get(name := f'INS_TCAL{number + 1}_ENABLE') == 1.0
+        if reader.params.get(name := f'INS_TCAL{number + 1}_ENABLE') == 1.0
     }
-    return AutopilotLog(str(path), imus, baros, compensated)
+    return chosen(path, imus, baros, compensated, imu, baro, allow_compensated)
 
 
 def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:

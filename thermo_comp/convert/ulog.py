@@ -27,7 +27,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Floats, Ints
-from .autopilot import AutopilotLog, stamps_ns
+from .autopilot import chosen, stamps_ns
 from .log import NO_STAMP, SLOW_HZ, ForeignLog, Readings
 
 _TOPICS = (
@@ -43,11 +43,15 @@ _NOT_THERE = 2**31 - 1
 _Columns = dict[str, Any]
 
 
-def read_ulog(path: str | Path) -> AutopilotLog:
+def read_ulog(
+    path: str | Path,
+    imu: int | None = None,
+    baro: int | None = None,
+    allow_compensated: bool = False,
+) -> ForeignLog:
     """
-    Read the inertial sensors of a PX4 log.
-
-    Raises RecordingError if pyulog is not installed, or the file is no ULog.
+    Read an IMU of a PX4 log; RecordingError as `chosen`, and if pyulog is not installed, or the
+    file is no ULog.
     """
     try:
         from pyulog import ULog
@@ -109,7 +113,7 @@ def read_ulog(path: str | Path) -> AutopilotLog:
                 'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
                 f'thermal drift out of these readings; {_PROFILE}'
             )
-    return AutopilotLog(str(path), imus, baros, compensated)
+    return chosen(Path(path), imus, baros, compensated, imu, baro, allow_compensated)
 
 
 def _combined(columns: _Columns) -> tuple[Ints, Floats, Floats | None]:
