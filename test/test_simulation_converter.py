@@ -8,14 +8,13 @@ from fractions import Fraction
 
 import numpy as np
 
-from thermo_comp.simulation.unit import Converter
+from thermo_comp.simulation.unit import balanced, first_charge, rounded
 
 
 def test_sum_of_counts_is_the_integral_within_one_count(rng: np.random.Generator) -> None:
-    converter = Converter()
     charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
-    start = converter.start(7)
-    counts, _ = converter.convert(charge, start)
+    start = first_charge(7)
+    counts, _ = balanced(charge, start)
     # At every instant, not only at the end; 1e-6 is the rounding of the float sum here.
     short = np.cumsum(charge, axis=0) + start / 2.0**40 - np.cumsum(counts, axis=0)
     assert short.min() > -1e-6
@@ -27,12 +26,11 @@ def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing() -> None:
     WHY: a float running sum of 1e9 counts has no digits left for the fraction. WHAT: whole and
     fraction are kept apart, so a day ends on the exact count.
     """
-    converter = Converter()
     charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)
     remainder = np.zeros(1, dtype=np.int64)
     total, n_cycles = 0, 0
     for _ in range(22):  # 24 h at 100 Hz are 8.64 million cycles
-        counts, remainder = converter.convert(charge, remainder)
+        counts, remainder = balanced(charge, remainder)
         total += int(counts.sum())
         n_cycles += len(counts)
     exact = n_cycles * Fraction(8935, 3)
@@ -41,28 +39,25 @@ def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing() -> None:
 
 
 def test_blocks_of_any_size_give_the_same_counts(rng: np.random.Generator) -> None:
-    converter = Converter()
     charge = rng.normal(0.0, 2e4, (10_000, 3))
-    start = converter.start(1)
-    whole, last = converter.convert(charge, start)
+    start = first_charge(1)
+    whole, last = balanced(charge, start)
     for size in (1, 7, 999, 10_000):
         remainder, pieces = start, []
         for first in range(0, len(charge), size):
-            counts, remainder = converter.convert(charge[first : first + size], remainder)
+            counts, remainder = balanced(charge[first : first + size], remainder)
             pieces.append(counts)
         np.testing.assert_array_equal(np.concatenate(pieces), whole)
         np.testing.assert_array_equal(remainder, last)
 
 
 def test_output_saturates_at_the_words_ends_and_recovers() -> None:
-    converter = Converter()
     charge = np.array([[4e4, -4e4, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
-    counts, _ = converter.convert(charge, np.zeros(3, dtype=np.int64))
+    counts, _ = balanced(charge, np.zeros(3, dtype=np.int64))
     np.testing.assert_array_equal(counts, [[32767, -32768, 0], [0, 0, 1], [1, 1, 0]])
 
 
 def test_without_a_carry_each_cycle_is_rounded_by_itself() -> None:
-    converter = Converter(carries_remainder=False)
     charge = np.full((5, 3), 10.4)
-    counts, _ = converter.convert(charge, converter.start(0))
+    counts, _ = rounded(charge, first_charge(0))
     np.testing.assert_array_equal(counts, 10)

@@ -3,9 +3,7 @@
 """
 Owns the physics of the errors: bias and scale driven by the temperatures of physical parts.
 
-Each effect sits in the part where it arises: a tempco in a reference, an integrator or a magnet,
-a thermo-EMF or a thermo-elastic stress in the difference between two parts, a creep or a slip in a
-joint, a leakage in a die, a load on a supply. Deviations count from the still state in which the
+Each effect sits in the part where it arises. Deviations count from the still state in which the
 board's thermometer shows the reference temperature, so bias and scale there are the unit's
 constants.
 """
@@ -60,12 +58,12 @@ class Effect(ABC):
     @abstractmethod
     def _signals(self, history: PartHistory) -> tuple[Floats, Floats | float]: ...
 
-    def change(self, history: PartHistory) -> tuple[Floats, Floats]:
-        """Return the change of the bias [ug] and of the scale [ppm], shape (m, 3)."""
+    def change(self, history: PartHistory) -> Floats:
+        """Return the change of the bias [ug] and of the scale [ppm], shape (2, m, 3)."""
         first, second = (np.reshape(s, (-1, 1)) for s in self._signals(history))
-        bias = first * np.array(self.bias) + second * np.array(self.bias_curvature)
-        scale = first * np.array(self.scale) + second * np.array(self.scale_curvature)
-        return bias, scale
+        straight, bent = (self.bias, self.scale), (self.bias_curvature, self.scale_curvature)
+        result: Floats = first * np.array(straight)[:, None] + second * np.array(bent)[:, None]
+        return result
 
 
 @dataclass(frozen=True)
@@ -82,9 +80,8 @@ class PartEffect(Effect):
 @dataclass(frozen=True)
 class DifferenceEffect(Effect):
     """
-    Stress or voltage between two parts: the difference of their deviations [K] and of the squares.
-
-    The squares are those of expansion or Seebeck coefficients that grow with temperature.
+    Stress or thermo-EMF between two parts: the difference of their deviations [K] and, where
+    expansion or Seebeck coefficients grow with temperature, of the squares.
     """
 
     hot: str
@@ -102,9 +99,8 @@ class FlowEffect(Effect):
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent``: a gas that rises in
     a gap (1.25), the load of a heat pump (1), its losses (2); times the deviation of `cold` to the
-    `power`. Where the supply of the pump limits it, the signal levels off at 1, ``x^e / (1 +
-    x^e)``: then it is a matter of on and off. The second signal is the first times the deviation
-    of `cold`.
+    `power`. Where the pump's supply limits it, it levels off at 1, ``x^e / (1 + x^e)``. The second
+    signal is the first times the deviation of `cold`.
     """
 
     hot: str
@@ -155,10 +151,9 @@ class CreepEffect(Effect):
 @dataclass(frozen=True)
 class SlipEffect(Effect):
     """
-    A joint that is strained with a part's temperature and slips: stress [K of free strain].
-
-    The stress depends on the way, not on the time. It gives way at once at `width` (Jenkins) or
-    bit by bit towards it (Dahl, Bouc-Wen); it starts relaxed.
+    A joint that is strained with a part's temperature and slips: stress [K of free strain], by the
+    way, not the time. It gives way at once at `width` (Jenkins) or bit by bit towards it (Dahl,
+    Bouc-Wen); it starts relaxed.
     """
 
     part: str
@@ -182,9 +177,6 @@ class SlipEffect(Effect):
 
 def drift_of(effects: Iterable[Effect], history: PartHistory) -> tuple[Floats, Floats]:
     """Return the change of the bias [ug] and the relative change of the scale, shape (m, 3)."""
-    bias, ppm = np.zeros((2, len(history.deviation), 3))
-    for effect in effects:
-        more = effect.change(history)
-        bias += more[0]
-        ppm += more[1]
+    changes = [effect.change(history) for effect in effects]
+    bias, ppm = sum(changes, start=np.zeros((2, len(history.deviation), 3)))
     return bias, ppm * 1e-6

@@ -30,7 +30,7 @@ from .drift import (
 )
 from .network import AIR, Link, ThermalNetwork, Thermostat
 from .streams import Stream, generator
-from .unit import Converter, GyroModel, SwitchedLoad, ThermometerModel, UnitModel, triple
+from .unit import GyroModel, SwitchedLoad, ThermometerModel, UnitModel, rounded, triple
 
 
 class _Specimen:
@@ -85,7 +85,6 @@ class _Specimen:
             'board': ThermometerModel('board', phase=0.5),
             'case': ThermometerModel('case'),
             'noise_density': (density, density, density),
-            'converter': Converter(),
         }
         return UnitModel(
             name=self.name,
@@ -189,7 +188,7 @@ def _mems(draw: _Specimen) -> UnitModel:
         board=ThermometerModel('board', noise_sd=0.02, phase=0.5),
         case=ThermometerModel('case', noise_sd=0.02),
         noise_density=(120.0, 120.0, 150.0),
-        converter=Converter(carries_remainder=False),
+        converter=rounded,
     )
     rate = (
         PartEffect('die', bias=draw.signed(5.0, 20.0), bias_curvature=draw.normal(0.1)),

@@ -20,7 +20,7 @@ from .cyclogram import Cyclogram
 from .drift import PartHistory, drift_of
 from .network import AIR, ThermalResponse
 from .streams import Stream, generator
-from .unit import UnitModel
+from .unit import UnitModel, first_charge
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
@@ -198,7 +198,7 @@ def simulate_blocks(
         noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
         noise = [generator(seed, Stream.ACCEL_NOISE, i) for i in range(3)]
         rate_noise = [generator(seed, Stream.GYRO_NOISE, i) for i in range(3)]
-        remainder = unit.converter.start(seed)
+        remainder = first_charge(seed)
         passed = -1
         for first in range(0, n_cycles, block_size):
             last = min(first + block_size, n_cycles)
@@ -209,7 +209,7 @@ def simulate_blocks(
             charge = part.bias + K * part.scale * s
             for i in range(3):
                 charge[:, i] += noise_sd[i] * noise[i].standard_normal(len(cycle))
-            counts, remainder = unit.converter.convert(charge, remainder)
+            counts, remainder = unit.converter(charge, remainder)
             rate, gyro = None, unit.gyro
             if gyro is not None:
                 rate = part.on_cycles(part.rate_bias) + gyro.constant(seed)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,55 +20,44 @@ from .network import ThermalNetwork, ThermalResponse
 from .streams import Stream, generator
 
 _NS = 1_000_000_000
-# Most negative and most positive output of 16 bits, counts.
-_LOW, _HIGH = -(1 << 15), (1 << 15) - 1
+_RANGE = -(1 << 15), (1 << 15) - 1  # of the output, counts
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
 _ROWS = 1 << 20  # rows summed at once: 2^20 fractions below 2^40 stay far below 2^63
 
 
-@dataclass(frozen=True)
-class Converter:
+def first_charge(seed: int) -> Ints:
+    """Return the charge on the integrators at power-on, shape (3,), in 2^-40 count."""
+    phases = [generator(seed, Stream.CONVERTER_PHASE, axis).integers(_ONE) for axis in range(3)]
+    return np.array(phases, dtype=np.int64)
+
+
+def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
     """
-    Signed 16-bit converter of a current into counts per cycle.
+    Convert the real-valued counts of consecutive cycles, shape (n, 3), to whole ones of 16 bits.
 
-    It balances charge: what is left over when a cycle ends stays on the integrator and counts in
-    the next cycle, so the sum of the counts follows the integral of the input to within one count
-    for ever. The carry is kept in fixed point: a long run loses nothing and blocks of any size
-    give the same counts. Or it rounds every cycle by itself, as a sampling converter does.
+    What is left over when a cycle ends, `remainder`, counts in the next one, so the sum of the
+    counts follows the integral of the input to within one count for ever. It is kept in fixed
+    point: a long run loses nothing and blocks of any size give the same counts. Charge beyond the
+    output range is lost, as in an integrator at its rail; the fraction is carried on even then.
     """
+    counts = np.empty(charge.shape, dtype=np.int32)
+    for first in range(0, len(charge), _ROWS):
+        rows = charge[first : first + _ROWS]
+        # Eq. (1): whole counts; the fraction is carried on.
+        whole = np.floor(rows)
+        fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
+        total = np.cumsum(fraction, axis=0) + remainder
+        carried = total >> _FRACTION_BITS
+        carry = np.diff(carried, axis=0, prepend=0)
+        counts[first : first + _ROWS] = np.clip(whole + carry, *_RANGE)
+        remainder = total[-1] - (carried[-1] << _FRACTION_BITS)
+    return counts, remainder
 
-    carries_remainder: bool = True
 
-    def start(self, seed: int) -> Ints:
-        """Return the charge on the integrators at power-on, shape (3,), in 2^-40 count."""
-        return np.array(
-            [generator(seed, Stream.CONVERTER_PHASE, axis).integers(_ONE) for axis in range(3)],
-            dtype=np.int64,
-        )
-
-    def convert(self, charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
-        """
-        Convert consecutive cycles: real-valued counts, shape (n, 3), to whole ones.
-
-        `remainder` is the charge left by the cycle before, as `start` or this method returned it.
-        Charge beyond the output range is lost, as in an integrator at its rail; the fraction of a
-        count is carried on even then.
-        """
-        if not self.carries_remainder:
-            return np.clip(np.rint(charge), _LOW, _HIGH).astype(np.int32), remainder
-        counts = np.empty(charge.shape, dtype=np.int32)
-        for first in range(0, len(charge), _ROWS):
-            rows = charge[first : first + _ROWS]
-            # Eq. (1): whole counts; the fraction is carried on.
-            whole = np.floor(rows)
-            fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
-            total = np.cumsum(fraction, axis=0) + remainder
-            carried = total >> _FRACTION_BITS
-            carry = np.diff(carried, axis=0, prepend=0)
-            counts[first : first + _ROWS] = np.clip(whole + carry, _LOW, _HIGH)
-            remainder = total[-1] - (carried[-1] << _FRACTION_BITS)
-        return counts, remainder
+def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
+    """Convert every cycle by itself, as a sampling converter does."""
+    return np.clip(np.rint(charge), *_RANGE).astype(np.int32), remainder
 
 
 @dataclass(frozen=True)
@@ -76,8 +66,7 @@ class ThermometerModel:
     One thermometer on one part: ``reading = quantum * round((T + offset + noise) / quantum)``.
 
     White noise, quantum (0 is continuous) and offset in K; `phase` is the instant of the first
-    reading within its period, 0..1. Raises ValueError if the rate is not positive, or noise,
-    quantum or phase is out of range.
+    reading within its period, 0..1.
     """
 
     node: str
@@ -182,7 +171,7 @@ class UnitModel:
     bias_at_reference: Triple
     misalignment: tuple[Triple, Triple, Triple]
     noise_density: Triple
-    converter: Converter
+    converter: Callable[[Floats, Ints], tuple[NDArray[np.int32], Ints]] = balanced
     reference_temperature: float = 20.0
     bias_walk: Triple = ZERO
     loads: tuple[SwitchedLoad, ...] = ()
