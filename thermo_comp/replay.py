@@ -46,7 +46,7 @@ from .unit.calibration import Calibration
 OUTPUT_TOPIC = 'imu/data_raw'
 REGIME_TOPIC = 'regime/dynamic'
 #: Messages corrected at once: enough that what is done per block costs little beside them.
-BLOCK_MESSAGES = 1 << 17
+BLOCK_MESSAGES = 1 << 15
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
 

@@ -13,7 +13,7 @@ import os
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
@@ -38,10 +38,9 @@ from mcap.records import (
 
 from .. import __version__
 from ..typing import Bytes
-from .chunks import MESSAGE_HEAD_BYTES
-from .encode import Merged
+from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .mcap_file import MAGIC, METADATA_NAME
-from .messages import Messages, join_messages
+from .messages import Messages, join_messages, pack, scatter
 from .rosbag2_metadata import Definition, FileSummary, dump_yaml, information, offered_qos
 
 #: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
@@ -49,6 +48,8 @@ _ZSTD_LEVEL = -1
 _MAX_PACKING = 2
 # Versions of mcap differ in which of its methods are typed.
 _new_builder: Callable[[], Any] = RecordBuilder
+#: Opcode, length, channel, sequence, log time, publish time.
+_RECORD_HEAD = np.dtype('u1, <u8, <u2, <u4, <i8, <i8')
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 
@@ -70,17 +71,18 @@ class McapOutput:
         name: str,
     ) -> None:
         self._name = name
+        self._metadata = metadata
         self._compression = '' if compression == 'none' else compression
         self._compress = _compressor(compression, level)
         self._chunk_bytes = chunk_bytes
         self._schemas: dict[str, Schema] = {}
         self._channels: dict[str, Channel] = {}
-        self._topics: dict[str, tuple[str, str]] = {}
+        self._types: dict[str, tuple[str, str]] = {}
         self._counts: dict[int, int] = {}
         self._chunks: list[ChunkIndex] = []
         self._metadata_index: list[MetadataIndex] = []
         self._tail: list[Messages] = []
-        self._packing: deque[tuple[Messages, Future[tuple[bytes | memoryview, int]]]] = deque()
+        self._packing: deque[tuple[Messages, Future[tuple[Any, int]]]] = deque()
         self._pool = ThreadPoolExecutor(1, 'recording')
         self._start_ns: int | None = None
         self._end_ns = 0
@@ -96,14 +98,11 @@ class McapOutput:
         Give the number of a topic's channel, made where it is new; None if its type is another.
         """
         if topic in self._channels:
-            same = self._topics[topic][0] == kind
-            return self._channels[topic].id if same else None
+            return self._channels[topic].id if self._types[topic][0] == kind else None
         if kind not in self._schemas:
-            text = definition.text.encode()
-            number = len(self._schemas) + 1
-            schema = Schema(id=number, data=text, encoding=definition.encoding, name=kind)
-            self._schemas[kind] = schema
-            self._put_record(schema)
+            number, text = len(self._schemas) + 1, definition.text.encode()
+            self._schemas[kind] = Schema(number, text, definition.encoding, kind)
+            self._put_record(self._schemas[kind])
         channel = Channel(
             id=len(self._channels) + 1,
             topic=topic,
@@ -115,26 +114,35 @@ class McapOutput:
             },
         )
         self._channels[topic] = channel
-        self._topics[topic] = (kind, definition.type_hash)
+        self._types[topic] = (kind, definition.type_hash)
         self._counts[channel.id] = 0
         self._put_record(channel)
         return channel.id
 
-    def append(self, merged: Merged) -> None:
-        """Add messages; whole chunks are written, the rest waits for more."""
-        while True:
-            waiting = sum(len(messages.data) for messages in self._tail)
-            messages = merged.take(self._chunk_bytes - waiting)
-            if messages is None:
-                return
-            self._tail.append(messages)
-            if waiting + len(messages.data) >= self._chunk_bytes:
-                self._close_chunk()
+    def append(self, batches: Sequence[Messages]) -> None:
+        """Add messages in log-time order; whole chunks are written, the rest waits for more."""
+        messages = join_messages([*self._tail, *batches])
+        n_old = sum(map(len, self._tail))
+        order = np.argsort(messages.log_ns[n_old:], kind='stable')
+        messages = messages.take(np.concatenate([np.arange(n_old), n_old + order]))
+        ends = np.cumsum(messages.size + MESSAGE_HEAD_BYTES)
+        begin = n_done = 0
+        while len(ends) and ends[-1] - n_done >= self._chunk_bytes:
+            end = int(np.searchsorted(ends, n_done + self._chunk_bytes)) + 1
+            self._close_chunk(messages.take(slice(begin, end)))
+            begin, n_done = end, int(ends[end - 1])
+        self._tail = [messages.take(slice(begin, None)).packed()]
 
-    def _close_chunk(self) -> None:
-        """Have the waiting messages compressed, and write what was compressed meanwhile."""
-        messages, self._tail = join_messages(self._tail), []
-        self._packing.append((messages, self._pool.submit(self._pack, messages.data)))
+    def _close_chunk(self, messages: Messages) -> None:
+        """Have messages laid out and compressed, and write what was so far."""
+        data, ends = pack(messages.data, messages.start, messages.size, MESSAGE_HEAD_BYTES)
+        at = ends - messages.size - MESSAGE_HEAD_BYTES
+        heads: Any = np.zeros(len(at), _RECORD_HEAD)
+        heads['f0'], heads['f1'] = MESSAGE, messages.size + (MESSAGE_HEAD_BYTES - PREFIX.size)
+        heads['f2'], heads['f4'], heads['f5'] = messages.channel, messages.log_ns, messages.log_ns
+        scatter(data, at, heads.view(np.dtype((np.void, MESSAGE_HEAD_BYTES))))
+        chunk = Messages(data, at, messages.size, messages.channel, messages.log_ns)
+        self._packing.append((chunk, self._pool.submit(self._pack, data)))
         self._put_packed(_MAX_PACKING)
 
     def _put_packed(self, n_left: int) -> None:
@@ -142,24 +150,21 @@ class McapOutput:
             messages, future = self._packing.popleft()
             self._put_chunk(messages, *future.result())
 
-    def _pack(self, data: Bytes) -> tuple[bytes | memoryview, int]:
-        return self._compress(data), zlib.crc32(data.data)
+    def _pack(self, data: Bytes) -> tuple[Any, int]:
+        return self._compress(data.data), zlib.crc32(data.data)
 
-    def finish(self, custom: Mapping[str, str]) -> FileSummary:
-        """
-        Write the last chunk, the summary and the footer; flush all to disk and close.
-
-        `custom` goes into rosbag2's own metadata record.
-        """
-        if self._tail:
-            self._close_chunk()
+    def finish(self) -> FileSummary:
+        """Write the last chunk, the summary and the footer; flush all to disk and close."""
+        for messages in self._tail:
+            if len(messages):
+                self._close_chunk(messages)
         self._put_packed(0)
         topics = (
-            (topic, *self._topics[topic], self._counts[channel.id])
+            (topic, *self._types[topic], self._counts[channel.id])
             for topic, channel in self._channels.items()
         )
         summary = FileSummary(self._name, self._start_ns or 0, self._end_ns, tuple(topics))
-        text = dump_yaml(information(summary, custom)).strip()
+        text = dump_yaml(information(summary, self._metadata)).strip()
         self._put_metadata('rosbag2', {'serialized_metadata': text})
         self._put_record(DataEnd(data_section_crc=0))
         self._put_summary()
@@ -172,46 +177,45 @@ class McapOutput:
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._stream.close()
 
-    def _put(self, data: bytes | memoryview) -> None:
+    def _put(self, data: Any) -> None:
         view = memoryview(data)
         while view:
             view = view[self._stream.write(view) :]
         self._at += len(data)
 
-    def _put_record(self, record: McapRecord) -> None:
+    def _put_record(self, *records: McapRecord) -> bytes:
         builder = _new_builder()
-        record.write(builder)
-        self._put(builder.end())
+        for record in records:
+            record.write(builder)
+        data: bytes = builder.end()
+        self._put(data)
+        return data
 
     def _put_metadata(self, name: str, content: Mapping[str, str]) -> None:
         begin = self._at
         self._put_record(Metadata(name, dict(content)))
         self._metadata_index.append(MetadataIndex(begin, self._at - begin, name))
 
-    def _put_chunk(self, messages: Messages, packed: bytes | memoryview, checksum: int) -> None:
+    def _put_chunk(self, messages: Messages, packed: Any, checksum: int) -> None:
         log_ns, channel = messages.log_ns, messages.channel
         start, end = int(np.min(log_ns)), int(np.max(log_ns))
         self._start_ns = start if self._start_ns is None else min(self._start_ns, start)
         self._end_ns = max(self._end_ns, end)
         name = self._compression.encode()
-        begin = self._at
-        n_bytes = len(messages.data)
+        begin, n_bytes = self._at, len(messages.data)
         head = (Opcode.CHUNK, 40 + len(name) + len(packed), start, end, n_bytes, checksum)
         self._put(struct.pack(f'<BQQQQII{len(name)}sQ', *head, len(name), name, len(packed)))
         self._put(packed)
         chunk_length = self._at - begin
         offsets: dict[int, int] = {}
         rows = np.empty(len(log_ns), _INDEX_ROW)
-        rows['log'] = log_ns
-        rows['offset'] = messages.start - MESSAGE_HEAD_BYTES
+        rows['log'], rows['offset'] = log_ns, messages.start
         for number in np.unique(channel).tolist():
             own = rows[channel == number]
             self._counts[number] += len(own)
             offsets[number] = self._at
-            self._put(
-                struct.pack('<BQHI', Opcode.MESSAGE_INDEX, 6 + own.nbytes, number, own.nbytes)
-                + own.tobytes()
-            )
+            index_head = (Opcode.MESSAGE_INDEX, 6 + own.nbytes, number, own.nbytes)
+            self._put(struct.pack('<BQHI', *index_head) + own.tobytes())
         self._chunks.append(
             ChunkIndex(
                 chunk_length=chunk_length,
@@ -222,12 +226,12 @@ class McapOutput:
                 message_index_length=self._at - begin - chunk_length,
                 message_index_offsets=offsets,
                 message_start_time=start,
-                uncompressed_size=len(messages.data),
+                uncompressed_size=n_bytes,
             )
         )
 
     def _put_summary(self) -> None:
-        summary_start = self._at
+        begin = self._at
         statistics = Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
@@ -239,33 +243,18 @@ class McapOutput:
             metadata_count=len(self._metadata_index),
             schema_count=len(self._schemas),
         )
-        builder = _new_builder()
-        for record in (
-            *self._schemas.values(),
-            *self._channels.values(),
-            statistics,
-            *self._chunks,
-            *self._metadata_index,
-        ):
-            record.write(builder)
-        body: bytes = builder.end()
-        self._put(body)
-        footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 20, summary_start, 0)
-        checksum = zlib.crc32(footer_head, zlib.crc32(body))
-        self._put_record(
-            Footer(summary_start=summary_start, summary_offset_start=0, summary_crc=checksum)
-        )
+        kinds, topics = self._schemas.values(), self._channels.values()
+        body = self._put_record(*kinds, *topics, statistics, *self._chunks, *self._metadata_index)
+        footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 20, begin, 0)
+        self._put_record(Footer(begin, 0, zlib.crc32(footer_head, zlib.crc32(body))))
         self._put(MAGIC)
 
 
 def _compressor(
     compression: Literal['none', 'lz4', 'zstd'], level: int | None
-) -> Callable[[Bytes], bytes | memoryview]:
+) -> Callable[[Any], Any]:
     if compression == 'zstd':
-        compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL if level is None else level)
-        return lambda data: compressor.compress(data.data)
+        return zstandard.ZstdCompressor(level=_ZSTD_LEVEL if level is None else level).compress
     if compression == 'lz4':
-        return lambda data: bytes(
-            lz4.frame.compress(data, compression_level=0 if level is None else level)
-        )
-    return lambda data: data.data
+        return lambda data: lz4.frame.compress(data, compression_level=level or 0)
+    return lambda data: data

@@ -121,10 +121,12 @@ def join_messages(pieces: Sequence[Messages]) -> Messages:
     )
 
 
-def pack(data: Bytes, start: Ints, size: Ints) -> tuple[Bytes, Ints]:
-    """Put pieces of bytes behind each other; gives these and the end of each piece."""
-    ends = np.cumsum(size)
-    packed = np.empty(int(np.sum(size)), np.uint8)
+def pack(data: Bytes, start: Ints, size: Ints, room: int = 0) -> tuple[Bytes, Ints]:
+    """
+    Put pieces of bytes behind each other, with room before each; gives these and each one's end.
+    """
+    ends = np.cumsum(size + room)
+    packed = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
     for each in np.unique(size[size > 0]).tolist():
         own = np.flatnonzero(size == each)
         scatter(packed, ends[own] - each, gather(data, start[own], each))

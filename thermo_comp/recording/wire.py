@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the serialized layout of stamped messages: many messages to columns in a few array passes.
+Owns the serialized layout of stamped messages: many messages to columns, and back, at once.
 
 All three input types are a std_msgs/Header followed by nothing but float64 numbers. In CDR::
 
@@ -16,13 +16,14 @@ which stamps and numbers are views. Messages of ROS 1 are serialized anew by `ro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RecordingError
-from ..typing import Floats, Ints
+from ..typing import Bytes, Floats, Ints
 from .messages import Messages, field, gather
 from .rosbag2_metadata import typestore
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED
@@ -88,6 +89,42 @@ def decode_stamped(messages: Messages, kind: str) -> Stamped:
     )
     frame = field(rows, HEAD_BYTES, f'S{frame_size}') if frame_size else np.zeros(n, 'S1')
     return Stamped(stamp_ns, values.astype(np.float64, 'C'), frame)
+
+
+def encode_stamped(
+    stamp_ns: Ints, frame_id: str, n_numbers: int, pieces: Sequence[tuple[int, Floats]]
+) -> Bytes:
+    """
+    Serialize (CDR, little-endian) a header and float64 numbers, as rows of bytes, shape (n, size).
+
+    Each piece is the first column of some of the numbers and their values, shape (n, width), or
+    (width,) for the same in each message; the others are 0.
+    """
+    characters = frame_id.encode() + b'\0'
+    body = 4 + (12 + len(characters) + 7) // 8 * 8
+    fields: Any = {
+        'names': ['order', 'sec', 'nanosec', 'length', 'frame', 'numbers'],
+        'formats': ['u1', '<i4', '<u4', '<u4', f'V{len(characters)}', ('<f8', (n_numbers,))],
+        'offsets': [1, 4, 8, 12, HEAD_BYTES, body],
+        'itemsize': body + 8 * n_numbers,
+    }
+    pattern: NDArray[Any] = np.zeros(1, np.dtype(fields))
+    pattern['order'], pattern['length'] = 1, len(characters)
+    pattern['frame'] = np.void(characters)
+    # What all have in common is written once, and copied with the rest.
+    for column, values in pieces:
+        if values.ndim == 1:
+            pattern['numbers'][:, column : column + len(values)] = values
+    row = pattern.view(np.uint8)
+    data = np.empty((len(stamp_ns), len(row)), np.uint8)
+    data[:] = row
+    rows = data.view(pattern.dtype)[:, 0]
+    rows['sec'] = seconds = stamp_ns // _NS
+    rows['nanosec'] = stamp_ns - seconds * _NS
+    for column, values in pieces:
+        if values.ndim > 1:
+            rows['numbers'][:, column : column + values.shape[1]] = values
+    return data
 
 
 def as_cdr(messages: Messages, kind: str) -> Messages:

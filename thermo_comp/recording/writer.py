@@ -20,13 +20,13 @@ from numpy.typing import ArrayLike
 
 from ..errors import OutputError, RecordingError
 from ..files import Draft, bag_kind
-from ..typing import Ints
+from ..typing import Bytes, Floats, Ints
 from .columns import ImuColumns, RawMessages
-from .encode import Merged, Piece, RawRecords, Records, StampedRecords, as_numbers, as_times
 from .mcap_out import McapOutput
+from .messages import Messages
 from .rosbag2_metadata import Definition, dump_metadata, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
-from .wire import N_NUMBERS
+from .wire import N_NUMBERS, encode_stamped
 
 Compression = Literal['none', 'lz4', 'zstd']
 
@@ -47,9 +47,9 @@ class BagWriter:
 
     Messages are buffered until `flush`, which merges all topics in log-time order; 64 MiB of them
     are flushed unasked. So one group of calls whose time spans overlap and a `flush` make a file
-    in log-time order, whatever order the calls had. Arrays are not copied: leave them as they are
-    until the `flush`. A process that is killed loses what is buffered and up to four chunks; the
-    rest stands in a hidden file beside the target and can be read as a torn bag.
+    in log-time order, whatever order the calls had. A process that is killed loses what is
+    buffered and up to four chunks; the rest stands in a hidden file beside the target and can be
+    read as a torn bag.
 
     The writing methods raise ValueError for shapes that do not fit and times that no ROS stamp can
     hold, OutputError where the disk is full or the like. Log times are the stamps, if not given.
@@ -71,8 +71,7 @@ class BagWriter:
         self._path = Path(path)
         self._metadata = dict(metadata or {})
         self._is_precious = is_precious
-        self._batches: list[Records] = []
-        self._n_buffered_bytes = 0
+        self._batches: list[Messages] = []
         self._file: McapOutput | None = None
         kind = bag_kind(path)
         self._is_file = not kind.is_folder
@@ -98,8 +97,8 @@ class BagWriter:
     ) -> None:
         """Write geometry_msgs/Vector3Stamped: counts per cycle, shape (n, 3)."""
         stamps = _as_stamps(stamp_ns)
-        numbers = as_numbers('xyz', xyz, len(stamps), 3)
-        self._write_stamped(topic, VECTOR3_STAMPED, stamps, log_ns, frame_id, [(0, numbers)])
+        pieces = [(0, _as_numbers('xyz', xyz, len(stamps), 3))]
+        self._write_stamped(topic, VECTOR3_STAMPED, stamps, log_ns, frame_id, pieces)
 
     def write_temperature(
         self,
@@ -143,10 +142,9 @@ class BagWriter:
             (28, 'linear_acceleration_covariance', linear_acceleration_covariance, 9),
         ]
         if imu is None:
-            nothing = np.zeros((1, 25))
-            nothing[0, 3] = 1.0
-            nothing[0, [4, 16]] = -1.0
-            columns.append((0, '', nothing[0], 25))
+            nothing = np.zeros(25)
+            nothing[3], nothing[[4, 16]] = 1.0, -1.0
+            columns.append((0, '', nothing, 25))
         else:
             columns += [
                 (0, 'imu.orientation', imu.orientation, 4),
@@ -154,19 +152,18 @@ class BagWriter:
                 (13, 'imu.angular_velocity', imu.angular_velocity, 3),
                 (16, 'imu.angular_velocity_covariance', imu.angular_velocity_covariance, 9),
             ]
-        pieces = [(at, as_numbers(name, value, n, width)) for at, name, value, width in columns]
+        pieces = [(at, _as_numbers(name, value, n, width)) for at, name, value, width in columns]
         self._write_stamped(topic, IMU, stamps, log_ns, frame_id, pieces)
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
         """Write std_msgs/Bool."""
-        times = as_times('log_ns', log_ns)
+        times = _as_times('log_ns', log_ns)
         flags = np.atleast_1d(np.asarray(values, np.bool_))
         if flags.shape != times.shape:
             raise ValueError(f'`values` must have {len(times)} values, got {flags.shape}')
         payloads = np.zeros((len(times), 5), np.uint8)
         payloads[:, 1], payloads[:, 4] = 1, flags
-        ends = 5 * np.arange(1, len(times) + 1)
-        self._add(RawRecords(self._channel(topic, BOOL), times, payloads.ravel(), ends))
+        self._add_rows(self._channel(topic, BOOL), times, payloads)
 
     def write_raw(
         self,
@@ -187,16 +184,15 @@ class BagWriter:
         else:
             data = np.frombuffer(b''.join(messages), np.uint8)
             ends = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
-        times = as_times('log_ns', log_ns, len(ends))
-        channel = self._channel(topic, type, definition)
-        self._add(RawRecords(channel, times, data, ends))
+        times = _as_times('log_ns', log_ns, len(ends))
+        self._add(self._channel(topic, type, definition), times, data, np.diff(ends, prepend=0))
 
     def flush(self) -> None:
         """Merge what is buffered in log-time order and hand it to the file."""
         if self._batches:
-            batches, self._batches, self._n_buffered_bytes = self._batches, [], 0
+            batches, self._batches = self._batches, []
             with self._translated():
-                self._open_file().append(Merged(batches))
+                self._open_file().append(batches)
 
     def close(self) -> None:
         """
@@ -210,7 +206,7 @@ class BagWriter:
         try:
             self.flush()
             with self._translated():
-                summary = self._file.finish(self._metadata)
+                summary = self._file.finish()
                 if not self._is_file:
                     text = dump_metadata(summary, self._metadata)
                     _write_text(self._draft.partial / 'metadata.yaml', text)
@@ -247,11 +243,11 @@ class BagWriter:
         stamp_ns: Ints,
         log_ns: ArrayLike | None,
         frame_id: str,
-        pieces: list[Piece],
+        pieces: Sequence[tuple[int, Floats]],
     ) -> None:
-        times = stamp_ns if log_ns is None else as_times('log_ns', log_ns, len(stamp_ns))
-        channel = self._channel(topic, kind)
-        self._add(StampedRecords(channel, stamp_ns, times, frame_id, N_NUMBERS[kind], pieces))
+        times = stamp_ns if log_ns is None else _as_times('log_ns', log_ns, len(stamp_ns))
+        rows = encode_stamped(stamp_ns, frame_id, N_NUMBERS[kind], pieces)
+        self._add_rows(self._channel(topic, kind), times, rows)
 
     def _channel(self, topic: str, kind: str, definition: tuple[str, str] | None = None) -> int:
         name = '/' + topic.strip('/')
@@ -270,11 +266,14 @@ class BagWriter:
             )
         return channel
 
-    def _add(self, records: Records) -> None:
-        if len(records.log_ns):
-            self._batches.append(records)
-            self._n_buffered_bytes += int(records.size.sum())
-            if self._n_buffered_bytes > _AUTO_FLUSH_BYTES:
+    def _add_rows(self, channel: int, log_ns: Ints, rows: Bytes) -> None:
+        self._add(channel, log_ns, rows.ravel(), np.full(len(rows), rows.shape[1]))
+
+    def _add(self, channel: int, log_ns: Ints, data: Bytes, size: Ints) -> None:
+        if len(log_ns):
+            numbers = np.full(len(log_ns), channel, np.uint16)
+            self._batches.append(Messages(data, np.cumsum(size) - size, size, numbers, log_ns))
+            if sum(len(one.data) for one in self._batches) > _AUTO_FLUSH_BYTES:
                 self.flush()
 
     def _open_file(self) -> McapOutput:
@@ -295,7 +294,7 @@ class BagWriter:
 
 
 def _as_stamps(stamp_ns: ArrayLike) -> Ints:
-    stamps = as_times('stamp_ns', stamp_ns)
+    stamps = _as_times('stamp_ns', stamp_ns)
     if len(stamps) and int(np.max(stamps)) >= STAMP_END_NS:
         raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))}')
     return stamps
@@ -306,3 +305,26 @@ def _write_text(path: Path, text: str) -> None:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
+
+
+def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
+    """Check a column of nanoseconds: `n` integers, none negative; ValueError for another."""
+    times = np.atleast_1d(np.asarray(values))
+    if times.size == 0:
+        times = times.astype(np.int64)
+    if times.dtype.kind not in 'iu' or times.ndim != 1:
+        raise ValueError(f'`{name}` must be one row of integers, got {times.dtype}')
+    if n is not None and len(times) != n:
+        raise ValueError(f'`{name}` must have {n} values, got {len(times)}')
+    checked: Ints = times.astype(np.int64, copy=False)
+    if len(checked) and int(np.min(checked)) < 0:
+        raise ValueError(f'`{name}` must not be negative, got {int(np.min(checked))}')
+    return checked
+
+
+def _as_numbers(name: str, values: ArrayLike, n: int, width: int) -> Floats:
+    """Check a column of numbers, shape (n, width) or (width,) for the same in each row."""
+    numbers = np.asarray(values, np.float64)
+    if numbers.shape not in {(n, width), (width,)}:
+        raise ValueError(f'`{name}` must have shape ({n}, {width}), got {numbers.shape}')
+    return numbers
