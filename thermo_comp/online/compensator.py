@@ -19,8 +19,9 @@ from typing import Final
 
 from ..unit.calibration import Calibration
 from .gravity_check import GravityCheck
+from .kernel import corrected, corrected_rate, lay_lines
 from .sample_checks import StuckCheck
-from .segments import EVER_NS, SEGMENT_NS, ThermalSide, lay_lines
+from .segments import EVER_NS, SEGMENT_NS, ThermalSide
 from .status import CompensatorConfig, Counters
 
 #: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
@@ -39,7 +40,7 @@ class Compensator:
         self.stuck = StuckCheck(self.config.stuck_timeout_s)
         self.thermal = ThermalSide(calibration, self.config, self.counters)
         self._use(calibration)
-        self.last_ns = self._event_ns = EVER_NS
+        self.last_ns = self.event_ns = EVER_NS
         #: Of the present segment, as `lay_lines` gives it; empty where no rate is corrected.
         self.rate_line: list[float] = []
 
@@ -60,7 +61,7 @@ class Compensator:
         out; it takes effect at the first sample not before it.
         """
         self.thermal.push(name, stamp_ns, celsius)
-        self._event_ns = min(self._event_ns, stamp_ns)
+        self.event_ns = min(self.event_ns, stamp_ns)
 
     def process(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
         """
@@ -69,7 +70,7 @@ class Compensator:
         Returns specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4];
         None where nothing must be published, with the reason counted in `counters`.
         """
-        if not self.last_ns < stamp_ns < self._event_ns:
+        if not self.last_ns < stamp_ns < self.event_ns:
             return self._process_first(stamp_ns, x, y, z)
         self.last_ns = stamp_ns
         stuck = self.stuck
@@ -87,35 +88,9 @@ class Compensator:
         if not (x or y or z) and stuck.is_on:
             self.counters.n_stuck += 1
             return None
-        (
-            start_ns,
-            (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1),
-            (ax, lx, qx, ay, ly, qy, az, lz, qz),
-            (yx, zx, zy, var_yx, var_zx, var_zy),
-        ) = self._segment
-        dt = (stamp_ns - start_ns) * 1e-9
-        # Eq. (7), solved for the input of each axis.
-        x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
-        y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
-        z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)
-        vx = ax + x * (lx + x * qx)
-        vy = ay + y * (ly + y * qy)
-        vz = az + z * (lz + z * qz)
-        xx = x * x
-        cxy = yx * vx
-        cxz = zx * vx
         self.counters.n_out += 1
-        return (
-            x,
-            yx * x + y,
-            zx * x + zy * y + z,
-            vx,
-            cxy,
-            cxz,
-            yx * cxy + vy + xx * var_yx,
-            yx * cxz + zy * vy,
-            zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy,
-        )
+        start_ns, line, misalignment = self._segment
+        return corrected(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
 
     @property
     def corrects_rate(self) -> bool:
@@ -130,14 +105,12 @@ class Compensator:
 
         Returns the rate and the variance of each axis [rad^2/s^2]; they have nothing in common.
         """
-        dt = (stamp_ns - self._segment[0]) * 1e-9
-        bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = self.rate_line
-        return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz
+        return corrected_rate(self.rate_line, (stamp_ns - self._segment[0]) * 1e-9, x, y, z)
 
     def _count_bad(self, x: float, y: float, z: float) -> None:
         full_scale = self._full_scale
         if self.is_refusing:
-            if self.thermal.rate_refuses:
+            if self.thermal.is_too_fast:
                 self.counters.n_too_fast += 1
             else:
                 self.counters.n_refuted += 1
@@ -158,31 +131,30 @@ class Compensator:
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
             # Every sample comes back here until there is a temperature, and is counted here.
-            self._event_ns = EVER_NS
+            self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
         counters = self.counters
-        start_ns = thermal.start_of(stamp_ns)
-        is_new = thermal.open(start_ns, counters.n_in - counters.n_out_of_order, stamp_ns)
-        self._event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
-        start, end = thermal.sample(start_ns), thermal.sample(start_ns + SEGMENT_NS)
-        slow, excess = thermal.slow_at(start_ns, end), thermal.noise_excess
-        line = lay_lines(thermal.correction, start, end, slow[:3], excess)
+        segment = thermal.segment(stamp_ns, counters.n_in - counters.n_out_of_order)
+        start_ns, is_new, is_too_fast, excess, start, end, slow = segment
+        self.event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
+        correction = thermal.correction
+        line = lay_lines(correction, start, end, slow[:3], excess)
         if thermal.rate_correction is not None:
             self.rate_line = lay_lines(thermal.rate_correction, start, end, slow[3:], excess)
-        self._segment = (start_ns, line[:12], line[12:], thermal.correction.misalignment)
+        self._segment = (start_ns, line, correction.misalignment)
         if not is_new:
             return self.process(stamp_ns, x, y, z)
-        self.is_refusing = thermal.rate_refuses
+        self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
-        if self.gravity.is_refuted and not thermal.rate_refuses:
+        if self.gravity.is_refuted and not is_too_fast:
             # It still tells when the trust is restored.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
                 counters.n_refuted += 1
         if row is not None and self.gravity.wants(stamp_ns):
-            self.gravity.add(stamp_ns, row[:3], row[3:], thermal.correction.noise_trace)
+            self.gravity.add(stamp_ns, row[:3], row[3:], correction.noise_trace)
         return None if self.is_refusing else row
 
     def _admit(self, stamp_ns: int) -> bool:
@@ -191,15 +163,18 @@ class Compensator:
         if stamp_ns > self.last_ns - TIME_JUMP_NS:
             self.counters.n_out_of_order += 1
             return False
+        self.jump_back(stamp_ns)
+        return True
+
+    def jump_back(self, stamp_ns: int) -> None:
+        """Begin anew at a sample before which time has jumped back: a bag that loops."""
         # Readings of the old time that no sample reached belong to the time that is gone.
-        self.thermal.queue.drop_after(stamp_ns)
+        self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self._forget_samples()
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
-        return True
 
     def _forget_samples(self) -> None:
-        # What comes is another recording.
         self.thermal.reset()
         self.stuck.reset()
         self.gravity = self._gravity_check()
@@ -218,15 +193,10 @@ class Compensator:
     def is_refusing(self, value: bool) -> None:
         self._limit = -1.0 if value else self._full_scale
 
-    def take_pending(self) -> list[tuple[int, int, int, float]]:
-        """Take the readings that no sample has reached: (stamp, kind, order, degC)."""
-        self._event_ns = EVER_NS
-        return self.thermal.queue.take()
-
     def flush(self, stamp_ns: int) -> None:
         """Let queued readings up to a stamp take effect; no samples are coming."""
         self.thermal.flush(stamp_ns)
-        self._event_ns = EVER_NS
+        self.event_ns = EVER_NS
 
     def swap(self, calibration: Calibration) -> None:
         """
@@ -237,7 +207,7 @@ class Compensator:
         """
         self.thermal.swap(calibration, self.now_ns)
         self._use(calibration)
-        self._event_ns = EVER_NS
+        self.event_ns = EVER_NS
 
     def reconfigure(self, config: CompensatorConfig) -> None:
         """Take over other settings between two samples."""
@@ -246,7 +216,7 @@ class Compensator:
         self.config = config
         self.gravity = self._gravity_check()
         self.thermal.reconfigure(config, self.now_ns)
-        self._event_ns = EVER_NS
+        self.event_ns = EVER_NS
 
     @property
     def now_ns(self) -> int | None:
@@ -255,7 +225,7 @@ class Compensator:
 
     def reset(self) -> None:
         """Forget temperatures, regime and queue; counters stay."""
-        self.thermal.queue.take()
+        self.thermal.queue.keep(lambda _: False)
         self.thermal.flags.clear()
         self._forget_samples()
-        self.last_ns = self._event_ns = EVER_NS
+        self.last_ns = self.event_ns = EVER_NS

@@ -1,149 +1,129 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the arithmetic of many samples: that of `Compensator.process`, in its order, column by column.
+Owns the arithmetic of a segment: bias, scale and variance as lines, and samples corrected by them.
 
-What a sample costs here is memory traffic, so the samples go through in pieces whose columns stay
-in the cache, and a segment's coefficients are spread over its samples just before they are used.
+The same lines of code take one sample, as floats, and the samples of many segments, as arrays.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from ..typing import Floats, Ints, Stamps
+from ..unit.correction import Correction, Variance
+from ..unit.functions import Number
 
-#: Samples corrected at a time.
-PIECE = 12288
+#: Samples corrected at a time: their columns stay in the cache.
+PIECE: Final = 4096
+
+
+def lay_lines(
+    correction: Correction,
+    start: Sequence[Number],
+    end: Sequence[Number],
+    slow: Sequence[Variance[Number]],
+    noise_excess: Number,
+) -> list[Number]:
+    """
+    Lay a line from the beginning of a segment, or of many as arrays, to the end.
+
+    Returns per axis bias, its change per second, scale, its change per second; then per axis a, b,
+    c of the error variance.
+    """
+    at_start = correction.bias_scale(start)
+    at_end, variances = correction.evaluate(end, slow)
+    result: list[Number] = []
+    for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
+        result += [bias, bias_end - bias, scale, scale_end - scale]
+    for (a, b, c), noise in zip(variances, correction.noise, strict=True):
+        result += [a + noise_excess * noise, b, c]
+    return result
+
+
+def corrected(
+    line: Iterable[Number],
+    misalignment: tuple[float, ...],
+    dt: Number,
+    x: Number,
+    y: Number,
+    z: Number,
+) -> tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]:
+    """Give specific force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s into a segment."""
+    (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
+     ax, lx, qx, ay, ly, qy, az, lz, qz) = line  # fmt: skip
+    yx, zx, zy, var_yx, var_zx, var_zy = misalignment
+    # Eq. (7), solved for the input of each axis.
+    x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
+    y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
+    z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)
+    vx = ax + x * (lx + x * qx)
+    vy = ay + y * (ly + y * qy)
+    vz = az + z * (lz + z * qz)
+    xx = x * x
+    cxy = yx * vx
+    cxz = zx * vx
+    return (
+        x,
+        yx * x + y,
+        zx * x + zy * y + z,
+        vx,
+        cxy,
+        cxz,
+        yx * cxy + vy + xx * var_yx,
+        yx * cxz + zy * vy,
+        zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy,
+    )
+
+
+def corrected_rate(
+    line: Iterable[Number], dt: Number, x: Number, y: Number, z: Number
+) -> tuple[Number, Number, Number, Number, Number, Number]:
+    """Give the angular rate x, y, z and the variance of each axis, `dt` s into a segment."""
+    bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = line
+    return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz
+
+
+#: Values of `corrected` in the order of a block's columns: the covariance as a whole matrix.
+_COLUMNS: Final = (0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8)
 
 
 class Lines:
-    """The coefficients of a block's segments (`segments.lay_lines`), spread on demand."""
+    """Segments one after the other: starts, lines as columns, and samples that each has."""
 
-    def __init__(self, start_ns: Ints, columns: list[Floats], counts: Ints) -> None:
+    def __init__(self, start_ns: Ints, columns: Sequence[Floats], counts: Ints) -> None:
         self._start_ns = start_ns
-        self.columns = columns
+        self._table = np.array(columns)
         self._ends = np.cumsum(counts)
-        self._begins = self._ends - counts
-        self._rows = slice(0, 0)
-        self._counts: Ints = counts
 
-    def select(self, begin: int, end: int) -> None:
-        """Say of which samples the coefficients are wanted."""
-        low = int(np.searchsorted(self._ends, begin, 'right'))
-        high = int(np.searchsorted(self._ends, end, 'left')) + 1
-        self._rows = slice(low, high)
-        ends = np.minimum(self._ends[self._rows], end)
-        self._counts = ends - np.maximum(self._begins[self._rows], begin)
-
-    def spread(self, column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Repeat the value of each selected segment for its samples, in a new array."""
-        return np.repeat(column[self._rows], self._counts)
-
-    def age(self, stamps: Stamps) -> Floats:
-        """Time since the beginning of each sample's segment [s]."""
-        start_ns = self.spread(self._start_ns)
-        age: Floats = np.subtract(stamps, start_ns, out=start_ns) * 1e-9
-        return age
-
-    def corrected(self, axis: int, raw: Floats, dt: Floats, out: Floats | None = None) -> Floats:
-        """Take bias and scale from the samples of one axis."""
-        bias, bias_slope, scale, scale_slope = self.columns[4 * axis : 4 * axis + 4]
-        value: Floats = self.spread(bias_slope)
-        value *= dt
-        value += self.spread(bias)
-        # Eq. (7), solved for the input.
-        np.subtract(raw, value, out=value)
-        divisor = self.spread(scale_slope)
-        divisor *= dt
-        divisor += self.spread(scale)
-        result: Floats = np.divide(value, divisor, out=value if out is None else out)
-        return result
-
-    def variance(self, axis: int, x: Floats, out: Floats | None = None) -> Floats:
-        """Error variance of one axis."""
-        a, b, c = self.columns[12 + 3 * axis : 15 + 3 * axis]
-        value: Floats = self.spread(c)
-        value *= x
-        value += self.spread(b)
-        value *= x
-        result: Floats = np.add(value, self.spread(a), out=value if out is None else out)
-        return result
-
-
-def correct(
-    lines: Lines, misalignment: tuple[float, ...], stamps: Stamps, samples: Floats
-) -> tuple[Floats, Floats]:
-    """
-    Correct the samples (n, 3) of segments: force (n, 3) [m/s^2] and covariance (n, 9) [m^2/s^4].
-    """
-    n = len(stamps)
-    raw = np.empty((3, min(n, PIECE)))
-    # The columns stand one after the other in memory: each is written in one run.
-    force, covariance = np.empty((3, n)), np.empty((9, n))
-    # What is not finite is corrected like the rest; whoever asked leaves it out.
-    with np.errstate(invalid='ignore', over='ignore'):
-        for begin in range(0, n, PIECE):
-            piece = slice(begin, min(begin + PIECE, n))
-            lines.select(piece.start, piece.stop)
-            columns = raw[:, : piece.stop - begin]
-            np.copyto(columns, samples[piece].T)
-            _correct(
-                lines, misalignment, stamps[piece], columns, force[:, piece], covariance[:, piece]
-            )
-    return force.T, covariance.T
-
-
-def correct_rates(lines: Lines, stamps: Stamps, rates: Floats) -> tuple[Floats, Floats]:
-    """Correct angular rates (n, 3), as `Compensator.correct_rate` does; and variances."""
-    lines.select(0, len(stamps))
-    dt = lines.age(stamps)
-    corrected, variance = np.empty((2, len(stamps), 3))
-    for axis in range(3):
-        bias = lines.spread(lines.columns[4 * axis + 1]) * dt
-        bias += lines.spread(lines.columns[4 * axis])
+    def correct(
+        self, stamps: Stamps, samples: Floats, misalignment: tuple[float, ...] | None
+    ) -> Floats:
+        """
+        Correct the samples (n, 3) of the segments: specific force and row-major covariance, shape
+        (12, n); or, as there is no misalignment, angular rates: these and variances, shape (6, n).
+        """
+        n = len(stamps)
+        order = _COLUMNS if misalignment else range(6)
+        result = np.empty((len(order), n))
+        # What is not finite is corrected like the rest; whoever asked leaves it out.
         with np.errstate(invalid='ignore', over='ignore'):
-            np.subtract(rates[:, axis], bias, out=corrected[:, axis])
-        variance[:, axis] = lines.spread(lines.columns[12 + 3 * axis])
-    return corrected, variance
-
-
-def _correct(
-    lines: Lines,
-    misalignment: tuple[float, ...],
-    stamps: Stamps,
-    raw: Floats,
-    force: Floats,
-    covariance: Floats,
-) -> None:
-    yx, zx, zy, var_yx, var_zx, var_zy = misalignment
-    dt = lines.age(stamps)
-    x = lines.corrected(0, raw[0], dt, out=force[0])
-    y, z = (lines.corrected(axis, raw[axis], dt) for axis in (1, 2))
-    vx = lines.variance(0, x, out=covariance[0])
-    vy, vz = lines.variance(1, y), lines.variance(2, z)
-    np.add(np.multiply(x, yx, out=dt), y, out=force[1])
-    third = zx * x
-    third += np.multiply(y, zy, out=dt)
-    np.add(third, z, out=force[2])
-    cxy = np.multiply(vx, yx, out=covariance[1])
-    cxz = np.multiply(vx, zx, out=covariance[2])
-    covariance[3] = cxy
-    covariance[6] = cxz
-    xx = np.multiply(x, x, out=z)
-    value = np.multiply(cxy, yx, out=third)
-    value += vy
-    np.add(value, np.multiply(xx, var_yx, out=dt), out=covariance[4])
-    value = np.multiply(cxz, yx, out=value)
-    value += np.multiply(vy, zy, out=dt)
-    covariance[5] = value
-    covariance[7] = value
-    value = np.multiply(cxz, zx, out=value)
-    value += np.multiply(vy, zy * zy, out=dt)
-    value += vz
-    value += np.multiply(xx, var_zx, out=dt)
-    yy = np.multiply(y, y, out=y)
-    np.add(value, np.multiply(yy, var_zy, out=dt), out=covariance[8])
+            for begin in range(0, n, PIECE):
+                end = min(begin + PIECE, n)
+                low = int(np.searchsorted(self._ends, begin, 'right'))
+                high = int(np.searchsorted(self._ends, end, 'left')) + 1
+                counts = np.diff(np.minimum(self._ends[low:high], end), prepend=begin)
+                dt = (stamps[begin:end] - np.repeat(self._start_ns[low:high], counts)) * 1e-9
+                line = np.repeat(self._table[:, low:high], counts, axis=1)
+                x, y, z = samples[begin:end].T
+                values = (
+                    corrected(line, misalignment, dt, x, y, z)
+                    if misalignment
+                    else corrected_rate(line, dt, x, y, z)
+                )
+                for column, place in zip(result, order, strict=True):
+                    column[begin:end] = values[place]
+        return result

@@ -54,34 +54,30 @@ class StuckCheck:
         self.n_same += 1
         return self.n_same >= STUCK_SAMPLES and stamp_ns - self.run[3] > self.limit_ns
 
-    def find(self, stamps: Ints, samples: Floats) -> Bools | None:
-        """Find the samples (n > 0, 3) that the stream would call stuck; None if none."""
+    def find(self, stamps: Ints, samples: Floats) -> Bools:
+        """Find the samples (n > 0, 3) that the stream would call stuck, or three exact zeros."""
+        n = len(stamps)
         x, y, z = samples.T
-        same = np.empty(len(stamps), dtype=bool)
+        same = np.empty(n, dtype=np.bool_)
         same[0] = (x[0], y[0], z[0]) == self.run[:3]
-        np.equal(x[1:], x[:-1], out=same[1:])
-        same[1:] &= y[1:] == y[:-1]
-        same[1:] &= z[1:] == z[:-1]
-        found: Bools | None = None
-        row = np.arange(len(stamps))
+        same[1:] = (x[1:] == x[:-1]) & (y[1:] == y[:-1]) & (z[1:] == z[:-1])
         changed = np.flatnonzero(~same)
-        if (
-            not len(changed)
-            or int(np.max(np.diff(changed, append=len(row)))) > STUCK_SAMPLES
-            or (self.n_same + int(changed[0]) >= STUCK_SAMPLES)
-        ):
+        found = np.zeros(n, dtype=np.bool_)
+        if int(np.max(np.diff(changed, prepend=-1 - self.n_same, append=n))) > STUCK_SAMPLES:
+            row = np.arange(n)
             begin = np.maximum.accumulate(np.where(same, -1, row))
             n_same = np.where(begin < 0, row + 1 + self.n_same, row - begin)
             since = np.where(begin < 0, self.run[3], stamps[begin])
-            found = same & (n_same >= STUCK_SAMPLES) & (stamps - since > self.limit_ns)
-            if not found.any():
-                found = None
+            found |= same & (n_same >= STUCK_SAMPLES) & (stamps - since > self.limit_ns)
         if len(changed):
-            last = int(changed[-1])
-            self.run = (float(x[last]), float(y[last]), float(z[last]), int(stamps[last]))
-            self.n_same = len(row) - 1 - last
+            last = changed.item(-1)
+            self.run = (x.item(last), y.item(last), z.item(last), int(stamps[last]))
+            self.n_same = n - 1 - last
         else:
-            self.n_same += len(row)
+            self.n_same += n
+        if self.is_on:
+            zeros = np.flatnonzero(x == 0.0)
+            found[zeros[~samples[zeros].any(axis=1)]] = True
         return found
 
 

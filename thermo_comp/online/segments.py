@@ -14,8 +14,7 @@ first segment that begins in each span of ten seconds of the stamps, and held.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 from ..thermal.memory import BOARD_INPUT
 from ..thermal.reading_queue import ReadingQueue
@@ -25,7 +24,6 @@ from ..thermal.state import BOARD, ThermalState
 from ..thermal.tracker import ThermalTracker
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction, Variance
-from ..unit.functions import Number
 from ..unit.rate_triad import rate_triad
 from ..unit.uncertainty import SlowUncertainty
 from .sample_checks import RateCheck
@@ -42,6 +40,22 @@ EVER_NS: Final = -(1 << 62)
 FOREVER_NS: Final = 1 << 62
 #: A unit that no thermometer watches is taken to be at the reference, within this sd [K].
 UNMEASURED_SD_K: Final = 10.0
+
+
+class Segment(NamedTuple):
+    """A run of time over which the correction is linear, and what the gate says of its samples."""
+
+    start_ns: int
+    #: Not the rest of one that the end of a block, or a call from outside, has cut.
+    is_new: bool
+    #: Whether samples come too fast to be conversions; and what their rate adds to their noise.
+    is_too_fast: bool
+    noise_excess: float
+    #: Thermal states at both ends.
+    start: tuple[float, ...]
+    end: tuple[float, ...]
+    #: What parameters and starts leave uncertain of each axis; of the angular rate's behind them.
+    slow: list[Variance[float]]
 
 
 class ThermalSide:
@@ -99,10 +113,7 @@ class ThermalSide:
         old, sensors = self.tracker, self.inputs
         detector = self.calibration.detector
         self._use(calibration, self.config)
-        if self.inputs != sensors:
-            waiting, self.queue = self.queue.take(), ReadingQueue()
-            for stamp_ns, kind, _, celsius in waiting:
-                self.push(sensors[kind], stamp_ns, celsius)
+        self.queue.keep(lambda entry: entry[2] in self.inputs)
         if calibration.detector == detector and self.correction.memory == old.spec:
             old.reconfigure(self._thermal_config(), now_ns)
             return
@@ -128,36 +139,32 @@ class ThermalSide:
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """Queue a reading, if the calibration knows its thermometer."""
         if name in self.inputs:
-            kind = self.inputs.index(name)
-            self.count_rejected(kind, self.queue.push(stamp_ns, kind, celsius))
+            self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
 
-    def apply(self, stamp_ns: int, kind: int, celsius: float) -> None:
-        """Let a reading of one of `inputs` take effect now."""
+    def _apply(self, name: str, stamp_ns: int, celsius: float) -> None:
+        """Let a reading take effect now."""
         self._n_applied += 1
         tracker = self.tracker
-        is_used = tracker.read(self.inputs[kind], stamp_ns, celsius)
-        if not is_used:
-            self.count_rejected(kind, 1)
-        elif kind == 0:
+        if not tracker.read(name, stamp_ns, celsius):
+            self._count_rejected(name, 1)
+        elif name == BOARD_INPUT:
             self.counters.n_board += 1
         else:
             self.counters.n_case += 1
-        if is_used and kind == 1:
             regime = tracker.detector.regime
-            if regime is not Regime.UNKNOWN:
+            if name == self.inputs[1] and regime is not Regime.UNKNOWN:
                 self.flags.append((stamp_ns, regime is Regime.DYNAMIC))
 
-    def count_rejected(self, kind: int, n_readings: int) -> None:
-        """Count readings of one of `inputs` that are not used."""
-        if kind == 0:
+    def _count_rejected(self, name: str, n_readings: int) -> None:
+        if name == BOARD_INPUT:
             self.counters.n_board_rejected += n_readings
         else:
             self.counters.n_case_rejected += n_readings
 
     def flush(self, stamp_ns: int) -> None:
         """Let what waits take effect up to a stamp."""
-        for reading_ns, kind, _, celsius in self.queue.due(stamp_ns):
-            self.apply(reading_ns, kind, celsius)
+        for reading_ns, _, name, _, celsius in self.queue.due(stamp_ns):
+            self._apply(name, reading_ns, celsius)
 
     @property
     def is_unmeasured(self) -> bool:
@@ -198,25 +205,23 @@ class ThermalSide:
         else:
             self.counters.n_stale += n_samples
 
-    def start_of(self, stamp_ns: int) -> int:
-        """Find where the segment of a stamp begins: counted from the last reading."""
-        updated_ns = self.tracker.updated_ns or 0
-        return stamp_ns - (stamp_ns - updated_ns) % SEGMENT_NS
-
-    def open(self, start_ns: int, n_seen: int, stamp_ns: int) -> bool:
+    def segment(self, stamp_ns: int, n_seen: int) -> Segment:
         """
-        Check the rate at a segment's first sample, `n_seen` samples after the first one; False if
-        a block's end has cut the segment, so that it only goes on.
+        Open the segment of a sample, `n_seen` samples after the first one: it is counted from the
+        last reading. A new one begins with a look at the rate.
         """
+        start_ns = stamp_ns - (stamp_ns - (self.tracker.updated_ns or 0)) % SEGMENT_NS
         key = (self._n_applied, start_ns)
-        if key == self._segment_key:
-            return False
-        self._segment_key = key
-        self.rate.update(n_seen, stamp_ns)
-        return True
+        is_new = key != self._segment_key
+        if is_new:
+            self._segment_key = key
+            self.rate.update(n_seen, stamp_ns)
+        start, end = self.sample(start_ns), self.sample(start_ns + SEGMENT_NS)
+        slow = self._slow_at(start_ns, end)
+        return Segment(start_ns, is_new, self.is_too_fast, self.noise_excess, start, end, slow)
 
     @property
-    def rate_refuses(self) -> bool:
+    def is_too_fast(self) -> bool:
         """Whether samples come too fast to be conversions of the calibrated cycle."""
         return self.rate.is_too_fast and self._counts_cycles
 
@@ -226,12 +231,8 @@ class ThermalSide:
         excess = self.rate.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
-    def slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[Variance[float]]:
-        """
-        Give the slow part of the variance of a segment, evaluated at its end or held.
-
-        Of the three axes, and behind these of those of the angular rate, if it is corrected.
-        """
+    def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[Variance[float]]:
+        """Give the slow part of the variance of a segment, evaluated at its end or held."""
         key = start_ns // SLOW_NS
         if key != self._slow_key:
             self._slow_key = key
@@ -241,26 +242,3 @@ class ThermalSide:
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             self._slow = [v for one in self._uncertainty for v in one.at(end_state, shares)]
         return self._slow
-
-
-def lay_lines(
-    correction: Correction,
-    start: Sequence[Number],
-    end: Sequence[Number],
-    slow: Sequence[Variance[Number]],
-    noise_excess: Number,
-) -> list[Number]:
-    """
-    Lay a line from the beginning of a segment, or of many as arrays, to the end.
-
-    Returns per axis bias, its change per second, scale, its change per second; then per axis a, b,
-    c of the error variance.
-    """
-    at_start = correction.bias_scale(start)
-    at_end, variances = correction.evaluate(end, slow)
-    result: list[Number] = []
-    for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
-        result += [bias, bias_end - bias, scale, scale_end - scale]
-    for (a, b, c), noise in zip(variances, correction.noise, strict=True):
-        result += [a + noise_excess * noise, b, c]
-    return result

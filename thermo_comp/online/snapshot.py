@@ -59,7 +59,7 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         case_step_k=case.step,
         is_lead_reversed=tracker.lead.is_reversed,
         rate_ratio=thermal.rate.ratio,
-        is_too_fast=thermal.rate_refuses,
+        is_too_fast=thermal.is_too_fast,
         gravity=compensator.gravity.result,
         is_refuted=compensator.gravity.is_refuted,
         rate_bias_sd=_rate_bias_sd(compensator),
