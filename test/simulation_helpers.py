@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from thermo_comp.simulation import Cyclogram, SimulatedRun
+from thermo_comp.simulation import Cyclogram, SimulatedRun, UnitModel
 from thermo_comp.typing import Bools, Floats
 
 
@@ -15,6 +17,11 @@ def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
     truth = run.truth
     rate = np.gradient(truth.temperature(truth.unit.board.node), truth.grid_s)
     return np.asarray(np.abs(rate) * 60.0 > threshold_k_min)
+
+
+def noiseless(unit: UnitModel) -> UnitModel:
+    """Return the unit with no white noise on the axes and the thermometers."""
+    return replace(unit.with_thermometers(noise_sd=0.0), noise_density=(0.0, 0.0, 0.0))
 
 
 def rates_k_min(program: Cyclogram) -> Floats:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import welch
-from simulation_helpers import ideal_regime, rippled
+from simulation_helpers import ideal_regime, noiseless, rippled
 
 from thermo_comp.simulation import (
     MICRO_G,
@@ -90,7 +90,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit: UnitModel) -> None:
 
 
 def test_one_noisy_axis_leaves_the_others_exactly_equal(unit: UnitModel) -> None:
-    quiet = unit.without_noise()
+    quiet = noiseless(unit)
     noisy = replace(quiet, noise_density=(0.0, 80.0, 0.0))
     a, b = simulate(quiet, SHORT, UP), simulate(noisy, SHORT, UP)
     np.testing.assert_array_equal(a.counts[:, [0, 2]], b.counts[:, [0, 2]])
@@ -118,7 +118,7 @@ def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None
 
 def test_axes_permute() -> None:
     base = replace(
-        unit_preset('bare-quartz', 2).without_noise(),
+        noiseless(unit_preset('bare-quartz', 2)),
         misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     )
     order = [2, 0, 1]
@@ -152,7 +152,7 @@ def test_axes_permute() -> None:
 
 def test_counts_follow_the_truth(unit: UnitModel) -> None:
     """Without noise the running sum of the counts is that of ``bias + K scale inverse(M) f``."""
-    run = simulate(unit.without_noise(), DEMO, UP, rate_hz=50.0)
+    run = simulate(noiseless(unit), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T
     charge = truth.bias + np.array(unit.scale_factor) * truth.scale * s

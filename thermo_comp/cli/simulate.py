@@ -14,9 +14,8 @@ from . import options
 from .options import option
 
 if TYPE_CHECKING:
-    from ..recording import BagWriter, ImuColumns
+    from ..recording import BagWriter
     from ..simulation import SimulatedRun, UnitModel
-    from ..typing import Bools
 
 
 def simulate(
@@ -143,7 +142,7 @@ def _write(
     """
     import numpy as np
 
-    from ..recording import Topics
+    from ..recording import ImuColumns, Topics
 
     topics = Topics()
     start_ns: int | None = None
@@ -158,24 +157,10 @@ def _write(
         stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]
         if is_imu:
             # As a driver reports it: scaled by what the data sheet says.
-            force, rest = counts / np.mean(unit.scale_factor), _beside(run, keep)
+            force, rate = counts / np.mean(unit.scale_factor), run.angular_rate
+            rest = None if rate is None else ImuColumns.of_rate(rate[keep])
             writer.write_imu(topics.imu, stamp_ns, force, np.zeros(9), 'imu_link', rest)
         else:
             writer.write_counts(topics.counts, stamp_ns, counts, 'imu_link')
         writer.flush()
         yield {'counts': len(stamp_ns), 'board': len(run.board), 'case': len(run.case)}
-
-
-def _beside(run: SimulatedRun, keep: Bools) -> ImuColumns | None:
-    """Give what an Imu holds beside the force: no orientation, a rate of unknown covariance."""
-    import numpy as np
-
-    from ..recording import ImuColumns
-
-    if run.angular_rate is None:
-        return None
-    n = int(keep.sum())
-    nothing, unknown = np.zeros((n, 9)), np.zeros((n, 9))
-    unknown[:, 0] = -1.0
-    level = np.tile((0.0, 0.0, 0.0, 1.0), (n, 1))
-    return ImuColumns(level, unknown, run.angular_rate[keep], nothing, nothing)

@@ -277,11 +277,7 @@ def _write(
             if log.input == 'counts':
                 writer.write_counts(topics.counts, stamp_ns, values, log.frame_id, newest[rows])
             else:
-                imu = None
-                if log.gyro is not None:
-                    # No orientation (REP 145), and a rate of unknown covariance.
-                    none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
-                    imu = ImuColumns(np.eye(4)[3], none, log.gyro[rows], unknown, unknown)
+                imu = None if log.gyro is None else ImuColumns.of_rate(log.gyro[rows])
                 writer.write_imu(
                     topics.imu, stamp_ns, values, np.zeros(9), log.frame_id, imu, newest[rows]
                 )

@@ -83,6 +83,15 @@ class ImuColumns:
     angular_velocity_covariance: Floats
     linear_acceleration_covariance: Floats
 
+    @classmethod
+    def of_rate(cls, rate: Floats) -> ImuColumns:
+        """Give what is no orientation (REP 145), and rates; their covariances are not known."""
+        no_orientation = [0.0, 0.0, 0.0, 1.0], [-1.0] + 8 * [0.0]
+        level, none, unknown = (
+            np.broadcast_to(row, (len(rate), len(row))) for row in (*no_orientation, np.zeros(9))
+        )
+        return cls(level, none, rate, unknown, unknown)
+
     def take(self, rows: Ints | slice) -> ImuColumns:
         """Choose some messages."""
         return ImuColumns(*(getattr(self, one.name)[rows] for one in fields(self)))

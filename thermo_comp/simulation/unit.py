@@ -20,6 +20,7 @@ from .network import ThermalNetwork, ThermalResponse
 from .streams import Stream, generator
 
 _NS = 1_000_000_000
+_REFERENCE_C = 20.0  # of the board in still air: there K and bias hold
 _RANGE = -(1 << 15), (1 << 15) - 1  # of the output, counts
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
@@ -155,7 +156,6 @@ class UnitModel:
         orthogonal frame, shape (3, 3)
     noise_density: white noise of the acceleration per axis, ug/sqrt(Hz): the mean over `T` seconds
         has the standard deviation ``noise_density / sqrt(T)``
-    reference_temperature: reading of the board's part at which K and bias hold in still air, degC
     bias_walk: random walk of the bias per axis within a run, ug per square root of an hour
     loads: loads beside the constant powers
     gyro: the gyroscope beside it, if there is one
@@ -172,7 +172,6 @@ class UnitModel:
     misalignment: tuple[Triple, Triple, Triple]
     noise_density: Triple
     converter: Callable[[Floats, Ints], tuple[NDArray[np.int32], Ints]] = balanced
-    reference_temperature: float = 20.0
     bias_walk: Triple = ZERO
     loads: tuple[SwitchedLoad, ...] = ()
     gyro: GyroModel | None = None
@@ -192,7 +191,7 @@ class UnitModel:
         """
         Temperatures [degC] of the parts in the still state of the reference, shape (n_parts,).
         """
-        air = self.network.air_for(self.board.node, self.reference_temperature)
+        air = self.network.air_for(self.board.node, _REFERENCE_C)
         return self.network.equilibrium(air)
 
     def with_thermometers(self, **changes: Any) -> UnitModel:
@@ -234,10 +233,6 @@ class UnitModel:
             bias_at_reference=triple(bias),
             misalignment=(triple(M[0]), triple(M[1]), triple(M[2])),
         )
-
-    def without_noise(self) -> UnitModel:
-        """Return the unit with no white noise on the axes and the thermometers."""
-        return replace(self.with_thermometers(noise_sd=0.0), noise_density=ZERO)
 
 
 def triple(values: Floats) -> Triple:
