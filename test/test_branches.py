@@ -14,7 +14,7 @@ from thermo_comp.fitting.reduction import reduce_source
 
 def look(rest, **keys):
     source = rest.source(**keys)
-    bag = reduce_source(source, 0, window_s=10.0, cell_s=2.0, min_rest_s=5.0, full_scale=None)
+    bag = reduce_source(source, window_s=10.0, cell_s=2.0, min_rest_s=5.0, full_scale=None)
     return find_branches(source, bag)
 
 

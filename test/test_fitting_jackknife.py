@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit_bags, reduce_bag
+from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit_bags
 from thermo_comp.fitting.posterior import Regression
+from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.windows import FEWEST_WINDOWS
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
@@ -20,10 +22,10 @@ def ratio(path: Path) -> float:
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
     nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
     block = ArrayBlock(stamps, accel, nothing_ns, nothing, nothing_ns, nothing)
-    options = FitOptions(
-        gravity=STANDARD_GRAVITY, input='m/s^2', window_s=1.0, cell_s=0.2, min_rest_s=1.0
-    )
-    bags = [reduce_bag(FitSource(path.stem, lambda: [block]), 0, options)]
+    options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
+    source = FitSource(path.stem, lambda: [block])
+    short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
+    bags = [reduce_source(source, full_scale=None, **short)]
     result = fit_bags(bags, options)
     posterior, prior = result.learnt.posterior, result.learnt.prior
     axes = (result.calibration.axes.x, result.calibration.axes.y, result.calibration.axes.z)

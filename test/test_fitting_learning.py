@@ -106,7 +106,7 @@ def test_widths_are_those_of_the_weights(calm: tuple[Regression, Learnt, Truth])
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(found.prior.on_bias[:4], true[:4], rtol=0.15)
     for worth in found.worth:
-        assert 0.0 < worth.effective <= 6.0 + 1e-9
+        assert 0.0 < worth.effective_parameters <= 6.0 + 1e-9
         assert len(worth.sd) == 2
 
 
@@ -151,10 +151,10 @@ def test_worth_is_the_fall_of_the_evidence_without_it() -> None:
             posterior.state, replace(prior, **{name: rest}), n_steps=STEPS, tolerance=1e-9
         )
         fall = posterior.log_evidence - without.log_evidence
-        assert worth.evidence == pytest.approx(fall, rel=0.01, abs=0.02), worth
+        assert worth.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), worth
     told = {(worth.part, worth.group): worth for worth in worths}
-    assert told['bias', 'board'].evidence > 10.0
-    assert told['bias', 'idle'].evidence < 0.5
+    assert told['bias', 'board'].log_evidence_change > 10.0
+    assert told['bias', 'idle'].log_evidence_change < 0.5
 
 
 def test_what_a_group_explains_is_what_it_adds(calm: tuple[Regression, Learnt, Truth]) -> None:
@@ -163,7 +163,7 @@ def test_what_a_group_explains_is_what_it_adds(calm: tuple[Regression, Learnt, T
     told = {(worth.part, worth.group): worth for worth in found.worth}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
     # Some 100 ug beside a noise of 2.
-    assert told['bias', 'board'].explains == pytest.approx(expected, rel=0.05)
+    assert told['bias', 'board'].explains_m_s2 == pytest.approx(expected, rel=0.05)
 
 
 def test_outliers_do_not_pull() -> None:

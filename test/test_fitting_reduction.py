@@ -49,7 +49,7 @@ def split(whole: ArrayBlock, n_parts: int) -> list[ArrayBlock]:
 def reduced(blocks: Iterable[ArrayBlock], **options: float | None) -> ReducedBag:
     kept = list(blocks)
     settings = {'window_s': 10.0, 'cell_s': 0.5, 'min_rest_s': 3.0, 'full_scale': 32767.0}
-    return reduce_source(FitSource('bag', lambda: kept), 0, **{**settings, **options})
+    return reduce_source(FitSource('bag', lambda: kept), **{**settings, **options})
 
 
 def still(rng: np.random.Generator, seconds: float, level: tuple[float, ...]) -> np.ndarray:
@@ -195,7 +195,6 @@ def test_fast_readings_are_averaged(rng: np.random.Generator) -> None:
         stamps(n), celsius, stamps(n), celsius,
     )  # fmt: skip
     board = reduced([whole]).board
-    assert board.n_read == n
     assert len(board.value) <= n / 19
     assert board.value.mean() == pytest.approx(celsius.mean(), abs=1e-3)
 
@@ -242,7 +241,7 @@ def course(quantum: float, noise: float, rng: np.random.Generator) -> Readings:
     celsius += noise * rng.standard_normal(len(time))
     if quantum:
         celsius = np.round(celsius / quantum) * quantum
-    return Readings(stamps(len(time), 1.0), celsius, len(time))
+    return Readings(stamps(len(time), 1.0), celsius)
 
 
 @pytest.mark.parametrize(('quantum', 'noise'), [(0.0, 0.005), (0.0, 0.05), (0.0625, 0.005)])
@@ -264,7 +263,7 @@ def test_whole_degrees_are_seen() -> None:
 
 
 def test_no_readings_keep_the_defaults() -> None:
-    empty = Readings(np.zeros(0, dtype=np.int64), np.zeros(0), 0)
+    empty = Readings(np.zeros(0, dtype=np.int64), np.zeros(0))
     base = DetectorSettings()
     assert learn_thermometer([empty], base.board) == base.board
 
@@ -274,7 +273,7 @@ def test_a_slow_ramp_is_not_to_be_missed(rng: np.random.Generator) -> None:
     time = np.arange(0.0, n)
     celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
     celsius = celsius + 0.005 * rng.standard_normal(n)
-    readings = Readings(stamps(n, 1.0), celsius, n)
+    readings = Readings(stamps(n, 1.0), celsius)
     bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
     # The ramp is 0.15 K/min: seven tenths of it.

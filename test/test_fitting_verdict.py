@@ -175,9 +175,8 @@ def test_scale_factors_far_from_one_are_said() -> None:
     ('change', 'message'),
     [
         ({'gravity': -1.0}, '`gravity` must be positive, got -1.0'),
-        ({'window_s': 0.0}, '`window_s` must be positive, got 0.0'),
         ({'full_scale': -5.0}, '`full_scale` must be positive, got -5.0'),
-        ({'cell_s': 20.0}, r'`cell_s` must not exceed `window_s` \(10.0\), got 20.0'),
+        ({'min_rest_s': 0.0}, '`min_rest_s` must be positive, got 0.0'),
         ({'input': 'g'}, "`input` must be 'counts' or 'm/s"),
     ],
 )

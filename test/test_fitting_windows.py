@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit, reduce_bag
-from thermo_comp.fitting.curves import sets_of
+from thermo_comp.fitting.options import sets_of
 from thermo_comp.fitting.reduction import ReducedBag
 from thermo_comp.fitting.windows import ThermalWindows, thermal_windows
 from thermo_comp.simulation import (
@@ -49,7 +49,7 @@ def sources(n: int, seed: int = 1) -> list[FitSource]:
 
 @pytest.fixture(scope='module')
 def bags() -> list[ReducedBag]:
-    return [reduce_bag(source, k, OPTIONS) for k, source in enumerate(sources(2))]
+    return [reduce_bag(source, OPTIONS) for source in sources(2)]
 
 
 def windows_of(bags: list[ReducedBag], columns: tuple[Column, ...] = bank()) -> ThermalWindows:

@@ -11,7 +11,7 @@ import pytest
 from position_helpers import START_NS
 
 from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit
-from thermo_comp.fitting.attitudes import rough_centre
+from thermo_comp.fitting.coverage import rough_centre
 from thermo_comp.simulation import positions
 
 GRAVITY = 9.80665

@@ -15,14 +15,14 @@ from position_helpers import GRAVITY, MG, Rest
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.reduction import reduce_source
-from thermo_comp.fitting.rests import describe, find_jumps, judge_rests
+from thermo_comp.fitting.verdict import describe, find_jumps
 from thermo_comp.simulation import positions
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 
 def reduced(source):
-    return reduce_source(source, 0, window_s=10.0, cell_s=2.0, min_rest_s=5.0, full_scale=None)
+    return reduce_source(source, window_s=10.0, cell_s=2.0, min_rest_s=5.0, full_scale=None)
 
 
 def bags(rng, n=9, jump_in=None, size=20.0):
@@ -46,7 +46,7 @@ def test_jump_in_one_bag_stops_the_fit(rng):
 
 
 def test_good_bags_pass(rng):
-    assert judge_rests([reduced(source) for source in bags(rng, n=6)], OPTIONS) == []
+    assert not any(find_jumps(reduced(source)) for source in bags(rng, n=6))
 
 
 def test_turning_is_no_jump(rng):
@@ -76,6 +76,4 @@ def test_steps_are_said_in_words(rng):
     rest.add((0.0, 0.0, 20.0 * MG), from_s=300.0)
     (jump,) = find_jumps(reduced(rest.source()))
     assert 'jumped by +' in describe(jump, MG)
-    assert 'may have been turned or jumped' in describe(replace(jump, kind='turn'), MG)
-    assert 'was moved' in describe(replace(jump, kind='motion'), MG)
     assert np.isnan(jump.turn_seen)

@@ -53,20 +53,20 @@ def hover(rng, seconds: float, vibration: float) -> tuple[np.ndarray, np.ndarray
 def test_a_flight_is_no_rest(rng, with_gyro):
     accel, gyro = hover(rng, 120.0, vibration=1.0)
     with pytest.raises(FitError, match=r'log: no still interval: its samples scatter by 9\d mg'):
-        reduce_bag(source(accel, gyro if with_gyro else None), 0, OPTIONS)
+        reduce_bag(source(accel, gyro if with_gyro else None), OPTIONS)
 
 
 def test_a_smooth_flight_is_told_by_its_gyroscope(rng):
     # Vibration of 15 mg is within what a noisy sensor shows; 4 deg/s is what none does.
     accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
     with pytest.raises(FitError, match='its gyroscope turns all the time'):
-        reduce_bag(source(accel, gyro), 0, OPTIONS)
+        reduce_bag(source(accel, gyro), OPTIONS)
 
 
 def test_of_a_log_only_the_ground_is_a_rest(rng):
     parts = [ground(rng, 12.0), hover(rng, 240.0, 15.0 * MG), ground(rng, 12.0)]
     accel, gyro = (np.concatenate(each) for each in zip(*parts, strict=True))
-    bag = reduce_bag(source(accel, gyro), 0, OPTIONS)
+    bag = reduce_bag(source(accel, gyro), OPTIONS)
     ends = [((i.start_ns - START_NS) * 1e-9, (i.end_ns - START_NS) * 1e-9) for i in bag.intervals]
     assert len(ends) == 2
     assert ends[0][1] < 12.0
@@ -78,14 +78,14 @@ def test_what_the_user_says_of_the_noise_decides(rng):
     quiet, _ = ground(rng, 30.0)
     options = FitOptions(gravity=GRAVITY, input='m/s^2', still_sd=10.0 * MG)
     with pytest.raises(FitError, match=r'by less than 10 mg at rest \(--still-sd\)'):
-        reduce_bag(source(accel), 0, options)
-    assert len(reduce_bag(source(quiet), 0, options).intervals) == 1
+        reduce_bag(source(accel), options)
+    assert len(reduce_bag(source(quiet), options).intervals) == 1
 
 
 def test_a_gyroscope_that_drifts_with_temperature_rests(rng):
     accel, gyro = ground(rng, 1200.0)
     gyro[:, 0] += np.radians(10.0) * np.linspace(0.0, 1.0, len(gyro)) ** 2
-    bag = reduce_bag(source(accel, gyro), 0, OPTIONS)
+    bag = reduce_bag(source(accel, gyro), OPTIONS)
     assert len(bag.intervals) == 1
     assert bag.n_still_cells == bag.n_cells
 
@@ -133,9 +133,9 @@ def test_motion_does_not_pass_for_a_rest_in_the_scan(rng):
 
 def test_the_shortest_rest_is_yours_to_say(rng):
     accel = by_hand(rng, 10, 3.5, ())
-    bag = reduce_bag(source(accel), 0, FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=2.0))
+    bag = reduce_bag(source(accel), FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=2.0))
     assert len(bag.intervals) == 10
     with pytest.raises(FitError, match='must rest in each position'):
-        reduce_bag(source(accel), 0, FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=60.0))
+        reduce_bag(source(accel), FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=60.0))
     with pytest.raises(ValueError, match='`min_rest_s` must be positive'):
         FitOptions(gravity=GRAVITY, min_rest_s=0.0)

@@ -124,7 +124,7 @@ def fit(
             offset=offset,
         )
     with out.progress('fitting') as done:
-        result = run(sources, wanted, lambda _stage, part: done(part))
+        result = run(sources, wanted, done)
     out.told((bag.source.name, bag.info.chosen, bag.truncated) for bag in result.bags if bag.info)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
@@ -175,7 +175,8 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
     from ..text import counted
     from ..unit.gravity import spoken
 
-    calibration, gyroscope = result.calibration, result.gyroscope
+    calibration = result.calibration
+    gyroscope = calibration.gyroscope if result.rates else None
     model, left_out = calibration.provenance.model, result.residuals[-1].left_out
     if verbose:
         _say_positions(out, result)
@@ -206,14 +207,15 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
     if gyroscope is not None:
         out.table(
             ('section', 'windows', 'raw', 'fitted', 'left out'),
-            _steps(gyroscope.residuals, ('raw', 'fitted', 'left_out'), millidegrees, n_axes=3),
+            _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, n_axes=3),
             title='angular rate at rest less the mean of each position, RMS of an axis in mdeg/s',
         )
-        unit = gyroscope.gyroscope
+        bias = _of_axes(gyroscope.bias_rad_s, millidegrees)
+        white = _of_axes(gyroscope.noise_density_rad_s_sqrt_hz, millidegrees)
+        walk = _of_axes(gyroscope.slow_noise_rad_s_sqrt_h, millidegrees)
         out.line(
-            f'angular rate of x y z: bias {_of_axes(unit.bias_rad_s, millidegrees)} mdeg/s, '
-            f'white {_of_axes(unit.noise_density_rad_s_sqrt_hz, millidegrees)} mdeg/s/sqrt(Hz), '
-            f'walk {_of_axes(unit.slow_noise_rad_s_sqrt_h, millidegrees)} mdeg/s/sqrt(h)'
+            f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
+            f'walk {walk} mdeg/s/sqrt(h)'
         )
     for finding in result.findings:
         if finding.level != 'good':
@@ -234,10 +236,9 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
             'gyroscope': gyroscope
             and {
                 **picked(
-                    gyroscope.gyroscope,
-                    'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h',
+                    gyroscope, 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
                 ),
-                'residuals_rad_s': gyroscope.residuals,
+                'residuals_rad_s': result.rates,
             },
             **picked(result, 'positions least_known findings'),
         }

@@ -67,7 +67,6 @@ def report(
                 open_bag(
                     path,
                     **reading,
-                    number=len(opened),
                     window_s=judging['window_s'],
                     calibration=loaded,
                     require=('board',) if loaded is None else needed_roles(loaded),

@@ -20,8 +20,14 @@ from ..recording.columns import Readings
 from ..recording.overview import ThermometerSurvey, survey_thermometer, thermal_findings
 from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints
-from .attitudes import SAME_DIRECTION_DEG, rough_centre
-from .coverage import constants_covariance, farthest, next_direction, worst_sd
+from .coverage import (
+    SAME_DIRECTION_DEG,
+    constants_covariance,
+    farthest,
+    next_direction,
+    rough_centre,
+    worst_sd,
+)
 
 # What is still for so long, or for a soak that is shorter, is a rest [s].
 _REST_S = 10.0

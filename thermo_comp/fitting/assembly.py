@@ -22,7 +22,6 @@ from ..unit.calibration import (
     AxisReference,
     AxisSet,
     Calibration,
-    GroupEvidence,
     Provenance,
     RegimeSet,
     ResidualSummary,
@@ -186,17 +185,7 @@ def build_calibration(
                 if finding.level != 'good'
             ),
         ),
-        evidence=tuple(
-            GroupEvidence(
-                group=worth.group,
-                part='bias' if worth.part == 'bias' else 'scale',
-                explains_m_s2=float(worth.explains),
-                effective_parameters=max(float(worth.effective), 0.0),
-                log_evidence_change=float(worth.evidence),
-                prior_sd=worth.sd,
-            )
-            for worth in (learnt.worth if is_seen else ())
-        ),
+        evidence=learnt.worth if is_seen else (),
         posterior=posterior_of(covariance),
     )
 

@@ -17,18 +17,15 @@ from ..unit.calibration import Calibration, Unit
 from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
 from .assembly import UnitFacts, build_calibration
-from .attitudes import distinct_directions
-from .coverage import LeastKnown, least_known
-from .curves import sets_of
+from .coverage import LeastKnown, distinct_directions, least_known
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
-from .gyroscope import GyroscopeFit, add_gyroscope, judge_rates
+from .gyroscope import RateRow, add_gyroscope
 from .learning import Learnt, learn
 from .offset import about, centred, find_offset, with_notes
-from .options import COUNTS_FULL_SCALE, FitOptions
+from .options import FitOptions, sets_of
 from .posterior import Regression
 from .priors import constants_of, known_of, prior_columns, prior_sets, state_of
 from .reduction import ReducedBag, reduce_source
-from .rests import judge_rests
 from .sensors import learn_detector
 from .sources import FitSource
 from .start import ConstantCalibration, constant_calibration, position_means
@@ -44,8 +41,10 @@ from .verdict import (
 )
 from .windows import CURVE, FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
 
-Progress = Callable[[str, float], None]
+Progress = Callable[[float], None]
 
+# Neighbouring windows of a position are merged up to this length for the regression [s].
+_WINDOW_S = 60.0
 # Usual full scales of units that report m/s^2.
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 # Stands in where the bags do not tell how far the board lags behind the case.
@@ -70,7 +69,7 @@ class FitResult:
     findings: what the data lacked, or not
     least_known: the attitude that the positions left unseen most
     windows, bags: the windows of the regression; the reduced bags
-    gyroscope: that of the angular rate; None where the bags have none, or there is a prior
+    rates: residuals of the angular rate; none where the bags have none, or there is a prior
     """
 
     calibration: Calibration
@@ -81,7 +80,7 @@ class FitResult:
     least_known: LeastKnown | None
     windows: ThermalWindows
     bags: tuple[ReducedBag, ...]
-    gyroscope: GyroscopeFit | None = None
+    rates: tuple[RateRow, ...] = ()
 
 
 def fit(
@@ -90,47 +89,30 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Raises FitError if the data contradict themselves, or there is no still interval.
+    Raises FitError if the data contradict themselves, or a bag has no still interval.
     """
-    tell = progress or _no_progress
     check_serial(sources, options)
-    return fit_bags(reduce_sources(sources, options, tell), options, tell)
-
-
-def reduce_sources(
-    sources: Sequence[FitSource], options: FitOptions, progress: Progress
-) -> list[ReducedBag]:
-    """
-    Stream all sources into their sufficient statistics.
-
-    Raises FitError if there is no source, or one has no samples or no still interval.
-    """
     if not sources:
         raise FitError('no bag was given')
     bags = []
     for number, source in enumerate(sources):
-        progress('reading', 0.5 * number / len(sources))
-        bags.append(reduce_bag(source, number, options))
-    return bags
+        if progress is not None:
+            progress(0.5 * number / len(sources))
+        bags.append(reduce_bag(source, options))
+    return fit_bags(bags, options, progress)
 
 
-def reduce_bag(source: FitSource, number: int, options: FitOptions) -> ReducedBag:
+def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
     """
     Stream one source into its sufficient statistics.
 
     Raises FitError if it has no samples or no still interval.
     """
-    full_scale = options.full_scale
-    if full_scale is None and options.input == 'counts':
-        full_scale = COUNTS_FULL_SCALE
     bag = reduce_source(
         source,
-        number,
-        window_s=options.window_s,
-        cell_s=options.cell_s,
         min_rest_s=options.min_rest_s,
         still_sd=options.still_sd / STANDARD_GRAVITY,
-        full_scale=full_scale,
+        full_scale=options.saturated_at,
         fewest_windows=FEWEST_WINDOWS,
     )
     if not bag.n_samples:
@@ -148,7 +130,7 @@ def fit_bags(
 
     Raises FitError if the data contradict themselves.
     """
-    tell = progress or _no_progress
+    tell = progress or (lambda _part: None)
     offset = find_offset(bags, options)
     if not offset.any():
         return _fit(bags, options, tell)
@@ -166,11 +148,10 @@ def fit_bags(
 def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
     """Fit a calibration to bags in which no force is about zero."""
     _check_temperatures(bags)
-    findings = list(enforce(judge_bags(bags, options), options))
-    findings += enforce(judge_rests(bags, options), options) + tuple(judge_rates(bags))
+    findings = enforce(judge_bags(bags, options), options)
     known = options.prior
     detector = options.detector or (known.detector if known else learn_detector(bags))
-    tell('temperatures', 0.55)
+    tell(0.55)
     sensors = known.sensors if known else sensors_of(bags)
     if known is not None:
         sets, columns = prior_sets(known), prior_columns(known)
@@ -182,9 +163,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         columns,
         sets,
         detector,
-        ThermalConfig(transition_time_s=options.transition_time_s),
+        ThermalConfig(),
         options.reference_temperature,
-        options.regression_window_s,
+        _WINDOW_S,
         sensors,
     )
     start = first_guess(windows, options) if known is None else constants_of(known)
@@ -192,7 +173,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(judge_windows(windows, up, has_case), options)
-    tell('regression', 0.7)
+    tell(0.7)
     nominal = start.scale
     regression = Regression(windows.data, options.gravity, nominal)
     inverse = np.linalg.inv(start.misalignment)
@@ -223,7 +204,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         state,
         prior,
         np.array(forced),
-        lambda part: tell('regression', 0.7 + 0.25 * part),
+        lambda part: tell(0.7 + 0.25 * part),
         held=(prior.on_scale > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
         # What the sets alone leave is a response, and no noise.
         walks=bool(columns) and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
@@ -248,13 +229,13 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         calibration = build_calibration(
             windows, regression, learnt, columns, sets, nominal, bags, facts, residuals, findings
         )
-        calibration, gyroscope = add_gyroscope(
+        calibration, rates = add_gyroscope(
             calibration, windows, columns, sets, bags, facts, options
         )
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     least = least_known(calibration, learnt.posterior.state.up)
-    unseen = judge_coverage(least)
+    unseen = list(judge_coverage(least))
     findings += unseen
     calibration = with_notes(calibration, [f'{one.name}: {one.message}' for one in unseen])
     return FitResult(
@@ -266,7 +247,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         least_known=least,
         windows=windows,
         bags=tuple(bags),
-        gyroscope=gyroscope,
+        rates=rates,
     )
 
 
@@ -383,9 +364,7 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     serial = check_serial([bag.source for bag in bags], options)
-    full_scale = options.full_scale
-    if full_scale is None and options.input == 'counts':
-        full_scale = COUNTS_FULL_SCALE
+    full_scale = options.saturated_at
     if full_scale is None:
         largest = max(bag.reach for bag in bags)
         full_scale = next(
@@ -394,7 +373,3 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
         )
     cycle = float(np.median([bag.cycle_s for bag in bags]))
     return Unit(serial, options.input, full_scale, cycle)
-
-
-def _no_progress(_stage: str, _part: float) -> None:
-    return None

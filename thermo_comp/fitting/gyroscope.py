@@ -21,7 +21,6 @@ from ..typing import Floats, Ints
 from ..unit.calibration import Calibration
 from ..unit.columns import Column
 from ..unit.gravity import EARTH_RATE
-from ..unit.gyroscope import Gyroscope
 from ..unit.metrics import ResidualStatistics, statistics_by_regime
 from ..unit.rate_triad import gyroscope_of
 from .assembly import UnitFacts, build_calibration
@@ -31,7 +30,6 @@ from .posterior import Regression
 from .reduction import ReducedBag
 from .start import position_means
 from .unknowns import Prior, initial_state
-from .verdict import Finding
 from .windows import CURVE, Sets, ThermalWindows
 
 # What it is on one axis, of an attitude that nobody knows.
@@ -58,16 +56,6 @@ class RateRow:
     left_out: ResidualStatistics
 
 
-@dataclass(frozen=True)
-class GyroscopeFit:
-    """A gyroscope, the thermometers that it needs beside the board, and its evidence."""
-
-    gyroscope: Gyroscope
-    sensors: tuple[str, ...]
-    learnt: Learnt
-    residuals: tuple[RateRow, ...]
-
-
 def add_gyroscope(
     calibration: Calibration,
     windows: ThermalWindows,
@@ -76,32 +64,18 @@ def add_gyroscope(
     bags: Sequence[ReducedBag],
     facts: UnitFacts,
     options: FitOptions,
-) -> tuple[Calibration, GyroscopeFit | None]:
-    """Give a calibration the gyroscope of its prior or, without one, of the bags."""
-    known = options.prior
-    if known is not None:
-        if known.gyroscope is None:
-            return calibration, None
-        return replace(calibration, gyroscope=known.gyroscope, sensors=facts.sensors), None
-    found = fit_gyroscope(windows, columns, sets, bags, facts, options.groups)
-    if found is None:
-        return calibration, None
-    needed = {*calibration.sensors, *found.sensors}
-    sensors = tuple(name for name in facts.sensors if name in needed)
-    return replace(calibration, gyroscope=found.gyroscope, sensors=sensors), found
+) -> tuple[Calibration, tuple[RateRow, ...]]:
+    """
+    Give a calibration the gyroscope of its prior or, without one, of the bags.
 
-
-def fit_gyroscope(
-    windows: ThermalWindows,
-    columns: Sequence[Column],
-    sets: Sets,
-    bags: Sequence[ReducedBag],
-    facts: UnitFacts,
-    allowed: Sequence[str] | None = None,
-) -> GyroscopeFit | None:
-    """Fit the gyroscope; None where a bag has no angular rate, or no temperature was recorded."""
+    There is none, and no row, where a bag has no angular rate, or no temperature was recorded.
+    """
+    if options.prior is not None:
+        known = options.prior.gyroscope
+        sensors = calibration.sensors if known is None else facts.sensors
+        return replace(calibration, gyroscope=known, sensors=sensors), ()
     if not windows.angular_rate.shape[1] or not windows.has_temperature:
-        return None
+        return calibration, ()
     data = replace(
         windows.data,
         mean=windows.angular_rate,
@@ -114,6 +88,7 @@ def fit_gyroscope(
     state = initial_state(data, regression.n_bags, level.mean(axis=0), one, np.zeros(3), up)
     is_curve = np.array([group == CURVE for group in data.groups])
     drift = float(np.sqrt(np.mean((data.mean - level[data.position]) ** 2, axis=0)).max())
+    allowed = options.groups
     takes_part = np.array([allowed is None or group in allowed for group in data.groups])
     prior = Prior(
         bias_mean=np.zeros(3),
@@ -133,16 +108,9 @@ def fit_gyroscope(
     turn_on = math.sqrt(max(learnt.prior.offset_sd**2 - _EARTH_SD**2, 0.0))
     told = replace(learnt, prior=replace(learnt.prior, offset_sd=turn_on))
     triad = build_calibration(windows, regression, told, columns, sets, one, bags, facts)
-    return GyroscopeFit(gyroscope_of(triad), triad.sensors, learnt, residuals)
-
-
-def judge_rates(bags: Sequence[ReducedBag]) -> list[Finding]:
-    """Say which bags keep the others from giving a gyroscope."""
-    if all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
-        return []
-    names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
-    text = f'{names}: not every sample has an angular rate, so no gyroscope was fitted'
-    return [Finding('rate', 'advice', text)]
+    needed = {*calibration.sensors, *triad.sensors}
+    sensors = tuple(name for name in facts.sensors if name in needed)
+    return replace(calibration, gyroscope=gyroscope_of(triad), sensors=sensors), residuals
 
 
 def _rows(windows: ThermalWindows, regression: Regression, learnt: Learnt) -> tuple[RateRow, ...]:

@@ -25,9 +25,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
+from ..unit.calibration import GroupEvidence
 from .posterior import Posterior, Regression
 from .unknowns import Prior, State
-from .worth import GroupWorth, earned, group_worth, mode_of, places_of, told_of, widths_of
+from .worth import earned, group_worth, mode_of, places_of, told_of, widths_of
 
 # Of the three weights of a column, what the data must tell under a wide prior to be asked.
 _SILENT = 0.05
@@ -70,7 +71,7 @@ class Learnt:
 
     posterior: Posterior
     prior: Prior
-    worth: tuple[GroupWorth, ...]
+    worth: tuple[GroupEvidence, ...]
     claim: Posterior
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration
-from .attitudes import rough_centre
+from .coverage import rough_centre
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .reduction import ReducedBag
 

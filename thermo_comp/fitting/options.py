@@ -1,17 +1,23 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what the user may say of a fit."""
+"""Owns what the user may say of a fit, and what its families of curves mean in functions."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
+
+import numpy as np
 
 from ..recording.stillness import STILL_SD
 from ..thermal.settings import DetectorSettings
 from ..unit.calibration import Calibration
+from ..unit.functions import CubicSpline, Exponential, Polynomial, TemperatureFunction
 from ..unit.gravity import STANDARD_GRAVITY
+from .reduction import ReducedBag
+from .windows import Sets
 
 #: The converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
@@ -21,6 +27,12 @@ CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
 GROUPS = (
     'curve', 'set', 'now', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play',
 )  # fmt: skip
+_ORDERS = {'linear': 1, 'quadratic': 2, 'cubic': 3}
+_SPLINE_PIECES = 4
+# Knots nearer to the reference than this part of their distance fall on it.
+_NEAR = 0.3
+# Semiconductors double their leakage in some 10 K: an e-fold of 15 K, and of twice that.
+_E_FOLDS_K = (15.0, 30.0)
 #: What is refused, and may be allowed by its name.
 REFUSALS = ('saturation', 'units', 'jump', 'swapped')
 
@@ -65,12 +77,8 @@ class FitOptions:
     offset: what raw words read without a force, as 32768; None finds it out
     reference_temperature: T_ref; the paper uses 20
     detector: thermometer and detector settings; None learns them from the bags
-    transition_time_s: cross-over time of the sets, as the node will use
-    window_s, cell_s: lengths of a window and of a cell
     min_rest_s: length of the shortest rest; None chooses, see `reduction`
     still_sd: largest scatter of the samples at rest [m/s^2]
-    regression_window_s: length up to which neighbouring windows of a position are merged for the
-        regression
     allow: names of refusals that the user overrides, see `verdict`
 
     Raises ValueError if a value is outside its range.
@@ -90,23 +98,15 @@ class FitOptions:
     offset: float | None = None
     reference_temperature: float = 20.0
     detector: DetectorSettings | None = None
-    transition_time_s: float = 30.0
-    window_s: float = 10.0
-    cell_s: float = 0.5
     min_rest_s: float | None = None
     still_sd: float = STILL_SD * STANDARD_GRAVITY
-    regression_window_s: float = 60.0
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in (
-            'gravity', 'window_s', 'cell_s', 'min_rest_s', 'still_sd', 'regression_window_s',
-        ):  # fmt: skip
+        for name in ('gravity', 'min_rest_s', 'still_sd', 'full_scale'):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {value}')
-        if self.full_scale is not None and not 0.0 < self.full_scale < math.inf:
-            raise ValueError(f'`full_scale` must be positive, got {self.full_scale}')
         if self.offset is not None and not math.isfinite(self.offset):
             raise ValueError(f'`offset` must be finite, got {self.offset}')
         if self.input not in ('counts', 'm/s^2'):
@@ -123,7 +123,37 @@ class FitOptions:
         for name in self.allow:
             if name not in REFUSALS:
                 raise ValueError(f'`allow` must be of {", ".join(REFUSALS)}, got {name!r}')
-        if not self.cell_s <= self.window_s:
-            raise ValueError(
-                f'`cell_s` must not exceed `window_s` ({self.window_s}), got {self.cell_s}'
-            )
+
+    @property
+    def saturated_at(self) -> float | None:
+        """Magnitude of a saturated sample, where it is known before the samples are."""
+        return self.full_scale or (COUNTS_FULL_SCALE if self.input == 'counts' else None)
+
+
+def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
+    """Choose the curves of the two sets."""
+    readings = [bag.board.value for bag in bags if len(bag.board.value)]
+    if not readings:
+        line = _family('linear', 0.0, 0.0)
+        return Sets(line, line)
+    span = (min(float(r.min()) for r in readings), max(float(r.max()) for r in readings))
+    lower, upper = (edge - options.reference_temperature for edge in span)
+    is_paper = options.model == 'golovach'
+    static = options.static_curve or ('linear' if is_paper else 'cubic')
+    dynamic = options.dynamic_curve or ('quadratic' if is_paper else None)
+    if dynamic is None and static in _ORDERS:
+        return Sets(_family(static, lower, upper), _family('quadratic', lower, upper))
+    return Sets(
+        _family(static, lower, upper), _family(dynamic or static, lower, upper), is_shared=False
+    )
+
+
+def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
+    if name in _ORDERS:
+        return Polynomial((0.0, *[1.0] * _ORDERS[name]))
+    if name == 'exponential':
+        return Exponential(-float(len(_E_FOLDS_K)), (1.0,) * len(_E_FOLDS_K), _E_FOLDS_K)
+    knots = np.linspace(lower, upper, _SPLINE_PIECES + 1)
+    step = max((upper - lower) / _SPLINE_PIECES, 1.0)
+    kept = sorted([0.0, *(float(k) for k in knots if abs(k) > _NEAR * step)])
+    return CubicSpline(tuple(kept), tuple(float(k != 0.0) for k in kept))

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -28,9 +28,12 @@ from ..recording.stillness import (
     why_restless,
 )
 from ..typing import Floats, Ints
-from .attitudes import best_rests
+from .coverage import best_rests
 from .sources import FitSource, angular_velocity
 
+#: Usual length of a window [s].
+WINDOW_S = 10.0
+_CELL_S = 0.5
 # Faster readings are averaged to this interval: no thermometer of this kind is that fast, and the
 # thermometers' recursion runs in Python.
 _SHORTEST_READING_INTERVAL_S = 0.2
@@ -42,22 +45,14 @@ _RATIOS = tuple(VARIANCE_RATIO * 2.0**power for power in range(6))
 _COLDEST, _HOTTEST = -273.15, 1e4
 
 
-@dataclass(frozen=True)
-class Readings:
-    """
-    One thermometer's readings over a bag.
-
-    stamp_ns: rising stamps, shape (n,)
-    value: temperatures, shape (n,)
-    n_read: readings in the bag, before averaging
-    """
+class Readings(NamedTuple):
+    """One thermometer's readings over a bag: rising stamps [ns] and temperatures, shape (n,)."""
 
     stamp_ns: Ints
     value: Floats
-    n_read: int
 
 
-NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0), 0)
+NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -65,7 +60,6 @@ class StillInterval:
     """
     One interval without motion: one position.
 
-    bag: number of the bag in the order given
     start_ns, end_ns: stamps of its first and last cell's middle
     begin_s: where its first window begins, since the bag's first sample [s]; the others follow on
     n_whole: windows of the full length; one that is shorter may come after them
@@ -76,7 +70,6 @@ class StillInterval:
     angular_rate: window means of it [rad/s], shape (n, 3); None where the bag has none throughout
     """
 
-    bag: int
     start_ns: int
     end_ns: int
     begin_s: float
@@ -152,10 +145,9 @@ class ReducedBag:
 
 def reduce_source(
     source: FitSource,
-    bag: int,
     *,
-    window_s: float,
-    cell_s: float,
+    window_s: float = WINDOW_S,
+    cell_s: float = _CELL_S,
     min_rest_s: float | None = None,
     still_sd: float = STILL_SD,
     full_scale: float | None,
@@ -169,7 +161,7 @@ def reduce_source(
     quiet beside the quietest, is what tells these best.
     """
     cells = CellAccumulator(cell_s, full_scale, window_s)
-    collectors: dict[str, _ReadingCollector] = {}
+    readings: dict[str, list[Readings]] = {}
     n_samples = 0
     has_rate = True
     for block in source.blocks():
@@ -178,7 +170,8 @@ def reduce_source(
             has_rate &= rate is not None and bool(np.isfinite(rate).all())
         cells.add(block.accel_stamp_ns, block.accel, rate)
         for name, (reading_ns, celsius, _) in block.temperatures.items():
-            collectors.setdefault(name, _ReadingCollector()).add(reading_ns, celsius)
+            own = readings.setdefault(name, [NO_READINGS])
+            own.append(_thinned(reading_ns, celsius, own[-1].stamp_ns[-1:]))
         n_samples += len(block.accel_stamp_ns)
     found, reader = cells.finish(), source.reader()
     ranges = _rests(found, min_rest_s, still_sd)
@@ -190,7 +183,6 @@ def reduce_source(
         intervals=tuple(
             _windows(
                 found,
-                bag,
                 lower,
                 upper,
                 min(per_window, max(1, (upper - lower) // fewest_windows)),
@@ -198,7 +190,10 @@ def reduce_source(
             )
             for lower, upper in ranges
         ),
-        temperatures={name: one.finish() for name, one in collectors.items()},
+        temperatures={
+            name: Readings(*map(np.concatenate, zip(*own, strict=True)))
+            for name, own in readings.items()
+        },
         n_samples=n_samples,
         n_dropped=found.n_dropped,
         n_saturated=found.n_saturated,
@@ -248,7 +243,7 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
 
 
 def _windows(
-    cells: Cells, bag: int, lower: int, upper: int, per_window: int, has_rate: bool
+    cells: Cells, lower: int, upper: int, per_window: int, has_rate: bool
 ) -> StillInterval:
     n_whole, rest = divmod(upper - lower, per_window)
     # Less than half a window weighs too little to be one.
@@ -266,7 +261,6 @@ def _windows(
         return np.asarray(summed / total[:, None])
 
     return StillInterval(
-        bag=bag,
         start_ns=cells.start_ns + round(cells.time[lower] * 1e9),
         end_ns=cells.start_ns + round(cells.time[upper - 1] * 1e9),
         begin_s=float(cells.index[lower]) * cells.cell_s,
@@ -279,46 +273,19 @@ def _windows(
     )
 
 
-class _ReadingCollector:
-    """
-    Gathers one thermometer's readings: possible ones, in rising order, averaged when very fast.
-    """
-
-    def __init__(self) -> None:
-        self._stamps: list[Ints] = []
-        self._values: list[Floats] = []
-        self._last_ns: int | None = None
-        self._n_read = 0
-
-    def add(self, stamp_ns: Ints, value: Floats) -> None:
-        if not len(stamp_ns):
-            return
-        stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
-        value = np.asarray(value, dtype=np.float64)
-        self._n_read += len(stamp_ns)
-        before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
-        use = (value > _COLDEST) & (value < _HOTTEST)
-        use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
-        stamp_ns, value = stamp_ns[use], value[use]
-        if not len(stamp_ns):
-            return
-        self._last_ns = int(stamp_ns[-1])
-        span_s = (stamp_ns[-1] - stamp_ns[0]) * 1e-9
-        size = int(_SHORTEST_READING_INTERVAL_S * (len(stamp_ns) - 1) / span_s) if span_s else 1
-        if size > 1:
-            n = len(stamp_ns) // size * size
-            if n:
-                first = stamp_ns[0]
-                middle = np.mean((stamp_ns[:n] - first).reshape(-1, size), axis=1)
-                stamp_ns = first + middle.astype(np.int64)
-                value = np.mean(value[:n].reshape(-1, size), axis=1)
-        self._stamps.append(stamp_ns)
-        self._values.append(value)
-
-    def finish(self) -> Readings:
-        empty = np.zeros(0, dtype=np.int64)
-        return Readings(
-            np.concatenate(self._stamps) if self._stamps else empty,
-            np.concatenate(self._values) if self._values else np.zeros(0),
-            self._n_read,
-        )
+def _thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
+    """Keep possible readings, in rising order after the last one; average very fast ones."""
+    stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
+    before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
+    use = (value > _COLDEST) & (value < _HOTTEST)
+    use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
+    stamp_ns, value = stamp_ns[use], value[use]
+    span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
+    size = int(_SHORTEST_READING_INTERVAL_S * (len(stamp_ns) - 1) / span_s) if span_s else 1
+    n = len(stamp_ns) // size * size if size > 1 else 0
+    if n:
+        first = stamp_ns[0]
+        middle = np.mean((stamp_ns[:n] - first).reshape(-1, size), axis=1)
+        stamp_ns = first + middle.astype(np.int64)
+        value = np.mean(value[:n].reshape(-1, size), axis=1)
+    return Readings(stamp_ns, value)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the bags say of the thermometers: noise, quantum, lag, ramps; the detector's settings.
+Owns what the bags say of the thermometers: noise, lag, ramps, detector; the causal thermal state.
 
 Rates are taken here from both sides, over a minute each, which only a recording allows; what is
 learnt makes the causal thermometers and the detector expect what this chamber did.
@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
-from ..typing import Bools, Floats
-from .reduction import Readings, ReducedBag
+from ..thermal.tracker import ThermalTracker
+from ..typing import Bools, Floats, Ints
+from .reduction import NO_READINGS, Readings, ReducedBag
 
 # Below this no thermometer is worth believing, and the recursion would follow rounding errors.
 _SMALLEST_NOISE = 1e-4
@@ -182,3 +183,39 @@ def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
     # A ripple within the noise of the rates is not seen: then the usual one may be there.
     hidden = min(usual, 3.0 * noise * lag_s)
     return float(np.clip(max(clean * lag_s, hidden), *_RIPPLE_RANGE_C))
+
+
+def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> tuple[list[str], Ints, Floats]:
+    """Thermometer, stamp and value of each reading; of equal stamps in the order of `inputs`."""
+    found = [bag.temperatures.get(name, NO_READINGS) for name in inputs]
+    stamps = np.concatenate([one.stamp_ns for one in found])
+    order = np.argsort(stamps, kind='stable')
+    names = np.repeat(inputs, [len(one.value) for one in found])[order]
+    values = np.concatenate([one.value for one in found])[order]
+    return names.tolist(), stamps[order], values
+
+
+def thermal_states(
+    bag: ReducedBag, tracker: ThermalTracker, step_s: float
+) -> tuple[float, Floats]:
+    """
+    Drive a tracker with a bag's readings and sample it on a grid.
+
+    `step_s`: grid step [s]. Returns time of the first grid point since the bag's first sample [s].
+    Returns `ThermalTracker.sample` at each grid point, shape (n, width).
+    """
+    names, stamps, values = readings_in_order(bag, ('board', *tracker.spec.sensors))
+    step_ns = round(step_s * 1e9)
+    begin = max(int(bag.board.stamp_ns[0]), bag.start_ns)
+    grid = np.arange(begin, max(bag.end_ns, begin) + step_ns, step_ns)
+    # Readings up to and including a grid stamp come first, as they do online.
+    due = np.searchsorted(stamps, grid, side='right')
+    rows = []
+    reading = 0
+    stamp_list, value_list = stamps.tolist(), values.tolist()
+    for stamp, stop in zip(grid.tolist(), due.tolist(), strict=True):
+        while reading < stop:
+            tracker.read(names[reading], stamp_list[reading], value_list[reading])
+            reading += 1
+        rows.append(tracker.sample(stamp))
+    return (begin - bag.start_ns) * 1e-9, np.array(rows)

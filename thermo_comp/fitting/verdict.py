@@ -9,18 +9,20 @@ goes into the result.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from ..errors import FitError
+from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
-from .attitudes import distinct_directions, geometry
-from .coverage import LeastKnown, spoken_direction
+from .branches import Event, find_branches
+from .coverage import LeastKnown, distinct_directions, geometry, spoken_direction
 from .options import FitOptions
 from .reduction import ReducedBag
 from .windows import ThermalWindows
@@ -35,6 +37,8 @@ _WORST_GEOMETRY = 6.0
 _SATURATED_NEEDED, _SATURATED_ADVISED = 0.05, 0.001
 # A direction is unseen whose |f| is known so many times less than in the positions.
 _UNSEEN = 3.0
+# Neighbours this close in time and direction may be one rest with a step in it.
+_NEAR_S, _NEAR_DEG = 30.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,11 @@ class Finding:
     message: str
 
 
-def enforce(findings: Sequence[Finding], options: FitOptions) -> tuple[Finding, ...]:
+def _advice(name: str, message: str) -> Finding:
+    return Finding(name, 'advice', message)
+
+
+def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
     """
     Stop at the first refusal that the user does not allow.
 
@@ -60,182 +68,191 @@ def enforce(findings: Sequence[Finding], options: FitOptions) -> tuple[Finding, 
     """
     result = []
     for finding in findings:
-        if finding.level == 'refusal':
-            if finding.name not in options.allow:
-                raise FitError(f'{finding.message} (override with --allow {finding.name})')
-            result.append(Finding(finding.name, 'advice', f'allowed: {finding.message}'))
-        else:
+        if finding.level != 'refusal':
             result.append(finding)
-    return tuple(result)
+        elif finding.name in options.allow:
+            result.append(_advice(finding.name, f'allowed: {finding.message}'))
+        else:
+            raise FitError(f'{finding.message} (override with --allow {finding.name})')
+    return result
 
 
-def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> list[Finding]:
-    """Judge the raw data: saturation, units, numbers that are no counts."""
-    findings = []
-    n_samples = sum(bag.n_samples for bag in bags)
-    n_saturated = sum(bag.n_saturated for bag in bags)
-    if n_saturated > _SATURATED_ADVISED * n_samples:
-        part = n_saturated / n_samples
-        findings.append(
-            Finding(
-                'saturation',
-                'refusal' if part > _SATURATED_NEEDED else 'advice',
-                f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more '
-                'than it can measure, or --full-scale is wrong',
-            )
+def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
+    """Judge the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
+    part = sum(bag.n_saturated for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
+    if part > _SATURATED_ADVISED:
+        yield Finding(
+            'saturation',
+            'refusal' if part > _SATURATED_NEEDED else 'advice',
+            f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
+            'it can measure, or --full-scale is wrong',
         )
     still = sum(bag.n_still_cells for bag in bags) / max(sum(bag.n_cells for bag in bags), 1)
     if still < 0.5:
-        findings.append(
-            Finding(
-                'motion',
-                'advice',
-                f'only {100.0 * still:.0f} % of the time is still; vibration or handling is in '
-                'the rest and was cut out',
-            )
+        yield _advice(
+            'motion',
+            f'only {100.0 * still:.0f} % of the time is still; vibration or handling is in the '
+            'rest and was cut out',
         )
-    if options.input == 'counts':
-        findings += _judge_counts(bags)
-    return findings
-
-
-def _judge_counts(bags: Sequence[ReducedBag]) -> list[Finding]:
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
     size = float(np.median(np.linalg.norm(means, axis=1)))
-    whole = all(bag.is_integer for bag in bags)
-    for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
-        if not whole and abs(size / one_g - 1.0) < 0.1:
-            return [
-                Finding(
+    if options.input == 'counts' and not all(bag.is_integer for bag in bags):
+        for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
+            if abs(size / one_g - 1.0) < 0.1:
+                yield Finding(
                     'units',
                     'refusal',
                     f'the samples have norm {size:.3g} and are no whole numbers: they look like '
                     f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2',
                 )
-            ]
-    if not whole:
-        return [
-            Finding(
+                break
+        else:
+            yield _advice(
                 'compensated',
-                'advice',
                 'the samples are no whole numbers: scaled or compensated before they were '
                 'recorded? A calibration made on them fits that output only',
             )
-        ]
-    return []
+    jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
+    if jumps:
+        per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
+        said = '; '.join(
+            f'{bag.source.name}: {describe(event, per_mg, bag.since_s)}' for bag, event in jumps
+        )
+        text = f'{said}: leave out such a bag, or end before it with --to'
+        yield Finding('jump', 'refusal', text)
+    if not all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
+        names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
+        text = f'{names}: not every sample has an angular rate, so no gyroscope was fitted'
+        yield _advice('rate', text)
 
 
-def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> list[Finding]:
+def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
     """
-    Judge what the still windows cover: temperatures, ramps, positions.
+    Find where a sensor jumped at rest, which no temperature explains.
+
+    The bag is streamed again only where that may be.
+    """
+    means = [np.average(one.mean, axis=0, weights=one.count) for one in bag.intervals]
+    ups = [mean / np.linalg.norm(mean) for mean in means]
+    near = np.cos(np.radians(_NEAR_DEG))
+    may_be = any(
+        after.start_ns - before.end_ns <= _NEAR_S * 1e9 and up @ other > near
+        for (before, up), (after, other) in pairwise(zip(bag.intervals, ups, strict=True))
+    )
+    events = find_branches(bag.source, bag)[0] if may_be else ()
+    return tuple(event for event in events if event.kind == 'jump')
+
+
+def describe(jump: Event, per_mg: float, since_s: float = 0.0) -> str:
+    """Say one jump in words; `since_s` is where the part of its bag begins."""
+    vector = ', '.join(f'{v / per_mg:+.3g}' for v in jump.step)
+    warmed = ''
+    if np.isfinite(jump.temperature_change):
+        warmed = (
+            f', while its temperature changed by {jump.temperature_change:+.2f} ± '
+            f'{jump.temperature_change_sd:.2f} K'
+        )
+    return (
+        f'at {jump.time + since_s:.1f} s the sensor jumped by {jump.along / per_mg:+.3g} mg along '
+        f'gravity ({vector}) within {jump.duration_s:.2g} s, without motion{warmed}: not a '
+        'function of temperature'
+    )
+
+
+def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
+    """
+    Judge what the still windows cover: temperatures, ramps, directions `up`, shape (n, 3).
 
     Nothing that is missing is refused: the posterior says what it costs. Refused is what
     contradicts itself.
-
-    `up`: directions, to first order, shape (n_positions, 3).
     """
-    findings = _judge_positions(up)
+    yield _judge_positions(up)
     if not windows.has_temperature:
         text = 'no temperature was recorded: the calibration holds at the temperature of the test'
-        return [*findings, Finding('temperature', 'advice', text)]
-    findings += _judge_span(windows) + _judge_ramps(windows)
-    if has_case:
-        return findings + _judge_order(windows)
-    text = 'no case temperature: the regime is told from the board alone, later and less surely'
-    return [*findings, Finding('case', 'advice', text)]
-
-
-def _judge_span(windows: ThermalWindows) -> list[Finding]:
-    lower, upper = float(np.min(windows.temperature)), float(np.max(windows.temperature))
-    span = upper - lower
+        yield _advice('temperature', text)
+        return
+    span = float(np.ptp(windows.temperature))
+    text = f'temperature span {span:.1f} degC'
     if span >= ADVISED_SPAN_K:
-        return [Finding('span', 'good', f'temperature span {span:.1f} degC')]
-    return [
-        Finding(
+        yield Finding('span', 'good', text)
+    else:
+        yield _advice(
             'span',
-            'advice',
-            f'temperature span {span:.1f} degC ({ADVISED_SPAN_K:g} advised): run the chamber over '
-            'the whole range of use',
+            f'{text} ({ADVISED_SPAN_K:g} advised): run the chamber over the whole range of use',
         )
-    ]
+    yield from _judge_ramps(windows)
+    if not has_case:
+        text = (
+            'no case temperature: the regime is told from the board alone, later and less surely'
+        )
+        yield _advice('case', text)
+        return
+    # The case leads: the gradient has the sign of the board's rate.
+    moving = np.abs(windows.rate) * 60.0 > RAMP_K_MIN
+    if windows.data.weight[moving].sum() >= 30.0 * windows.data.weight.max():
+        correlation = float(np.corrcoef(windows.gradient[moving], windows.rate[moving])[0, 1])
+        if correlation <= -0.3:
+            yield Finding(
+                'swapped',
+                'refusal',
+                f'the board temperature leads the case (correlation {correlation:.2f} of gradient '
+                'and rate): are the two sensors exchanged?',
+            )
 
 
-def _judge_ramps(windows: ThermalWindows) -> list[Finding]:
+def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
     rate = windows.rate * 60.0
     heating, cooling = float(np.mean(rate > RAMP_K_MIN)), float(np.mean(rate < -RAMP_K_MIN))
-    findings = []
     if heating + cooling < 0.02:
-        text = (
+        yield _advice(
+            'ramps',
             f'no ramp: the board never changes by {RAMP_K_MIN:g} K/min for long, so what a ramp '
-            'does is not known; record ramps between the soaks'
+            'does is not known; record ramps between the soaks',
         )
-        findings.append(Finding('ramps', 'advice', text))
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
         seen, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
-        text = (
-            f'only {seen} was seen; errors in a ramp change sign with its direction, so '
-            f'record {missing}, too'
+        yield _advice(
+            'directions',
+            f'only {seen} was seen; errors in a ramp change sign with its direction, so record '
+            f'{missing}, too',
         )
-        findings.append(Finding('directions', 'advice', text))
     calm = float(np.mean(windows.weight <= 0.5))
     if calm < 0.05:
-        text = (
-            f'only {100.0 * calm:.0f} % of the windows are static: the soaks end before the '
-            'unit has settled; let some last several hours'
+        yield _advice(
+            'soak',
+            f'only {100.0 * calm:.0f} % of the windows are static: the soaks end before the unit '
+            'has settled; let some last several hours',
         )
-        findings.append(Finding('soak', 'advice', text))
-    return findings
 
 
-def _judge_order(windows: ThermalWindows) -> list[Finding]:
-    """Check that the case leads: the gradient has the sign of the board's rate."""
-    moving = np.abs(windows.rate) * 60.0 > RAMP_K_MIN
-    if windows.data.weight[moving].sum() < 30.0 * windows.data.weight.max():
-        return []
-    gradient = windows.gradient - np.median(windows.gradient)
-    correlation = float(np.corrcoef(gradient[moving], windows.rate[moving])[0, 1])
-    if correlation > -0.3:
-        return []
-    return [
-        Finding(
-            'swapped',
-            'refusal',
-            f'the board temperature leads the case (correlation {correlation:.2f} of gradient '
-            'and rate): are the two sensors exchanged?',
-        )
-    ]
-
-
-def _judge_positions(up: Floats) -> list[Finding]:
+def _judge_positions(up: Floats) -> Finding:
     n = len(distinct_directions(up))
     if n < POSITIONS_NEEDED:
-        text = (
-            f'{n} distinct position{"s" * (n != 1)}: what tells bias from scale stays at its '
-            f'prior (that takes {POSITIONS_NEEDED}, the misalignment {POSITIONS_FOR_MISALIGNMENT})'
+        return _advice(
+            'positions',
+            f'{counted(n, "distinct position")}: what tells bias from scale stays at its prior '
+            f'(that takes {POSITIONS_NEEDED}, the misalignment {POSITIONS_FOR_MISALIGNMENT})',
         )
-        return [Finding('positions', 'advice', text)]
     if not can_tell_misalignment(up):
-        text = (
+        return _advice(
+            'misalignment',
             f'{n} distinct positions tell bias and scale, the misalignment stays at its prior: '
-            f'it takes {POSITIONS_FOR_MISALIGNMENT} well spread ones'
+            f'it takes {POSITIONS_FOR_MISALIGNMENT} well spread ones',
         )
-        return [Finding('misalignment', 'advice', text)]
     if n < POSITIONS_ADVISED:
-        text = f'{n} positions; {POSITIONS_ADVISED} give more'
-        return [Finding('positions', 'advice', text)]
-    return [Finding('positions', 'good', f'{n} positions')]
+        return _advice('positions', f'{n} positions; {POSITIONS_ADVISED} give more')
+    return Finding('positions', 'good', f'{n} positions')
 
 
-def judge_coverage(least: LeastKnown | None) -> list[Finding]:
+def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
     """Judge whether the positions left a direction unseen, and say what that costs."""
-    if least is None or least.sd_m_s2 < _UNSEEN * least.seen_sd_m_s2:
-        return []
-    text = (
-        f'{least.away_deg:.0f} deg away from every position |f| is known to '
-        f'{spoken(least.sd_m_s2)} (1 sd), in them to {spoken(least.seen_sd_m_s2)}: record one '
-        f'with {spoken_direction(np.array(least.up))}'
-    )
-    return [Finding('unseen', 'advice', text)]
+    if least is not None and least.sd_m_s2 >= _UNSEEN * least.seen_sd_m_s2:
+        yield _advice(
+            'unseen',
+            f'{least.away_deg:.0f} deg away from every position |f| is known to '
+            f'{spoken(least.sd_m_s2)} (1 sd), in them to {spoken(least.seen_sd_m_s2)}: record one '
+            f'with {spoken_direction(np.array(least.up))}',
+        )
 
 
 def can_tell_misalignment(up: Floats) -> bool:
@@ -252,14 +269,13 @@ def judge_result(
     slow: float,
     options: FitOptions,
     has_temperature: bool = True,
-) -> list[Finding]:
+) -> Iterator[Finding]:
     """
     Judge what the fit left.
 
     `K`: scale factors, shape (3,). `slow`: RMS over the axes of what no temperature explains
     [m/s^2].
     """
-    findings = []
     overall = rows[-1]
     raw, fitted = overall.raw.micro_g.rms, overall.fitted.micro_g.rms
     others = ''
@@ -268,16 +284,15 @@ def judge_result(
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     if has_temperature and slow / MICRO_G > max(0.3 * raw, 0.5 * fitted):
         why = ': temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
-        findings.append(Finding('misfit', 'advice', text + why))
+        yield _advice('misfit', text + why)
     elif raw < 1.2 * fitted and has_temperature:
         why = ': no temperature drift above the noise; already compensated?'
-        findings.append(Finding('compensated', 'advice', text + why))
+        yield _advice('compensated', text + why)
     else:
-        findings.append(Finding('residual', 'good', text))
+        yield Finding('residual', 'good', text)
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
-        text = (
+        yield _advice(
+            'units',
             f'the scale factors are {K.min():.3g}..{K.max():.3g}, expected near 1 for m/s^2: is '
-            'the unit, or --gravity, right?'
+            'the unit, or --gravity, right?',
         )
-        findings.append(Finding('units', 'advice', text))
-    return findings

@@ -21,8 +21,8 @@ from ..thermal.tracker import ThermalTracker
 from ..typing import Floats, Ints
 from ..unit.columns import Column, ColumnTable, memory_of
 from ..unit.functions import TemperatureFunction
-from .history import thermal_states
 from .reduction import ReducedBag
+from .sensors import thermal_states
 from .unknowns import Windows
 
 #: Groups of the sets themselves, beside those of the response.

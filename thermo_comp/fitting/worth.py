@@ -12,48 +12,25 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from ..typing import Floats, Ints
+from ..unit.calibration import GroupEvidence
 from .posterior import Posterior, Regression
 from .unknowns import Prior
 
 
-@dataclass(frozen=True)
-class GroupWorth:
-    """
-    What one group of columns is worth.
-
-    part, group: 'bias' or 'scale', and its name
-    explains: RMS over windows and axes of what it adds to the prediction [m/s^2]
-    effective: effective parameters, of all axes
-    evidence: how much the log evidence falls without it
-    sd: prior sd of the weights of its columns, for columns of unit RMS ([m/s^2], relative)
-    """
-
-    part: str
-    group: str
-    explains: float
-    effective: float
-    evidence: float
-    sd: tuple[float, ...]
-
-
 def told_of(posterior: Posterior, part: str) -> Floats:
-    """
-    Effective parameters of each column, of all axes; 0 for those that take no part, shape (m,).
-    """
+    """Effective parameters of each column, of all axes; 0 for those without a part, shape (m,)."""
     places = places_of(posterior, part)
     told = np.append(posterior.told, 0.0)
     return np.asarray(np.where(places >= 0, told[places], 0.0).sum(axis=0))
 
 
 def places_of(posterior: Posterior, part: str) -> Ints:
-    """
-    Return the places of the weights of a part, shape (3, m); -1 for columns that take no part.
-    """
+    """Return the places of the weights of a part, shape (3, m); -1 for columns without one."""
     return posterior.layout.on_bias if part == 'bias' else posterior.layout.on_scale
 
 
@@ -90,14 +67,15 @@ def earned(mode: Floats, covariance: Floats, places: Ints, sd: float | Floats) -
 
 def group_worth(
     regression: Regression, posterior: Posterior, prior: Prior
-) -> tuple[GroupWorth, ...]:
+) -> tuple[GroupEvidence, ...]:
     """Say what each group explains, spends and earns."""
     names = np.array(regression.windows.groups)
     columns = regression.windows.columns / regression.rms
     mode = mode_of(posterior)
     force = regression.gravity * posterior.state.up[regression.windows.position]
     result = []
-    for part in ('bias', 'scale'):
+    parts: tuple[Literal['bias', 'scale'], ...] = ('bias', 'scale')
+    for part in parts:
         weights = posterior.state.on_bias if part == 'bias' else posterior.state.on_scale
         sd, told = widths_of(prior, part), told_of(posterior, part)
         for group in dict.fromkeys(regression.windows.groups):
@@ -109,11 +87,11 @@ def group_worth(
                 added = added * force
             places = places_of(posterior, part)[:, used]
             result.append(
-                GroupWorth(
-                    part,
+                GroupEvidence(
                     group,
+                    part,
                     float(np.sqrt(np.mean(added**2))),
-                    float(told[used].sum()),
+                    max(float(told[used].sum()), 0.0),
                     earned(mode, posterior.covariance, places.ravel(), np.tile(sd[used], 3)),
                     tuple(float(value) for value in sd[used]),
                 )

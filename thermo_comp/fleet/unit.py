@@ -91,7 +91,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 source = replace(source, sha256=hashes[name])
                 how = replace(options.fit, input='m/s^2' if info.input == 'imu' else 'counts')
                 chosen.append(info.chosen)
-                bags.append(reduce_bag(source, len(bags), how))
+                bags.append(reduce_bag(source, how))
                 kinds[how.input] = name
         except RecordingError as error:  # noqa: PERF203 - no bag stops the others
             # Named as the fleet does, wherever it lies.

@@ -19,7 +19,6 @@ from ..errors import RecordingError
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import digest, recording_source
-from ..online.status import CompensatorConfig
 from ..recording import Input, RecordingInfo, Role, Topics
 from ..recording.stillness import STILL_SD
 from ..replay import check_unit, input_for, needed_roles
@@ -57,7 +56,6 @@ def open_bag(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     *,
-    number: int = 0,
     window_s: float = WINDOW_S,
     calibration: Calibration | None = None,
     require: Collection[Role] = _BOARD,
@@ -66,8 +64,8 @@ def open_bag(
     """
     Read one bag, in bounded memory, for windows of `window_s` seconds.
 
-    `number` is its place among several. What is read, what is saturated and what a rest scatters
-    by is as the `calibration` says, else the usual.
+    What is read, what is saturated and what a rest scatters by is as the `calibration` says, else
+    the usual.
 
     Raises RecordingError if it cannot be read or has no board temperature; ValueError if
     `window_s` is not positive.
@@ -84,7 +82,6 @@ def open_bag(
         still_sd = max(still_sd, _NOISES / np.sqrt(calibration.unit.cycle_time_s) * density)
     reduced = reduce_source(
         replace(source, sha256=digest(Path(path))),
-        number,
         window_s=sum_s,
         cell_s=min(_CELL_S, sum_s),
         still_sd=still_sd,
@@ -102,12 +99,9 @@ def judge_bags(
     gravity: float | None = None,
     window_s: float = WINDOW_S,
     tolerance: float | None = None,
-    config: CompensatorConfig | None = None,
 ) -> Judgement | None:
     """Judge a calibration on reduced bags; None where no window was corrected."""
-    windows = corrected_windows(
-        bags, calibration, gravity=gravity, window_s=window_s, config=config
-    )
+    windows = corrected_windows(bags, calibration, gravity=gravity, window_s=window_s)
     known = {source.sha256 for source in calibration.provenance.sources if source.sha256}
     is_seen = all(bag.source.sha256 in known for bag in bags)
     return judge(windows, calibration, tolerance, is_seen=is_seen) if len(windows) else None
@@ -120,7 +114,6 @@ def evaluate(
     gravity: float | None = None,
     window_s: float = WINDOW_S,
     tolerance: float | None = None,
-    config: CompensatorConfig | None = None,
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     serial: str | None = None,
@@ -146,7 +139,6 @@ def evaluate(
             path,
             topics,
             input,
-            number=number,
             window_s=window_s,
             calibration=first,
             require=needed_roles(*(one for _, one in calibrations)),
@@ -163,7 +155,6 @@ def evaluate(
             gravity=gravity,
             window_s=window_s,
             tolerance=tolerance,
-            config=config,
         )
         if judgement is None:
             raise RecordingError(

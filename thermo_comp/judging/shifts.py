@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..fitting.attitudes import distinct_directions
+from ..fitting.coverage import distinct_directions
 from ..fitting.verdict import POSITIONS_NEEDED
 from ..typing import Floats
 from ..unit.gravity import MICRO_G

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
-from ..fitting.history import readings_in_order
 from ..fitting.reduction import ReducedBag
+from ..fitting.sensors import readings_in_order
 from ..online.compensator import Compensator
 from ..online.gravity_check import variance_along
 from ..online.snapshot import take_snapshot
@@ -119,7 +119,6 @@ def corrected_windows(
     *,
     gravity: float | None = None,
     window_s: float = WINDOW_S,
-    config: CompensatorConfig | None = None,
 ) -> Windows:
     """
     Correct the windows of bags of the calibration's unit; local gravity is its own by default.
@@ -127,9 +126,7 @@ def corrected_windows(
     Raises RecordingError if the samples of a bag are too slow for such windows.
     """
     # A window's mean is no sample: what looks for stuck or too large ones would misread it.
-    config = replace(
-        config or CompensatorConfig(), stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
-    )
+    config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     thermal = Compensator(calibration, config).thermal
     n_gyro = 9 + Layout(thermal.correction.memory).width if thermal.rate_correction else 0
     table = _table(

@@ -11,9 +11,8 @@ from operator import itemgetter
 import numpy as np
 
 from ..fitting import FitResult
-from ..fitting.history import readings_in_order
 from ..fitting.reduction import ReducedBag
-from ..fitting.sensors import learn_detector
+from ..fitting.sensors import learn_detector, readings_in_order
 from ..fitting.verdict import Finding
 from ..judging import WINDOW_S, OpenedBag, judge_bags
 from ..judging.history import history_of

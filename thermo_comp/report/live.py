@@ -105,13 +105,11 @@ class LiveReport:
     def _evidence(self) -> Evidence:
         calibration = load_calibration(self._calibration)
         bags = []
-        for number, path in enumerate(self._bags):
+        for path in self._bags:
             signature = _signature([path])
             known = self._opened.get(path)
             if known is None or known[0] != signature:
-                bag = open_bag(
-                    path, self._topics, self._input, number=number, calibration=calibration
-                )
+                bag = open_bag(path, self._topics, self._input, calibration=calibration)
                 if self._read is not None:
                     self._read(bag.info)
                 known = (signature, bag)
