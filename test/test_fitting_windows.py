@@ -204,9 +204,9 @@ def test_curves(bags, options, static, dynamic, is_shared) -> None:  # type: ign
 @pytest.fixture(scope='module', params=['golovach', 'exponential'])
 def result(request: pytest.FixtureRequest) -> FitResult:
     if request.param == 'golovach':
-        return fit(sources(12), replace(OPTIONS, model='golovach'))
+        return fit(sources(9), replace(OPTIONS, model='golovach'))
     groups = ('curve', 'set', 'board')
-    return fit(sources(12), replace(OPTIONS, static_curve=request.param, groups=groups))
+    return fit(sources(9), replace(OPTIONS, static_curve=request.param, groups=groups))
 
 
 def states_of(windows: ThermalWindows, calibration: Calibration) -> tuple[Floats, ...]:

@@ -72,10 +72,15 @@ def fitted(unit):
     return fit([source_of(one, unit.scale_factor) for one in records], OPTIONS)
 
 
-def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted):
+@pytest.fixture(scope='module')
+def held_out(unit):
+    return arrays(unit, plan('held-out', 2), 99)
+
+
+def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
     calibration = fitted.calibration
     own = calibration.gyroscope
-    for record in arrays(unit, plan('held-out', 2), 99):
+    for record in held_out:
         block = block_of(record, unit.scale_factor)
         out = process_block(Compensator(calibration), block, block.imu.angular_velocity)
         n = len(out.index) // 240
@@ -106,12 +111,13 @@ def test_the_fit_tells_what_other_positions_see(fitted):
 
 def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     records = arrays(unit, plan('chamber-9', 2)[:2], 2)
-    with_rate = fit([source_of(one, unit.scale_factor) for one in records], OPTIONS)
+    options = replace(OPTIONS, groups=('curve', 'set', 'now', 'board'))
+    with_rate = fit([source_of(one, unit.scale_factor) for one in records], options)
     silent = [np.zeros((len(one.counts), 3)) for one in records]
     sources = [
         source_of(o, unit.scale_factor, rate) for o, rate in zip(records, silent, strict=True)
     ]
-    without = fit(sources, OPTIONS)
+    without = fit(sources, options)
     assert with_rate.calibration.gyroscope is not None
     assert without.calibration.gyroscope is None
     same = replace(
@@ -124,7 +130,7 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     sources = [
         source_of(o, unit.scale_factor, rate) for o, rate in zip(records, broken, strict=True)
     ]
-    result = fit(sources, OPTIONS)
+    result = fit(sources, options)
     assert result.calibration.gyroscope is None
     (said,) = (one.message for one in result.findings if one.name == 'rate')
     assert (
@@ -227,15 +233,14 @@ def test_with_a_prior_the_gyroscope_is_the_priors(unit, fitted):
     assert again.rates == ()
 
 
-def judged_on(unit, calibration, seed, kind='held-out'):
-    records = arrays(unit, plan(kind, 2), seed)[:3]
-    bags = [reduce_source(source_of(one, unit.scale_factor), full_scale=None) for one in records]
-    return judge_bags(bags, calibration)
+def reduced(unit, records):
+    sources = [source_of(one, unit.scale_factor) for one in records[:3]]
+    return [reduce_source(source, full_scale=None) for source in sources]
 
 
-def test_evaluation_judges_the_changes_by_their_claim(unit, fitted):
-    calibration = fitted.calibration
-    judged = judged_on(unit, calibration, 99)
+def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
+    calibration, bags = fitted.calibration, reduced(unit, held_out)
+    judged = judge_bags(bags, calibration)
     rate = judged.rate
     assert rate.kind is Verdict.VALID
     assert judged.exit_code == 0
@@ -250,21 +255,22 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted):
     # A gyroscope of another unit is found out, and so is one that claims nothing.
     own = calibration.gyroscope
     other = replace(own, response=(), static=own.dynamic, dynamic=own.dynamic, posterior=None)
-    wrong = judged_on(unit, replace(calibration, gyroscope=other), 99)
+    wrong = judge_bags(bags[:1], replace(calibration, gyroscope=other))
     assert wrong.is_valid
     assert wrong.rate.kind is Verdict.RECALIBRATE
     assert wrong.exit_code == 1
-    assert judged_on(unit, replace(calibration, gyroscope=None), 99).rate is None
+    assert judge_bags(bags[:1], replace(calibration, gyroscope=None)).rate is None
     # One that claims nothing, as an import, is not shown to be wrong.
     silent = replace(other, residual_sd_rad_s=(0.0, 0.0, 0.0))
-    unknown = judged_on(unit, replace(calibration, gyroscope=silent), 99)
+    unknown = judge_bags(bags[:1], replace(calibration, gyroscope=silent))
     assert unknown.rate.kind is Verdict.NO_CLAIM
     assert np.isnan(unknown.rate.sections['all'].claimed_rms)
     assert unknown.exit_code == 0
 
 
 def test_where_no_temperature_changes_nothing_is_wrong(unit, fitted):
-    rate = judged_on(unit, fitted.calibration, 3, 'tumble').rate
+    bags = reduced(unit, arrays(unit, plan('tumble', 2)[:3], 3))
+    rate = judge_bags(bags, fitted.calibration).rate
     section = rate.sections['all']
     assert section.rms < section.raw_rms < 1.3 * section.rms
     assert rate.kind is Verdict.WIDE

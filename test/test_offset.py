@@ -12,6 +12,7 @@ from position_helpers import START_NS
 
 from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit
 from thermo_comp.fitting.coverage import rough_centre
+from thermo_comp.fitting.offset import about
 from thermo_comp.simulation import positions
 
 GRAVITY = 9.80665
@@ -45,12 +46,20 @@ def constants(result):
     return np.array([one.bias for one in triad]), np.array([one.scale_factor for one in triad])
 
 
+@pytest.fixture(scope='module')
+def words():
+    return words_of(positions(14, 3), np.random.default_rng(1))
+
+
+@pytest.fixture(scope='module')
+def plain(words):
+    return fit([source(words)], OPTIONS)
+
+
 @pytest.mark.parametrize(
     ('offset', 'declared'), [(32768.0, False), (32768.0, True), (8192.0, False), (20000.0, False)]
 )
-def test_the_nine_numbers_are_those_of_signed_words(rng, offset, declared):
-    words = words_of(positions(14, 3), rng)
-    plain = fit([source(words)], OPTIONS)
+def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declared):
     found = fit([source(words + offset)], replace(OPTIONS, offset=offset if declared else None))
     bias, scale = constants(found)
     np.testing.assert_allclose(bias - offset, constants(plain)[0], atol=0.02)
@@ -92,8 +101,8 @@ def test_rails_of_words_without_a_sign_are_saturated(rng):
     assert bag.n_saturated == 2
 
 
-def test_a_prior_knows_the_offset(rng):
-    known = fit([source(words_of(positions(14, 3), rng) + 32768.0)], OPTIONS).calibration
+def test_a_prior_knows_the_offset(rng, plain):
+    known = about(plain.calibration, np.full(3, 32768.0))
     up = np.array((0.6, 0.0, 0.8))
     found = fit([source(words_of([up], rng) + 32768.0)], replace(OPTIONS, prior=known))
     np.testing.assert_allclose(constants(found)[0], 32768.0 + BIAS, atol=2.0)

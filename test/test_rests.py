@@ -18,7 +18,7 @@ from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.verdict import describe, find_jumps
 from thermo_comp.simulation import positions
 
-OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
+OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',))
 
 
 def reduced(source):
