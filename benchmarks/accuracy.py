@@ -22,10 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit
+from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.priors import population
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
+from thermo_comp.recording import Block
+from thermo_comp.recording.columns import Readings
 from thermo_comp.simulation import (
     MICRO_G,
     STANDARD_GRAVITY,
@@ -75,16 +77,18 @@ PLAN_GOALS = {
 }
 
 
-def block(record: SimulatedRun) -> ArrayBlock:
+def block(record: SimulatedRun) -> Block:
     """Return one record as a block."""
-    return ArrayBlock(
-        record.accel_stamp_ns,
-        record.counts.astype(np.float64),
-        record.board_stamp_ns,
-        record.board,
-        record.case_stamp_ns,
-        record.case,
-    )
+    stamps, counts = record.accel_stamp_ns, record.counts.astype(np.float64)
+    readings = {
+        'board': (record.board_stamp_ns, record.board),
+        'case': (record.case_stamp_ns, record.case),
+    }
+    temperatures = {
+        name: Readings(at, celsius, np.searchsorted(stamps, at))
+        for name, (at, celsius) in readings.items()
+    }
+    return Block(stamps, counts, '', None, temperatures, {})
 
 
 @dataclass(frozen=True)

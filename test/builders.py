@@ -165,3 +165,23 @@ def columns_from_events(events):
             for name, rows in readings.items()
         },
     )
+
+
+@dataclass(frozen=True)
+class ArrayBlock:
+    """A block made of arrays at hand."""
+
+    accel_stamp_ns: np.ndarray
+    accel: np.ndarray
+    board_stamp_ns: np.ndarray
+    board: np.ndarray
+    case_stamp_ns: np.ndarray
+    case: np.ndarray
+
+    @property
+    def temperatures(self):
+        own = {'board': (self.board_stamp_ns, self.board), 'case': (self.case_stamp_ns, self.case)}
+        return {
+            name: (stamp_ns, celsius, np.searchsorted(self.accel_stamp_ns, stamp_ns))
+            for name, (stamp_ns, celsius) in own.items()
+        }

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from builders import ArrayBlock
 
-from thermo_comp.fitting.sources import ArrayBlock, FitSource
+from thermo_comp.fitting.sources import FitSource
 
 GRAVITY = 9.80665
 MG = GRAVITY * 1e-3

@@ -10,7 +10,9 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit
+from builders import ArrayBlock
+
+from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.recording import BagWriter
 from thermo_comp.report import Evidence, evidence_of_fit, write_report
 from thermo_comp.simulation import (

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import ArrayBlock
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit
+from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation import (

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import ArrayBlock
 
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit_bags
+from thermo_comp.fitting import FitOptions, FitSource, fit_bags
 from thermo_comp.fitting.posterior import Regression
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.windows import FEWEST_WINDOWS

@@ -9,9 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import ArrayBlock
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import ArrayBlock, FitSource, normal_gravity, resolve_gravity
+from thermo_comp.fitting import FitSource, normal_gravity, resolve_gravity
 from thermo_comp.fitting.reduction import Readings, ReducedBag, reduce_source
 from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
 from thermo_comp.recording.stillness import CellAccumulator, still_intervals

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import ArrayBlock
 
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit, reduce_bag
+from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit, reduce_bag
 from thermo_comp.fitting.options import sets_of
 from thermo_comp.fitting.reduction import ReducedBag
 from thermo_comp.fitting.windows import ThermalWindows, thermal_windows

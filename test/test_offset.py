@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import ArrayBlock
 from position_helpers import START_NS
 
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitSource, fit
+from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.coverage import rough_centre
 from thermo_comp.fitting.offset import about
 from thermo_comp.simulation import positions

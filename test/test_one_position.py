@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from builders import ArrayBlock
 from position_helpers import GRAVITY, MG, START_NS, Rest
 
 from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
-from thermo_comp.fitting.sources import ArrayBlock, FitSource
+from thermo_comp.fitting.sources import FitSource
 from thermo_comp.simulation import positions
 from thermo_comp.unit.calibration import parameter_layout
 

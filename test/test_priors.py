@@ -9,10 +9,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from builders import ArrayBlock
 
 from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import ArrayBlock, FitOptions, FitResult, FitSource, fit
+from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.fitting.options import Ageing
 from thermo_comp.fitting.priors import population
 from thermo_comp.simulation import (

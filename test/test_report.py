@@ -249,9 +249,9 @@ def test_bag_is_read_in_bounded_memory(tmp_path):
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert opened.reduced.n_samples == n_times * len(one.counts)
+    assert opened.n_samples == n_times * len(one.counts)
     # All columns of this bag would be 32 bytes a sample and more; blocks are a part of that.
-    assert peak < 64 * opened.reduced.n_samples
+    assert peak < 64 * opened.n_samples
 
 
 def test_figures_as_png(tmp_path):

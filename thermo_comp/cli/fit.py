@@ -125,7 +125,7 @@ def fit(
         )
     with out.progress('fitting') as done:
         result = run(sources, wanted, done)
-    out.told((bag.source.name, bag.info.chosen, bag.truncated) for bag in result.bags if bag.info)
+    out.told((bag.source.name, bag.info.chosen, bag.info.truncated) for bag in result.bags)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
         from ..report import write_report

@@ -14,7 +14,7 @@ from . import options
 from .options import argument, option
 
 if TYPE_CHECKING:
-    from ..judging import OpenedBag
+    from ..fitting import ReducedBag
 
 
 def report(
@@ -60,7 +60,7 @@ def report(
     info = None
     if certificate_info is not None:
         info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
-    opened: list[OpenedBag] = []
+    opened: list[ReducedBag] = []
     with out.progress('reading', total=max(len(paths), 1)) as done:
         for path in paths:
             opened.append(

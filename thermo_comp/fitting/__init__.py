@@ -9,11 +9,10 @@ from .fit import FitResult, fit, fit_bags, reduce_bag
 from .gravity import normal_gravity, resolve_gravity
 from .options import FitOptions
 from .reduction import ReducedBag
-from .sources import ArrayBlock, FitSource
+from .sources import FitSource
 from .verdict import Finding
 
 __all__ = [
-    'ArrayBlock',
     'Finding',
     'FitOptions',
     'FitResult',

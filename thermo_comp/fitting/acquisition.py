@@ -50,11 +50,8 @@ Surveys = Mapping[str, ThermometerSurvey]
 @dataclass(frozen=True)
 class Position:
     """
-    One position: where it points, for how long, what it was warm, why it is not good ('' = it is).
-
-    up: unit vector of the force in sensor axes, shape (3,); NaN before it rests
-    still_s, n_rests: time at rest, and in how many pieces: one more with each knock
-    sd_g: noise of its mean
+    One position: where it points (NaN before it rests), how long and in how many pieces it rests,
+    the noise of its mean, its temperatures, and why it is not good ('' = it is).
     """
 
     up: Floats
@@ -70,15 +67,10 @@ class Account:
     """
     What a test has and what it still lacks.
 
-    positions: in the order of recording; the last one goes on
-    n_good, is_complete: positions that are good; whether these are as many as wanted
-    worst_sd_g: what the constants leave of the force in the worst attitude
-    constants_sd: of bias [g], relative scale, M [rad], shape (9,), see `coverage`
-    next_up, next_deg: where to turn it next, and by how much from now; NaN before any sample
-    hole, hole_deg: the direction farthest from all positions, and how far that is
-    thermometers: over all positions
-    now, is_still: the newest reading's direction, NaN before any; whether it rests
-    findings: what is missing, one sentence each
+    The last of the positions goes on. `worst_sd_g` is what the constants leave of the force in the
+    worst attitude, `constants_sd` is of bias [g], relative scale and M [rad], as in `coverage`. It
+    is to be turned to `next_up`, by `next_deg` from `now`, the newest reading's direction (NaN
+    before any); `hole` is farthest from all positions. Findings say what is missing.
     """
 
     positions: tuple[Position, ...]
@@ -109,11 +101,7 @@ class _Rest:
 
 
 class Acquisition:
-    """
-    The test so far: so many positions wanted, each at rest for `soak_s`.
-
-    `offset` is the word of no force; where nothing is said, it is looked for from four on.
-    """
+    """The test so far: positions wanted, each at rest for `soak_s`, and the word of no force."""
 
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset

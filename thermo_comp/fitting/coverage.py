@@ -72,9 +72,8 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     """
     Find the direction where a position of noise `sd` [g] lowers the mean variance the most.
 
-    The mean is over all attitudes; what a rank-one update takes from it has a closed form. Faces
-    of a cube are preferred where they are nearly as good, then its edges, then its corners; what
-    is near a direction of `seen` (n, 3) is not proposed.
+    Faces of a cube are preferred where they are nearly as good, then its edges, then its corners;
+    what is near a direction of `seen` (n, 3) is not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -141,11 +140,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """
-    Worst standard deviation of bias, scale and misalignment per unit of norm noise.
-
-    `up`: directions, shape (n, 3).
-    """
+    """Worst sd of bias, scale and misalignment per unit of norm noise, of directions (n, 3)."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -191,9 +186,7 @@ class LeastKnown:
     """
     The attitude of which a calibration knows least, at its reference temperature and at rest.
 
-    up: the direction, a unit vector
-    away_deg: angle to the nearest position; 180 without any
-    sd_m_s2, seen_sd_m_s2: standard deviation of |f| there; its median in the positions
+    Beside its angle to the nearest position stand the sd of |f| there and its median in them.
     """
 
     up: tuple[float, float, float]

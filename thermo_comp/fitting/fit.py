@@ -59,18 +59,7 @@ _OFFSET_SD, _SIGMA = 1e-6, 1e-5
 
 @dataclass(frozen=True)
 class FitResult:
-    """
-    A fit and its evidence.
-
-    calibration: the result
-    learnt: posterior, prior and what each group is worth
-    residuals: over the windows of the fit
-    positions: the still intervals
-    findings: what the data lacked, or not
-    least_known: the attitude that the positions left unseen most
-    windows, bags: the windows of the regression; the reduced bags
-    rates: residuals of the angular rate; none where the bags have none, or there is a prior
-    """
+    """A fit and its evidence; `rates` are the gyroscope's residuals, where one was fitted."""
 
     calibration: Calibration
     learnt: Learnt
@@ -103,11 +92,7 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """
-    Stream one source into its sufficient statistics.
-
-    Raises FitError if it has no samples or no still interval.
-    """
+    """Stream one source into its sufficient statistics; FitError if it never rests."""
     bag = reduce_source(
         source,
         min_rest_s=options.min_rest_s,
@@ -125,11 +110,7 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
 def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress | None = None
 ) -> FitResult:
-    """
-    Fit a calibration to bags that have been reduced, by whomever.
-
-    Raises FitError if the data contradict themselves.
-    """
+    """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
     tell = progress or (lambda _part: None)
     offset = find_offset(bags, options)
     if not offset.any():
@@ -265,11 +246,7 @@ def _check_temperatures(bags: Sequence[ReducedBag]) -> None:
 
 
 def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """
-    Guess the triad without temperature: by its ellipsoid, or by the norm where that is not seen.
-
-    Raises FitError if the norms are no gravity.
-    """
+    """Guess the triad without temperature: by its ellipsoid, or where that is not seen, a norm."""
     means = position_means(windows.data)
     gravity = options.gravity
     norms = np.linalg.norm(means, axis=1)
@@ -338,9 +315,7 @@ def _drift(windows: ThermalWindows, start: ConstantCalibration) -> float:
 
 
 def board_lag(windows: ThermalWindows) -> float:
-    """
-    Time constant of the board behind the case: slope of the gradient over the board's rate [s].
-    """
+    """Time constant of the board behind the case: slope of the gradient over its rate [s]."""
     rate = windows.rate - np.mean(windows.rate)
     power = float(rate @ rate)
     lag = float(rate @ windows.gradient) / power if power > 0.0 else np.nan
@@ -348,11 +323,7 @@ def board_lag(windows: ThermalWindows) -> float:
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
-    """
-    Find the unit's serial.
-
-    Raises FitError if the bags name different units and the user none, or the serial is none.
-    """
+    """Find the unit's serial; FitError if the bags name different ones, or it is none."""
     serials = {source.serial for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         raise FitError(f'the bags are of different units: {", ".join(sorted(serials))}')

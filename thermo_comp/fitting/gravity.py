@@ -32,11 +32,8 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     """
     Gravity of the WGS 84 ellipsoid (Somigliana) at a height above it.
 
-    Real gravity differs by up to some 30 mGal (30 ug) in mountains; where a gravimeter value or
-    a national gravity model is at hand it is better.
-
-    `latitude_deg`: geodetic latitude [deg], -90..90. `height_m`: height above the ellipsoid [m],
-    -1000..10000. Raises ValueError if an argument is not finite or outside its range.
+    Real gravity differs by up to some 30 mGal (30 ug) in mountains. Raises ValueError for a
+    latitude outside -90..90 deg or a height outside -1000..10000 m.
     """
     if not -90.0 <= latitude_deg <= 90.0:
         raise ValueError(f'`latitude_deg` must be within -90..90, got {latitude_deg}')
@@ -56,11 +53,7 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
 def resolve_gravity(
     gravity: float | None, latitude_deg: float | None, height_m: float | None
 ) -> float:
-    """
-    Take local gravity from what the user gave, and refuse to guess.
-
-    Raises FitError if nothing was given or the value is no gravity found on Earth's surface.
-    """
+    """Take local gravity from what the user gave; FitError if that is none of the Earth's."""
     if gravity is None:
         if latitude_deg is None or height_m is None:
             raise FitError(

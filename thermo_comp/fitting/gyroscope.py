@@ -42,13 +42,7 @@ _SIGMA = 1e-5
 
 @dataclass(frozen=True)
 class RateRow:
-    """
-    The angular rate at rest of one section, less the mean of each position [rad/s].
-
-    section: ``static``, ``dynamic`` or ``all``
-    raw, fitted: as measured, and by the calibration that these windows gave
-    left_out: each position by the others alone
-    """
+    """The rate at rest of one section less the mean of each position, as of `ResidualRow`."""
 
     section: str
     raw: ResidualStatistics
@@ -65,11 +59,7 @@ def add_gyroscope(
     facts: UnitFacts,
     options: FitOptions,
 ) -> tuple[Calibration, tuple[RateRow, ...]]:
-    """
-    Give a calibration the gyroscope of its prior or, without one, of the bags.
-
-    There is none, and no row, where a bag has no angular rate, or no temperature was recorded.
-    """
+    """Give a calibration the gyroscope of its prior, else of bags with rates and temperature."""
     if options.prior is not None:
         known = options.prior.gyroscope
         sensors = calibration.sensors if known is None else facts.sensors

@@ -39,12 +39,7 @@ REFUSALS = ('saturation', 'units', 'jump', 'swapped')
 
 @dataclass(frozen=True)
 class Ageing:
-    """
-    What a unit has changed by since its last calibration.
-
-    bias: standard deviation of each bias [m/s^2]
-    scale: of each relative scale factor
-    """
+    """Sd of what each bias [m/s^2] and relative scale has changed by since a calibration."""
 
     bias: float = 0.0
     scale: float = 0.0

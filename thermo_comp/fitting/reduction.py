@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -53,6 +54,8 @@ class Readings(NamedTuple):
 
 
 NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0))
+# What arrays say of themselves.
+NO_RECORDING = RecordingInfo(Path(), '', {}, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -117,20 +120,10 @@ class ReducedBag:
     is_integer: bool
     middle: float = 0.0
     reach: float = 0.0
-    info: RecordingInfo | None = None
+    info: RecordingInfo = NO_RECORDING
     since_s: float = 0.0
     restless: str = ''
     angular_rate: Literal['none', 'part', 'whole'] = 'none'
-
-    @property
-    def metadata(self) -> Mapping[str, str]:
-        """What the bag's writer left in it."""
-        return self.info.metadata if self.info else {}
-
-    @property
-    def truncated(self) -> str | None:
-        """What of the bag is missing."""
-        return self.info.truncated if self.info else None
 
     @property
     def board(self) -> Readings:
@@ -205,7 +198,7 @@ def reduce_source(
         is_integer=found.is_integer,
         middle=found.middle,
         reach=_reach(found),
-        info=reader.info if reader else None,
+        info=reader.info if reader else NO_RECORDING,
         since_s=reader.since_s if reader else 0.0,
         restless='' if ranges else _why_restless(found, n_samples, still_sd),
         angular_rate='whole' if has_rate else 'part' if found.rate.any() else 'none',

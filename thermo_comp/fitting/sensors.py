@@ -33,12 +33,7 @@ _RAMP_MARGIN = 1.5
 
 @dataclass(frozen=True)
 class Course:
-    """
-    One thermometer's course over one bag, seen from both sides.
-
-    rate: rate on a grid of ten seconds [K/s], shape (n,)
-    rate_sd: noise of it
-    """
+    """One thermometer's rate over one bag, on a grid of ten seconds, and its noise [K/s]."""
 
     rate: Floats
     rate_sd: float
@@ -106,11 +101,7 @@ def learn_thermometer(
 
 
 def quantum_of(values: Floats) -> float:
-    """
-    Find the step of a rounded sensor.
-
-    `values`: readings, shape (n,).
-    """
+    """Find the step of a rounded sensor in its readings, shape (n,)."""
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -199,10 +190,9 @@ def thermal_states(
     bag: ReducedBag, tracker: ThermalTracker, step_s: float
 ) -> tuple[float, Floats]:
     """
-    Drive a tracker with a bag's readings and sample it on a grid.
+    Drive a tracker with a bag's readings and sample it on a grid, shape (n, width).
 
-    `step_s`: grid step [s]. Returns time of the first grid point since the bag's first sample [s].
-    Returns `ThermalTracker.sample` at each grid point, shape (n, width).
+    Returns, too, when the grid begins, since the bag's first sample [s].
     """
     names, stamps, values = readings_in_order(bag, ('board', *tracker.spec.sensors))
     step_ns = round(step_s * 1e9)

@@ -9,41 +9,17 @@ Bags, tables and simulated runs provide the same blocks as to the compensator.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from ..errors import FitError
 from ..files import shown_name
-from ..online.blocks import AccelBlock, Readings
+from ..online.blocks import AccelBlock
 from ..recording import Block, Input, RecordingInfo, RecordingReader, Role, Topics, open_recording
-from ..typing import Floats, Ints
+from ..typing import Floats
 
 _SAMPLES: tuple[Role, ...] = ('accel',)
-
-
-@dataclass(frozen=True)
-class ArrayBlock:
-    """A block of arrays at hand: stamps and samples, then those of each thermometer."""
-
-    accel_stamp_ns: Ints
-    accel: Floats
-    board_stamp_ns: Ints
-    board: Floats
-    case_stamp_ns: Ints
-    case: Floats
-    others: Mapping[str, tuple[Ints, Floats]] = field(default_factory=dict)
-
-    @property
-    def temperatures(self) -> Mapping[str, Readings]:
-        """Stamps, readings and how many samples came before, by the name of the thermometer."""
-        board, case = (self.board_stamp_ns, self.board), (self.case_stamp_ns, self.case)
-        return {
-            name: (stamp_ns, celsius, np.searchsorted(self.accel_stamp_ns, stamp_ns))
-            for name, (stamp_ns, celsius) in {'board': board, 'case': case, **self.others}.items()
-        }
 
 
 def angular_velocity(block: object) -> Floats | None:
@@ -62,13 +38,9 @@ def _no_recording() -> RecordingReader | None:
 @dataclass(frozen=True)
 class FitSource:
     """
-    One bag (or what stands for one), to be streamed in file order.
+    One bag (or what stands for one): `blocks` gives a fresh iterable in file order for each pass.
 
-    name: what messages and provenance call it
-    blocks: gives a fresh iterable of blocks; called once per pass
-    sha256: hash of the content, for the provenance
-    serial: unit serial found in the source's metadata
-    reader: gives what read it last, which knows what was missing; None for arrays
+    `reader` gives what read it last, which knows what was missing; None for arrays.
     """
 
     name: str
@@ -118,11 +90,7 @@ def recording_source(
     require: Collection[Role] = _SAMPLES,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[FitSource, RecordingInfo]:
-    """
-    Make a source of a recording: looked at now, and opened anew for each pass.
-
-    Raises RecordingError if it cannot be read or lacks a topic.
-    """
+    """Make a source of a recording: looked at now, and opened anew for each pass."""
     path = Path(path)
     with open_recording(path, topics, input, require=require) as reader:
         info, topic = reader.info, reader.topics.get('accel')
@@ -144,9 +112,7 @@ def recording_source(
 
 
 def digest(path: Path) -> str:
-    """
-    Return the SHA-256 of a bag: of the file, or of a directory's files in the order of names.
-    """
+    """Return the SHA-256 of a bag: of a file, or of a directory's in the order of names."""
     total = hashlib.sha256()
     files = [path] if path.is_file() else sorted(p for p in path.rglob('*') if p.is_file())
     for name in files:

@@ -3,8 +3,8 @@
 """
 Owns the verdict: whether the bags can carry a calibration, with numbers and advice.
 
-Only contradictions are refused. A refusal stops the fit unless the user allows it by name; advice
-goes into the result.
+Only contradictions are refused: of what is missing the posterior says what it costs. A refusal
+stops the fit unless the user allows it by name; advice goes into the result.
 """
 
 from __future__ import annotations
@@ -43,13 +43,7 @@ _NEAR_S, _NEAR_DEG = 30.0, 10.0
 
 @dataclass(frozen=True)
 class Finding:
-    """
-    One thing that the fit noticed of the data.
-
-    name: short name; a refusal is overridden by it
-    level: what it means
-    message: one line with the number found, the number needed and what to do
-    """
+    """What the fit noticed: a name, which overrides a refusal, and a line with numbers."""
 
     name: str
     level: Literal['refusal', 'advice', 'good']
@@ -61,11 +55,7 @@ def _advice(name: str, message: str) -> Finding:
 
 
 def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
-    """
-    Stop at the first refusal that the user does not allow.
-
-    Raises FitError if there is a refusal; its text says how to mend it and how to override it.
-    """
+    """Raise FitError at the first refusal that the user does not allow."""
     result = []
     for finding in findings:
         if finding.level != 'refusal':
@@ -127,11 +117,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
 
 
 def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
-    """
-    Find where a sensor jumped at rest, which no temperature explains.
-
-    The bag is streamed again only where that may be.
-    """
+    """Find where a sensor jumped at rest; streams the bag again only where that may be."""
     means = [np.average(one.mean, axis=0, weights=one.count) for one in bag.intervals]
     ups = [mean / np.linalg.norm(mean) for mean in means]
     near = np.cos(np.radians(_NEAR_DEG))
@@ -160,12 +146,7 @@ def describe(jump: Event, per_mg: float, since_s: float = 0.0) -> str:
 
 
 def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
-    """
-    Judge what the still windows cover: temperatures, ramps, directions `up`, shape (n, 3).
-
-    Nothing that is missing is refused: the posterior says what it costs. Refused is what
-    contradicts itself.
-    """
+    """Judge what the still windows cover: temperatures, ramps, directions `up`, shape (n, 3)."""
     yield _judge_positions(up)
     if not windows.has_temperature:
         text = 'no temperature was recorded: the calibration holds at the temperature of the test'
@@ -270,12 +251,7 @@ def judge_result(
     options: FitOptions,
     has_temperature: bool = True,
 ) -> Iterator[Finding]:
-    """
-    Judge what the fit left.
-
-    `K`: scale factors, shape (3,). `slow`: RMS over the axes of what no temperature explains
-    [m/s^2].
-    """
+    """Judge what the fit left; `slow` is what no temperature explains, RMS of the axes [m/s^2]."""
     overall = rows[-1]
     raw, fitted = overall.raw.micro_g.rms, overall.fitted.micro_g.rms
     others = ''

@@ -103,14 +103,14 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         except FitError as error:
             problems.append(str(error))
     serials = sorted({bag.source.serial for bag in bags if bag.source.serial})
-    lots = [lot for bag in bags if (lot := bag.metadata.get('lot'))]
+    lots = [lot for bag in bags if (lot := bag.info.metadata.get('lot'))]
     serial = serials[0] if serials else unit.name.rpartition('/')[2]
     row = started_row(
         unit,
         serial=serial,
         lot=lots[0] if lots else unit.lot,
         n_left_out=len(problems),
-        n_torn=sum(bool(bag.truncated) for bag in bags),
+        n_torn=sum(bool(bag.info.truncated) for bag in bags),
         left_out='; '.join(problems),
         chosen='; '.join(dict.fromkeys(filter(None, chosen))),
         prior=options.prior_sha256,
@@ -142,7 +142,7 @@ def _fitted(
     row = outcome.row
     result = fit_bags(bags, how)
     calibration = dump_calibration(result.calibration)
-    lost = [f'{bag.source.name}: {bag.truncated}' for bag in bags if bag.truncated]
+    lost = [f'{bag.source.name}: {bag.info.truncated}' for bag in bags if bag.info.truncated]
     if row['n_left_out']:
         lost.append(f'{row["n_left_out"]} of {row["n_bags"]} bags are left out: {row["left_out"]}')
     evidence = evidence_of_fit(result, is_brief=not has_page)

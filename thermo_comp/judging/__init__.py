@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the judgement of a calibration against recordings: one judge, for every command."""
 
-from .evaluation import Evaluation, OpenedBag, evaluate, judge_bags, open_bag
+from .evaluation import Evaluation, evaluate, judge_bags, open_bag
 from .judgement import Judgement, judge
 from .rates import RateJudgement
 from .shifts import AxisShift
@@ -15,7 +15,6 @@ __all__ = [
     'AxisShift',
     'Evaluation',
     'Judgement',
-    'OpenedBag',
     'RateJudgement',
     'Section',
     'Verdict',

@@ -19,7 +19,7 @@ from ..errors import RecordingError
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import digest, recording_source
-from ..recording import Input, RecordingInfo, Role, Topics
+from ..recording import Input, Role, Topics
 from ..recording.stillness import STILL_SD
 from ..replay import check_unit, input_for, needed_roles
 from ..unit.calibration import Calibration
@@ -35,18 +35,10 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class OpenedBag:
-    """A bag that was read once: what it holds, its sums at rest and its temperature readings."""
-
-    info: RecordingInfo
-    reduced: ReducedBag
-
-
-@dataclass(frozen=True)
 class Evaluation:
     """What recordings tell of calibrations, by name; the notes say what was not judged."""
 
-    bags: tuple[OpenedBag, ...]
+    bags: tuple[ReducedBag, ...]
     judgements: dict[str, Judgement]
     notes: tuple[str, ...]
 
@@ -60,15 +52,12 @@ def open_bag(
     calibration: Calibration | None = None,
     require: Collection[Role] = _BOARD,
     progress: Progress | None = None,
-) -> OpenedBag:
+) -> ReducedBag:
     """
     Read one bag, in bounded memory, for windows of `window_s` seconds.
 
     What is read, what is saturated and what a rest scatters by is as the `calibration` says, else
-    the usual.
-
-    Raises RecordingError if it cannot be read or has no board temperature; ValueError if
-    `window_s` is not positive.
+    the usual. Raises RecordingError if it cannot be read or has no board temperature.
     """
     sum_s = sum_length(window_s)
     if calibration is not None:
@@ -80,16 +69,16 @@ def open_bag(
         full_scale = calibration.unit.full_scale
         density = max(calibration.noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
         still_sd = max(still_sd, _NOISES / np.sqrt(calibration.unit.cycle_time_s) * density)
-    reduced = reduce_source(
+    bag = reduce_source(
         replace(source, sha256=digest(Path(path))),
         window_s=sum_s,
         cell_s=min(_CELL_S, sum_s),
         still_sd=still_sd,
         full_scale=full_scale,
     )
-    if 'board' in require and not len(reduced.board.value):
+    if 'board' in require and not len(bag.board.value):
         raise RecordingError('no board temperature in it', path=str(path))
-    return OpenedBag(reduced.info or info, reduced)
+    return bag
 
 
 def judge_bags(
@@ -125,9 +114,8 @@ def evaluate(
     Local gravity and what is read are those of the first calibration by default; `tolerance` is
     the largest RMS that is accepted [m/s^2]; of `serial` see `replay.check_unit`.
 
-    Raises ValueError without a recording or calibration, or if `window_s` or `tolerance` is not
-    positive; RecordingError if a recording cannot be read, or none of them rests for a window;
-    CalibrationError if a calibration is for another unit.
+    Raises RecordingError if one cannot be read, or none rests for a window; CalibrationError if a
+    calibration is for another unit.
     """
     if not paths or not calibrations:
         raise ValueError('`paths` and `calibrations` must hold at least one each')
@@ -150,11 +138,7 @@ def evaluate(
     judgements = {}
     for name, calibration in calibrations:
         judgement = judge_bags(
-            [bag.reduced for bag in bags],
-            calibration,
-            gravity=gravity,
-            window_s=window_s,
-            tolerance=tolerance,
+            bags, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
         )
         if judgement is None:
             raise RecordingError(

@@ -107,8 +107,7 @@ def judge(
     """
     Judge a calibration by its windows; a `tolerance` on the RMS [m/s^2] decides where given.
 
-    Of windows that the fit has seen, what it left on positions left out stands for them. Raises
-    ValueError if there is no window, or `tolerance` is not positive.
+    Of windows that the fit has seen, what it left on positions left out stands for them.
     """
     if not len(windows):
         raise ValueError('`windows` must hold at least one')

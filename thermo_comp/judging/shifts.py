@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..fitting.coverage import distinct_directions
+from ..fitting.coverage import distinct_directions, norm_columns
 from ..fitting.verdict import POSITIONS_NEEDED
 from ..typing import Floats
 from ..unit.gravity import MICRO_G
@@ -45,13 +45,7 @@ def distinct_positions(windows: Windows) -> int:
 
 
 def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:
-    """
-    Fit nine constants to the positions' means; none with fewer than six distinct positions.
-
-    `misalignment_sd` is how well the calibration knows the three elements of M.
-    """
-    from scipy.optimize import least_squares
-
+    """Fit nine constants to the positions' means; none with fewer than six distinct ones."""
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity
@@ -64,26 +58,22 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     count = np.unique(windows.position, return_counts=True)[1]
     variance = 1.0 / known + scatter / np.maximum(count / _ALIKE, 1.0)
     sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_MISS)
-    skew_sd = np.maximum(misalignment_sd, _SMALLEST_SKEW)
-
-    def misses(constants: Floats) -> Floats:
-        bias, scale, skew = constants.reshape(3, 3)
-        x, y, z = ((force - bias) / (1.0 + scale)).T
-        true = np.stack((x, y + skew[0] * x, z + skew[1] * x + skew[2] * y))
-        return np.concatenate(((np.linalg.norm(true, axis=0) - 1.0) / sd, skew / skew_sd))
-
-    found = least_squares(misses, np.zeros(9), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    # Linear in shifts, as small as they are: of the norms, and of a misalignment that is known.
+    sizes = np.linalg.norm(force, axis=1)
+    seen = norm_columns(force / sizes[:, None]) / sd[:, None]
+    seen = np.vstack((seen, np.eye(9)[6:] / np.maximum(misalignment_sd, _SMALLEST_SKEW)[:, None]))
+    misses = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
+    found = np.linalg.lstsq(seen, misses, rcond=None)[0]
     # What the constants leave unexplained makes them less sure.
-    freedom = len(sd) - 6
-    excess = max(1.0, 2.0 * found.cost / freedom) if freedom > 0 else 1.0
-    jacobian = np.asarray(found.jac)
-    spread = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * excess)
+    freedom, left = len(sd) - 6, float(np.sum((misses - seen @ found) ** 2))
+    excess = max(1.0, left / freedom) if freedom > 0 else 1.0
+    spread = np.sqrt(np.diag(np.linalg.pinv(seen.T @ seen)) * excess)
     return tuple(
         AxisShift(
-            bias=float(found.x[i]) * gravity,
-            bias_sd=float(spread[i]) * gravity,
-            scale=float(found.x[3 + i]),
-            scale_sd=float(spread[3 + i]),
+            float(found[i]) * gravity,
+            float(spread[i]) * gravity,
+            float(found[3 + i]),
+            float(spread[3 + i]),
         )
         for i in range(3)
     )

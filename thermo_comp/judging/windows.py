@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -30,6 +30,7 @@ from ..online.status import CompensatorConfig
 from ..thermal.state import Layout
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.calibration import AXES, Calibration
+from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.metrics import norm_residual
 
@@ -115,62 +116,48 @@ def usual_window(bags: Sequence[ReducedBag]) -> float:
 
 def corrected_windows(
     bags: Sequence[ReducedBag],
-    calibration: Calibration,
+    calibration: Calibration | None,
     *,
     gravity: float | None = None,
     window_s: float = WINDOW_S,
 ) -> Windows:
     """
-    Correct the windows of bags of the calibration's unit; local gravity is its own by default.
+    Correct the windows of bags; RecordingError if the samples are too slow for such windows.
 
-    Raises RecordingError if the samples of a bag are too slow for such windows.
+    Without a calibration they stay as they are: static, inside any range, without a claim.
     """
-    # A window's mean is no sample: what looks for stuck or too large ones would misread it.
-    config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
-    thermal = Compensator(calibration, config).thermal
-    n_gyro = 9 + Layout(thermal.correction.memory).width if thermal.rate_correction else 0
-    table = _table(
-        bags,
-        window_s,
-        lambda bag, sums: _correct(Compensator(calibration, config), bag, sums),
-        n_gyro,
+    table = _table(bags, calibration, window_s)
+    raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)
+    if calibration is not None:
+        gravity = calibration.gravity_m_s2 if gravity is None else gravity
+        axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+        K, bias = np.array([(axis.scale_factor, axis.bias) for axis in axes]).T
+        M = np.array(calibration.misalignment)
+        raw = (raw - bias) / K @ M.T
+        force = table['force']
+        along = force / np.linalg.norm(force, axis=1, keepdims=True) @ M
+        noise = along**2 @ np.array(Correction(calibration).noise)
+        # Of a message's noise the rounding is carried on to the next: a mean has none of it.
+        white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
+        mean_white = white / (calibration.unit.cycle_time_s * table['count'])
+        claimed_sd = np.sqrt(np.maximum(table['variance'] - noise, 0.0) + mean_white)
+        noise_sd = np.sqrt(mean_white)
+    bag = table['bag'].astype(np.int64)
+    origin = np.array([one.start_ns for one in bags], dtype=np.int64)
+    same = ('time', 'count', 'mean', 'board', 'rate', 'force', 'gyro')
+    return Windows(
+        window_s=window_s,
+        gravity=np.nan if gravity is None else gravity,
+        bag=bag,
+        position=table['position'].astype(np.int64),
+        start_ns=np.rint(table['start'] * 1e9).astype(np.int64) + origin[bag],
+        is_dynamic=table['weight'] > 0.5,
+        is_inside=table['excess'] <= _EDGE,
+        raw=raw,
+        claimed_sd=claimed_sd,
+        noise_sd=noise_sd,
+        **{name: table[name] for name in same},
     )
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    K, bias = np.array([(axis.scale_factor, axis.bias) for axis in axes]).T
-    M = np.array(calibration.misalignment)
-    force = table['force']
-    along = force / np.linalg.norm(force, axis=1, keepdims=True) @ M
-    noise = along**2 @ np.array(thermal.correction.noise)
-    # Of a message's noise the rounding is carried on to the next: a mean has none of it.
-    white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
-    mean_white = white / (calibration.unit.cycle_time_s * table['count'])
-    return _windows(
-        bags,
-        table,
-        window_s,
-        calibration.gravity_m_s2 if gravity is None else gravity,
-        raw=np.asarray((table['mean'] - bias) / K @ M.T),
-        claimed_sd=np.sqrt(np.maximum(table['variance'] - noise, 0.0) + mean_white),
-        noise_sd=np.sqrt(mean_white),
-    )
-
-
-def raw_windows(bags: Sequence[ReducedBag], gravity: float, window_s: float) -> Windows:
-    """
-    Take the windows as they are: static, inside any range, without a claim.
-
-    Raises RecordingError as `corrected_windows` does; unknown gravity is NaN.
-    """
-
-    def keep(bag: ReducedBag, sums: _Table) -> None:
-        since = (bag.board.stamp_ns - bag.start_ns) * 1e-9
-        sums['board'] = np.interp(sums['time'], since, bag.board.value)
-        sums['force'] = sums['mean']
-        sums['excess'] = sums['rate'] = sums['weight'] = 0.0
-
-    table = _table(bags, window_s, keep)
-    nothing = np.full(len(table), np.nan)
-    return _windows(bags, table, window_s, gravity, table['mean'], nothing, nothing)
 
 
 def csv_of(windows: Windows, bags: Sequence[str]) -> str:
@@ -216,13 +203,11 @@ _ONCE = ('bag', 'position', 'start', 'count', 'excess')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance')
 
 
-def _table(
-    bags: Sequence[ReducedBag],
-    window_s: float,
-    correct: Callable[[ReducedBag, _Table], None],
-    n_gyro: int = 0,
-) -> _Table:
+def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s: float) -> _Table:
     """Put the sums of bags together to windows, a row each."""
+    n_gyro = 0
+    if calibration is not None and calibration.gyroscope is not None:
+        n_gyro = 9 + Layout(Correction(calibration).memory).width
     kind = np.dtype(
         [(name, float) for name in (*_ONCE, *_AVERAGED)]
         + [('mean', float, 3), ('force', float, 3), ('gyro', float, n_gyro)]
@@ -250,7 +235,10 @@ def _table(
             n_positions += 1
         whole = np.concatenate(sums)
         if len(whole):
-            correct(bag, whole)
+            if calibration is None:
+                _keep(bag, whole)
+            else:
+                _correct(calibration, bag, whole)
             # Messages were lost, or the bag ends within it.
             usual = np.median(whole['count'])
             whole['excess'][whole['count'] < _LEAST_FILLED * usual] = np.nan
@@ -269,35 +257,18 @@ def _joined(sums: _Table) -> _Table:
     return np.asarray(result[np.isfinite(result['excess'])])
 
 
-def _windows(
-    bags: Sequence[ReducedBag],
-    table: _Table,
-    window_s: float,
-    gravity: float,
-    raw: Floats,
-    claimed_sd: Floats,
-    noise_sd: Floats,
-) -> Windows:
-    bag = table['bag'].astype(np.int64)
-    origin = np.array([one.start_ns for one in bags], dtype=np.int64)
-    same = ('time', 'count', 'mean', 'board', 'rate', 'force', 'gyro')
-    return Windows(
-        window_s=window_s,
-        gravity=gravity,
-        bag=bag,
-        position=table['position'].astype(np.int64),
-        start_ns=np.rint(table['start'] * 1e9).astype(np.int64) + origin[bag],
-        is_dynamic=table['weight'] > 0.5,
-        is_inside=table['excess'] <= _EDGE,
-        raw=raw,
-        claimed_sd=claimed_sd,
-        noise_sd=noise_sd,
-        **{name: table[name] for name in same},
-    )
+def _keep(bag: ReducedBag, sums: _Table) -> None:
+    since = (bag.board.stamp_ns - bag.start_ns) * 1e-9
+    sums['board'] = np.interp(sums['time'], since, bag.board.value)
+    sums['force'] = sums['mean']
+    sums['excess'] = sums['rate'] = sums['weight'] = 0.0
 
 
-def _correct(compensator: Compensator, bag: ReducedBag, sums: _Table) -> None:
+def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     """Run sums through the compensator, with the readings that came before each."""
+    # A window's mean is no sample: what looks for stuck or too large ones would misread it.
+    config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+    compensator = Compensator(calibration, config)
     names, stamps, values = readings_in_order(bag, compensator.thermal.inputs)
     readings = zip(names, stamps.tolist(), values.tolist(), strict=True)
     reading = next(readings, None)

@@ -14,9 +14,9 @@ from ..fitting import FitResult
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector, readings_in_order
 from ..fitting.verdict import Finding
-from ..judging import WINDOW_S, OpenedBag, judge_bags
+from ..judging import WINDOW_S, corrected_windows, judge_bags
 from ..judging.history import history_of
-from ..judging.windows import raw_windows, usual_window
+from ..judging.windows import usual_window
 from ..replay import check_unit
 from ..thermal.memory import BOARD_INPUT
 from ..thermal.regime import Regime
@@ -36,7 +36,7 @@ _MOST_POINTS = 4000
 
 
 def evidence_of_bags(
-    bags: Sequence[OpenedBag],
+    bags: Sequence[ReducedBag],
     calibration: Calibration | None = None,
     *,
     gravity: float | None = None,
@@ -54,7 +54,6 @@ def evidence_of_bags(
     Raises CalibrationError for a calibration of another unit; RecordingError if samples are too
     slow for such windows.
     """
-    reduced = [bag.reduced for bag in bags]
     judgement = None
     unit = 'counts'
     if calibration is not None:
@@ -63,28 +62,28 @@ def evidence_of_bags(
         unit = calibration.unit.input
         gravity = calibration.gravity_m_s2 if gravity is None else gravity
         judgement = judge_bags(
-            reduced, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
+            bags, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
         )
         windows = None if judgement is None else judgement.windows
     else:
         if any(bag.info.input == 'imu' for bag in bags):
             unit = 'm/s^2'
-        windows = raw_windows(reduced, np.nan if gravity is None else gravity, window_s)
+        windows = corrected_windows(bags, None, gravity=gravity, window_s=window_s)
     if calibration is not None:
         serial = calibration.unit.serial
-    said = sorted({bag.source.serial for bag in reduced if bag.source.serial})
+    said = sorted({bag.source.serial for bag in bags if bag.source.serial})
     return Evidence(
         serial=serial or ', '.join(said) or 'unknown',
         unit=unit,
         gravity=gravity,
         calibration=calibration,
-        bags=tuple(map(_facts, reduced)),
-        shown=_shown(reduced, calibration),
+        bags=tuple(map(_facts, bags)),
+        shown=_shown(bags, calibration),
         windows=windows,
         judgement=judgement,
         findings=() if calibration is None else _against(calibration),
         history=() if calibration is None or not others else history_of([calibration, *others]),
-        is_simulated=_is_simulated(reduced),
+        is_simulated=_is_simulated(bags),
     )
 
 
@@ -115,7 +114,7 @@ def evidence_of_fit(result: FitResult, *, is_brief: bool = False) -> Evidence:
 
 
 def _is_simulated(bags: Sequence[ReducedBag]) -> bool:
-    return any(_SIMULATED in bag.metadata for bag in bags)
+    return any(_SIMULATED in bag.info.metadata for bag in bags)
 
 
 def _is_reservation(finding: Finding) -> bool:
@@ -153,7 +152,7 @@ def _span_ns(bag: ReducedBag) -> tuple[int, int]:
 
 def _facts(bag: ReducedBag) -> BagFacts:
     start_ns, end_ns = _span_ns(bag)
-    remarks = [bag.truncated] if bag.truncated else []
+    remarks = [bag.info.truncated] if bag.info.truncated else []
     if bag.n_saturated:
         remarks.append(f'{bag.n_saturated} samples saturated, left out')
     if bag.n_dropped:

@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ThermoCompError
-from ..judging import OpenedBag, open_bag
+from ..fitting import ReducedBag
+from ..judging import open_bag
 from ..recording import Input, RecordingInfo, Topics
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence
@@ -68,7 +69,7 @@ class LiveReport:
         self._topics, self._input, self._read = topics, input, read
         self._judging = judging  # of `evidence_of_bags`
         self._lock = threading.Lock()
-        self._opened: dict[Path, tuple[str, OpenedBag]] = {}
+        self._opened: dict[Path, tuple[str, ReducedBag]] = {}
         self._version = ''
         self._made: tuple[Evidence, list[tuple[ReportFigure, str]]] | None = None
         self._notice = ''
