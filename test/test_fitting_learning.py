@@ -107,7 +107,7 @@ def test_widths_are_those_of_the_weights(calm: tuple[Regression, Learnt, Truth])
     np.testing.assert_allclose(found.prior.on_bias[:4], true[:4], rtol=0.15)
     for worth in found.worth:
         assert 0.0 < worth.effective_parameters <= 6.0 + 1e-9
-        assert len(worth.sd) == 2
+        assert len(worth.prior_sd) == 2
 
 
 def test_truth_lies_within_the_claimed_sd(noisy: tuple[Regression, Learnt, Truth]) -> None:
