@@ -197,7 +197,6 @@ def test_a_thousand_reloads_at_1_khz(tmp_path: Path) -> None:
                 time.sleep(max(0.0, due - time.monotonic()))
         node.settle()
         heard = node.take()
-        assert int(heard.values['sample rate [Hz]'].split('.')[0]) > 0
     assert len(answers) >= n_reloads
     assert all(answers)
     assert len(heard.force) == n_samples

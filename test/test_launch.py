@@ -133,7 +133,7 @@ def test_our_node_s_executable_parameters_and_topics() -> None:
     assert named <= {field.name for field in fields(NodeConfig)}
     # A serial such as 0042 would otherwise arrive as a number.
     assert all(one.get('type') == 'str' for one in node.findall('param') if one.get('name'))
-    source = (ROOT / 'thermo_comp' / 'ros' / 'node.py').read_text()
+    source = (ROOT / 'thermo_comp' / 'ros' / 'relay.py').read_text()
     defaults = {one.get('name'): one.get('default') for one in parse(OURS).findall('arg')}
     for remap in node.findall('remap'):
         topic = remap.get('from')

@@ -12,61 +12,34 @@ from __future__ import annotations
 import gc
 import os
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from copy import copy
-from dataclasses import replace
-from functools import partial
+from contextlib import suppress
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
-from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Bool
 
 from ..errors import CalibrationError, ThermoCompError
 from ..online.compensator import Compensator
-from ..online.snapshot import take_snapshot
-from ..online.stamped_flag import STAMPED_TOPIC
 from ..text import hold_standard_streams, one_line
 from . import parameters
-from .conversions import SampleConverter, Traffic
-from .diagnostics import Snapshot, build, look_at
-from .parameters import NodeConfig, ParameterError
+from .diagnostics import Reporter
 from .process import SignalWatch, use_profile
 from .reader import LoadedCalibration, Reader, check, load, read
-from .relay import Relay
+from .relay import INPUTS, Relay
 from .requests import ParameterRequests
-from .waitloop import RawSubscription, WaitLoop, undeclared_overrides
+from .waitloop import WaitLoop, undeclared_overrides
 
 NODE_NAME = 'thermo_comp'
-
-#: As many samples as may wait for one wake-up, in and out: 0.2 s at 10 kHz.
-SAMPLE_QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
-TEMPERATURE_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-OUTPUT_QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
-FLAG_QOS = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-DIAGNOSTICS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 #: With best effort, samples that come at some 7 kHz or more are taken some at a time, so long
 #: after the last ones [s]: it saves a third of the CPU time at 10 kHz. At 5 kHz it would make each
 #: wait for longer than it takes to relay it.
 REST_S = 0.2e-3
-
-#: After so long without samples [s] readings take effect without them.
-IDLE_S = 5.0
 
 USAGE = """\
 usage: thermo_comp_node --ros-args -p calibration_file:=PATH [-p NAME:=VALUE ...]
@@ -84,17 +57,6 @@ NOT_GIVEN = 'not_given.'
 
 #: What files, values, the environment and the middleware do: RuntimeError is its own, too.
 _NOT_OURS = (ThermoCompError, OSError, RuntimeError, ParameterException)
-
-_INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
-
-
-@contextmanager
-def _opening() -> Iterator[None]:
-    """Say what a name or a quality of service of the user's does."""
-    try:
-        yield
-    except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
-        raise ParameterError(f'a topic cannot be opened: {error}') from error
 
 
 class CompensationNode:
@@ -116,12 +78,9 @@ class CompensationNode:
         self._compensator = Compensator(
             self._loaded.calibration, self._config.compensator_config()
         )
-        self._n_publishers = 0
-        self._level = b''
-        self._last_samples = time.monotonic()
         self._loop = WaitLoop(self.node, REST_S)
-        self._relay = self._open_topics()
-        self._reported = self._snapshot()
+        self._relay = Relay(self.node, self._loop, self._compensator, self._config)
+        self._reporter = Reporter(self.node, self._loop, self._relay, self._compensator)
         self._read: LoadedCalibration | None = None
         self._prepared = (self._config, self._loaded, self._relay.samples)
         self.node.add_pre_set_parameters_callback(parameters.coerce)
@@ -129,15 +88,13 @@ class CompensationNode:
         self.node.add_post_set_parameters_callback(self._post_set)
         self._reader = Reader()
         self._requests = ParameterRequests(self.node, self._loop, self._prepare, self._set)
-        self._loop.call_every(self._config.diagnostics_period, self._report)
+        self._report_every(self._config.diagnostics_period)
         self._log = self.node.get_logger()
-        inputs = tuple(
-            f'qos_overrides.{self.node.resolve_topic_name(topic)}.'
-            for _, topic in _INPUTS.values()
-        )
+        topics = [self.node.resolve_topic_name(topic) for _, topic in INPUTS.values()]
+        # The input that is not open may be opened later, with these.
+        known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in undeclared_overrides(self.node):
-            # The input that is not open may be opened later, with these.
-            if not name.startswith((*inputs, NOT_GIVEN)):
+            if not name.startswith(known):
                 self._log.warning(f'there is no parameter `{one_line(name)}`, it has no effect')
 
     def run(self) -> None:
@@ -155,92 +112,8 @@ class CompensationNode:
         self._loop.close()
         self.node.destroy_node()
 
-    def _open_topics(self) -> Relay:
-        """Create the subscriptions and publishers, and what connects them."""
-        overridable, compensator = QoSOverridingOptions.with_default_policies(), self._compensator
-        samples = self._open_samples(self._config)
-        self._thermometers = compensator.thermal.inputs
-        with _opening():
-            temperatures = [
-                (
-                    self._loop.subscribe(
-                        Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False
-                    ),
-                    partial(compensator.push, name),
-                )
-                for name in self._thermometers
-            ]
-            imu, flag, stamped, self._diagnostics = (
-                self.node.create_publisher(
-                    message_type, topic, copy(qos), qos_overriding_options=overridable
-                )
-                for message_type, topic, qos in (
-                    (Imu, 'imu/data_raw', OUTPUT_QOS),
-                    (Bool, 'regime/dynamic', FLAG_QOS),
-                    (DiagnosticArray, STAMPED_TOPIC, FLAG_QOS),
-                    (DiagnosticArray, '/diagnostics', DIAGNOSTICS_QOS),
-                )
-            )
-        self._traffic = Traffic()
-        converter = self._new_converter(self._config)
-        return Relay(self.node, compensator, converter, samples, temperatures, imu, flag, stamped)
-
-    def _open_samples(self, config: NodeConfig) -> RawSubscription:
-        with _opening():
-            return self._loop.subscribe(*_INPUTS[config.input], SAMPLE_QOS)
-
-    def _new_converter(self, config: NodeConfig) -> SampleConverter:
-        return SampleConverter(_INPUTS[config.input][0], config.frame_id, self._traffic)
-
-    def _snapshot(self) -> Snapshot:
-        last = self._relay.converter.last_result
-        variances = None if last is None else (last[3], last[6], last[8])
-        thermal = self._compensator.thermal
-        noise = [(1.0 + thermal.noise_excess) * one for one in thermal.correction.noise]
-        names = ('sample', *self._thermometers)
-        return Snapshot(
-            take_snapshot(self._compensator),
-            replace(self._traffic, n_failures=self._loop.n_failures),
-            variances,
-            noise,
-            time.monotonic() - self._last_samples,
-            tuple(
-                look_at(self.node, name, one.subscription)
-                for name, one in zip(names, self._relay.inputs, strict=True)
-            ),
-        )
-
-    def _report(self) -> None:
-        """Publish diagnostics; log when the level changes."""
-        self._count_lost()
-        if self._compensator.counters.n_in != self._reported.status.counters.n_in:
-            self._last_samples = time.monotonic()
-        silence_s = time.monotonic() - self._last_samples
-        if silence_s > IDLE_S:
-            self._relay.advance_without_samples(int(silence_s * 1e9))
-        now = self._snapshot()
-        status = build(self.node.get_fully_qualified_name(), self._loaded, now, self._reported)
-        self._reported = now
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.node.get_clock().now().to_msg()
-        self._diagnostics.publish(array)
-        if status.level != self._level:
-            self._level = status.level
-            # rclpy wants one call per severity and place.
-            if status.level == DiagnosticStatus.OK:
-                self._log.info(status.message)
-            elif status.level == DiagnosticStatus.WARN:
-                self._log.warning(status.message)
-            else:
-                self._log.error(status.message)
-
-    def _count_lost(self) -> None:
-        """Count gaps in the driver's numbering, which mean something only while it is one."""
-        samples = self._relay.samples
-        n_lost, samples.n_lost = samples.n_lost, 0
-        before, self._n_publishers = self._n_publishers, samples.subscription.get_publisher_count()
-        if before == self._n_publishers == 1:
-            self._traffic.n_lost += n_lost
+    def _report_every(self, period_s: float) -> None:
+        self._loop.call_every(period_s, lambda: self._reporter.report(self._loaded))
 
     def _prepare(self, changes: list[Parameter]) -> LoadedCalibration | None:
         """Read the calibration that a change asks for, beside the samples."""
@@ -272,7 +145,7 @@ class CompensationNode:
             check(loaded, config)
             self._check_thermometers(loaded)
             if config.input != self._config.input:
-                samples = self._open_samples(config)
+                samples = self._relay.open_samples(config)
         except ThermoCompError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self._prepared = (config, loaded, samples)
@@ -291,22 +164,18 @@ class CompensationNode:
 
     def _post_set(self, _changes: list[Parameter]) -> None:
         """Apply what `_on_set` checked."""
-        before, relay = self._config, self._relay
-        config, loaded, samples = self._prepared
+        before, (self._config, loaded, samples) = self._config, self._prepared
+        config = self._config
         if loaded is not self._loaded:
             self._loaded = loaded
             self._compensator.swap(loaded.calibration)
             self._say_calibration()
-        self._config = config
         if config.compensator_config() != before.compensator_config():
             self._compensator.reconfigure(config.compensator_config())
         if (config.input, config.frame_id) != (before.input, before.frame_id):
-            relay.converter = self._new_converter(config)
-        if samples is not relay.samples:
-            self._loop.unsubscribe(relay.samples)
-            relay.samples = samples
+            self._relay.configure(config, samples)
         if config.diagnostics_period != before.diagnostics_period:
-            self._loop.call_every(config.diagnostics_period, self._report)
+            self._report_every(config.diagnostics_period)
 
     def _say_calibration(self) -> None:
         loaded = self._loaded

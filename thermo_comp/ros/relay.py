@@ -13,18 +13,35 @@ that input is used, nor the first messages after it, which may still be of the o
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import copy
+from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
 from ..online.compensator import Compensator
-from ..online.stamped_flag import stamped_flag
-from .conversions import SampleConverter, read_temperature
-from .waitloop import RawSubscription, RCLError
+from ..online.stamped_flag import STAMPED_TOPIC, stamped_flag
+from .conversions import SampleConverter, Traffic, read_temperature
+from .parameters import NodeConfig, ParameterError
+from .waitloop import RawSubscription, RCLError, WaitLoop
+
+INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
+#: As many samples as may wait for one wake-up, in and out: 0.2 s at 10 kHz.
+SAMPLE_QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
+TEMPERATURE_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+OUTPUT_QOS = QoSProfile(depth=2000)
+FLAG_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 #: Without samples, readings take effect but for those not older than the newest by this [ns]: a
 #: sample that Fast DDS has to repeat can be 3 s late.
@@ -33,52 +50,79 @@ IDLE_NS = 1_000_000_000
 #: The two messages of the flag, serialized.
 _FLAGS: list[bytes] = [serialize_message(Bool(data=is_dynamic)) for is_dynamic in (False, True)]
 
-#: Takes a temperature: stamp [ns] and degC.
-Push = Callable[[int, float], None]
+# A temperature that has arrived: received [ns], of which thermometer, stamp [ns], degC.
+_Reading = tuple[int, str, int, float]
 
-# A temperature that has arrived: received [ns], stamp [ns], degC, and where it goes.
-_Reading = tuple[int, int, float, Push]
+
+@contextmanager
+def _opening() -> Iterator[None]:
+    """Say what a name or a quality of service of the user's does."""
+    try:
+        yield
+    except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
+        raise ParameterError(f'a topic cannot be opened: {error}') from error
+
+
+def open_publisher(node: Node, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
+    """Create a publisher whose quality of service is open to overrides."""
+    overridable = QoSOverridingOptions.with_default_policies()
+    with _opening():
+        return node.create_publisher(
+            message_type, topic, copy(qos), qos_overriding_options=overridable
+        )
 
 
 class Relay:
-    """What stands between inputs and outputs; each thermometer comes with who takes it."""
+    """What stands between the inputs of a node and its outputs."""
 
     def __init__(
-        self,
-        node: Node,
-        compensator: Compensator,
-        converter: SampleConverter,
-        samples: RawSubscription,
-        temperatures: Sequence[tuple[RawSubscription, Push]],
-        imu: Publisher,
-        flag: Publisher,
-        stamped: Publisher,
+        self, node: Node, loop: WaitLoop, compensator: Compensator, config: NodeConfig
     ) -> None:
-        self._node = node
-        self._compensator = compensator
-        #: May be exchanged between two wake-ups, and so may `samples`.
-        self.converter = converter
-        self.samples = samples
-        self._temperatures: list[tuple[RawSubscription, Push]] = list(temperatures)
+        self._node, self._loop, self._compensator = node, loop, compensator
+        self.traffic = Traffic()
+        self.samples = self.open_samples(config)
+        self.configure(config, self.samples)
+        with _opening():
+            #: By their names.
+            self.thermometers = {
+                name: loop.subscribe(
+                    Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False
+                )
+                for name in compensator.thermal.inputs
+            }
+        imu = open_publisher(node, Imu, 'imu/data_raw', OUTPUT_QOS)
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
-        self._publish_flag, self._publish_stamped = flag.publish, stamped.publish
+        self._publish_flag = open_publisher(node, Bool, 'regime/dynamic', FLAG_QOS).publish
+        stamped = open_publisher(node, DiagnosticArray, STAMPED_TOPIC, FLAG_QOS)
+        self._publish_stamped = stamped.publish
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
-        self._traffic = converter.traffic
         self._contested: set[RawSubscription] = set()
 
     @property
-    def inputs(self) -> list[RawSubscription]:
-        """The samples and the readings, in the order in which they were given."""
-        return [self.samples, *[subscription for subscription, _ in self._temperatures]]
+    def inputs(self) -> dict[str, RawSubscription]:
+        """The samples, then the readings, by their names in the diagnostics."""
+        return {'sample': self.samples, **self.thermometers}
+
+    def open_samples(self, config: NodeConfig) -> RawSubscription:
+        """Subscribe to the samples of a configuration; ParameterError if that cannot be."""
+        with _opening():
+            return self._loop.subscribe(*INPUTS[config.input], SAMPLE_QOS)
+
+    def configure(self, config: NodeConfig, samples: RawSubscription) -> None:
+        """Go over to a configuration and the samples that were opened for it."""
+        if samples is not self.samples:
+            self._loop.unsubscribe(self.samples)
+        self.samples = samples
+        self.converter = SampleConverter(INPUTS[config.input][0], config.frame_id, self.traffic)
 
     def on_data(self) -> None:
         """Work through everything that has arrived."""
         messages, received_ns = self.samples.drain()
-        for subscription, push in self._temperatures:
+        for name, subscription in self.thermometers.items():
             readings, read_ns = subscription.drain()
             if readings and self._is_of_one(subscription, len(readings)):
-                self._take_readings(readings, read_ns, push)
+                self._take_readings(name, readings, read_ns)
         if not messages or not self._is_of_one(self.samples, len(messages)):
             return
         if self._readings:
@@ -94,7 +138,7 @@ class Relay:
             self._contested.remove(subscription)
         else:
             return True
-        self._traffic.n_contested += n
+        self.traffic.n_contested += n
         return False
 
     def advance_without_samples(self, silence_ns: int) -> None:
@@ -110,35 +154,34 @@ class Relay:
         last_ns = self._compensator.now_ns
         if last_ns is not None:
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
-        for _, stamp_ns, celsius, push in self._readings:
+        for _, name, stamp_ns, celsius in self._readings:
             if stamp_ns <= horizon_ns:
-                push(stamp_ns, celsius)
-        self._readings = [one for one in self._readings if one[1] > horizon_ns]
+                self._compensator.push(name, stamp_ns, celsius)
+        self._readings = [one for one in self._readings if one[2] > horizon_ns]
         self._compensator.flush(horizon_ns)
         self._publish_flags()
 
-    def _take_readings(self, messages: list[bytes], received_ns: list[int], push: Push) -> None:
+    def _take_readings(self, name: str, messages: list[bytes], received_ns: list[int]) -> None:
         for data, received in zip(messages, received_ns, strict=True):
             reading = read_temperature(data)
             if reading is None:
-                self._traffic.n_malformed += 1
+                self.traffic.n_malformed += 1
             else:
-                stamp_ns, celsius = reading
-                self._newest_reading_ns = stamp_ns
-                self._readings.append((received, stamp_ns, celsius, push))
+                self._newest_reading_ns = reading[0]
+                self._readings.append((received, name, *reading))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
         """Relay up to the last reading that came before the last sample; return the rest."""
         start = 0
         later: list[_Reading] = []
         for reading in sorted(self._readings, key=lambda one: one[0]):
-            received, stamp_ns, celsius, push = reading
+            received, name, stamp_ns, celsius = reading
             if received > received_ns[-1]:
                 later.append(reading)
                 continue
             end = bisect_left(received_ns, received, start)
             self._relay(messages[start:end])
-            push(stamp_ns, celsius)
+            self._compensator.push(name, stamp_ns, celsius)
             start = end
         self._readings = later
         return messages[start:]
@@ -164,10 +207,10 @@ class Relay:
                 self._publish_stamped(stamped_flag(stamp_ns, is_dynamic, serial))
             except RCLError:
                 self._count_unpublished()
-            self._traffic.n_flags += 1
+            self.traffic.n_flags += 1
 
     def _count_unpublished(self) -> None:
         """Go on after a message that the middleware did not take, but not after the shutdown."""
         if not self._node.context.ok():
             raise ExternalShutdownException
-        self._traffic.n_unpublished += 1
+        self.traffic.n_unpublished += 1
