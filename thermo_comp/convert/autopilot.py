@@ -41,10 +41,8 @@ def chosen(
     allow_compensated: bool,
 ) -> ForeignLog:
     """
-    Take one IMU and one barometer out of what a log holds; None takes the lowest instance.
-
-    Raises RecordingError if the instance is not there, its drift is gone (`compensated` says why)
-    and that is not allowed, or the readings have no noise: a simulator's.
+    Take one IMU and one barometer out of what a log holds, by default those of lowest instance;
+    `compensated` says why the thermal drift of an IMU is gone from its readings already.
     """
     why = compensated.get(min(imus, default=0) if imu is None else imu)
     if why and not allow_compensated:
@@ -70,9 +68,8 @@ def chosen(
 
 def stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
     """
-    Turn microseconds since the autopilot's start into stamps.
-
-    `NO_STAMP` where the number is no time: beyond a century, from a damaged file.
+    Turn microseconds since the autopilot's start into stamps; `NO_STAMP` where the number is no
+    time: beyond a century, from a damaged file.
     """
     whole = np.asarray(microseconds)
     size = whole.astype(np.float64)

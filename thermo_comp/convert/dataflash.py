@@ -8,10 +8,7 @@ number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. The readi
 ArduPilot's own correction, so a log made with ``INS_TCALn_ENABLE = 1`` is refused: its thermal
 drift is already taken out.
 
-References
-----------
-.. [1] https://ardupilot.org/copter/docs/logmessages.html
-
+The messages: https://ardupilot.org/copter/docs/logmessages.html
 """
 
 from __future__ import annotations
@@ -49,12 +46,7 @@ def read_dataflash(
     baro: int | None = None,
     allow_compensated: bool = False,
 ) -> ForeignLog:
-    """
-    Read an IMU of an ArduPilot log, counted from 0: the old type ``IMU2`` is 1.
-
-    Raises RecordingError as `chosen`, and if pymavlink is not installed, or the file is no
-    DataFlash log.
-    """
+    """Read an IMU of an ArduPilot log, counted from 0: the old type ``IMU2`` is 1."""
     try:
         from pymavlink.DFReader import DFReader_binary
     except ImportError as failure:
@@ -112,9 +104,7 @@ def read_dataflash(
 
 
 def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
-    """
-    Gather one message type: its columns, and how many of its messages the file ends inside of.
-    """
+    """Gather one message type: its columns, and how many of its messages were cut off."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
     offsets = np.asarray(reader.offsets[number], dtype=np.int64)

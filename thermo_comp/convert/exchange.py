@@ -62,7 +62,7 @@ def export_calibration(
 
     `number`: which set or IMU, where the file numbers them; `device_id`: PX4's id of the sensor,
     by which it matches the set. At the attitude `up`, a unit vector, the drift of the scale is
-    folded into the offset. Raises ValueError if `number` or `up` is impossible.
+    folded into the offset.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
@@ -182,8 +182,7 @@ def import_calibration(
     Read the file of one of `TOOLS`, told by what it holds, as a calibration of a unit.
 
     `number` chooses a set, IMU or instance; None takes the only one there is. `full_scale` is in
-    m/s^2. The result has the same set in both regimes. Raises CalibrationError if the text is no
-    such file, or an incomplete or impossible one.
+    m/s^2. The result has the same set in both regimes.
     """
     read = (tool.read(text, number) for tool in TOOLS.values())
     content = next((one for one in read if one is not None), None)

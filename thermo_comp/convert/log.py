@@ -100,9 +100,8 @@ class ConversionReport:
     """
     What came in, what went out, and what was seen on the way.
 
-    Rows are left out that are short, hold no numbers, or a stamp that ROS has not; rows whose time
-    goes back or stands still, or whose reading is clipped, are kept. `unit` is the one stated,
-    `believed` what the readings at rest speak for.
+    Rows are left out that are short, hold no numbers, or a stamp that ROS has not; the other
+    findings are kept. `unit` is the one stated, `believed` what the readings at rest speak for.
     """
 
     source: str
@@ -141,12 +140,7 @@ def write_log(
     force: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> ConversionReport:
-    """
-    Check a log and write it as a bag: ``*.mcap`` makes a bare file, else a rosbag2 directory.
-
-    Raises RecordingError if no row is usable, a stated unit contradicts the readings, or the
-    serial is none. Raises OutputError if the bag may not or cannot be written.
-    """
+    """Check a log and write it as a bag: a bare file ``*.mcap``, else a rosbag2 directory."""
     if log.serial:
         try:
             valid_serial(log.serial)
@@ -247,9 +241,7 @@ def _write(
     newest: Ints,
     progress: Callable[[float], None] | None,
 ) -> None:
-    """
-    Write the messages; a stamp that goes back keeps its place in the bag through its log time.
-    """
+    """Write the messages; a stamp that goes back keeps its place through its log time."""
     topics, n = Topics(), len(log.stamp_ns)
     waiting = [
         (f'temperature/{name}', readings, np.maximum.accumulate(readings.stamp_ns))

@@ -8,10 +8,7 @@ with the temperature of the same chip; ``sensor_baro`` holds a second temperatur
 1 Hz unless the logger's profile asks for more (``SDLOG_PROFILE``: thermal calibration). Where it
 is missing, ``sensor_combined`` stands in: after PX4's calibration, and without a temperature.
 
-References
-----------
-.. [1] https://docs.px4.io/main/en/dev_log/ulog_file_format
-
+The format: https://docs.px4.io/main/en/dev_log/ulog_file_format
 """
 
 from __future__ import annotations
@@ -49,10 +46,7 @@ def read_ulog(
     baro: int | None = None,
     allow_compensated: bool = False,
 ) -> ForeignLog:
-    """
-    Read an IMU of a PX4 log; RecordingError as `chosen`, and if pyulog is not installed, or the
-    file is no ULog.
-    """
+    """Read an IMU of a PX4 log."""
     try:
         from pyulog import ULog
     except ImportError as failure:
@@ -146,9 +140,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """
-    Interpolate the rate to the accelerometer's stamps; None where it was logged more sparsely.
-    """
+    """Interpolate the rate to the accelerometer's stamps; None where it was logged sparsely."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)

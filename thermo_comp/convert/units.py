@@ -3,9 +3,8 @@
 """
 Owns the belief about units: what a still accelerometer reads says what it reads in.
 
-At rest the specific force is gravity, whatever the attitude: |a| is 1 in g, 9.8 in m/s^2, 1000 in
-mg, and the sensitivity in counts. A log whose map says otherwise is refused, because a factor of
-9.8 that nobody sees ends in a calibration.
+At rest the specific force is gravity, whatever the attitude. A log whose map says otherwise is
+refused, because a factor of 9.8 that nobody sees ends in a calibration.
 """
 
 from __future__ import annotations
@@ -53,9 +52,8 @@ class Stillness:
 
 def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     """
-    Find where a recording rests, from its noise alone, whatever its unit; readings (n, 3).
-
-    Unlike a fit, it takes no threshold in parts of g, and a part counts however short it is.
+    Find where a recording rests, from its noise alone, whatever its unit, and however shortly;
+    readings (n, 3).
     """
     reduced = CellAccumulator(_CELL_S, None)
     reduced.add(stamp_ns, accel)

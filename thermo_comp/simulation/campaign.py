@@ -47,8 +47,6 @@ def positions(n: int, seed: int = 0) -> Floats:
     icosahedron: the sets that tell bias, scale and misalignment apart best for their number. Other
     sets take the faces of a cube, then its edges, then its corners; beyond 26, an even spiral over
     the sphere. 6, 9, 12, 18, 24 and 26 are balanced. `seed` turns each by a small random angle.
-
-    Raises ValueError if `n` is below 1.
     """
     if n < 1:
         raise ValueError(f'`n` must be at least 1, got {n}')
@@ -96,8 +94,6 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     temperature), 'tumble-3', 'tumble-1' (the same and 3 or 1 of 3 h in the chamber) or 'held-out'
     (3 positions with other ramps and attitudes, for judging). `seed` is that of the attitudes and
     of the room's temperature.
-
-    Raises ValueError if there is no such plan.
     """
     if name not in PLAN_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')

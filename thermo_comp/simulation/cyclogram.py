@@ -48,8 +48,6 @@ class Cyclogram:
     Air temperature [degC] in the chamber over time [s]: straight lines between points.
 
     Before the first point the air rests at the first temperature, after the last one at the last.
-    Raises ValueError if there are fewer than two points, the lengths differ, a value is not
-    finite, or the times do not start at 0 and increase.
     """
 
     time_s: tuple[float, ...]
@@ -87,9 +85,6 @@ def parse_cyclogram(text: str) -> Cyclogram:
     degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the
     starting temperature and takes no rate; a later one without a rate keeps the last rate (1 K/min
     if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
-
-    Raises ValueError if a step cannot be read, with its number and text, or the program has no
-    duration.
     """
     text = _PROGRAMS.get(text.strip(), text)
     time, temperature, rate = [0.0], list[float](), 1.0

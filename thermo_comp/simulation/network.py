@@ -5,9 +5,8 @@ Owns the heat paths: lumped parts joined by conductances, self-heating, the ther
 
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
 parts, then the thermostat's integral and set point; `u` is the air temperature; `p` holds the
-constant powers. Where the air is straight between knots the solution is a straight line plus
-decaying modes, so any instant is evaluated without integrating up to it. A network with convection
-has no modes and is integrated, interval by interval.
+constant powers. Between knots of the air the solution is a straight line plus decaying modes. A
+network with convection has no modes and is integrated, interval by interval.
 """
 
 from __future__ import annotations
@@ -31,10 +30,8 @@ _MODES_CONDITION = 1e9  # eigenvectors worse than that have no accurate modal so
 @dataclass(frozen=True)
 class Link:
     """
-    Heat path between two parts, or between a part and the chamber's air, `AIR`.
-
-    The conductance is in W/K (at 1 K, with convection); the heat flows as the power `exponent` of
-    the difference: 1 by conduction, 1.25 by free convection.
+    Heat path between two parts, or a part and the chamber's air, `AIR`: W/K (at 1 K, with
+    convection). Heat flows as the power `exponent` of the difference, 1.25 by free convection.
     """
 
     a: str
@@ -46,10 +43,8 @@ class Link:
 @dataclass(frozen=True)
 class Thermostat:
     """
-    Proportional-integral heater of one part, which holds `set_point` [degC].
-
-    Gains in W/K and W/(K s); `soft_start` is the time constant with which the set point is
-    approached after power-on, s; the heater gives 0 to `max_power` W.
+    Heater of one part, 0 to `max_power` W, which holds `set_point` [degC], and approaches it with
+    the time constant `soft_start` [s]; gains in W/K and W/(K s).
     """
 
     node: str
@@ -65,9 +60,7 @@ class ThermalNetwork:
     """
     Parts with heat capacities [J/K], the paths between them, and the power [W] they dissipate.
 
-    The keys of `capacity` name the parts and fix their order. Raises ValueError if a capacity or
-    conductance is not positive, a link, power or thermostat names an unknown part, or a part has
-    no heat path to the air.
+    The keys of `capacity` name the parts and fix their order.
     """
 
     capacity: Mapping[str, float]
@@ -138,9 +131,7 @@ class ThermalNetwork:
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
-        """
-        Return what convection adds to ``dx/dt`` of one state, and its derivatives by the state.
-        """
+        """Return what convection adds to ``dx/dt`` of one state, and its derivatives by it."""
         index = {name: i for i, name in enumerate(self.nodes)}
         flow, slope = np.zeros(len(state)), np.zeros((len(state), len(state)))
         for link in self.links:
@@ -199,9 +190,7 @@ class ThermalResponse:
 
     `knot_air` are the air temperatures at the `knot_time` [s], shape (m,); `power` is what the
     parts dissipate between the knots beside the constant powers, W, shape (m - 1, n_parts). A warm
-    start is in equilibrium with everything on; else the unit is switched on at the first knot,
-    every part at the air's temperature. Raises ValueError if the program drives the thermostat's
-    heater out of its power range, or the network's modes cannot be told apart.
+    start is in equilibrium with everything on; else all is switched on at the air's temperature.
     """
 
     def __init__(
@@ -274,9 +263,7 @@ class ThermalResponse:
             self._integrated.append(solved.sol)
 
     def states(self, time: ArrayLike) -> Floats:
-        """
-        Return the parts' temperatures, the thermostat's integral [W] and set point, shape (m, k).
-        """
+        """Return the parts' temperatures, the thermostat's integral [W] and set point, (m, k)."""
         time = np.atleast_1d(np.asarray(time, dtype=float))
         k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
         states = np.empty((len(time), len(self.network.system()[1])))

@@ -201,10 +201,7 @@ def _mems(draw: _Specimen) -> UnitModel:
 
 def _triad(draw: _Specimen) -> UnitModel:
     """
-    Draw a triad of bare heads on a board whose errors have one kind of physics.
-
-    The heads' tempcos lag with the heads; each kind adds its own. The magnitudes are what such
-    errors have: some micro-g per kelvin of bias, tens of ppm per kelvin of scale.
+    Draw a triad of bare heads on a board: tempcos that lag with the heads, and its kind's physics.
     """
     kind = draw.name
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
@@ -257,16 +254,6 @@ def _tempcos(draw: _Specimen, parts: list[str]) -> list[Effect]:
     ]
 
 
-def _expansion(draw: _Specimen) -> list[Effect]:
-    # Quartz against metal: the expansion coefficients differ, and the more the warmer it is.
-    return [
-        DifferenceEffect(
-            'board', 'head', bias=draw.signed(3.0, 12.0), bias_curvature=draw.signed(0.1, 0.5),
-            scale=draw.signed(10.0, 40.0), scale_curvature=draw.signed(0.3, 1.5),
-        )
-    ]  # fmt: skip
-
-
 def _slips(draw: _Specimen) -> list[Effect]:
     # Per axis a joint that gives way at once and one that does so bit by bit.
     effects: list[Effect] = []
@@ -276,20 +263,6 @@ def _slips(draw: _Specimen) -> list[Effect]:
             stress = draw.signed(1.5, 4.0)[i] / width
             effects.append(SlipEffect('head', width, is_gradual, bias=_only(i, stress)))
     return effects
-
-
-def _flows(draw: _Specimen) -> list[Effect]:
-    # A heat pump between case and board: its load, its losses, and the gas it stirs.
-    return [
-        FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
-        FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
-        FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
-    ]
-
-
-def _leakage(draw: _Specimen) -> list[Effect]:
-    # Doubles every 7 to 10 K; a few ug at the reference.
-    return [LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))]
 
 
 def _loads(draw: _Specimen) -> list[Effect]:
@@ -319,13 +292,27 @@ _BETWEEN = ('between', 'switched-load')
 # Without lags but for what a difference of temperatures makes.
 _ON_BOARD = ('paper', 'demo')
 _EXTRA: dict[str, Callable[[_Specimen], list[Effect]]] = {
-    'products': _expansion,
+    # Quartz against metal: the expansion coefficients differ, and the more the warmer it is.
+    'products': lambda draw: [
+        DifferenceEffect(
+            'board', 'head', bias=draw.signed(3.0, 12.0), bias_curvature=draw.signed(0.1, 0.5),
+            scale=draw.signed(10.0, 40.0), scale_curvature=draw.signed(0.3, 1.5),
+        )
+    ],
     'hysteresis': _slips,
-    'even': _flows,
-    'convection': _leakage,
+    # A heat pump between case and board: its load, its losses, and the gas it stirs.
+    'even': lambda draw: [
+        FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
+        FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
+        FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
+    ],
+    # Doubles every 7 to 10 K; a few ug at the reference.
+    'convection': lambda draw: [
+        LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))
+    ],
     'paper': _loads,
     'demo': _sample,
-}
+}  # fmt: skip
 _INSTRUMENTS = {'thermostatted': _thermostatted, 'bare-quartz': _bare_quartz, 'mems': _mems}
 TRIAD_NAMES = (
     'own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load',
@@ -346,8 +333,6 @@ def unit_preset(name: str, seed: int = 0) -> UnitModel:
     'convection' (heat that flows through gas, and a leakage), 'switched-load' (electronics that
     heat by turns), 'paper' (a load while the ambient changes), 'slow-noise' (a bias that walks),
     'plain' (no thermal error at all), 'demo' (the sample unit: paper and lags).
-
-    Raises ValueError if there is no such kind.
     """
     if name not in UNIT_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(UNIT_NAMES)}, got {name!r}')

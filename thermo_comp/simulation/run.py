@@ -74,9 +74,7 @@ class Truth:
         return result
 
     def temperature(self, node: str) -> Floats:
-        """
-        Return the temperature [degC] of one part, or the air, on the thermal grid, shape (m,).
-        """
+        """Return the temperature [degC] of one part, or `AIR`, on the thermal grid, (m,)."""
         nodes = self.unit.network.nodes
         return self.air if node == AIR else self.temperatures[:, nodes.index(node)]
 
@@ -102,10 +100,7 @@ class SimulatedRun:
     name: str = ''
 
     def corrected_by_truth(self, window_s: float = 60.0) -> Floats:
-        """
-        Return the specific force that a perfect thermal model makes of the counts, as means over
-        whole windows, shape (w, 3), m/s^2.
-        """
+        """Return what a perfect thermal model makes of windows' mean counts, (w, 3), m/s^2."""
         unit = self.truth.unit
         per = round(window_s / (2.0 * self.truth.cycle_s[0]))
         n = len(self.counts) // per
@@ -157,9 +152,6 @@ def simulate_blocks(
     gravity: local gravity, m/s^2
     warm: true starts in thermal equilibrium; False switches the unit on at the start
     like: the truth of another run of this unit through this program: the same heat flow
-
-    Raises ValueError if `block_size` is below 1, rate or gravity is not positive, the program is
-    shorter than a cycle, `up` is no direction, or the thermostat's power does not suffice.
     """
     if block_size < 1:
         raise ValueError(f'`block_size` must be at least 1, got {block_size}')

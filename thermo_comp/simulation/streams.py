@@ -31,7 +31,5 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
-    """
-    Return the generator of one source, at the start of its stream, for an axis or other number.
-    """
+    """Return the generator of one source, for an axis or other number, at its stream's start."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))

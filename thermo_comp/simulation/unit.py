@@ -64,10 +64,8 @@ def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
 @dataclass(frozen=True)
 class ThermometerModel:
     """
-    One thermometer on one part: ``reading = quantum * round((T + offset + noise) / quantum)``.
-
-    White noise, quantum (0 is continuous) and offset in K; `phase` is the instant of the first
-    reading within its period, 0..1.
+    One thermometer on one part: ``reading = quantum * round((T + offset + noise) / quantum)``, all
+    in K, a quantum of 0 continuous; `phase`, 0..1, is when in its period it reads first.
     """
 
     node: str
@@ -123,10 +121,7 @@ class GyroModel:
         return np.asarray((drift + np.array(self.bias_at_reference)) * MILLIDEGREE)
 
     def constant(self, seed: int) -> Floats:
-        """
-        Return what a run reads beside the bias: the Earth's rate, in an attitude of its own, and
-        the turn-on; rad/s, shape (3,).
-        """
+        """Return a run's Earth rate, in an attitude of its own, and turn-on; rad/s, (3,)."""
         rng = generator(seed, Stream.GYRO_OFFSET)
         north = rng.standard_normal(3)
         turn_on = self.turn_on * MILLIDEGREE * rng.standard_normal(3)
@@ -188,9 +183,7 @@ class UnitModel:
 
     @property
     def origin(self) -> Floats:
-        """
-        Temperatures [degC] of the parts in the still state of the reference, shape (n_parts,).
-        """
+        """Temperatures [degC] of the parts in the reference's still state, shape (n_parts,)."""
         air = self.network.air_for(self.board.node, _REFERENCE_C)
         return self.network.equilibrium(air)
 
@@ -201,10 +194,8 @@ class UnitModel:
 
     def sibling(self, seed: int, spread: float = 0.15) -> UnitModel:
         """
-        Return another unit of the same type: every coefficient and time constant a bit different.
-
-        `spread` is the largest relative difference of a coefficient, a width or a heat capacity;
-        constants and misalignment are its own.
+        Return another unit of the same type: constants and misalignment are its own, each
+        coefficient, width and heat capacity differs by a share of up to `spread`.
         """
         rng = generator(seed, Stream.SIBLING)
 
