@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import gc
+import json
 import logging
 import os
 import shutil
@@ -20,7 +21,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 from hypothesis import settings
@@ -76,6 +77,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Keep the collector from walking through what was imported, again and again."""
     gc.freeze()
+
+
+def parsed(text: str) -> dict[str, Any]:
+    """Parse what a command prints for machines: one object, and no NaN, which JSON has not."""
+
+    def no_nan(text: str) -> None:
+        raise AssertionError(f'{text} is not JSON')
+
+    data = json.loads(text, parse_constant=no_nan)
+    assert isinstance(data, dict)
+    return data
 
 
 class Cli(Protocol):

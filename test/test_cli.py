@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import rich_calibration
-from conftest import Cli
+from conftest import Cli, parsed
 
 from thermo_comp.cli import output
 from thermo_comp.cli.app import app, split_ros_arguments
@@ -80,18 +80,18 @@ class TestOutput:
         assert row.split() == ['/accel/counts', 'geometry_msgs/msg/Vector3Stamped', '8996']
 
     def test_json_is_one_object(self, bag: Path, unit: Path, cli: Cli, tmp_path: Path) -> None:
-        data = json.loads(cli('info', bag, '--json').stdout)
+        data = parsed(cli('info', bag, '--json').stdout)
         assert data['samples'] == 8996
         assert data['board']['highest'] > 20.0
-        data = json.loads(cli('info', unit, '--json').stdout)
+        data = parsed(cli('info', unit, '--json').stdout)
         assert data['calibration']['unit']['serial'] == 'T-1'
         arguments = ('replay', bag, '-c', unit, '-o', tmp_path / 'out', '--serial', '', '--json')
-        data = json.loads(cli(*arguments).stdout)
+        data = parsed(cli(*arguments).stdout)
         assert data['samples_in'] == data['samples_out'] == 8996
         # A case reading after the very last sample takes effect at none.
         assert data['flags'] <= data['counters']['n_case']
         arguments = ('evaluate', bag, '-c', unit, '--serial', '', '--json')
-        data = json.loads(cli(*arguments, code=None).stdout)
+        data = parsed(cli(*arguments, code=None).stdout)
         assert set(data['calibrations']) == {'unit'}
         assert data['is_valid'] == data['verdict'].startswith('valid')
 
@@ -184,7 +184,7 @@ class TestPlay:
     def test_sends_everything_under_the_names_asked_for(self, bag: Path, cli: Cli) -> None:
         arguments = ('play', bag, '--rate', '0', '--wait', '0', '--json')
         finished = cli(*arguments, '--ros-args', '-r', '__ns:=/here')
-        data = json.loads(finished.stdout)
+        data = parsed(finished.stdout)
         info = inspect_recording(bag)
         assert data['messages'] == {
             f'/here{name}': count for name, (_, count) in info.topics.items()
@@ -204,7 +204,7 @@ class TestReport:
     ) -> None:
         page = tmp_path / 'page.html'
         arguments = ('report', bag, '-c', unit, '--serial', '', '-o', page, '--json')
-        data = json.loads(cli(*arguments, code=None).stdout)
+        data = parsed(cli(*arguments, code=None).stdout)
         assert data['headline'] == f'{data["verdict"]}: {data["reason"]}'
         assert page.read_text().startswith('<!DOCTYPE html>')
         assert 'exists already' in cli(*arguments, code=1).stderr
@@ -278,7 +278,7 @@ class TestTopics:
         profile.write_text('counts: /imu/raw\nboard: /t2\ntemperature/magnet: /t3\n')
         topics = ('--topics', profile, '--topic', 'board=/t1', '--case-topic', '/t2')
         for arguments in (topics, (*topics[:4], '--case-topic=/t2')):
-            seen = json.loads(cli('info', named, *arguments, '--json').stdout)
+            seen = parsed(cli('info', named, *arguments, '--json').stdout)
             degrees = {name: one['lowest'] for name, one in seen['thermometers'].items()}
             assert degrees == {'board': 20.0, 'case': 21.0, 'magnet': 22.0}
             assert seen['chosen'] is None

@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import Cli, Once
+from conftest import Cli, Once, parsed
 from desk_helpers import Desk
 from typer.main import get_command
 
@@ -40,13 +39,17 @@ OF_ITS_OWN = {
     for name in COMMANDS
     if name != 'demo'
 }
-# What prints figures and ends by itself: what serves a page, listens or plays a bag does not.
-WITH_JSON = [
-    one
-    for one in EXAMPLES
-    if one.split()[1] not in ('view', 'play') and 'record --positions' not in one
-]
-
+# Of each command that prints figures and ends by itself: what serves a page or listens does not;
+# play, report and fit have theirs in test_cli and test_docs.
+WITH_JSON = list(
+    {
+        one.split()[1]: one
+        for one in EXAMPLES
+        if one.split()[1] not in ('view', 'play', 'report')
+        and 'record --positions' not in one
+        and 'bags/unit42/*' not in one
+    }.values()
+)
 QUICK = [one for one in EXAMPLES if one.split()[1] in ('info', 'convert', 'export', 'import')]
 
 
@@ -80,13 +83,7 @@ def test_the_example_runs_and_fits_a_pipe(example: str, desk: Desk, program: Cli
 def test_json_is_one_object_and_nothing_else(example: str, desk: Desk) -> None:
     finished = desk.run(f'{example} --json -q')
     assert finished.stderr == ''
-
-    def no_nan(text: str) -> None:
-        raise AssertionError(f'{text} is not JSON')
-
-    data = json.loads(finished.stdout, parse_constant=no_nan)
-    assert isinstance(data, dict)
-    assert data
+    assert parsed(finished.stdout)
 
 
 @pytest.mark.parametrize('example', QUICK)

@@ -18,9 +18,10 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 import yaml
-from conftest import ROOT, Cli, Once
-from desk_helpers import Desk, same_words
+from conftest import ROOT, Cli, Once, parsed
+from desk_helpers import Desk
 from matplotlib import pyplot as plt
+from readme_helpers import is_alike
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
@@ -66,8 +67,10 @@ def test_the_command_does_what_the_page_says(
     if '--install-completion' in command:
         pytest.skip('writes into the home of who runs it')
     finished = desk.run(command)
+    if '--json' in command:
+        assert parsed(finished.stdout)
     if output.strip():
-        assert same_words(finished.stdout, output), finished.stdout
+        assert is_alike(finished.stdout, output), finished.stdout
 
 
 def test_there_are_commands_to_run() -> None:
@@ -128,7 +131,7 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> N
         said = io.StringIO()
         with contextlib.redirect_stdout(said):
             exec(''.join(cell['source']), names)  # noqa: S102 - our own page
-        assert same_words(said.getvalue(), shown), said.getvalue()
+        assert is_alike(said.getvalue(), shown), said.getvalue()
         assert len(plt.get_fignums()) == len(drawn)
         n_figures += len(drawn)
         plt.close('all')

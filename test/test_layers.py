@@ -7,7 +7,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -77,8 +77,9 @@ def unit_of(path: Path) -> str:
     return relative.parts[0].removesuffix('.py')
 
 
-def imports_of(path: Path, with_types: bool = True) -> Iterator[tuple[int, str]]:
-    """Yield (line, absolute dotted name) of every import, also of those inside functions."""
+@cache
+def imports_of(path: Path, with_types: bool = True) -> list[tuple[int, str]]:
+    """Return (line, absolute dotted name) of every import, also of those inside functions."""
     here = ('thermo_comp', *path.relative_to(PACKAGE).with_suffix('').parts)
     tree = ast.parse(path.read_text(encoding='utf-8'), str(path))
     typing = {
@@ -87,19 +88,20 @@ def imports_of(path: Path, with_types: bool = True) -> Iterator[tuple[int, str]]
         if isinstance(node, ast.If) and ast.unparse(node.test) == 'TYPE_CHECKING'
         for inner in ast.walk(node)
     }
+    found: list[tuple[int, str]] = []
     for node in ast.walk(tree):
         if node in typing and not with_types:
             continue
         if isinstance(node, ast.Import):
-            for name in node.names:
-                yield node.lineno, name.name
+            found += [(node.lineno, name.name) for name in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = [*here[: -node.level]] if node.level else []
             base += (node.module or '').split('.') if node.module else []
-            for name in node.names:
-                yield node.lineno, '.'.join([*base, name.name])
+            found += [(node.lineno, '.'.join([*base, name.name])) for name in node.names]
+    return found
 
 
+@cache
 def own_unit(name: str) -> str | None:
     """
     Return the unit that an absolute name of this package belongs to, None for other packages.
@@ -130,6 +132,7 @@ def test_imports_go_down_only(path: Path) -> None:
     assert not wrong
 
 
+@cache
 def own_file(name: str) -> str:
     """
     Return the file of this package that an absolute name is imported from, by its dotted name.

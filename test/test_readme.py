@@ -9,29 +9,24 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import Cli
+from conftest import Cli, Once
+from desk_helpers import write_fit_of_the_readme
 from readme_helpers import FENCES, README, ROOT, is_alike, shown
 
 from thermo_comp.cli.app import app
 
 
-def test_the_shown_commands_give_the_shown_output(tmp_path: Path, cli: Cli) -> None:
+def test_the_shown_commands_give_the_shown_output(tmp_path: Path, cli: Cli, once: Once) -> None:
     # The demo has a test of its own, test_cli_demo.
-    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     commands = shown()
     assert list(commands) == ['demo', 'fit', 'evaluate', 'replay', 'info']
-    for name in ('fit', 'evaluate', 'replay', 'info'):
+    made = once('unit42.yaml', lambda folder: write_fit_of_the_readme(folder / 'unit42.yaml', cli))
+    assert is_alike((made / 'unit42.txt').read_text(), commands['fit'][1])
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    (tmp_path / 'unit.yaml').symlink_to(made / 'unit42.yaml')
+    for name in ('evaluate', 'replay', 'info'):
         words, expected = commands[name]
-        arguments = [
-            str(path)
-            for word in words
-            for path in (
-                sorted(p.relative_to(tmp_path) for p in tmp_path.glob(word))
-                if '*' in word
-                else [word]
-            )
-        ]
-        got = cli(*arguments, cwd=tmp_path).stdout
+        got = cli(*words, cwd=tmp_path).stdout
         assert is_alike(got, expected), f'{" ".join(words)}\n{got}'
 
 
