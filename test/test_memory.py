@@ -16,7 +16,6 @@ from thermo_comp.thermal.memory import (
     START_APART,
     LagBank,
     MemorySpec,
-    Plays,
     ThermalMemory,
     start_covariance,
 )
@@ -78,29 +77,33 @@ def test_a_guess_that_stays_wrong_adds_up_to_its_own_error():
     assert bank.extra == pytest.approx([0.25], rel=1e-6)
 
 
+def plays(*widths):
+    return ThermalMemory(MemorySpec(plays=tuple((0.0, width) for width in widths)))
+
+
 def test_the_loop_of_a_play():
     # Half-width 1 on 0 -> 5 -> 0 -> 5: up at v - 1, stands still over 2, down at v + 1.
-    plays = Plays((1.0,))
+    memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
-    for v in way.tolist():
-        plays.step(v)
-        P.append(plays.at(v)[0] + v)
+    for k, v in enumerate(way.tolist()):
+        memory.board_step(k, v)
+        P.append(memory.at(k, v, [0.0])[0] + v)
     up, down, again = P[:51], P[51:102], P[102:]
     assert up == pytest.approx([max(v - 1.0, 0.0) for v in way[:51]])
     assert down == pytest.approx([min(4.0, v + 1.0) for v in way[51:102]])
     assert again == pytest.approx([max(1.0, v - 1.0) for v in way[102:]])
-    assert plays.at(9.0) == [-1.0]
-    assert plays.at(-9.0) == [1.0]
+    assert memory.at(200, 9.0, [0.0]) == [-1.0]
+    assert memory.at(200, -9.0, [0.0]) == [1.0]
 
 
 def test_a_play_does_not_depend_on_how_fast_it_goes():
-    slow, fast = Plays((0.4, 1.6)), Plays((0.4, 1.6))
-    for v in np.linspace(0.0, 3.0, 1000):
-        slow.step(float(v))
-    for v in (0.0, 3.0):
-        fast.step(v)
-    assert slow.at(3.0) == pytest.approx(fast.at(3.0))
+    slow, fast = plays(0.4, 1.6), plays(0.4, 1.6)
+    for k, v in enumerate(np.linspace(0.0, 3.0, 1000)):
+        slow.board_step(k, float(v))
+    for k, v in enumerate((0.0, 3.0)):
+        fast.board_step(k, v)
+    assert slow.at(1000, 3.0, [0.0]) == pytest.approx(fast.at(1000, 3.0, [0.0]))
 
 
 def test_a_play_on_a_lag_follows_the_lag():
@@ -151,22 +154,3 @@ def test_the_start_fades_with_each_time_constant():
     memory.neighbours[0].step(300 * SECOND_NS, 2.0)
     found = memory.start_shares(600 * SECOND_NS)
     assert found == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])
-
-
-@pytest.mark.parametrize(
-    ('keys', 'message'),
-    [
-        ({'sensors': ()}, 'at least one thermometer'),
-        ({'sensors': ('case', 'case')}, 'each once'),
-        ({'sensors': ('board',)}, 'each once'),
-        ({'lags': (('lid', 60.0),)}, 'must be of board, case'),
-        ({'lags': (('board', 0.0),)}, 'time constant above 0'),
-        ({'lags': (('case', 60.0), ('board', 60.0))}, 'in the order of'),
-        ({'lags': (('board', 60.0), ('board', 60.0))}, 'each once'),
-        ({'plays': ((60.0, 1.0),)}, 'one of its lags'),
-        ({'plays': ((0.0, 0.0),)}, 'half-width above 0'),
-    ],
-)
-def test_refusals(keys, message):
-    with pytest.raises(ValueError, match=message):
-        MemorySpec(**keys)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -29,8 +30,6 @@ BOARD_START_SD: Final = 3.0
 NEIGHBOUR_START_SD: Final = 1.0
 #: Readings farther apart than this part of a time constant leave the way between them open.
 SPARSE_SHARE: Final = 0.1
-#: Steps of as many lengths are remembered with their exponentials.
-_KNOWN_STEPS: Final = 256
 #: A lag that keeps less than this has forgotten.
 _FADED: Final = 1e-18
 
@@ -41,36 +40,11 @@ class MemorySpec:
     What a tracker remembers: thermometers by name, the first of which leads the detector; lags as
     (``'board'`` or a sensor, whose gradient it is; time constant [s]), in the order of `inputs`;
     plays as (time constant of the board's lag that it follows, 0 for the board; half-width [K]).
-
-    Raises ValueError if there is no sensor, a name comes twice, or a lag or play has no input.
     """
 
     sensors: tuple[str, ...] = ('case',)
     lags: tuple[tuple[str, float], ...] = ()
     plays: tuple[tuple[float, float], ...] = ()
-
-    def __post_init__(self) -> None:
-        inputs = self.inputs
-        if not self.sensors or len(set(inputs)) < len(inputs):
-            raise ValueError(
-                f'`sensors` must name at least one thermometer, each once, beside '
-                f'{BOARD_INPUT}, got {self.sensors}'
-            )
-        for name, tau in self.lags:
-            if name not in inputs or not tau > 0.0:
-                raise ValueError(
-                    f'`lags` must be of {", ".join(inputs)} with a time constant above 0, '
-                    f'got {name} and {tau}'
-                )
-        places = [inputs.index(name) for name, _ in self.lags]
-        if places != sorted(places) or len(set(self.lags)) < len(self.lags):
-            raise ValueError(f'`lags` must stand in the order of {inputs}, each once')
-        for tau, width in self.plays:
-            if not width > 0.0 or (tau and (BOARD_INPUT, tau) not in self.lags):
-                raise ValueError(
-                    f'`plays` must have a half-width above 0 and follow the board or one of its '
-                    f'lags, got {width} on {tau}'
-                )
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -110,7 +84,6 @@ class LagBank:
     def __init__(self, taus: tuple[float, ...]) -> None:
         self.taus = taus
         self._sparse_s = SPARSE_SHARE * min(taus, default=math.inf)
-        self._steps: dict[int, tuple[list[float], list[float]]] = {}
         self._nil = [0.0] * len(taus)
         self.forget()
 
@@ -140,7 +113,7 @@ class LagBank:
             self.lagging, self.extra = self.at(stamp_ns, value)
             self.stamp_ns = stamp_ns
             if sd or dt_ns * 1e-9 > self._sparse_s:
-                self._doubt(self._steps[dt_ns][0], dt_ns * 1e-9, change, sd)
+                self._doubt(_coefficients(self.taus, dt_ns)[0], dt_ns * 1e-9, change, sd)
         self.input = value
 
     def _doubt(self, decays: list[float], dt: float, change: float, sd: float) -> None:
@@ -163,23 +136,12 @@ class LagBank:
             self.has_extra = True
             self.extra = [variance + change * change for variance in self.extra]
 
-    def _coefficients(self, dt_ns: int) -> tuple[list[float], list[float]]:
-        dt = dt_ns * 1e-9
-        lost = [-math.expm1(-dt / tau) for tau in self.taus]
-        decays = [1.0 - part for part in lost]
-        gains = [part * (tau / dt) for part, tau in zip(lost, self.taus, strict=True)]
-        if len(self._steps) >= _KNOWN_STEPS:
-            self._steps.clear()
-        self._steps[dt_ns] = decays, gains
-        return decays, gains
-
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
         """Give ``u - L`` [K] of each lag at a stamp with the input `value`, and its variance."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
-        dt_ns = stamp_ns - seen_ns
-        decays, gains = self._steps.get(dt_ns) or self._coefficients(dt_ns)
+        decays, gains = _coefficients(self.taus, stamp_ns - seen_ns)
         change = value - self.input
         lagging = [
             m * e + change * gain for m, e, gain in zip(self.lagging, decays, gains, strict=True)
@@ -195,77 +157,50 @@ class LagBank:
         return [math.exp(-age / tau) for tau in self.taus]
 
 
-class Plays:
-    """
-    Play operators, the parts of rate-independent hysteresis, of some half-widths r [K] on an input
-    v, which they follow only where it pushes them: ``P = min(max(P, v - r), v + r)``.
-    """
-
-    def __init__(self, widths: tuple[float, ...]) -> None:
-        self.widths = widths
-        self._held: list[float] = []
-
-    def forget(self) -> None:
-        """Begin anew with the next input, in the middle of every play."""
-        self._held = []
-
-    def step(self, v: float) -> None:
-        """Take the next value of the input."""
-        held = self._held
-        if not held:
-            self._held = [v] * len(self.widths)
-            return
-        self._held = [
-            v - r if p < v - r else v + r if p > v + r else p
-            for p, r in zip(held, self.widths, strict=True)
-        ]
-
-    def at(self, v: float) -> list[float]:
-        """Give each play less its input, for a value that is not remembered."""
-        if not self._held:
-            return [0.0] * len(self.widths)
-        result = []
-        for held, r in zip(self._held, self.widths, strict=True):
-            beside = held - v
-            result.append(-r if beside < -r else r if beside > r else beside)
-        return result
+@lru_cache(maxsize=1024)
+def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], list[float]]:
+    """Give what a step keeps of each lag, and what it takes of the input's change."""
+    dt = dt_ns * 1e-9
+    lost = [-math.expm1(-dt / tau) for tau in taus]
+    return [1.0 - part for part in lost], [
+        part * (tau / dt) for part, tau in zip(lost, taus, strict=True)
+    ]
 
 
 class ThermalMemory:
-    """All that a tracker remembers: lags of the board and of each gradient, plays."""
+    """
+    All that a tracker remembers: lags of the board and of each gradient, plays.
+
+    A play is a part of rate-independent hysteresis, of a half-width r [K] on an input v, which it
+    follows only where this pushes it: ``P = min(max(P, v - r), v + r)``.
+    """
 
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
         self.board = LagBank(spec.taus(BOARD_INPUT))
         self.neighbours = [LagBank(spec.taus(name)) for name in spec.sensors]
         self.is_empty = not spec.lags and not spec.plays
-        places: list[int] = []
-        widths: list[list[float]] = []
-        for tau, width in spec.plays:
-            place = self.board.taus.index(tau) if tau else -1
-            if not places or places[-1] != place:
-                places.append(place)
-                widths.append([])
-            widths[-1].append(width)
-        #: Plays that follow the same input stand together: index of the lag, -1 for none.
-        self._plays = [
-            (place, Plays(tuple(some))) for place, some in zip(places, widths, strict=True)
-        ]
+        #: Of each play the lag that it follows, -1 for the board itself, and its half-width.
+        self._inputs = [self.board.taus.index(tau) if tau else -1 for tau, _ in spec.plays]
+        self._widths = [width for _, width in spec.plays]
+        self._held: list[float] = []
 
     def forget(self) -> None:
-        """Forget everything."""
+        """Forget everything; each play begins anew in its middle."""
         self.board.forget()
         for bank in self.neighbours:
             bank.forget()
-        for _, plays in self._plays:
-            plays.forget()
+        self._held = []
 
     def board_step(self, stamp_ns: int, board: float) -> None:
         """Take the next estimate of the board temperature [degC]."""
-        bank = self.board
-        bank.step(stamp_ns, board)
-        for place, plays in self._plays:
-            plays.step(board if place < 0 else board - bank.lagging[place])
+        self.board.step(stamp_ns, board)
+        lagging = self.board.lagging
+        inputs = [board if place < 0 else board - lagging[place] for place in self._inputs]
+        self._held = [
+            v - r if p < v - r else v + r if p > v + r else p
+            for p, v, r in zip(self._held or inputs, inputs, self._widths, strict=True)
+        ]
 
     def note_jump(self, change: float) -> None:
         """Doubt everything by a change of the board temperature that was none."""
@@ -285,16 +220,17 @@ class ThermalMemory:
         result = [0.0] * (2 * len(values))
         result[0::2] = values
         result[1::2] = extra
-        for place, plays in self._plays:
-            result += plays.at(board if place < 0 else board - lagging[place])
+        if not self._held:
+            return result + [0.0] * len(self._widths)
+        for place, p, r in zip(self._inputs, self._held, self._widths, strict=True):
+            beside = p - (board if place < 0 else board - lagging[place])
+            result.append(-r if beside < -r else r if beside > r else beside)
         return result
 
     def start_shares(self, stamp_ns: int) -> list[float]:
         """Say what is left at a stamp of each lag's start, 1 to 0, in the order of the spec."""
-        result = self.board.start_shares(stamp_ns)
-        for bank in self.neighbours:
-            result = result + bank.start_shares(stamp_ns)
-        return result
+        banks = (self.board, *self.neighbours)
+        return [share for bank in banks for share in bank.start_shares(stamp_ns)]
 
 
 def memory_on_grid(
