@@ -226,7 +226,7 @@ def test_unknown_until_the_windows_are_filled():
         board.update(k * SECOND_NS, 20.0)
         case.update(k * SECOND_NS, 20.0)
         assert detector.update(k * SECOND_NS, case, board) == UNKNOWN
-    assert (detector.direction, detector.switched_ns) == (0, None)
+    assert detector.direction == 0
 
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=12000.0, **parts):
@@ -418,9 +418,8 @@ def test_reset_is_a_fresh_start():
             regimes.append(detector.update(k * SECOND_NS, case, board))
         assert regimes[0] == UNKNOWN
         assert regimes[-1] == STATIC
-        assert detector.switched_ns == regimes.index(STATIC) * SECOND_NS
         detector.reset()
-        assert (detector.regime, detector.direction, detector.switched_ns) == (UNKNOWN, 0, None)
+        assert (detector.regime, detector.direction) == (UNKNOWN, 0)
 
 
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])

@@ -60,21 +60,14 @@ class GravityCheck:
         self.is_refuted = False
         self._n_alike = 0
         self._is_against = False
-        self._window_ns: int | None = None
-        self._last_ns = 0
-        self._clear_window()
-        self._last_mean: tuple[float, float, float] | None = None
+        self._forces: list[Sequence[float]] = []
+        self._begin_ns = self._last_ns = 0
+        self._last_mean: list[float] | None = None
         self._residual = 0.0
         self._variance = 0.0
         self._weight = 0.0
         self._n_windows = 0
         self._is_still = False
-
-    def _clear_window(self) -> None:
-        self._n = 0
-        self._sum_x = self._sum_y = self._sum_z = 0.0
-        self._squares = 0.0
-        self._origin = (0.0, 0.0, 0.0)
 
     def wants(self, stamp_ns: int) -> bool:
         """Say whether a sample is far enough from the last one to tell something new."""
@@ -88,34 +81,27 @@ class GravityCheck:
         noise_variance: float,
     ) -> None:
         """Take a sample, its covariance xx .. zz, and the noise of one in the trace [m^2/s^4]."""
-        start = self._window_ns
-        x, y, z = force
         if (
-            start is None
-            or not 0 <= stamp_ns - start < LONGEST_WINDOW_NS
+            not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
             or not 0 <= stamp_ns - self._last_ns < 3 * WINDOW_NS
         ):
-            self._window_ns = start = stamp_ns
-            self._clear_window()
-            self._origin = (x, y, z)
+            self._forces = []
+        if not self._forces:
+            self._begin_ns = stamp_ns
         self._last_ns = stamp_ns
-        from_x, from_y, from_z = self._origin
-        dx, dy, dz = x - from_x, y - from_y, z - from_z
-        self._sum_x += dx
-        self._sum_y += dy
-        self._sum_z += dz
-        self._squares += dx * dx + dy * dy + dz * dz
-        self._n += 1
-        if self._n >= SMALLEST_WINDOW and stamp_ns - start >= 0.98 * WINDOW_NS:
+        self._forces.append(force)
+        is_long = stamp_ns - self._begin_ns >= 0.98 * WINDOW_NS
+        if is_long and len(self._forces) >= SMALLEST_WINDOW:
             self._close(covariance, noise_variance)
-            self._window_ns = None
+            self._forces = []
 
     def _close(self, covariance: Sequence[float], noise_variance: float) -> None:
-        n = self._n
-        shift = [self._sum_x / n, self._sum_y / n, self._sum_z / n]
-        mean = tuple(o + s for o, s in zip(self._origin, shift, strict=True))
-        scatter = (self._squares - n * sum([s * s for s in shift], 0.0)) / (n - 1)
-        last, self._last_mean = self._last_mean, (mean[0], mean[1], mean[2])
+        n = len(self._forces)
+        axes = list(zip(*self._forces, strict=True))
+        mean = [math.fsum(values) / n for values in axes]
+        squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
+        scatter = math.fsum(squares) / (n - 1)
+        last, self._last_mean = self._last_mean, mean
         # Two means of n samples differ by noise, too: at most four standard deviations of it.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         self._is_still = (
@@ -125,7 +111,7 @@ class GravityCheck:
         )
         if not self._is_still:
             return
-        size = math.sqrt(sum([value * value for value in mean], 0.0))
+        size = math.hypot(*mean)
         # The calibration's error is common to the samples of a window, their noise averages out.
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n

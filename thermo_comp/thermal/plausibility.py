@@ -36,8 +36,6 @@ OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: A frozen sensor may be off by any temperature it was made for, at most by this [K].
 LARGEST_DOUBT: Final = 60.0
-#: Doubt below this is none [K^2].
-_SMALLEST_DOUBT: Final = 1e-6
 
 #: A lead must be this large [K] and this part of the movement to be one ...
 LEAD_K: Final = 0.5
@@ -60,10 +58,6 @@ class Fault(Enum):
     FROZEN = 'frozen'
     #: A change that no part can make: its readings do not count.
     STEP = 'jumped'
-
-
-#: Looked at with every reading.
-_NO_FAULT = Fault.NONE
 
 
 class SensorCheck:
@@ -121,7 +115,7 @@ class SensorCheck:
         age = (stamp_ns - own_ns) * 1e-9
         # A reading that is near anything the estimate may have come to is no step: the usual case.
         if (
-            fault is _NO_FAULT
+            fault is Fault.NONE
             and abs(celsius - own.temperature) + abs(own.rate) * age < LARGEST_STEP
         ):
             self._n_used += 1
@@ -188,11 +182,6 @@ class SensorCheck:
         if not self._jumped:
             return 0.0
         return self._jumped * exp(-max(stamp_ns - self._jumped_ns, 0) * self._decay)
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether `doubt` may give anything but 0."""
-        return self._n_same >= self._n_doubtful or self._jumped > _SMALLEST_DOUBT
 
     def doubt(self, stamp_ns: int) -> float:
         """Return the variance that comes to the temperature's: standstills and jumps [K^2]."""

@@ -71,7 +71,6 @@ class RegimeDetector:
         """Back to unknown, as after time has jumped back."""
         self.regime = Regime.UNKNOWN
         self.direction = 0
-        self.switched_ns: int | None = None
         self._stamp_ns: int | None = None
         self._calm_ns: int | None = None
         self._held_until_ns: int | None = None
@@ -143,7 +142,6 @@ class RegimeDetector:
             change.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
             self.regime = Regime.STATIC
             self.direction = 0
-            self.switched_ns = stamp_ns
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
@@ -162,7 +160,6 @@ class RegimeDetector:
         self.regime = Regime.DYNAMIC
         self.direction = direction
         self._turning_ns = None
-        self.switched_ns = stamp_ns
         self._is_grown = False
         # An onset is seen long before the rate has grown: give the ramp time to show.
         hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))

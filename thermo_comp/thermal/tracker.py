@@ -65,7 +65,6 @@ class ThermalTracker:
         #: Stamp of the newest reading that was used, None before the first.
         self.updated_ns: int | None = None
         self._decided_ns: int | None = None
-        self._is_doubted = False
         self._weight = 0.0
         self._weight_ns = 0
         self._target = 0.0
@@ -115,7 +114,6 @@ class ThermalTracker:
             self._guess_gradients(stamp_ns)
         for other in self._checks:
             other.watch_other()
-        self._note(stamp_ns)
         if not self.is_live(stamp_ns):
             self._decide(stamp_ns, None)
         return True
@@ -134,7 +132,6 @@ class ThermalTracker:
             return False
         if bank.taus and self.board.stamp_ns is not None:
             bank.step(stamp_ns, sensor.temperature - self.board.at(stamp_ns)[0])
-        self._note(stamp_ns)
         if place == 0:
             self._board_check.watch_other()
             detector = self.detector
@@ -157,46 +154,28 @@ class ThermalTracker:
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            self._is_doubted = True
-            if not self._may_begin_anew(check, stamp_ns, patience_s):
+            # One that has stayed for long where it cannot have come to begins again.
+            age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
+            if check.fault != Fault.STEP or age_s <= patience_s:
                 return False
-        if is_anew or check.is_revived:
+            check.reset()
+        is_new = is_anew or check.is_revived
+        if is_new:
             sensor.reset()
         if not sensor.update(stamp_ns, celsius):
             return False
-        is_new = is_anew or check.is_revived
         has_restarted = sensor.n_restarts != n_restarts
         if before_ns is not None and (is_new or has_restarted):
-            lag_s = sensor.settings.lag_s
-            is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > lag_s
+            is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
             if isinstance(memory, ThermalMemory) and (is_anew or is_gap):
                 memory.forget()
             if is_new or not is_gap:
                 change = sensor.temperature - before
                 check.note_jump(stamp_ns, change)
                 memory.note_jump(change)
-        return True
-
-    @staticmethod
-    def _may_begin_anew(check: SensorCheck, stamp_ns: int, patience_s: float) -> bool:
-        """Let a sensor begin again that has stayed for long where it cannot have come to."""
-        seen_ns = check.own.stamp_ns
-        if check.fault != Fault.STEP or seen_ns is None:
-            return False
-        if (stamp_ns - seen_ns) * 1e-9 <= patience_s:
-            return False
-        check.reset()
-        return True
-
-    def _note(self, stamp_ns: int) -> None:
         if self.updated_ns is None or stamp_ns > self.updated_ns:
             self.updated_ns = stamp_ns
-        is_doubted = (
-            self._board_check.is_doubtful or self.lead.is_reversed or self.lead.doubt > 0.0
-        )
-        for check in self._checks:
-            is_doubted = is_doubted or check.is_doubtful
-        self._is_doubted = is_doubted
+        return True
 
     def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
         board = self.board if self.board.stamp_ns is not None else None
@@ -252,8 +231,7 @@ class ThermalTracker:
             gradients.append(gradient)
             state.append(gradient)
             state.append(variance)
-        if self._is_doubted:
-            self._add_doubt(stamp_ns, state)
+        self._add_doubt(stamp_ns, state)
         if not self.memory.is_empty:
             state += self.memory.at(stamp_ns, board, gradients)
         return tuple(state)
