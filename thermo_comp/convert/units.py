@@ -28,6 +28,7 @@ _TOLERANCE = 0.2
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12
+_RUN_ROWS = 1 << 16  # reduced at once: bounded memory
 # Noise this many times the quiet level is handling, not noise: the sd of 12 samples stays within
 # a factor of 2 of its mean.
 _MOVING_RATIO = 4.0
@@ -56,7 +57,9 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     readings (n, 3).
     """
     reduced = CellAccumulator(_CELL_S, None)
-    reduced.add(stamp_ns, accel)
+    for first in range(0, len(accel), _RUN_ROWS):
+        run = slice(first, first + _RUN_ROWS)
+        reduced.add(stamp_ns[run], accel[run])
     cells = reduced.finish()
     full = cells.count >= _MIN_SAMPLES
     if full.any():
