@@ -82,16 +82,18 @@ def test_each_value_by_hand():
     spec = memory_of(columns, ('case', 'tip'))
     layout = Layout(spec)
     # board, var, rate, weight, unknown; case, tip; two lags; a play.
-    state = (23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1)
+    state = np.array(
+        [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
+    ).T
     assert layout.width == len(state)
-    found = ColumnTable(columns, spec, 20.0).values(state)
+    found = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
     expected = [
         -0.7, 0.01, 0.5, -0.3, -0.9, math.tanh(0.64) * 9.0, 0.1, 0.25, 0.375, 0.125 * 27.0,
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0,
     ]  # fmt: skip
     assert found == pytest.approx(expected)
     # t is held at the edge of the calibrated temperatures, the lag itself is not.
-    at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)
+    at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5
 
@@ -107,10 +109,10 @@ def test_one_state_has_the_bits_of_many(boards):
             tracker.read(name, second * SECOND_NS, celsius + ahead * second)
         rows.append(tracker.sample(second * SECOND_NS + 300_000_000))
     spec = tracker.spec
-    many = ColumnTable(columns, spec, 20.0, (-20.0, 30.0)).values(tuple(np.array(rows).T.copy()))
-    for k, row in enumerate(rows):
-        one = ColumnTable(columns, spec, 20.0, (-20.0, 30.0)).values(row)
-        assert one == [column[k] for column in many]
+    table, states = ColumnTable(columns, spec, 20.0, (-20.0, 30.0)), np.array(rows).T
+    many = table.values(states)
+    for k in range(len(rows)):
+        np.testing.assert_array_equal(table.values(states[:, [k]])[:, 0], many[:, k])
 
 
 def test_lags_of_a_neighbour_in_a_ramp():
@@ -123,7 +125,8 @@ def test_lags_of_a_neighbour_in_a_ramp():
         tracker.read('board', second * SECOND_NS, 20.0)
         tracker.read('case', second * SECOND_NS, 20.0)
         tracker.read('tip', second * SECOND_NS, 20.0 + rate * second)
-    found = ColumnTable(columns, spec, 20.0).values(tracker.sample(n * SECOND_NS))
+    state = np.array(tracker.sample(n * SECOND_NS))[:, np.newaxis]
+    found = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
     expected = [rate * (n - tau * -math.expm1(-n / tau)) for tau in BANK_TAUS]
     # The thermometer needs some readings to bend into the ramp: a few mK.
     assert found == pytest.approx(expected, abs=0.02)

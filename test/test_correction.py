@@ -169,19 +169,14 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
         nominal = Correction(unit).bias_scale(state)
         scatter = []
         for d in draws.tolist():
-            moved = Correction(drawn(unit, layout, d)).bias_scale(state)
+            bias, scale = (Correction(drawn(unit, layout, d)).bias_scale(state) - nominal) / 300.0
             levels = [
                 (1.0 - weight) * d[block.static] + weight * d[block.dynamic]
                 for block in layout.scale
             ]
-            scatter.append(
-                [
-                    ((bias - b) / 300.0, (scale - s) / 300.0 + level)
-                    for (bias, scale), (b, s), level in zip(moved, nominal, levels, strict=True)
-                ]
-            )
+            scatter.append(np.column_stack((bias, scale + levels)))
         scatter = np.array(scatter)
-        for axis, (a, b, c) in enumerate(slow.at(state, nobody)):
+        for axis, (a, b, c) in enumerate(np.reshape(slow.at(state, nobody), (3, 3))):
             for x in (-9.8, 0.0, 9.8):
                 found = np.var(scatter[:, axis, 0] + scatter[:, axis, 1] * x)
                 # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %: 4 sigma.
@@ -244,8 +239,8 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     small = 0.05
     moved[first : first + 2 * len(lags) : 2] += small * (draws * np.array(shares)).T
     found = Correction(wide).bias_scale(tuple(moved))
-    for axis, (a, b, c) in enumerate(slow):
-        bias, scale = found[axis]
+    for axis, (a, b, c) in enumerate(np.reshape(slow, (3, 3))):
+        bias, scale = found[:, axis]
         for x in (-9.8, 0.0, 9.8):
             expected = np.var(bias / 300.0 + scale / 300.0 * x) / small**2
             # 4000 draws: 2.2 %; 4 sigma.
@@ -323,11 +318,11 @@ def test_the_state_at_the_edge_of_a_column_is_held_and_what_is_cut_off_is_paid_f
         response=(term('now', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
     )
     correction = Correction(unit)
-    nothing = [(0.0, 0.0, 0.0)] * 3
     inside, outside = ((20.0, 0.0, 0.0, 0.0, 0.0, g, 0.0) for g in (1.0, 3.0))
-    assert correction.bias_scale(inside) == correction.bias_scale(outside)
-    (_, edge), (_, beyond) = (correction.evaluate(s, nothing) for s in (inside, outside))
-    assert math.sqrt(beyond[0][0] - edge[0][0]) == pytest.approx(30.0 / 300.0 * 2.0)
-    assert beyond[1] == edge[1]
-    assert correction.relative_excess(outside) == pytest.approx(2.0)
-    assert correction.gradient_excess(outside) == 2.0
+    edge, beyond = (correction.line(s, s, np.zeros(9), 0.0) for s in (inside, outside))
+    assert beyond[:12].tolist() == edge[:12].tolist()
+    assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
+    assert beyond[15:18].tolist() == edge[15:18].tolist()
+    excess = correction.excess(outside, is_dynamic=False)
+    assert excess.relative == pytest.approx(2.0)
+    assert excess[:3] == (0.0, 0.0, 2.0)

@@ -108,7 +108,7 @@ def test_columns_are_those_of_the_tracker(bags: list[ReducedBag]) -> None:
             tracker.read(name, at, value)
             reading += 1
         states.append(tracker.sample(stamp))
-    phi = np.column_stack(table.values(tuple(np.array(states).T)))
+    phi = table.values(np.array(states).T).T
     seconds = (grid - bag.start_ns) * 1e-9
     n_sets = rows.shape[1] - phi.shape[1]
     # Means over the windows of a minute.
@@ -160,15 +160,14 @@ def test_the_lag_of_a_column_moves_it_as_its_start_says(bags: list[ReducedBag]) 
     state[0] = 27.0
     for lag, place in layout.lags.items():
         state[place] = 0.3 + 1e-4 * lag[1]
-    before = np.array(table.values(tuple(state)))
+    before = table.values(state[:, np.newaxis])
     for column_number, column in enumerate(bank()):
         if not column.lag or column.kind == 'play':
             continue
         moved = state.copy()
         moved[layout.lags[column.lag]] += 1e-6
-        slope = (
-            np.array(table.values(tuple(moved)))[column_number] - before[column_number]
-        ) / 1e-6
+        after = table.values(moved[:, np.newaxis])
+        slope = (after - before)[column_number, 0] / 1e-6
         u = state[layout.lags[column.lag]]
         expected = (2.0 * u if column.kind == 'square' else 1.0) * 7.0**column.power
         assert slope == pytest.approx(expected, rel=1e-4)
@@ -235,7 +234,7 @@ def test_the_file_corrects_as_the_regression(result: FitResult) -> None:
     windows, calibration = result.windows, result.calibration
     state, prior = result.learnt.posterior.state, result.learnt.prior
     correction = Correction(calibration)
-    pairs = correction.bias_scale(states_of(windows, calibration))
+    pairs = correction.bias_scale(states_of(windows, calibration)).swapaxes(0, 1)
     force = np.column_stack(
         [(windows.data.mean[:, k] - bias) / scale for k, (bias, scale) in enumerate(pairs)]
     )

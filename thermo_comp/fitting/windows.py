@@ -123,9 +123,10 @@ def thermal_windows(
         begin, grid, states, shares = _states(
             reduced, spec, detector, config, reference_temperature
         )
-        raw = table.raw(tuple(states.T))
+        raw = table.raw(states.T)
         curves, groups = sets.columns(states[:, BOARD] - reference_temperature, states[:, WEIGHT])
-        values = [*curves, *table.weighted(raw, states[:, BOARD], states[:, WEIGHT])]
+        factors, _ = table.factors(states[:, BOARD], states[:, WEIGHT])
+        values = [*curves, *(raw * factors)]
         moved = _moved(columns, spec, states, shares, reference_temperature)
         whole = np.column_stack((states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved))
         for interval in reduced.intervals:

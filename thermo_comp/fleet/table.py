@@ -172,11 +172,11 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
     parts: dict[str, Sequence[float] | Floats] = {
         'scale_{0}': scale,
         'scale_sd_{0}_ppm': scale_sd * 1e6,
-        'scale_slope_{0}_ppm_k': [one.scale_function.slope(0.0) * 1e6 for one in static],
+        'scale_slope_{0}_ppm_k': [float(one.scale_function.slope(0.0)) * 1e6 for one in static],
         'bias_{0}_ug': bias / MICRO_G,
         'bias_sd_{0}_ug': bias_sd / MICRO_G,
         'bias_slope_{0}_ug_k': [
-            one.bias_function.slope(0.0) / (axis.scale_factor * MICRO_G)
+            float(one.bias_function.slope(0.0)) / (axis.scale_factor * MICRO_G)
             for one, axis in zip(static, axes, strict=True)
         ],
         'm_{0}_urad': [calibration.misalignment[i][j] * 1e6 for i, j in _BELOW],

@@ -10,7 +10,6 @@ is gathered, evaluated for all segments together and applied to all samples by t
 from __future__ import annotations
 
 from dataclasses import fields
-from itertools import chain
 from typing import TypeAlias
 
 import numpy as np
@@ -19,7 +18,7 @@ from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.correction import Correction
 from .blocks import AccelBlock, CompensatedBlock
 from .compensator import TIME_JUMP_NS, Compensator
-from .kernel import Lines, lay_lines
+from .kernel import Lines
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
 
@@ -153,7 +152,7 @@ def _apply(
         force = lines.correct(stamps, samples, correction.misalignment)
         is_kept = _judge(compensator, segments, stamps, samples, force)
         if angular_rate is not None and of_rate is not None:
-            rate = _lines(of_rate, segments, 3).correct(stamps, angular_rate[index], None)
+            rate = _lines(of_rate, segments, 9).correct(stamps, angular_rate[index], None)
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
             rate = rate[:, is_kept] if has_rate else rate
@@ -164,15 +163,11 @@ def _apply(
 def _lines(correction: Correction, segments: list[tuple[Segment, int]], first: int) -> Lines:
     """Evaluate a correction for all segments; its slow variances are those from the `first` on."""
     each = [segment for segment, _ in segments]
-    start, end = (np.array([one[end] for one in each]).T for end in (4, 5))
-    flat = [list(chain.from_iterable(one.slow[first : first + 3])) for one in each]
-    slow = np.array(flat).T.reshape(3, 3, -1)
+    start, end, slow = (np.array([one[part] for one in each]).T for part in (4, 5, 6))
     excess = np.array([one.noise_excess for one in each])
-    columns = lay_lines(
-        correction, list(start), list(end), [(a, b, c) for a, b, c in slow], excess
-    )
+    table = correction.line(start, end, slow[first : first + 9], excess)
     starts = np.array([one.start_ns for one in each], dtype=np.int64)
-    return Lines(starts, columns, np.array([count for _, count in segments]))
+    return Lines(starts, table, np.array([count for _, count in segments]))
 
 
 def _judge(

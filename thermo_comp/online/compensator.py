@@ -19,7 +19,7 @@ from typing import Final
 
 from ..unit.calibration import Calibration
 from .gravity_check import GravityCheck
-from .kernel import corrected, corrected_rate, lay_lines
+from .kernel import corrected, corrected_rate
 from .sample_checks import StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, ThermalSide
 from .status import CompensatorConfig, Counters
@@ -41,7 +41,7 @@ class Compensator:
         self.thermal = ThermalSide(calibration, self.config, self.counters)
         self._use(calibration)
         self.last_ns = self.event_ns = EVER_NS
-        #: Of the present segment, as `lay_lines` gives it; empty where no rate is corrected.
+        #: Of the present segment, as `Correction.line` gives it; empty where no rate is corrected.
         self.rate_line: list[float] = []
 
     def _use(self, calibration: Calibration) -> None:
@@ -139,9 +139,9 @@ class Compensator:
         start_ns, is_new, is_too_fast, excess, start, end, slow = segment
         self.event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
         correction = thermal.correction
-        line = lay_lines(correction, start, end, slow[:3], excess)
+        line = correction.line(start, end, slow[:9], excess).tolist()
         if thermal.rate_correction is not None:
-            self.rate_line = lay_lines(thermal.rate_correction, start, end, slow[3:], excess)
+            self.rate_line = thermal.rate_correction.line(start, end, slow[9:], excess).tolist()
         self._segment = (start_ns, line, correction.misalignment)
         if not is_new:
             return self.process(stamp_ns, x, y, z)

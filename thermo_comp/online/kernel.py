@@ -1,47 +1,24 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the arithmetic of a segment: bias, scale and variance as lines, and samples corrected by them.
+Owns the arithmetic of samples: corrected by the line of bias, scale and variance of their segment.
 
 The same lines of code take one sample, as floats, and the samples of many segments, as arrays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, TypeVar
 
 import numpy as np
 
 from ..typing import Floats, Ints, Stamps
-from ..unit.correction import Correction, Variance
-from ..unit.functions import Number
 
+#: One sample's, or those of many.
+Number = TypeVar('Number', float, Floats)
 #: Samples corrected at a time: their columns stay in the cache.
 PIECE: Final = 4096
-
-
-def lay_lines(
-    correction: Correction,
-    start: Sequence[Number],
-    end: Sequence[Number],
-    slow: Sequence[Variance[Number]],
-    noise_excess: Number,
-) -> list[Number]:
-    """
-    Lay a line from the beginning of a segment, or of many as arrays, to the end.
-
-    Returns per axis bias, its change per second, scale, its change per second; then per axis a, b,
-    c of the error variance.
-    """
-    at_start = correction.bias_scale(start)
-    at_end, variances = correction.evaluate(end, slow)
-    result: list[Number] = []
-    for (bias, scale), (bias_end, scale_end) in zip(at_start, at_end, strict=True):
-        result += [bias, bias_end - bias, scale, scale_end - scale]
-    for (a, b, c), noise in zip(variances, correction.noise, strict=True):
-        result += [a + noise_excess * noise, b, c]
-    return result
 
 
 def corrected(
@@ -94,9 +71,9 @@ _COLUMNS: Final = (0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8)
 class Lines:
     """Segments one after the other: starts, lines as columns, and samples that each has."""
 
-    def __init__(self, start_ns: Ints, columns: Sequence[Floats], counts: Ints) -> None:
+    def __init__(self, start_ns: Ints, table: Floats, counts: Ints) -> None:
         self._start_ns = start_ns
-        self._table = np.array(columns)
+        self._table = table
         self._ends = np.cumsum(counts)
 
     def correct(

@@ -23,7 +23,7 @@ from ..thermal.settings import ThermalConfig
 from ..thermal.state import BOARD, ThermalState
 from ..thermal.tracker import ThermalTracker
 from ..unit.calibration import Calibration
-from ..unit.correction import Correction, Variance
+from ..unit.correction import Correction
 from ..unit.rate_triad import rate_triad
 from ..unit.uncertainty import SlowUncertainty
 from .sample_checks import RateCheck
@@ -55,7 +55,7 @@ class Segment(NamedTuple):
     start: tuple[float, ...]
     end: tuple[float, ...]
     #: What parameters and starts leave uncertain of each axis; of the angular rate's behind them.
-    slow: list[Variance[float]]
+    slow: list[float]
 
 
 class ThermalSide:
@@ -93,7 +93,7 @@ class ThermalSide:
     def _forget_segment(self) -> None:
         self._segment_key: tuple[int, int] | None = None
         self._slow_key: int | None = None
-        self._slow: list[Variance[float]] = []
+        self._slow: list[float] = []
 
     def _thermal_config(self) -> ThermalConfig:
         return ThermalConfig(
@@ -231,7 +231,7 @@ class ThermalSide:
         excess = self.rate.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
-    def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[Variance[float]]:
+    def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[float]:
         """Give the slow part of the variance of a segment, evaluated at its end or held."""
         key = start_ns // SLOW_NS
         if key != self._slow_key:

@@ -36,10 +36,9 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     if usual < stale_after:
         stale_after = max(usual, SHORTEST_STALE_S)
     state = thermal.sample(stamp_ns)
-    correction = thermal.correction
     board, case = (tracker.checks[name] for name in thermal.inputs[:2])
     is_dynamic = tracker.detector.regime == Regime.DYNAMIC
-    excess = (correction.dynamic if is_dynamic else correction.static).excess(state)
+    excess = thermal.correction.excess(state, is_dynamic=is_dynamic)
     return CompensatorStatus(
         counters,
         stamp_ns,
@@ -49,10 +48,10 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         board_age > stale_after,
         board_age > compensator.config.temperature_timeout_s,
         not tracker.is_live(stamp_ns),
-        correction.relative_excess(state),
+        excess.relative,
         excess.temperature,
         excess.rate * 60.0,
-        gradient_excess_k=correction.gradient_excess(state),
+        gradient_excess_k=excess.gradient,
         board_fault=board.fault,
         case_fault=case.fault,
         board_step_k=board.step,

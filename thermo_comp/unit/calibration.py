@@ -89,6 +89,10 @@ class Axes:
     y: AxisReference
     z: AxisReference
 
+    def __iter__(self) -> Iterator[AxisReference]:
+        """Give the three axes in order."""
+        return iter((self.x, self.y, self.z))
+
 
 @dataclass(frozen=True)
 class AxisSet:

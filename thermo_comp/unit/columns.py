@@ -26,13 +26,13 @@ and t at those of the calibrated temperatures. The groups of the bank are its ki
 *mixed* are board, and now and neighbour, of power 1: coefficients that change with temperature.
 
 This is the one table of columns: tracker, fit, correction, covariance and file take theirs from
-here, so that another regressor is an entry of `bank` and, if it is of a new kind, of `_value`.
+here, so that another regressor is an entry of `bank` and, if it is of a new kind, of `_FORMS`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal
 
@@ -40,7 +40,8 @@ import numpy as np
 
 from ..thermal.memory import BOARD_INPUT, MemorySpec
 from ..thermal.state import BOARD, RATE, WEIGHT, Layout
-from .functions import Number, hold
+from ..typing import Floats
+from .functions import by_element, hold
 from .schema import Bounds, NotNegative
 
 #: A range that holds nothing back, of any value.
@@ -172,12 +173,25 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     )
 
 
+#: What a value is made of: its form and slope, of x = number of the state / width.
+_FORMS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
+    'line': (lambda x: x, np.ones_like),
+    'square': (lambda x: x * x, lambda x: 2.0 * x),
+    'size': (np.abs, np.sign),
+    'even': (
+        lambda x: by_element(math.tanh, x * x),
+        lambda x: 2.0 * x * (1.0 - by_element(math.tanh, x * x) ** 2),
+    ),
+}
+_DURING: Final = ('always', 'static', 'dynamic')
+
+
 class ColumnTable:
     """
-    Columns, ready to be evaluated; the same bits for one state and for many.
+    Columns, ready to be evaluated over states, shape (width, n); a result has (n_columns, n).
 
-    reference_temperature: T_ref [degC]
-    temperature_range_c: at the edges of which t is held [degC]
+    Each state is evaluated alone, number by number, so that one has the bits of many.
+    `reference_temperature` is T_ref, `temperature_range_c` where t is held [degC].
     """
 
     def __init__(
@@ -192,134 +206,72 @@ class ColumnTable:
         self._reference = reference_temperature
         lower, upper = temperature_range_c
         self._t_range = lower - reference_temperature, upper - reference_temperature
-        self._n_powers = max((column.power for column in columns), default=0)
+        self._range = np.array([one.range for one in columns]).reshape(-1, 2).T[:, :, np.newaxis]
+        self._power = np.array([one.power for one in columns], np.int64)
+        self._lowered = np.maximum(self._power - 1, 0)
+        self._during = np.array([_DURING.index(one.during) for one in columns], np.int64)
         #: Whether any column belongs to one regime alone.
-        self.differs = any(column.during != 'always' for column in columns)
+        self.differs = bool(self._during.any())
         # What differs only in power, range or regime is evaluated once.
-        sources: dict[tuple[str, int, float], int] = {}
-        self._plan: list[tuple[int, float, float, int, str]] = []
-        for column in columns:
-            width = column.width_k if column.kind == 'even' else 0.0
-            bend = column.kind if column.kind in ('even', 'size', 'square') else ''
-            key = (bend, _place(column, layout), width)
-            source = sources.setdefault(key, len(sources))
-            self._plan.append((source, *column.range, column.power, column.during))
-        self._sources = list(sources)
+        of = [_source(one, layout) for one in columns]
+        sources = list(dict.fromkeys(of))
+        self._source = np.array([sources.index(one) for one in of], np.int64)
+        self._places = np.array([place for place, _, _ in sources], np.int64)
+        self._widths = np.array([width for _, _, width in sources])[:, np.newaxis]
+        rows = {
+            form: [k for k, (_, own, _) in enumerate(sources) if own == form] for form in _FORMS
+        }
+        self._forms = [(rows[form], *both) for form, both in _FORMS.items() if rows[form]]
+        #: Which number of a state each column is made of.
+        self.places = self._places[self._source]
 
-    def raw(self, state: Sequence[Number]) -> list[Number]:
+    def raw(self, states: Floats) -> Floats:
         """Evaluate u of each column, not held."""
-        found = [_value(bend, state[place], width) for bend, place, width in self._sources]
-        return [found[source] for source, _, _, _, _ in self._plan]
+        u = states[self._places] / self._widths
+        for rows, value, _ in self._forms:
+            u[rows] = value(u[rows])
+        return np.asarray(u[self._source])
 
-    def held(self, raw: Sequence[Number]) -> list[Number]:
+    def held(self, raw: Floats) -> Floats:
         """Hold what `raw` gives at the edges of the columns' ranges."""
-        return [
-            hold(u, lower, upper)
-            for u, (_, lower, upper, _, _) in zip(raw, self._plan, strict=True)
-        ]
+        return hold(raw, *self._range)
 
-    def excess(
-        self, raw: Sequence[Number], held: Sequence[Number], nil: Number, which: Iterable[int]
-    ) -> Number:
-        """Say how far the farthest of some columns lies outside its range, in half ranges."""
-        result = nil
-        for k in which:
-            _, lower, upper, _, _ = self._plan[k]
-            excess = abs(raw[k] - held[k]) / ((upper - lower) / 2.0)
-            if isinstance(excess, np.ndarray):
-                result = np.maximum(result, excess)
-            elif excess > result:
-                result = excess
-        return result
+    def excess(self, raw: Floats) -> Floats:
+        """Say how far each column lies outside its range, in half ranges."""
+        lower, upper = self._range
+        return np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
 
-    def values(self, state: Sequence[Number]) -> list[Number]:
-        """Evaluate phi of each column."""
-        return self.weighted(self.held(self.raw(state)), state[BOARD], state[WEIGHT])
-
-    def weighted(self, factors: Sequence[Number], board: Number, weight: Number) -> list[Number]:
-        """
-        Multiply a number per column by its power of t and share of its regime; u held makes phi.
-        """
-        powers = self._powers(board)
-        rest = 1.0 - weight
-        result = []
-        for factor, (_, _, _, power, during) in zip(factors, self._plan, strict=True):
-            phi = factor * powers[power] if power else factor
-            if during != 'always':
-                phi = phi * (rest if during == 'static' else weight)
-            result.append(phi)
-        return result
-
-    def slopes(
-        self, state: Sequence[Number], raw: Sequence[Number]
-    ) -> tuple[list[Number], list[Number]]:
-        """Differentiate phi, ranges aside."""
-        board, weight = state[BOARD], state[WEIGHT]
-        one = board * 0.0 + 1.0
-        inner = []
-        for u, (source, _, _, _, _) in zip(raw, self._plan, strict=True):
-            bend, place, width = self._sources[source]
-            slope = one
-            if bend == 'even':
-                slope = 2.0 / (width * width) * state[place] * (1.0 - u * u)
-            elif bend == 'square':
-                slope = 2.0 * state[place]
-            elif bend == 'size':
-                slope = _sign(state[place])
-            inner.append(slope)
-        powers = self._powers(board)
-        rest = 1.0 - weight
-        outer = []
-        for u, (_, _, _, power, during) in zip(raw, self._plan, strict=True):
-            slope = one * 0.0
-            if power:
-                slope = u * float(power)
-            if power > 1:
-                slope = slope * powers[power - 1]
-            if during != 'always':
-                slope = slope * (rest if during == 'static' else weight)
-            outer.append(slope)
-        return self.weighted(inner, board, weight), outer
-
-    def _powers(self, board: Number) -> list[Number]:
-        """Raise t to the powers that occur; that of 0 is not used."""
+    def factors(self, board: Floats, weight: Floats) -> tuple[Floats, Floats]:
+        """Give by what u held is multiplied to make phi: power of t and share; and its slope."""
         t = hold(board - self._reference, *self._t_range)
-        powers = [t, t]
-        for _ in range(1, self._n_powers):
-            powers.append(powers[-1] * t)
-        return powers
+        n_powers = int(self._power.max(initial=0))
+        powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
+        shares = np.array([np.ones_like(weight), 1.0 - weight, weight])[self._during]
+        lowered = self._power[:, np.newaxis] * powers[self._lowered] if n_powers else 0.0
+        return powers[self._power] * shares, lowered * shares
+
+    def values(self, states: Floats) -> Floats:
+        """Evaluate phi of each column."""
+        factors, _ = self.factors(states[BOARD], states[WEIGHT])
+        return np.asarray(self.held(self.raw(states)) * factors)
+
+    def slopes(self, states: Floats) -> Floats:
+        """Differentiate u by the number that it is made of, ranges aside."""
+        x = states[self._places] / self._widths
+        for rows, _, slope in self._forms:
+            x[rows] = slope(x[rows])
+        return np.asarray((x / self._widths)[self._source])
 
 
-def _place(column: Column, layout: Layout) -> int:
-    """Find the number of a sample that a column is made of."""
+def _source(column: Column, layout: Layout) -> tuple[int, str, float]:
+    """Find which number of a state a column is made of, in which form, of which width."""
+    form = column.kind if column.kind in _FORMS else 'line'
     if column.kind == 'rate':
-        return RATE
-    if column.kind == 'play':
-        return layout.plays[column.tau_s, column.width_k]
-    if column.lag:
-        return layout.lags[column.lag]
-    return layout.gradients[column.sensor]
-
-
-def _value(bend: str, u: Number, width: float) -> Number:
-    if not bend:
-        return u
-    if bend == 'square':
-        return u * u
-    if bend == 'size':
-        return abs(u)
-    x = u / width
-    return _tanh(x * x)
-
-
-def _sign(x: Number) -> Number:
-    if isinstance(x, np.ndarray):
-        return np.sign(x)
-    return math.copysign(1.0, x) if x else 0.0
-
-
-def _tanh(x: Number) -> Number:
-    """Hyperbolic tangent with the same bits for a float and for an array of them."""
-    if isinstance(x, np.ndarray):
-        return np.array([math.tanh(v) for v in x.ravel().tolist()]).reshape(x.shape)
-    return math.tanh(x)
+        place = RATE
+    elif column.kind == 'play':
+        place = layout.plays[column.tau_s, column.width_k]
+    elif column.lag:
+        place = layout.lags[column.lag]
+    else:
+        place = layout.gradients[column.sensor]
+    return place, form, column.width_k if form == 'even' else 1.0

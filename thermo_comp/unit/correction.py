@@ -1,34 +1,30 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the arithmetic of the correction: a thermal state in, bias, scale and error variances out.
+Owns the arithmetic of the correction: thermal states in, bias, scale and error variances out.
 
-Written once for one float and for arrays of knots, with the same operations in the same order,
-so a stream and a batch get the same bits. Notation as in `calibration`; x is the axis' specific
-force before the misalignment, its error variance is ``v(x) = a + b x + c x^2``. Its part that
-changes slowly is `uncertainty`'s, and comes in ready.
+States are columns, shape (width, n), of the numbers that `thermal.state` lays out; one state is
+n = 1. Sums run in one order and no state knows of another, so a stream and a batch get the same
+bits. What is said of three axes stands in rows: the bias of x, y, z, then their scale. Notation
+as in `calibration`; x is an axis' specific force before the misalignment, its error variance is
+``v(x) = a + b x + c x^2`` [m^2/s^4].
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from ..thermal.memory import MemorySpec
-from ..thermal.state import BOARD, GRADIENT, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout
+from ..thermal.memory import BOARD_INPUT, MemorySpec
+from ..thermal.state import BOARD, RATE, UNKNOWN, VAR_BOARD, WEIGHT, Layout
+from ..typing import Floats
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
-from .curves import SetCurves
-from .functions import Number
+from .functions import Functions, hold
 from .gravity import MICRO_G
-from .response import Sensitivity, Weights
-
-#: (bias, scale) of one axis.
-BiasScale: TypeAlias = tuple[Number, Number]
-#: (a, b, c) of one axis.
-Variance: TypeAlias = tuple[Number, Number, Number]
 
 #: While the sets cross over, the output moves no faster than this [m/s^3] (1 ug per second) ...
 GENTLE_RATE = MICRO_G
@@ -37,13 +33,87 @@ LONGEST_TRANSITION = 10.0
 _GAP_TEMPERATURES = 33
 #: Rounding to whole counts, twice 1/12 where the converter carries the remainder on [counts^2].
 ROUNDING_VARIANCE = 1.0 / 6.0
+#: So many states at once bound the memory that a line takes.
+_CHUNK = 2048
+
+
+class Excess(NamedTuple):
+    """How far a thermal state lies outside the calibrated ranges; 0 inside."""
+
+    #: Of the set of the regime, signed [K] and [K/s].
+    temperature: float
+    rate: float
+    #: Of the gradient that is farthest outside, signed [K].
+    gradient: float
+    #: All sizes in half ranges, added.
+    relative: float
+
+
+class Curves:
+    """
+    What the two sets make of the board temperature alone: in a result, row 0 is the static set's.
+
+    Beyond its own range a set goes on as the other does, as far as that one was calibrated: what
+    the two differ by is held, not what they have in common.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._reference = calibration.reference_temperature_c
+        sets = calibration.regime_sets()
+        edges = np.array([(one.temperature_range_c, one.rate_range_k_min) for one in sets])
+        # Of each set lower and upper edge, shape (2, 2, 1), first lower.
+        self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
+        self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
+        rows = [
+            [one.bias_function for one in axes] + [one.scale_function for one in axes]
+            for axes in (one.axes() for one in sets)
+        ]
+        self._functions, self._others = Functions(rows), Functions(rows[::-1])
+        biases = [axis.bias for axis in calibration.axes]
+        deltas = [[axis.delta for axis in one.axes()] for one in sets]
+        self._levels = np.add(biases, deltas)[:, :, np.newaxis]
+        #: What each axis' set leaves unexplained, as a variance [m^2/s^4], shape (2, 3, 1).
+        self.residuals = np.array(
+            [[[axis.residual_sd_m_s2**2] for axis in one.axes()] for one in sets]
+        )
+
+    def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
+        """
+        Say how far outside the sets' ranges states lie, shape (2, n): [K], [K/s], and both in half
+        ranges, added.
+        """
+        t, rate = states[BOARD] - self._reference, states[RATE]
+        over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
+        half, half_rate = (one[1] - one[0] for one in (self._t_range, self._rate_range))
+        relative = np.abs(over) / (half / 2.0) + np.abs(too_fast) / (half_rate / 2.0)
+        return over, too_fast, relative
+
+    def values(self, board: Floats) -> Floats:
+        """Evaluate bias [input units] and relative scale at board temperatures, (2, 6, n)."""
+        t = board - self._reference
+        held = hold(t, *self._t_range)
+        result = self._functions.value(held)
+        result[:, :3] += self._levels
+        if (held != t).any():
+            here, edge = (hold(one, *self._t_range[:, ::-1]) for one in (t, held))
+            result += self._others.value(here) - self._others.value(edge)
+        return result
+
+    def slopes(self, board: Floats) -> Floats:
+        """Differentiate what `values` gives, by the board temperature [per K], (2, 6, n)."""
+        return self._functions.slope(hold(board - self._reference, *self._t_range))
+
+    def bases(self, board: Floats, row: int) -> list[list[Floats]]:
+        """Give the regressors of each set's free coefficients of one of the six."""
+        held = hold(board - self._reference, *self._t_range)
+        functions = [one[row] for one in self._functions.rows]
+        return [one.basis(t) for one, t in zip(functions, held, strict=True)]
 
 
 class Correction:
     """
     Both sets of a calibration, blended by the weight of the thermal state, and its response.
 
-    calibration: the unit
     memory: what the tracker must remember, for the angular rate, too; or what it does remember
     noise: variance of the noise of one message per axis, rounding included [m^2/s^4]
     noise_trace: their sum
@@ -51,59 +121,67 @@ class Correction:
     """
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
-        self.static = SetCurves(calibration.static, calibration.dynamic, calibration)
-        self.dynamic = SetCurves(calibration.dynamic, calibration.static, calibration)
-        self._edges = [one.temperature_range_c for one in calibration.regime_sets()]
-        axes = calibration.axes
-        self._K = tuple(axis.scale_factor for axis in (axes.x, axes.y, axes.z))
+        self.curves = Curves(calibration)
+        edges = [edge for one in calibration.regime_sets() for edge in one.temperature_range_c]
+        self._span = min(edges), max(edges)
+        K = [axis.scale_factor for axis in calibration.axes]
+        self.K = np.array(K)[:, np.newaxis]
         self._gravity = calibration.gravity_m_s2
-        response = calibration.response
-        gyroscope = calibration.gyroscope
+        response, gyroscope = calibration.response, calibration.gyroscope
         columns = (*response, *(gyroscope.response if gyroscope else ()))
         self.memory = memory or memory_of(columns, calibration.sensors)
-        lower, upper = zip(*self._edges, strict=True)
         self.table = ColumnTable(
-            response, self.memory, calibration.reference_temperature_c, (min(lower), max(upper))
+            response, self.memory, calibration.reference_temperature_c, self._span
         )
-        self._weights = [Weights(response, axis) for axis in range(3)]
-        self._sensitivities = [Sensitivity(response, axis, self.memory) for axis in range(3)]
-        layout = Layout(self.memory)
-        self._gradients = list(layout.gradients.values())
-        self._lags = list(layout.lags.values())
+        weights = np.array([(*term.bias, *term.scale) for term in response])
+        self._W = weights.reshape(-1, 6).T[:, :, np.newaxis]
+        self._is_present = (self._W[:3] != 0.0) | (self._W[3:] != 0.0)
+        self._find_felt()
         rounding = ROUNDING_VARIANCE if calibration.unit.input == 'counts' else 0.0
         self.noise = tuple(
-            density * density / calibration.unit.cycle_time_s + rounding / (K * K)
-            for density, K in zip(calibration.noise_density_m_s2_sqrt_hz, self._K, strict=True)
+            density * density / calibration.unit.cycle_time_s + rounding / (k * k)
+            for density, k in zip(calibration.noise_density_m_s2_sqrt_hz, K, strict=True)
         )
         self.noise_trace = sum(self.noise, 0.0)
-        M, sd = calibration.misalignment, calibration.misalignment_sd
-        variances = [value * value for value in sd]
+        M, variances = calibration.misalignment, [sd**2 for sd in calibration.misalignment_sd]
         posterior = calibration.posterior
         if posterior is not None:
             own = (posterior.matrix[-3:] ** 2).sum(axis=1) + posterior.variances[-3:]
             variances = own.tolist()
         self.misalignment = (M[1][0], M[2][0], M[2][1], *variances)
 
-    def bias_scale(self, state: Sequence[Number]) -> list[BiasScale[Number]]:
-        """Evaluate the bias and the scale of the three axes."""
-        return self._bias_scale(state, self.table.values(state))
+    def _find_felt(self) -> None:
+        """Find which numbers of a state can be wrong, and which columns are made of each."""
+        layout, places = Layout(self.memory), self.table.places
+        lags = {place: lag for lag, place in layout.lags.items()}
+        gradients = set(layout.gradients.values())
+        # Plays are taken to follow their input, so they feel nothing.
+        by_place = [k for k in np.argsort(places) if places[k] in lags or places[k] in gradients]
+        self._felt_columns = np.array(by_place, np.int64)
+        self.felt_places, self._felt_starts = np.unique(places[by_place], return_index=True)
+        # ``T - L`` rises with T, ``g = T_s - T`` falls; the lag of a gradient does neither.
+        on_board = {**dict.fromkeys(gradients, -1.0)}
+        on_board |= {place: float(name == BOARD_INPUT) for place, (name, _) in lags.items()}
+        signs = [on_board[place] for place in self.felt_places.tolist()]
+        self._signs = np.array(signs)[:, np.newaxis, np.newaxis]
 
-    def _bias_scale(
-        self, state: Sequence[Number], phi: Sequence[Number]
-    ) -> list[BiasScale[Number]]:
-        weight = state[WEIGHT]
-        rest = 1.0 - weight
-        static, dynamic = self.static.values(state[BOARD]), self.dynamic.values(state[BOARD])
-        result = []
-        for axis, (bias_s, scale_s), (bias_d, scale_d) in zip(
-            range(3), static, dynamic, strict=True
-        ):
-            bias, relative = self._weights[axis].add(
-                rest * bias_s + weight * bias_d, rest * scale_s + weight * scale_d, phi
-            )
-            # Eq. (8): K at this temperature.
-            result.append((bias, relative * self._K[axis]))
+    def bias_scale(self, states: npt.ArrayLike) -> Floats:
+        """Evaluate bias and scale of the three axes, shape (2, 3) for one state, or (2, 3, n)."""
+        table = np.asarray(states, dtype=np.float64)
+        columns = table.reshape(len(table), -1)
+        sets, phi = self.curves.values(columns[BOARD]), self.table.values(columns)
+        found = self._blended(sets, columns[WEIGHT], phi)
+        return found.reshape(2, 3, *table.shape[1:])
+
+    def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
+        result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
+        # Eq. (8): K at this temperature.
+        result[3:] *= self.K
         return result
+
+    def _weigh(self, columns: Floats, start: Floats) -> Floats:
+        """Add ``W @ columns`` to a start, shape (6, n), column by column."""
+        return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
         """
@@ -112,133 +190,130 @@ class Correction:
         `given_s`: the time over which the sets are to cross over [s]; 0 = a hard switch. Returns
         the time that the difference of the two sets needs, in soaks [s].
         """
-        needed = self._largest_gap() / GENTLE_RATE
-        return min(max(given_s, needed), LONGEST_TRANSITION * given_s)
+        board = np.linspace(*self._span, _GAP_TEMPERATURES)
+        static, dynamic = self.curves.values(board)
+        gap = dynamic - static
+        scale = np.abs(gap[3:]).max(axis=0)
+        largest = float(
+            (np.sqrt(((gap[:3] / self.K) ** 2).sum(axis=0)) + self._gravity * scale).max()
+        )
+        return min(max(given_s, largest / GENTLE_RATE), LONGEST_TRANSITION * given_s)
 
-    def _largest_gap(self) -> float:
-        """Bound what the two sets differ by at rest [m/s^2]."""
-        lower, upper = zip(*self._edges, strict=True)
-        board = np.linspace(min(lower), max(upper), _GAP_TEMPERATURES)
-        square, relative = np.zeros_like(board), np.zeros_like(board)
-        for bias, scale in self._gaps(board):
-            square = square + bias**2
-            relative = np.maximum(relative, np.abs(scale))
-        return float(np.max(np.sqrt(square) + self._gravity * relative))
-
-    def _gaps(self, board: Number) -> list[tuple[Number, Number]]:
-        """Give what the sets differ by at a board temperature: bias / K and relative scale."""
-        static, dynamic = self.static.values(board), self.dynamic.values(board)
-        return [
-            ((bias_d - bias_s) / K, scale_d - scale_s)
-            for K, (bias_s, scale_s), (bias_d, scale_d) in zip(
-                self._K, static, dynamic, strict=True
-            )
-        ]
-
-    def relative_excess(self, state: Sequence[Number]) -> Number:
-        """
-        Say how far a thermal state lies outside the calibrated ranges, in half ranges; 0 inside.
-        """
+    def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
+        """Say how far a state lies outside the calibrated ranges."""
+        states = np.array(state)[:, np.newaxis]
+        over, too_fast, relative = (one[:, 0].tolist() for one in self.curves.excess(states))
         weight = state[WEIGHT]
-        raw = self.table.raw(state)
-        static, dynamic = self.static.excess(state), self.dynamic.excess(state)
-        curves = (1.0 - weight) * static.relative + weight * dynamic.relative
-        every = range(len(self.table.columns))
-        return curves + self.table.excess(raw, self.table.held(raw), weight * 0.0, every)
+        curves = (1.0 - weight) * relative[0] + weight * relative[1]
+        raw = self.table.raw(states)
+        beyond = (raw - self.table.held(raw))[:, 0].tolist()
+        columns = zip(beyond, self.table.columns, strict=True)
+        gradients = [0.0, *(one for one, column in columns if column.kind == 'now')]
+        of_columns = float(self.table.excess(raw).max(initial=0.0))
+        return Excess(
+            over[is_dynamic], too_fast[is_dynamic], max(gradients, key=abs), curves + of_columns
+        )
 
-    def gradient_excess(self, state: Sequence[float]) -> float:
-        """
-        Say how far the gradients lie outside the calibrated ranges, the farthest, signed [K].
-        """
-        raw = self.table.raw(state)
-        over = [0.0]
-        for column, u, held in zip(self.table.columns, raw, self.table.held(raw), strict=True):
-            if column.kind == 'now':
-                over.append(u - held)
-        return max(over, key=abs)
+    def felt(self, states: Floats, factors: Floats) -> Floats:
+        """Differentiate bias and relative scale by each number of `felt_places`, (p, 6, n)."""
+        slopes = (self.table.slopes(states) * factors)[self._felt_columns]
+        if not len(slopes):
+            return np.empty((0, 6, states.shape[1]))
+        each = self._W[:, self._felt_columns] * slopes
+        return np.asarray(np.add.reduceat(each, self._felt_starts, axis=1).swapaxes(0, 1))
 
-    def evaluate(
-        self, state: Sequence[Number], slow: Sequence[Variance[Number]]
-    ) -> tuple[list[BiasScale[Number]], list[Variance[Number]]]:
+    def line(
+        self,
+        start: npt.ArrayLike,
+        end: npt.ArrayLike,
+        slow: npt.ArrayLike,
+        noise_excess: npt.ArrayLike,
+    ) -> Floats:
         """
-        Evaluate bias, scale and error variance of each axis, noise of one message included.
+        Lay a line from the state at the beginning of a segment to that at its end, or many.
 
-        To the variance comes what the two sets disagree by, while the regime is unknown, while
-        they cross over, and in proportion to how far the state lies outside the calibrated
-        ranges. While the regime is unknown either set may be the right one, and the variances of
-        both count.
+        Of the error variance a, b, c of each axis come in that change slowly, shape (9, n).
 
-        Returns per axis, ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
+        Returns per axis bias, its change, scale, its change; then per axis a, b, c of the error
+        variance, with noise of one message grown by its excess: shape (21,) or (21, n).
         """
-        weight, unknown = state[WEIGHT], state[UNKNOWN]
+        ends = np.array((start, end), dtype=np.float64)
+        n = ends[0, 0].size
+        if n > _CHUNK:
+            columns = (*ends, np.asarray(slow), np.asarray(noise_excess))
+            cuts = range(_CHUNK, n, _CHUNK)
+            parts = zip(*(np.split(one, cuts, axis=-1) for one in columns), strict=True)
+            return np.hstack([self.line(*part) for part in parts])
+        states = np.concatenate(ends.reshape(2, -1, n), axis=1)
+        board = states[BOARD]
+        sets = self.curves.values(board)
+        raw = self.table.raw(states)
+        factors = self.table.factors(board, states[WEIGHT])
+        phi = self.table.held(raw) * factors[0]
+        found = self._blended(sets, states[WEIGHT], phi).reshape(2, 3, 2, n)
+        lines = np.stack((found[:, :, 0], found[:, :, 1] - found[:, :, 0]), axis=2)
+        factors_at_end = factors[0][:, n:], factors[1][:, n:]
+        gap = (sets[1] - sets[0])[:, n:]
+        unchanging = np.reshape(slow, (3, 3, n))
+        v = self._variance(states[:, n:], raw[:, n:], factors_at_end, gap, unchanging)
+        v[:, 0] += np.array(self.noise)[:, np.newaxis] * (1.0 + np.asarray(noise_excess))
+        line = np.concatenate((lines.swapaxes(0, 1).reshape(12, n), v.reshape(9, n)))
+        return line.reshape(21, *ends.shape[2:])
+
+    def _variance(
+        self,
+        states: Floats,
+        raw: Floats,
+        factors: tuple[Floats, Floats],
+        gap: Floats,
+        slow: Floats,
+    ) -> Floats:
+        """
+        Evaluate a, b, c of each axis, shape (3, 3, n), without the noise of a message.
+
+        To what the thermometers, the memory and what is slow leave uncertain comes what the two
+        sets disagree by (`gap`), while the regime is unknown, while they cross over, and in
+        proportion to how far the state lies outside the calibrated ranges. While the regime is
+        unknown either set may be the right one, and the variances of both count.
+        """
+        board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         rest = 1.0 - weight
-        raw = self.table.raw(state)
         held = self.table.held(raw)
-        phi = self.table.weighted(held, state[BOARD], weight)
-        static, dynamic = self.static.excess(state), self.dynamic.excess(state)
-        outside = rest * static.relative + weight * dynamic.relative
-        doubt = unknown + weight * rest + outside * outside
-        shares = rest + unknown * weight, weight + unknown * rest
-        excesses = static.temperature, dynamic.temperature
-        slopes = self.static.slopes(state[BOARD]), self.dynamic.slopes(state[BOARD])
-        on_input, on_power = self.table.slopes(state, raw)
-        beyond = [u - edge for u, edge in zip(raw, held, strict=True)]
-        cut_off = self.table.weighted(beyond, state[BOARD], weight)
-        nil = weight * 0.0
-        variances = []
-        gaps = self._gaps(state[BOARD])
+        excess, _, relative = self.curves.excess(states)
+        outside = rest * relative[0] + weight * relative[1]
+        shares = np.array([rest + unknown * weight, weight + unknown * rest])
+        variances = (shares * (states[VAR_BOARD] + excess * excess), states[self.felt_places + 1])
+        felt = self.felt(states, factors[0])
+        # The response hangs on the board's temperature through the powers of t and what is felt.
+        on_board = self._weigh(raw * factors[1], in_order(self._signs * felt, 0))
+        slopes = self.curves.slopes(board) + on_board
+        v = self._spread(np.concatenate(variances), np.concatenate((slopes, felt)))
+        v[:, 0] += (shares[:, np.newaxis] * self.curves.residuals).sum(axis=0)
+        # Far outside, the residual of the fit says nothing any more: it grows with the excess.
+        own = np.where(self._is_present, self.table.excess(raw), 0.0).max(axis=1, initial=0.0)
+        v = (v + slow) * (1.0 + (outside + own) ** 2)[:, np.newaxis]
         if self.table.differs:
-            gaps = self._with_response(gaps, state, held)
-        for axis, K in enumerate(self._K):
-            felt = self._sensitivities[axis]
-            a, b, c = nil, nil, nil
-            of_board = felt.on_board(on_input, on_power, nil)
-            for share, curves, excess, slope in zip(
-                shares, (self.static, self.dynamic), excesses, slopes, strict=True
-            ):
-                variance = share * (state[VAR_BOARD] + excess * excess)
-                bias = (slope[axis][0] + of_board[0]) / K
-                scale = slope[axis][1] + of_board[1]
-                a, b, c = _with(a, b, c, variance, bias, scale)
-                a = a + share * curves.residuals[axis]
-            for place, (bias, scale) in zip(
-                self._gradients, felt.on_gradients(on_input, nil), strict=True
-            ):
-                a, b, c = _with(a, b, c, state[place + VAR_GRADIENT - GRADIENT], bias / K, scale)
-            for place, (bias, scale) in zip(self._lags, felt.on_lags(on_input, nil), strict=True):
-                a, b, c = _with(a, b, c, state[place + 1], bias / K, scale)
-            a, b, c = a + slow[axis][0], b + slow[axis][1], c + slow[axis][2]
-            # Far outside, the residual of the fit says nothing any more: it grows with the excess.
-            present = self._weights[axis].present
-            relative = outside + self.table.excess(raw, held, nil, present)
-            grown = 1.0 + relative * relative
-            a, b, c = _with(grown * a, grown * b, grown * c, doubt, *gaps[axis])
-            bias, scale = self._weights[axis].add(nil, nil, cut_off)
-            a, b, c = _with(a, b, c, nil + 1.0, bias / K, scale)
-            variances.append((a + self.noise[axis], b, c))
-        return self._bias_scale(state, phi), variances
+            of_static, of_dynamic = (
+                self.table.factors(board, np.full_like(weight, of))[0] for of in (0.0, 1.0)
+            )
+            gap = self._weigh(held * (of_dynamic - of_static), gap)
+        doubt = unknown + weight * rest + outside * outside
+        cut_off = self._weigh((raw - held) * factors[0], np.zeros_like(gap))
+        more = self._spread(np.array([doubt, np.ones_like(doubt)]), np.array([gap, cut_off]))
+        return np.asarray(v + more)
 
-    def _with_response(
-        self, gaps: list[tuple[Number, Number]], state: Sequence[Number], held: Sequence[Number]
-    ) -> list[tuple[Number, Number]]:
-        """Add what the columns that belong to one regime make of the difference of the sets."""
-        nil = state[WEIGHT] * 0.0
-        of_static = self.table.weighted(held, state[BOARD], nil)
-        of_dynamic = self.table.weighted(held, state[BOARD], nil + 1.0)
-        change = [d - s for d, s in zip(of_dynamic, of_static, strict=True)]
-        result = []
-        for axis, (bias, scale) in enumerate(gaps):
-            more, relative = self._weights[axis].add(nil, nil, change)
-            result.append((bias + more / self._K[axis], scale + relative))
-        return result
+    def _spread(self, variances: Floats, moved: Floats) -> Floats:
+        """
+        Say what independent errors, shape (p, n), make of each axis' a, b, c, shape (3, 3, n), if
+        each moves bias and relative scale by `moved` per unit, shape (p, 6, n).
+        """
+        variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
+        parts = (variance * bias * bias, 2.0 * variance * bias * scale, variance * scale * scale)
+        return in_order(np.stack(parts, axis=2), 0)
 
 
-def _with(
-    a: Number, b: Number, c: Number, variance: Number, bias: Number, scale: Number
-) -> tuple[Number, Number, Number]:
-    """Add what an error makes of v(x) that moves the axis by ``bias + scale x`` per unit."""
-    return (
-        a + variance * bias * bias,
-        b + 2.0 * variance * bias * scale,
-        c + variance * scale * scale,
-    )
+def in_order(values: Floats, axis: int) -> Floats:
+    """Sum along an axis, one after the other, however many there are along the others."""
+    if not values.shape[axis]:
+        return np.asarray(values.sum(axis=axis))
+    return np.asarray(np.add.accumulate(values, axis=axis).take(-1, axis))

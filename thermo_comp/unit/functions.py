@@ -3,28 +3,29 @@
 """
 Owns a function of temperature: polynomial, cubic spline or exponential, normalised at t = 0.
 
-Every function takes ``t = T_board - T_ref`` [K], as one float or as an array, and gives the
-same bits for both: only ``+ - * /`` in a fixed order are used, and `math.exp` element by
-element. Each is linear in its free coefficients, so `basis` gives both the regressors of the
-fit and the derivatives that carry the parameter covariance (Eq. (9) and (10) of the paper, which
-asks for polynomials, splines and exponentials).
+Every function takes ``t = T_board - T_ref`` [K], and gives one temperature the bits of many: only
+``+ - * /`` in a fixed order are used, and `math.exp` number by number. Each is linear in its free
+coefficients, so `basis` gives both the regressors of the fit and the derivatives that carry the
+parameter covariance (Eq. (9) and (10) of the paper, which asks for polynomials, splines and
+exponentials).
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, TypeVar
+from itertools import zip_longest
+from typing import Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from ..typing import Floats
 
-#: One float, or an array of them: what every evaluation here maps onto itself.
-Number = TypeVar('Number', float, Floats)
+#: A temperature, or many.
+Kelvins: TypeAlias = float | Floats
 
 #: How exactly a function must meet its value at the reference.
 NORMALISATION_TOLERANCE = 1e-9
@@ -33,15 +34,32 @@ _KNOT_STEP = 1e-3
 _FARTHEST_KNOT = 2000.0
 
 
-def hold(value: Number, lower: float, upper: float) -> Number:
-    """Hold a value at the edges of a range, given in its unit."""
-    if isinstance(value, np.ndarray):
-        return np.minimum(np.maximum(value, lower), upper)
-    return lower if value < lower else upper if value > upper else value
+def hold(value: Floats, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Floats:
+    """Hold values at the edges of a range, given in their unit."""
+    return np.asarray(np.minimum(np.maximum(value, lower), upper))
+
+
+def by_element(function: Callable[[float], float], x: Kelvins) -> Floats:
+    """Map every number; numpy's own functions may round differently by how many there are."""
+    return np.array([function(v) for v in np.ravel(x).tolist()]).reshape(np.shape(x))
+
+
+class _Family:
+    """What the families have in common."""
+
+    @property
+    def free_coefficients(self) -> tuple[float, ...]:
+        """The free coefficients, in the order of `basis`."""
+        raise NotImplementedError
+
+    @property
+    def n_free(self) -> int:
+        """Number of free coefficients."""
+        return len(self.free_coefficients)
 
 
 @dataclass(frozen=True)
-class Polynomial:
+class Polynomial(_Family):
     """
     ``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10), with the leading constant where it belongs).
 
@@ -60,45 +78,34 @@ class Polynomial:
         _check_finite('coefficients', self.coefficients)
 
     @property
-    def n_free(self) -> int:
-        """Number of free coefficients: all but the value at the reference."""
-        return len(self.coefficients) - 1
-
-    @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The free coefficients, in the order of `basis`."""
+        """All but the value at the reference."""
         return self.coefficients[1:]
 
     def with_free(self, values: tuple[float, ...]) -> Polynomial:
         """Return the same function with other free coefficients."""
         return replace(self, coefficients=(self.coefficients[0], *values))
 
-    def value(self, t: Number) -> Number:
+    def value(self, t: Kelvins) -> Floats:
         """Evaluate at `t` [K]."""
-        result = t * 0.0 + self.coefficients[-1]
-        for coefficient in reversed(self.coefficients[:-1]):
-            result = result * t + coefficient
-        return result
+        return _horner(self.coefficients, t)
 
-    def slope(self, t: Number) -> Number:
+    def slope(self, t: Kelvins) -> Floats:
         """Evaluate the derivative at `t`, per K."""
-        result = t * 0.0
-        for power in range(len(self.coefficients) - 1, 0, -1):
-            result = result * t + power * self.coefficients[power]
-        return result
+        return _horner(self.slopes, t)
 
-    def basis(self, t: Number) -> list[Number]:
+    @property
+    def slopes(self) -> tuple[float, ...]:
+        """The coefficients of the derivative."""
+        return tuple(k * c for k, c in enumerate(self.coefficients))[1:] or (0.0,)
+
+    def basis(self, t: Kelvins) -> list[Floats]:
         """Evaluate the derivatives with respect to the free coefficients: t, t^2, ..."""
-        result: list[Number] = []
-        power = t
-        for _ in range(self.n_free):
-            result.append(power)
-            power = power * t
-        return result
+        return list(np.multiply.accumulate([np.asarray(t)] * self.n_free)) if self.n_free else []
 
 
 @dataclass(frozen=True)
-class CubicSpline:
+class CubicSpline(_Family):
     """
     Natural cubic spline through values at knots, one of which is the reference (0 K).
 
@@ -133,13 +140,8 @@ class CubicSpline:
             raise ValueError('`knots_k` must contain 0, the reference temperature')
 
     @property
-    def n_free(self) -> int:
-        """Number of free coefficients: the values at all knots but the reference."""
-        return len(self.values) - 1
-
-    @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The free coefficients, in the order of `basis`."""
+        """The values at all knots but the reference."""
         at = self.knots_k.index(0.0)
         return self.values[:at] + self.values[at + 1 :]
 
@@ -149,54 +151,42 @@ class CubicSpline:
         return replace(self, values=(*values[:at], self.values[at], *values[at:]))
 
     @cached_property
-    def _pieces(self) -> list[tuple[float, ...]]:
+    def _pieces(self) -> Floats:
         return _natural_pieces(self.knots_k, self.values)
 
     @cached_property
-    def _cardinal_pieces(self) -> list[list[tuple[float, ...]]]:
-        result = []
-        for j, knot in enumerate(self.knots_k):
-            if knot != 0.0:
-                unit = tuple(1.0 if i == j else 0.0 for i in range(len(self.knots_k)))
-                result.append(_natural_pieces(self.knots_k, unit))
-        return result
+    def _cardinal_pieces(self) -> list[Floats]:
+        units = np.eye(len(self.knots_k))
+        return [
+            _natural_pieces(self.knots_k, unit)
+            for knot, unit in zip(self.knots_k, units, strict=True)
+            if knot != 0.0
+        ]
 
-    def value(self, t: Number) -> Number:
+    def value(self, t: Kelvins) -> Floats:
         """Evaluate at `t` [K]."""
-        return self._evaluate(self._pieces, t, _cubic)
+        return self._evaluate(self._pieces, t)
 
-    def slope(self, t: Number) -> Number:
+    def slope(self, t: Kelvins) -> Floats:
         """Evaluate the derivative at `t`, per K."""
-        return self._evaluate(self._pieces, t, _cubic_slope)
+        return self._evaluate(self._pieces, t, 1)
 
-    def basis(self, t: Number) -> list[Number]:
+    def basis(self, t: Kelvins) -> list[Floats]:
         """Evaluate the derivatives with respect to the free values: the cardinal splines."""
-        return [self._evaluate(pieces, t, _cubic) for pieces in self._cardinal_pieces]
+        return [self._evaluate(pieces, t) for pieces in self._cardinal_pieces]
 
-    def _evaluate(
-        self,
-        pieces: list[tuple[float, ...]],
-        t: Number,
-        form: Callable[[Number, Number, Number, Number, Number], Number],
-    ) -> Number:
-        knots = self.knots_k
-        held = hold(t, knots[0], knots[-1])
-        if isinstance(held, np.ndarray):
-            where = np.clip(np.searchsorted(knots, held, side='right') - 1, 0, len(knots) - 2)
-            table = np.array(pieces)[where]
-            return form(
-                held - np.array(knots)[where],
-                table[..., 0],
-                table[..., 1],
-                table[..., 2],
-                table[..., 3],
-            )
-        index = min(max(bisect_right(knots, held) - 1, 0), len(knots) - 2)
-        return form(held - knots[index], *pieces[index])
+    def _evaluate(self, pieces: Floats, t: Kelvins, order: int = 0) -> Floats:
+        knots = np.array(self.knots_k)
+        held = hold(np.asarray(t), knots[0], knots[-1])
+        where = np.clip(np.searchsorted(knots, held, side='right') - 1, 0, len(knots) - 2)
+        h, (a, b, c, d) = held - knots[where], pieces[:, where]
+        if order:
+            return np.asarray((3.0 * d * h + 2.0 * c) * h + b)
+        return np.asarray(((d * h + c) * h + b) * h + a)
 
 
 @dataclass(frozen=True)
-class Exponential:
+class Exponential(_Family):
     """
     ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``.
 
@@ -230,13 +220,8 @@ class Exponential:
             raise ValueError('`e_fold_k` must be at least 1 K in magnitude')
 
     @property
-    def n_free(self) -> int:
-        """Number of free coefficients: the amplitudes (the e-folds give the shape)."""
-        return len(self.amplitudes)
-
-    @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The free coefficients, in the order of `basis`."""
+        """The amplitudes (the e-folds give the shape)."""
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...]) -> Exponential:
@@ -244,27 +229,69 @@ class Exponential:
         at_reference = self.constant + math.fsum(self.amplitudes)
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
-    def value(self, t: Number) -> Number:
+    def value(self, t: Kelvins) -> Floats:
         """Evaluate at `t` [K]."""
-        result = t * 0.0 + self.constant
+        result = np.asarray(t) * 0.0 + self.constant
         for amplitude, e_fold in zip(self.amplitudes, self.e_fold_k, strict=True):
-            result = result + amplitude * _exp(t / e_fold)
+            result = result + amplitude * by_element(math.exp, t / e_fold)
         return result
 
-    def slope(self, t: Number) -> Number:
+    def slope(self, t: Kelvins) -> Floats:
         """Evaluate the derivative at `t`, per K."""
-        result = t * 0.0
+        result = np.asarray(t) * 0.0
         for amplitude, e_fold in zip(self.amplitudes, self.e_fold_k, strict=True):
-            result = result + amplitude / e_fold * _exp(t / e_fold)
+            result = result + amplitude / e_fold * by_element(math.exp, t / e_fold)
         return result
 
-    def basis(self, t: Number) -> list[Number]:
+    def basis(self, t: Kelvins) -> list[Floats]:
         """Evaluate the derivatives with respect to the amplitudes at a fixed reference value."""
-        return [_exp(t / e_fold) - 1.0 for e_fold in self.e_fold_k]
+        return [by_element(math.exp, t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 
 #: Any of the three families.
 TemperatureFunction = Polynomial | CubicSpline | Exponential
+
+
+class Functions:
+    """Several rows of functions, each row at temperatures of its own; polynomials in one go."""
+
+    def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
+        self.rows = rows
+        self._others = [
+            (i, k, one)
+            for i, row in enumerate(rows)
+            for k, one in enumerate(row)
+            if not isinstance(one, Polynomial)
+        ]
+        own = [
+            one if isinstance(one, Polynomial) else Polynomial((0.0,)) for r in rows for one in r
+        ]
+        shape = -1, len(rows), len(rows[0]), 1
+        self._values, self._slopes = (
+            np.array(list(zip_longest(*many, fillvalue=0.0))).reshape(shape)
+            for many in ([one.coefficients for one in own], [one.slopes for one in own])
+        )
+
+    def value(self, t: Floats) -> Floats:
+        """Evaluate at `t`, shape (n_rows, n) [K]: shape (n_rows, n_functions, n)."""
+        result = _horner(self._values, t[:, np.newaxis])
+        for i, k, function in self._others:
+            result[i, k] = function.value(t[i])
+        return result
+
+    def slope(self, t: Floats) -> Floats:
+        """Evaluate the derivatives at `t`, per K."""
+        result = _horner(self._slopes, t[:, np.newaxis])
+        for i, k, function in self._others:
+            result[i, k] = function.slope(t[i])
+        return result
+
+
+def _horner(coefficients: Floats | tuple[float, ...], t: Kelvins) -> Floats:
+    result = np.asarray(t) * 0.0 + coefficients[-1]
+    for one in coefficients[-2::-1]:
+        result = result * t + one
+    return result
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
@@ -281,39 +308,16 @@ def _check_finite(name: str, values: tuple[float, ...]) -> None:
             raise ValueError(f'`{name}` must be finite, got {value}')
 
 
-def _exp(x: Number) -> Number:
+def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
     """
-    Exponentiate with the same bits for a float and for an array of them.
-
-    numpy's vector exponential rounds differently from libm's in the last place.
-    """
-    if isinstance(x, np.ndarray):
-        return np.array([math.exp(v) for v in x.ravel().tolist()]).reshape(x.shape)
-    return math.exp(x)
-
-
-def _cubic(h: Number, a: Number, b: Number, c: Number, d: Number) -> Number:
-    return ((d * h + c) * h + b) * h + a
-
-
-def _cubic_slope(h: Number, _a: Number, b: Number, c: Number, d: Number) -> Number:
-    return (3.0 * d * h + 2.0 * c) * h + b
-
-
-def _natural_pieces(
-    knots: tuple[float, ...], values: tuple[float, ...]
-) -> list[tuple[float, ...]]:
-    """
-    Coefficients of ``a + b h + c h^2 + d h^3`` on each interval, h from its left knot.
+    Give ``a + b h + c h^2 + d h^3`` on each interval, h from its left knot, shape (4, n - 1).
 
     The second derivatives at the knots solve the usual tridiagonal system with zeros at both
     ends. numpy serves: the node must not load an optimiser, which scipy's interpolation does.
     """
-    x = np.array(knots)
-    y = np.array(values)
-    n = len(x)
-    h = np.diff(x)
+    y, h = np.asarray(values), np.diff(np.asarray(knots))
     slopes = np.diff(y) / h
+    n = len(y)
     matrix = np.eye(n)
     right = np.zeros(n)
     for i in range(1, n - 1):
@@ -321,5 +325,4 @@ def _natural_pieces(
         right[i] = 6.0 * (slopes[i] - slopes[i - 1])
     curvature = np.linalg.solve(matrix, right)
     b = slopes - h * (2.0 * curvature[:-1] + curvature[1:]) / 6.0
-    pieces = np.column_stack((y[:-1], b, curvature[:-1] / 2.0, np.diff(curvature) / (6.0 * h)))
-    return [tuple(row) for row in pieces.tolist()]
+    return np.array([y[:-1], b, curvature[:-1] / 2.0, np.diff(curvature) / (6.0 * h)])

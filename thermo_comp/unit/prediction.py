@@ -82,12 +82,9 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
     `states`: as `ramp_states` gives them, shape (n, width). Returns of each axis [m/s^2], shape
     (n, 3). Returns of each axis [input units per m/s^2], shape (n, 3).
     """
-    pairs = Correction(calibration).bias_scale([np.ascontiguousarray(c) for c in states.T])
-    one = np.ones(len(states))
-    bias, scale = (np.column_stack([pair[k] * one for pair in pairs]) for k in (0, 1))
-    axes = calibration.axes
-    K = [axis.scale_factor for axis in (axes.x, axes.y, axes.z)]
-    return bias / K, scale
+    correction = Correction(calibration)
+    bias, scale = correction.bias_scale(states.T)
+    return (bias / correction.K).T, scale.T
 
 
 def ramp_states(

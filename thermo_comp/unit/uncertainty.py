@@ -14,29 +14,28 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..thermal.memory import start_covariance
-from ..thermal.state import BOARD, WEIGHT
+from ..thermal.state import BOARD, WEIGHT, Layout
 from ..typing import Floats
 from .calibration import Calibration, parameter_layout
-from .correction import Correction, Variance
-from .response import Sensitivity
+from .correction import Correction
 
 
 class SlowUncertainty:
-    """
-    What the posterior and the start of the lags leave uncertain.
-
-    calibration: the unit
-    correction: its correction
-    """
+    """What the posterior and the start of the lags leave uncertain."""
 
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
-        axes = calibration.axes
-        self._K = [axis.scale_factor for axis in (axes.x, axes.y, axes.z)]
-        memory = correction.memory
-        self._felt = [Sensitivity(calibration.response, axis, memory) for axis in range(3)]
-        start = start_covariance(memory.lags)
-        self._root = np.asarray(np.linalg.cholesky(start), dtype=np.float64)
+        self._K = correction.K[:, 0].tolist()
+        lags = correction.memory.lags
+        root = np.linalg.cholesky(start_covariance(lags))
+        place_of = list(Layout(correction.memory).lags.values())
+        #: Which of what is felt are lags, and these by index into the memory's.
+        found = [
+            (k, place_of.index(p)) for k, p in enumerate(correction.felt_places) if p in place_of
+        ]
+        self._felt = [k for k, _ in found]
+        self._lags = [lag for _, lag in found]
+        self._root = np.asarray(root, dtype=np.float64)[self._lags]
         self._blocks: list[tuple[Floats, Floats, Floats, Floats]] = []
         posterior = calibration.posterior
         if posterior is None:
@@ -52,33 +51,26 @@ class SlowUncertainty:
             n_bias = bias.end - bias.static
             self._blocks.append((rows[:n_bias], rest[of_bias], rows[n_bias:], rest[of_scale]))
 
-    def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[Variance[float]]:
-        """
-        Evaluate (a, b, c) of each axis at one state.
-
-        Returns ``v(x) = a + b x + c x^2`` [m^2/s^4], x in m/s^2.
-        """
+    def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
+        """Evaluate a, b, c of each axis at one state: ``v(x) = a + b x + c x^2`` [m^2/s^4]."""
+        states = np.array(state)[:, np.newaxis]
         table = self._correction.table
-        raw = table.raw(state)
-        phi = table.weighted(table.held(raw), state[BOARD], state[WEIGHT])
-        on_input, _ = table.slopes(state, raw)
-        shares = np.array(start_shares)
-        result = []
+        factors, _ = table.factors(states[BOARD], states[WEIGHT])
+        phi = table.held(table.raw(states)) * factors
+        felt = self._correction.felt(states, factors)[self._felt, :, 0]
+        moved = felt * np.array(start_shares)[self._lags, np.newaxis]
+        result: list[float] = []
         for axis, K in enumerate(self._K):
-            felt: Floats = np.array(self._felt[axis].on_lags(on_input, 0.0)).reshape(-1, 2)
-            bias, scale = ((self._root * (felt[:, k] * shares)[:, np.newaxis]) for k in (0, 1))
-            a, b, c = _products(bias.sum(axis=0) / K, scale.sum(axis=0))
+            bias, scale = ((self._root * moved[:, [row]]).sum(axis=0) for row in (axis, axis + 3))
+            v = _products(bias / K, scale)
             if self._blocks:
                 of_bias, var_bias, of_scale, var_scale = self._blocks[axis]
-                on_bias, on_scale = self._regressors(state, phi, axis)
-                on_bias = on_bias / K
-                bias = (of_bias * on_bias[:, np.newaxis]).sum(axis=0)
-                scale = (of_scale * on_scale[:, np.newaxis]).sum(axis=0)
-                more = _products(bias, scale)
-                a += more[0] + float((var_bias * on_bias * on_bias).sum())
-                b += more[1]
-                c += more[2] + float((var_scale * on_scale * on_scale).sum())
-            result.append((a, b, c))
+                on_bias = self._regressors(states, phi, axis) / K
+                on_scale = self._regressors(states, phi, axis + 3)
+                v += _products((of_bias * on_bias).sum(axis=0), (of_scale * on_scale).sum(axis=0))
+                v[0] += (var_bias * on_bias[:, 0] ** 2).sum()
+                v[2] += (var_scale * on_scale[:, 0] ** 2).sum()
+            result += v.tolist()
         return result
 
     def of_bias(
@@ -90,47 +82,27 @@ class SlowUncertainty:
         Returns the variance of the bias, and that of its distance from a mean over states, as
         `mean_of` takes it of rows, shapes (n, 3) [m^2/s^4].
         """
-        columns = list(np.ascontiguousarray(states.T))
-        table = self._correction.table
-        board, weight = columns[BOARD], columns[WEIGHT]
-        phi = table.weighted(table.held(table.raw(columns)), board, weight)
-        static, dynamic = (
-            self._correction.static.bases(board),
-            self._correction.dynamic.bases(board),
-        )
-        rest = 1.0 - weight
+        columns = states.T
+        phi = self._correction.table.values(columns)
         whole, away = np.zeros((2, len(states), 3))
         for axis, (rows, variances, _, _) in enumerate(self._blocks):
-            on_bias = [rest, *(rest * value for value in static[axis][0])]
-            on_bias += [weight, *(weight * value for value in dynamic[axis][0]), *phi]
-            felt = np.column_stack(on_bias) / self._K[axis]
+            felt = self._regressors(columns, phi, axis).T / self._K[axis]
             for result, one in ((whole, felt), (away, felt - mean_of(felt))):
                 result[:, axis] = ((one @ rows) ** 2).sum(axis=1) + one**2 @ variances
         return whole, away
 
-    def _regressors(
-        self, state: Sequence[float], phi: list[float], axis: int
-    ) -> tuple[Floats, Floats]:
+    def _regressors(self, states: Floats, phi: Floats, row: int) -> Floats:
         """
-        Give what multiplies each parameter of bias and of scale, in the order of the posterior.
+        Give what multiplies each parameter of a row's bias or scale, in the posterior's order.
         """
-        weight = state[WEIGHT]
-        bias: list[float] = []
-        scale: list[float] = []
-        for share, curves in (
-            (1.0 - weight, self._correction.static),
-            (weight, self._correction.dynamic),
-        ):
-            of_bias, of_scale = curves.bases(state[BOARD])[axis]
-            bias += [share, *(share * value for value in of_bias)]
-            scale += [share, *(share * value for value in of_scale)]
-        return np.array(bias + phi), np.array(scale + phi)
+        correction, weight = self._correction, states[WEIGHT]
+        found: list[Floats] = []
+        bases = correction.curves.bases(states[BOARD], row)
+        for share, basis in zip((1.0 - weight, weight), bases, strict=True):
+            found += [share, *(share * one for one in basis)]
+        return np.vstack((*found, phi))
 
 
-def _products(bias: Floats, scale: Floats) -> tuple[float, float, float]:
+def _products(bias: Floats, scale: Floats) -> Floats:
     # Sums along the rows above, and of products here: the same bits wherever the arrays lie.
-    return (
-        float((bias * bias).sum()),
-        2.0 * float((bias * scale).sum()),
-        float((scale * scale).sum()),
-    )
+    return np.array([(bias * bias).sum(), 2.0 * (bias * scale).sum(), (scale * scale).sum()])
