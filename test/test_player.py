@@ -32,8 +32,8 @@ from std_msgs.msg import Bool
 from thermo_comp.errors import OutputError, RecordingError, ThermoCompError
 from thermo_comp.recording import BagWriter, ImuColumns, Topics, read_recording
 from thermo_comp.ros import player
+from thermo_comp.ros.listener import Recorder
 from thermo_comp.ros.player import play
-from thermo_comp.ros.recorder import Recorder
 
 WINDOW = player.WINDOW['accel']
 

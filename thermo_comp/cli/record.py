@@ -125,7 +125,7 @@ def _listen(
 ) -> None:
     """Record live topics."""
     options.require_ros()
-    from ..ros.live import LiveTopics
+    from ..ros.listener import LiveTopics
 
     with LiveTopics(**reading, ros_args=ros_args) as live:
         out.line('listening; Ctrl-C ends it with whole bags')

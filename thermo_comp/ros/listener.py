@@ -1,45 +1,315 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a node that only listens: its subscriptions are emptied in a thread of its own."""
+"""
+Owns nodes that only listen: the node's output into a bag, its inputs as blocks.
+
+The log time of an output is the stamp of an Imu, and for anything else the newest such stamp
+before it, as in what `replay` writes; so a bag that was played faster than real time is recorded
+in its own time, whatever the clock on the wall says meanwhile. That of an input is when it was
+received.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from queue import SimpleQueue
+from struct import Struct
+from typing import Any
 
+import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
 from rclpy.context import Context
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Imu, Temperature
+from std_msgs.msg import Bool
 
-from .waitloop import WaitLoop
+from ..errors import ThermoCompError
+from ..online.stamped_flag import STAMPED_TOPIC
+from ..recording import ROLES, BagWriter, Input, Role, Topics
+from ..recording.decode import Decoder, Feed
+from ..recording.growing import News
+from ..recording.messages import Messages
+from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
+from .waitloop import RawSubscription, WaitLoop
+
+#: The node's outputs.
+OUTPUTS: Mapping[str, Any] = {
+    'imu/data_raw': Imu,
+    'regime/dynamic': Bool,
+    STAMPED_TOPIC: DiagnosticArray,
+}
+#: Time between two looks at what is published, and between two blocks [s].
+LOOK_S, BLOCK_S = 0.5, 1.0
+
+_RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+_AS_OFFERED = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.BEST_AVAILABLE
+)
+_CLASSES = {VECTOR3_STAMPED: Vector3Stamped, IMU: Imu, TEMPERATURE: Temperature}
+_STAMP = Struct('<iI')
 
 
-class Listener:
-    """A node with a loop around it; `start` runs it until `close`, calling back for new data."""
+class _Listener:
+    """A node whose subscriptions are emptied in a thread of its own, while the context lasts."""
 
-    def __init__(self, name: str, ros_args: Sequence[str]) -> None:
+    _name: str
+
+    def __init__(self, ros_args: Sequence[str]) -> None:
+        self._ros_args = ros_args
+
+    def __enter__(self) -> Any:
+        """Open the subscriptions and start the thread."""
         self._context = Context()
-        rclpy.init(args=['--ros-args', *ros_args], context=self._context)
-        self.node = rclpy.create_node(name, context=self._context)
-        self.loop = WaitLoop(self.node)
-        self._thread: threading.Thread | None = None
-
-    def start(self, on_data: Callable[[], None]) -> None:
-        """Run the loop; once more at its end for what came last."""
-
-        def run() -> None:
-            self.loop.run(on_data)
-            on_data()
-
-        self._thread = threading.Thread(target=run, name=self.node.get_name())
+        rclpy.init(args=['--ros-args', *self._ros_args], context=self._context)
+        self._node = rclpy.create_node(self._name, context=self._context)
+        self._loop = WaitLoop(self._node)
+        self._open()
+        self._thread = threading.Thread(target=self._run, name=self._name)
         self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop listening."""
+        self.close()
 
     def close(self) -> None:
         """Stop, take what came last, destroy the node; do nothing the second time."""
-        if not self._context.ok():
-            return
-        self.loop.stop()
-        if self._thread is not None:
+        if self._context.ok():
+            self._loop.stop()
             self._thread.join()
-        self.loop.close()
-        self.node.destroy_node()
-        self._context.try_shutdown()
+            self._loop.close()
+            self._node.destroy_node()
+            self._context.try_shutdown()
+
+    def _run(self) -> None:
+        self._loop.run(self._take)
+        self._take()
+
+    def _open(self) -> None:
+        """Subscribe."""
+        raise NotImplementedError
+
+    def _take(self) -> None:
+        """Empty the subscriptions."""
+        raise NotImplementedError
+
+
+class Recorder(_Listener):
+    """Records topics into a bag that any rosbag2 tool opens."""
+
+    _name = 'thermo_comp_recorder'
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        topics: Mapping[str, Any] = OUTPUTS,
+        ros_args: Sequence[str] = (),
+        overwrite: bool = False,
+    ) -> None:
+        super().__init__(ros_args)
+        self._path, self._topics, self._overwrite = Path(path), topics, overwrite
+        self._changed = threading.Condition()
+        self._counts = dict.fromkeys(topics, 0)
+        self._failure: ThermoCompError | None = None
+        self._newest: dict[str, bytes] = {}
+        self._newest_ns: int | None = None
+        # What came before any stamp.
+        self._early: dict[str, list[bytes]] = {}
+
+    def __enter__(self) -> Recorder:
+        """Open the bag and listen."""
+        self._writer = BagWriter(self._path, overwrite=self._overwrite)
+        super().__enter__()
+        return self
+
+    def _open(self) -> None:
+        self._subscriptions = {
+            name: self._loop.subscribe(kind, name, _RELIABLE)
+            for name, kind in self._topics.items()
+        }
+
+    def __exit__(self, *raised: object) -> None:
+        """Stop; finish the bag, or drop it after an error."""
+        self.close()
+        if raised[0] is None and self._failure is None:
+            self._writer.close()
+            return
+        self._writer.abort()
+        if raised[0] is None and self._failure is not None:
+            raise self._failure
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages recorded so far, by the relative topic name."""
+        with self._changed:
+            return dict(self._counts)
+
+    def newest(self, name: str) -> Any:
+        """Return the newest message of a topic, be it recorded or not; None before any."""
+        data = self._newest.get(name)
+        return None if data is None else deserialize_message(data, self._topics[name])
+
+    def wait_for_publishers(
+        self, timeout_s: float, while_true: Callable[[], bool] = lambda: True
+    ) -> bool:
+        """Wait until every topic has a publisher; False after the time-out or at a False."""
+        deadline = time.monotonic() + timeout_s
+        while not all(one.count_publishers() for one in self._subscriptions.values()):
+            if time.monotonic() > deadline or not while_true():
+                return False
+            time.sleep(0.02)
+        return True
+
+    def wait_until(self, is_done: Callable[[Mapping[str, int]], bool], timeout_s: float) -> bool:
+        """Wait until the counts are as wanted; False after the time-out [s]."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._failure is not None or is_done(self._counts), timeout_s
+            )
+            return self._failure is None and is_done(self._counts)
+
+    def _take(self) -> None:
+        """Write what has arrived, until that fails."""
+        new: dict[str, int] = {}
+        try:
+            for name, subscription in self._subscriptions.items():
+                fresh = subscription.drain()[0]
+                if fresh and self._failure is None:
+                    new[name] = self._write(name, fresh)
+        except ThermoCompError as error:
+            self._failure = error
+        if new or self._failure is not None:
+            with self._changed:
+                for name, n_messages in new.items():
+                    self._counts[name] += n_messages
+                self._changed.notify_all()
+
+    def _write(self, name: str, fresh: list[bytes]) -> int:
+        """Record messages and what came before any stamp; return how many."""
+        kind, self._newest[name] = self._topics[name], fresh[-1]
+        if kind is Imu:
+            log_ns = np.array([_STAMP.unpack_from(data, 4) for data in fresh]) @ (10**9, 1)
+            self._newest_ns = int(log_ns[-1])
+        elif self._newest_ns is None:
+            self._early.setdefault(name, []).extend(fresh)
+            return 0
+        else:
+            fresh = self._early.pop(name, []) + fresh
+            log_ns = np.full(len(fresh), self._newest_ns)
+        self._writer.write_raw(name, _type_name(kind), log_ns, fresh)
+        return len(fresh)
+
+
+class LiveTopics(_Listener):
+    """Listens to the node's inputs: a topic is subscribed to once somebody publishes it."""
+
+    _name = 'thermo_comp_record'
+
+    def __init__(self, topics: Topics, input: Input, ros_args: Sequence[str] = ()) -> None:  # noqa: A002
+        super().__init__(ros_args)
+        self._topics, self._input = topics, input
+        self._feeds: dict[Role, Feed] = {}
+        self._heard: dict[Role, RawSubscription] = {}
+        self._waiting: SimpleQueue[tuple[Role, list[bytes], list[int]]] = SimpleQueue()
+        #: Why nothing comes, one sentence each.
+        self.problems: tuple[str, ...] = ()
+
+    def _open(self) -> None:
+        self._look()
+        self._loop.call_every(LOOK_S, self._look)
+
+    @property
+    def n_lost(self) -> int:
+        """Messages that were sent and did not get here."""
+        return sum(one.n_lost for one in self._heard.values())
+
+    def blocks(self, wait: Callable[[float], bool]) -> Iterator[News | None]:
+        """
+        Give what has come, and None after each time; to the last message.
+
+        `wait` waits so long [s] and tells whether to end.
+        """
+        is_over = False
+        while not is_over:
+            is_over = wait(BLOCK_S)
+            if is_over:
+                self.close()
+            waiting = [self._waiting.get() for _ in range(self._waiting.qsize())]
+            if waiting:
+                yield from self._decode(waiting)
+            yield None
+
+    def _decode(self, waiting: list[tuple[Role, list[bytes], list[int]]]) -> Iterator[News]:
+        """Decode what came, in the order of arrival."""
+        feeds = dict(self._feeds)
+        channels = dict(enumerate(feeds))
+        numbers = {role: number for number, role in channels.items()}
+        messages = Messages.of(
+            [one for _, messages, _ in waiting for one in messages],
+            [numbers[role] for role, messages, _ in waiting for _ in messages],
+            [one for _, _, received_ns in waiting for one in received_ns],
+        )
+        names = list(dict.fromkeys((*ROLES[1:], *(role for role in feeds if role != 'accel'))))
+        decoder = Decoder(feeds, channels, names, True)
+        topics = {role: feed.topic for role, feed in feeds.items()}
+        for block in decoder.blocks(messages.in_order()):
+            yield News(block, topics)
+
+    def _look(self) -> None:
+        """Subscribe to what is published; say what is not."""
+        problems: list[str] = []
+        chosen = self._feeds.get('accel')
+        inputs = {
+            getattr(self._topics, key): kind
+            for key, kind in (('counts', VECTOR3_STAMPED), ('imu', IMU))
+            if self._input in (key, 'auto') and (chosen is None or chosen.type == kind)
+        }
+        if not any(self._hear('accel', name, kind, problems) for name, kind in inputs.items()):
+            listed = ' or '.join(map(self._node.resolve_topic_name, inputs))
+            problems.append(f'nobody publishes {listed}')
+        front = self._node.resolve_topic_name('temperature/name').removesuffix('name')
+        further = {
+            name.removeprefix(front): name
+            for name, kinds_of in self._node.get_topic_names_and_types()
+            if TEMPERATURE in kinds_of and name.startswith(front)
+        }
+        further = {k: topic for k, topic in further.items() if is_thermometer(k)}
+        own = {'board': self._topics.board, 'case': self._topics.case}
+        for name, topic in {**own, **further, **self._topics.further}.items():
+            self._hear(name, topic, TEMPERATURE, problems)
+        self.problems = tuple(problems)
+
+    def _hear(self, role: Role, topic: str, kind: str, problems: list[str]) -> bool:
+        """Subscribe to a topic if somebody publishes it; tell whether it is heard."""
+        name = self._node.resolve_topic_name(topic)
+        if role in self._heard:
+            n_publishers = self._heard[role].count_publishers()
+            if n_publishers != 1:
+                problems.append(f'{n_publishers or "no"} publishers on {name}, expected one')
+            return True
+        offers = self._node.get_publishers_info_by_topic(name)
+        if any(one.topic_type != kind for one in offers):
+            problems.append(f'{name} has the type {offers[0].topic_type}, expected {kind}')
+        elif offers:
+            self._feeds[role] = Feed(name, kind, 'cdr')
+            self._heard[role] = self._loop.subscribe(
+                _CLASSES[kind], topic, _AS_OFFERED, is_hot=role == 'accel'
+            )
+        return role in self._heard
+
+    def _take(self) -> None:
+        for role, subscription in self._heard.items():
+            messages, received_ns = subscription.drain()
+            if messages:
+                self._waiting.put((role, messages, received_ns))
+
+
+def _type_name(message_type: Any) -> str:
+    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'

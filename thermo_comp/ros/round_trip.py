@@ -29,9 +29,9 @@ from ..errors import ThermoCompError
 from ..online.stamped_flag import STAMPED_TOPIC
 from ..recording import ROLES
 from ..unit.calibration_file import load_calibration
+from .listener import OUTPUTS, Recorder
 from .node import NODE_NAME
 from .player import PlayReport, play
-from .recorder import OUTPUTS, Recorder
 
 #: What the node makes of samples.
 SAMPLES = 'imu/data_raw'
