@@ -218,7 +218,7 @@ def test_hours_of_bag_stay_a_small_page(tmp_path):
     shown, windows = evidence().shown, evidence().windows
     time = np.arange(0.0, 86400.0, 0.5)
     value = 20.0 + 15.0 * np.sin(time / 9000.0) + np.random.default_rng(1).normal(size=len(time))
-    readings = Readings(shown.start_ns + (time * 1e9).astype(np.int64), value, len(time))
+    readings = Readings(shown.start_ns + (time * 1e9).astype(np.int64), value)
     rows = np.resize(np.arange(len(windows)), 8640)
     long = replace(
         evidence(),

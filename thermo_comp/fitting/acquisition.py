@@ -20,14 +20,7 @@ from ..recording.columns import Readings
 from ..recording.overview import ThermometerSurvey, survey_thermometer, thermal_findings
 from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints
-from .coverage import (
-    SAME_DIRECTION_DEG,
-    constants_covariance,
-    farthest,
-    next_direction,
-    rough_centre,
-    worst_sd,
-)
+from . import coverage
 
 # What is still for so long, or for a soak that is shorter, is a rest [s].
 _REST_S = 10.0
@@ -185,7 +178,7 @@ class Acquisition:
             self._first = means[0]
         ups = self._directions(means)
         up = self._directions(self._first[None])[0]
-        other = ups @ up < math.cos(math.radians(SAME_DIRECTION_DEG))
+        other = ups @ up < math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
         if not other.any():
             return None
         lower = ranges[int(np.argmax(other))][0]
@@ -200,7 +193,7 @@ class Acquisition:
         }
         self._begin_ns, self._n_looked, self._first = end_ns, 0, None
         means = np.array([one.mean for one in self._rests if one.n_rests]).reshape(-1, 3)
-        self._centre = rough_centre(means)
+        self._centre = coverage.rough_centre(means)
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
         """Put the rests of the position together, up to where the next one begins."""
@@ -224,10 +217,7 @@ class Acquisition:
         )
 
     def _directions(self, means: Floats) -> Floats:
-        """Give unit vectors of raw means, about the centre that they have so far."""
-        arms = means - self._centre
-        norms = np.linalg.norm(arms, axis=1, keepdims=True)
-        return np.asarray(arms / np.where(norms > 0.0, norms, np.nan))
+        return coverage.directions(means, self._centre)
 
     def account(self) -> Account:
         """Say what there is and what is missing."""
@@ -247,17 +237,17 @@ class Acquisition:
             )
         found = [one for one in positions if np.isfinite(one.up).all()]
         seen = np.array([one.up for one in found]).reshape(-1, 3)
-        covariance = constants_covariance(seen, np.array([one.sd_g for one in found]))
-        next_up = next_direction(covariance, found[-1].sd_g if found else _FLOOR_SD, seen)
+        covariance = coverage.constants_covariance(seen, np.array([one.sd_g for one in found]))
+        next_up = coverage.next_direction(covariance, found[-1].sd_g if found else _FLOOR_SD, seen)
         now, is_still = self._now(cells)
-        hole, hole_deg = farthest(seen)
+        hole, hole_deg = coverage.farthest(seen)
         n_good = sum(not one.reason for one in positions)
         thermometers = _together([one.surveys for one in rests])
         return Account(
             tuple(positions),
             n_good,
             n_good >= self._n_wanted,
-            worst_sd(covariance),
+            coverage.worst_sd(covariance),
             np.sqrt(np.diag(covariance)),
             next_up,
             float(np.degrees(np.arccos(np.clip(now @ next_up, -1.0, 1.0)))),
@@ -277,7 +267,7 @@ class Acquisition:
             return 'reads zero'
         if noise > _RESTLESS:
             return 'restless'
-        near = math.cos(math.radians(SAME_DIRECTION_DEG))
+        near = math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
         for number, one in enumerate(before, 1):
             if not one.reason and float(one.up @ up) > near:
                 return f'as position {number}'

@@ -107,11 +107,10 @@ def distinct_directions(up: Floats) -> Floats:
     return np.array(kept).reshape(-1, 3)
 
 
-def directions(means: Floats) -> Floats:
-    """Make unit vectors of mean readings, shape (n, 3), about their rough centre."""
-    arms = means - rough_centre(means)
-    norms = np.linalg.norm(arms, axis=1, keepdims=True)
-    return np.asarray(arms / np.where(norms > 0.0, norms, 1.0))
+def directions(means: Floats, centre: Floats) -> Floats:
+    """Make unit vectors of mean readings (n, 3) about a centre; NaN where there is none."""
+    norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
+    return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
 
 def rough_centre(means: Floats) -> Floats:
@@ -155,7 +154,8 @@ def best_rests(candidates: list[Floats]) -> int:
     The one that tells bias and scale best: by what its rests leave of |f| - g, and how they are
     spread. The first, unless another is clearly better, or where no set has enough attitudes.
     """
-    enough = [len(distinct_directions(directions(means))) for means in candidates]
+    ups = [directions(means, rough_centre(means)) for means in candidates]
+    enough = [len(distinct_directions(one)) for one in ups]
     n_most = max(enough, default=0)
     costs = np.full(len(candidates), np.inf)
     for number, means in enumerate(candidates):

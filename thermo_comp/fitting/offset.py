@@ -9,7 +9,7 @@ of no force, and that word is a part of the calibration's bias.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -19,6 +19,7 @@ from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration
 from .coverage import rough_centre
 from .options import COUNTS_FULL_SCALE, FitOptions
+from .priors import constants_of
 from .reduction import ReducedBag
 
 # A bias beyond this part of 1 g is a word of no force.
@@ -32,11 +33,9 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
     if options.input != 'counts':
         return np.zeros(3)
     if options.prior is not None:
-        axes = options.prior.axes
-        bias = np.array([axis.bias for axis in (axes.x, axes.y, axes.z)])
-        scale = np.array([axis.scale_factor for axis in (axes.x, axes.y, axes.z)])
-        is_far = np.abs(bias / scale).max() > _LARGEST_BIAS * options.gravity
-        return np.asarray(np.rint(bias) if is_far else np.zeros(3))
+        known = constants_of(options.prior)
+        is_far = np.abs(known.bias / known.scale).max() > _LARGEST_BIAS * options.gravity
+        return np.asarray(np.rint(known.bias) * is_far)
     middle = max(bag.middle for bag in bags)
     if middle:
         return np.full(3, middle)
@@ -47,16 +46,13 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
 def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
     """Take the words of no force out of a bag, and of its source."""
     blocks = bag.source.blocks
-    return replace(
-        bag,
-        source=replace(
-            bag.source,
-            blocks=lambda: (
-                replace(cast(Any, block), accel=block.accel - offset) for block in blocks()
-            ),
-        ),
-        intervals=tuple(replace(one, mean=one.mean - offset) for one in bag.intervals),
-    )
+
+    def moved() -> Iterator[Any]:
+        for block in blocks():
+            yield replace(cast(Any, block), accel=block.accel - offset)
+
+    intervals = tuple(replace(one, mean=one.mean - offset) for one in bag.intervals)
+    return replace(bag, source=replace(bag.source, blocks=moved), intervals=intervals)
 
 
 def about(calibration: Calibration, offset: Floats) -> Calibration:
@@ -66,16 +62,11 @@ def about(calibration: Calibration, offset: Floats) -> Calibration:
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
         # Words of 16 bits without a sign, of which nobody said how long they are.
         full_scale = 2.0 * COUNTS_FULL_SCALE + 1.0
-    return replace(
-        calibration,
-        unit=replace(unit, full_scale=full_scale),
-        axes=Axes(
-            *(
-                AxisReference(axis.scale_factor, axis.bias + by)
-                for axis, by in zip((axes.x, axes.y, axes.z), offset.tolist(), strict=True)
-            )
-        ),
+    moved = (
+        AxisReference(axis.scale_factor, axis.bias + by)
+        for axis, by in zip((axes.x, axes.y, axes.z), offset.tolist(), strict=True)
     )
+    return replace(calibration, unit=replace(unit, full_scale=full_scale), axes=Axes(*moved))
 
 
 def with_notes(calibration: Calibration, notes: Sequence[str]) -> Calibration:

@@ -35,6 +35,13 @@ _NEAR = 0.3
 _E_FOLDS_K = (15.0, 30.0)
 #: What is refused, and may be allowed by its name.
 REFUSALS = ('saturation', 'units', 'jump', 'swapped')
+_WORDS: dict[str, tuple[str, ...]] = {
+    'input': ('counts', 'm/s^2'),
+    'model': ('response', 'golovach'),
+    **dict.fromkeys(('static_curve', 'dynamic_curve'), CURVES),
+    **dict.fromkeys(('groups', 'forced'), GROUPS),
+    'allow': REFUSALS,
+}
 
 
 @dataclass(frozen=True)
@@ -53,17 +60,14 @@ class Ageing:
 @dataclass(frozen=True)
 class FitOptions:
     """
-    Options of a fit.
+    Options of a fit; ValueError if one is outside its range.
 
     gravity: local gravity; see `gravity.resolve_gravity`
     model: the whole bank, thinned by evidence; or the paper: a linear static and a quadratic
         dynamic set, without a response
-    static_curve, dynamic_curve: ``linear``, ``quadratic``, ``cubic``, ``spline`` or
-        ``exponential``; None takes the model's own
-    groups: groups of columns that may take part; None takes all
-    forced: groups that stay whatever they earn
-    prior: what is known beforehand: of the type of unit, or of this unit; its columns are the
-        model
+    static_curve, dynamic_curve: one of `CURVES`; None takes the model's own
+    groups, forced: groups of columns that may take part (None: all); that stay whatever they earn
+    prior: what is known beforehand, of the type or of this unit; its columns are the model
     ageing: what the prior's covariance has grown by since
     serial: unit serial; None takes the sources'
     input: unit of the samples
@@ -75,8 +79,6 @@ class FitOptions:
     min_rest_s: length of the shortest rest; None chooses, see `reduction`
     still_sd: largest scatter of the samples at rest [m/s^2]
     allow: names of refusals that the user overrides, see `verdict`
-
-    Raises ValueError if a value is outside its range.
     """
 
     gravity: float
@@ -104,20 +106,11 @@ class FitOptions:
                 raise ValueError(f'`{name}` must be positive, got {value}')
         if self.offset is not None and not math.isfinite(self.offset):
             raise ValueError(f'`offset` must be finite, got {self.offset}')
-        if self.input not in ('counts', 'm/s^2'):
-            raise ValueError(f"`input` must be 'counts' or 'm/s^2', got {self.input!r}")
-        if self.model not in ('response', 'golovach'):
-            raise ValueError(f"`model` must be 'response' or 'golovach', got {self.model!r}")
-        for name in ('static_curve', 'dynamic_curve'):
-            value = getattr(self, name)
-            if value is not None and value not in CURVES:
-                raise ValueError(f'`{name}` must be one of {", ".join(CURVES)}, got {value!r}')
-        for group in (*(self.groups or ()), *self.forced):
-            if group not in GROUPS:
-                raise ValueError(f'`groups` must be of {", ".join(GROUPS)}, got {group!r}')
-        for name in self.allow:
-            if name not in REFUSALS:
-                raise ValueError(f'`allow` must be of {", ".join(REFUSALS)}, got {name!r}')
+        for name, words in _WORDS.items():
+            given = getattr(self, name)
+            for word in given if isinstance(given, tuple) else (given,):
+                if word is not None and word not in words:
+                    raise ValueError(f'`{name}` must be of {", ".join(words)}, got {word!r}')
 
     @property
     def saturated_at(self) -> float | None:

@@ -19,15 +19,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..recording import RecordingInfo
-from ..recording.stillness import (
-    STILL_SD,
-    VARIANCE_RATIO,
-    CellAccumulator,
-    Cells,
-    still_intervals,
-    why_restless,
-)
+from ..recording import RecordingInfo, stillness
+from ..recording.stillness import CellAccumulator, Cells
 from ..typing import Floats, Ints
 from .coverage import best_rests
 from .sources import FitSource, angular_velocity
@@ -41,7 +34,7 @@ _SHORTEST_READING_INTERVAL_S = 0.2
 _LEAST_FILLED = 0.9
 # What is tried, the strictest first: lengths of the shortest rest [s], ratios of variances.
 _MIN_RESTS_S = (3.0, 2.0, 1.0)
-_RATIOS = tuple(VARIANCE_RATIO * 2.0**power for power in range(6))
+_RATIOS = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
 # Nothing that is read outside these is a temperature of a part [degC].
 _COLDEST, _HOTTEST = -273.15, 1e4
 
@@ -61,16 +54,12 @@ NO_RECORDING = RecordingInfo(Path(), '', {}, 0, 0)
 @dataclass(frozen=True)
 class StillInterval:
     """
-    One interval without motion: one position.
+    One interval without motion: one position, from its first to its last cell's middle.
 
-    start_ns, end_ns: stamps of its first and last cell's middle
-    begin_s: where its first window begins, since the bag's first sample [s]; the others follow on
-    n_whole: windows of the full length; one that is shorter may come after them
-    time: mean time of each window's samples since the bag's first sample [s], shape (n,)
-    count: samples per window, shape (n,)
-    mean: window means of the raw samples, shape (n, 3)
-    sample_sd: scatter of single samples, shape (3,)
-    angular_rate: window means of it [rad/s], shape (n, 3); None where the bag has none throughout
+    Its windows follow each other from `begin_s`, since the bag's first sample [s]; `n_whole` have
+    the full length, one that is shorter may come after them. Of each the mean `time` [s], `count`
+    and `mean` of the raw samples are kept, and that of the angular rate [rad/s], None where the
+    bag has none throughout. `sample_sd` is the scatter of single samples.
     """
 
     start_ns: int
@@ -89,20 +78,12 @@ class ReducedBag:
     """
     What the fit keeps of one bag.
 
-    source: where it came from
-    start_ns, end_ns: first and last stamp of the samples used
-    intervals: still intervals in order
-    temperatures: by the name of the thermometer
-    n_samples, n_dropped, n_saturated: samples read; not finite or out of order; at the full scale
-    n_cells, n_still_cells: length of the bag, and of its still intervals, in cells
-    window_s: length of a window: as asked, or a multiple of it where the samples are slow [s]
-    cycle_s: typical interval between samples
-    is_integer: whether all samples were whole numbers
-    middle: the word of no force where the words have no sign, else 0
-    reach: how far the readings go, handling included, but for single glitches
-    info, since_s: what a recording says of itself, now that it is read; where its part begins [s]
-    restless: what speaks against rests, where there is none
-    angular_rate: how much of the bag has one, of finite numbers
+    Stamps are of the first and last sample used; dropped are samples that are not finite or out of
+    order. Its length, and that at rest, are counted in cells; windows last `window_s` as asked,
+    or a multiple where the samples are slow; `cycle_s` is typical between samples. `middle` is the
+    word of no force where the words have no sign, else 0; `reach` how far the readings go but for
+    single glitches; `since_s` where the part begins that was read [s]; `restless` what speaks
+    against rests, where there is none; `angular_rate` how much of the bag has one, all finite.
     """
 
     source: FitSource
@@ -142,7 +123,7 @@ def reduce_source(
     window_s: float = WINDOW_S,
     cell_s: float = _CELL_S,
     min_rest_s: float | None = None,
-    still_sd: float = STILL_SD,
+    still_sd: float = stillness.STILL_SD,
     full_scale: float | None,
     fewest_windows: int = 1,
 ) -> ReducedBag:
@@ -216,7 +197,7 @@ def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
     if 2 * cells.n_saturated > n_samples:
         share = 100.0 * cells.n_saturated / n_samples
         return f'{share:.0f} % of its samples are at the full scale, see --full-scale'
-    return why_restless(cells, still_sd)
+    return stillness.why_restless(cells, still_sd)
 
 
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
@@ -224,7 +205,7 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
     found: list[list[tuple[int, int]]] = []
     for shortest in _MIN_RESTS_S if min_rest_s is None else (min_rest_s,):
         for ratio in _RATIOS:
-            ranges = still_intervals(cells, shortest, still_sd, ratio)
+            ranges = stillness.still_intervals(cells, shortest, still_sd, ratio)
             if ranges not in found:
                 found.append(ranges)
     weighted = cells.mean * cells.count[:, None]

@@ -10,7 +10,7 @@ outside the calibrated ranges is told apart and decides nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -65,7 +65,8 @@ class Judgement:
     @property
     def headline_rms(self) -> float:
         """RMS of what a new attitude will see: left out of the fit, or of bags it has not seen."""
-        return _headline(self.left_out_rms, self.sections['all'])
+        in_sample = self.sections['all'].rms
+        return self.left_out_rms if np.isfinite(self.left_out_rms) else in_sample
 
     @property
     def verdict(self) -> str:
@@ -116,42 +117,32 @@ def judge(
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
     sections = sections_of(windows, windows.raw_residual, windows.residual, claimed)
-    left_out = calibration.provenance.left_out_rms if is_seen else np.nan
     shifts = axis_shifts(windows.select(windows.is_inside), calibration.misalignment_sd)
-    moved = what_moved(shifts) if claims else ()
-    is_thermal = calibration.needs_temperature
-    kind, reason = _verdict(windows, sections, left_out, tolerance, moved, claims, is_thermal)
-    return Judgement(
-        kind=kind,
-        reason=reason,
+    found = Judgement(
+        kind=Verdict.OUTSIDE,
+        reason='',
         sections=sections,
-        left_out_rms=left_out,
+        left_out_rms=calibration.provenance.left_out_rms if is_seen else np.nan,
         tolerance=tolerance,
         shifts=shifts,
-        moved=moved,
+        moved=what_moved(shifts) if claims else (),
         axis_rms=rms_by_axis(windows),
         n_positions=distinct_positions(windows),
         windows=windows,
         rate=judge_rates(windows, calibration),
     )
+    kind, reason = _verdict(found, claims, calibration.needs_temperature)
+    return replace(found, kind=kind, reason=reason)
 
 
-def _verdict(
-    windows: Windows,
-    sections: Sections,
-    left_out: float,
-    tolerance: float | None,
-    moved: tuple[str, ...],
-    claims: bool,
-    is_thermal: bool,
-) -> tuple[Verdict, str]:
-    one, outside = sections['all'], sections['outside']
+def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict, str]:
+    sections, windows, tolerance = found.sections, found.windows, found.tolerance
+    one, outside, left_out = sections['all'], sections['outside'], found.left_out_rms
     if not one.n:
-        reason = (
-            f'all {_windows(outside.n, windows)} lie there, {_span(windows)}; {_numbers(outside)}'
-        )
-        return Verdict.OUTSIDE, reason
-    worst = max([s.rms for s in sections.regimes or [one]] + [_headline(left_out, one)])
+        span = f'at {np.min(windows.board):.1f} to {np.max(windows.board):.1f} degC'
+        said = f'all {_windows(outside.n, windows)} lie there, {span}; {_numbers(outside)}'
+        return Verdict.OUTSIDE, said
+    worst = max([s.rms for s in sections.regimes or [one]] + [found.headline_rms])
     ratio = sections.worst_ratio
     # A NaN of no claim compares false.
     is_wide = one.claimed_rms > (tolerance or min(WIDE_PART * one.raw_rms, _WIDE_CLAIM))
@@ -161,32 +152,28 @@ def _verdict(
         kind = Verdict.RECALIBRATE
     elif tolerance is None and not claims:
         kind = Verdict.NO_CLAIM
-    elif tolerance is None and (ratio > LARGEST_RATIO or moved):
+    elif tolerance is None and (ratio > LARGEST_RATIO or found.moved):
         kind = Verdict.RECALIBRATE
     else:
         kind = Verdict.WIDE if is_wide else Verdict.VALID
-    said = [f'{_numbers(one)} over {_windows(one.n, windows)}']
+    says = [f'{_numbers(one)} over {_windows(one.n, windows)}']
     if np.isfinite(left_out):
-        said = [f'{spoken(left_out)} RMS of |f| - g on positions left out; in sample {said[0]}']
+        says = [f'{spoken(left_out)} RMS of |f| - g on positions left out; in sample {says[0]}']
     if tolerance is not None:
         where = 'on positions left out' if worst == left_out else 'in the worse regime'
-        said.append(f'{spoken(worst)} {where}, {spoken(tolerance)} tolerated')
+        says.append(f'{spoken(worst)} {where}, {spoken(tolerance)} tolerated')
     elif claims:
-        said.append(f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}')
+        says.append(f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}')
     else:
-        said.append('the calibration says nothing of its uncertainty: give a tolerance')
-    if moved:
-        said.append('moved: ' + ', '.join(moved))
+        says.append('the calibration says nothing of its uncertainty: give a tolerance')
+    if found.moved:
+        says.append('moved: ' + ', '.join(found.moved))
     if outside.n:
-        said.append(
+        says.append(
             f'{_windows(outside.n, windows)} outside the calibrated ranges not judged: '
             f'{spoken(outside.rms)}'
         )
-    return kind, '; '.join(said)
-
-
-def _headline(left_out: float, section: Section) -> float:
-    return left_out if np.isfinite(left_out) else section.rms
+    return kind, '; '.join(says)
 
 
 def _numbers(section: Section) -> str:
@@ -198,7 +185,3 @@ def _numbers(section: Section) -> str:
 
 def _windows(n: int, windows: Windows) -> str:
     return f'{counted(n, "window")} of {windows.window_s:g} s'
-
-
-def _span(windows: Windows) -> str:
-    return f'at {np.min(windows.board):.1f} to {np.max(windows.board):.1f} degC'

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
+from ..fitting.priors import constants_of
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import readings_in_order
 from ..online.compensator import Compensator
@@ -130,12 +131,9 @@ def corrected_windows(
     raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)
     if calibration is not None:
         gravity = calibration.gravity_m_s2 if gravity is None else gravity
-        axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-        K, bias = np.array([(axis.scale_factor, axis.bias) for axis in axes]).T
-        M = np.array(calibration.misalignment)
-        raw = (raw - bias) / K @ M.T
-        force = table['force']
-        along = force / np.linalg.norm(force, axis=1, keepdims=True) @ M
+        constants, force = constants_of(calibration), table['force']
+        raw = constants.force(raw)
+        along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(Correction(calibration).noise)
         # Of a message's noise the rounding is carried on to the next: a mean has none of it.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
