@@ -19,6 +19,7 @@ import numpy as np
 
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .drift import (
+    ZERO,
     CreepEffect,
     DifferenceEffect,
     Effect,
@@ -38,7 +39,7 @@ class _Specimen:
 
     def __init__(self, name: str, seed: int) -> None:
         self.name = name
-        self.serial = f'{name}-{seed:04d}'
+        self._seed = seed
         self._rng = generator(seed, Stream.UNIT, UNIT_NAMES.index(name))
 
     def near(self, value: float) -> float:
@@ -72,29 +73,22 @@ class _Specimen:
         *,
         full_scale_g: float,
         bias_ug: float,
-        density: float = 5.0,
         spread: float = 0.01,
         misalignment_sd: float = 1e-3,
         **others: Any,
     ) -> UnitModel:
-        """Return the unit, its constants drawn; a quartz one with a charge-balancing converter."""
+        """Return the unit, its constants drawn."""
         K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), spread)
         bx, by, bz = self.normal(bias_ug)
         yx, zx, zy = self.normal(misalignment_sd)
-        parts: dict[str, Any] = {
-            'board': ThermometerModel('board', phase=0.5),
-            'case': ThermometerModel('case'),
-            'noise_density': (density, density, density),
-        }
         return UnitModel(
-            name=self.name,
-            serial=self.serial,
+            serial=f'{self.name}-{self._seed:04d}',
             network=network,
             drift=drift,
             scale_factor=K,
             bias_at_reference=(bx * K[0] * MICRO_G, by * K[1] * MICRO_G, bz * K[2] * MICRO_G),
             misalignment=((1.0, 0.0, 0.0), (yx, 1.0, 0.0), (zx, zy, 1.0)),
-            **{**parts, **others},
+            **others,
         )
 
 
@@ -226,16 +220,18 @@ def _triad(draw: _Specimen) -> UnitModel:
     drift = _tempcos(draw, ['board'] if kind in _ON_BOARD else heads)
     if kind in _EXTRA:
         drift += _EXTRA[kind](draw)
-    others: dict[str, Any] = {}
+    loads: tuple[SwitchedLoad, ...] = ()
     if kind == 'switched-load':
-        others['loads'] = (SwitchedLoad('board', draw.between(0.3, 0.8)),)
-    if kind == 'slow-noise':
-        others['bias_walk'] = (3.0, 3.0, 3.0)
-    if kind == 'plain':
-        drift = []
-    # With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
+        loads = (SwitchedLoad('board', draw.between(0.3, 0.8)),)
     return draw.unit(
-        network, tuple(drift), full_scale_g=9.975, bias_ug=1500.0, density=3.0, **others
+        network,
+        tuple(drift) if kind != 'plain' else (),
+        full_scale_g=9.975,
+        bias_ug=1500.0,
+        # With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
+        noise_density=(3.0, 3.0, 3.0),
+        bias_walk=(3.0, 3.0, 3.0) if kind == 'slow-noise' else ZERO,
+        loads=loads,
     )
 
 

@@ -156,16 +156,15 @@ class UnitModel:
     gyro: the gyroscope beside it, if there is one
     """
 
-    name: str
     serial: str
     network: ThermalNetwork
     drift: tuple[Effect, ...]
-    board: ThermometerModel
-    case: ThermometerModel
     scale_factor: Triple
     bias_at_reference: Triple
     misalignment: tuple[Triple, Triple, Triple]
-    noise_density: Triple
+    board: ThermometerModel = ThermometerModel('board', phase=0.5)
+    case: ThermometerModel = ThermometerModel('case')
+    noise_density: Triple = (5.0, 5.0, 5.0)
     converter: Callable[[Floats, Ints], tuple[NDArray[np.int32], Ints]] = balanced
     bias_walk: Triple = ZERO
     loads: tuple[SwitchedLoad, ...] = ()
