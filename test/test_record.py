@@ -139,7 +139,7 @@ class TestGrowing:
             if news is not None:
                 assert news.info is not None
                 assert news.info.metadata['serial'] == 'lab-7'
-                for one in news.block.raw:
+                for one in news.block.raw.values():
                     found.setdefault(one.topic, []).extend(messages_of(one))
         assert n_looks == 10
         assert found == contents([session])

@@ -191,7 +191,7 @@ def test_raw_messages_are_the_very_bytes(tmp_path: Path, accel: str) -> None:
     write_rosbag1(tmp_path / 'bag.bag', messages)
     for name in ('bag.mcap', 'bag', 'bag.bag'):
         with open_recording(tmp_path / name) as reader:
-            found = {raw.topic: raw for block in reader.blocks(raw=True) for raw in block.raw}
+            found = {raw.topic: raw for one in reader.blocks(raw=True) for raw in one.raw.values()}
         assert set(found) == {accel, BOARD, CASE}
         for topic, raw in found.items():
             pieces = np.split(raw.data, raw.ends)[:-1]
@@ -257,7 +257,7 @@ def test_raw_messages_of_overlapping_chunks_are_in_order_too(tmp_path: Path) -> 
     found = [
         piece.tobytes()
         for block in blocks
-        for raw in block.raw
+        for raw in block.raw.values()
         if raw.topic == ACCEL
         for piece in np.split(raw.data, raw.ends)[:-1]
     ]

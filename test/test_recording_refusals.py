@@ -78,7 +78,7 @@ def test_ros_1_messages_in_an_mcap_file(tmp_path: Path) -> None:
     assert block.frame_id == 'link'
     # Given out raw, it is CDR like any other.
     message = Message(ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
-    assert block.raw[0].data.tobytes() == serialize(message)
+    assert block.raw['accel'].data.tobytes() == serialize(message)
 
 
 def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:

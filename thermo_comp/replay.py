@@ -300,8 +300,6 @@ def _write_inputs(writer: BagWriter, block: Block, reader: RecordingReader) -> N
     """Copy the inputs; their log time becomes their stamp, as that of the outputs is."""
     stamps = {name: one.stamp_ns for name, one in block.temperatures.items()}
     stamps['accel'] = block.accel_stamp_ns
-    roles = {topic: role for role, topic in reader.topics.items()}
-    for raw in block.raw:
-        times = stamps[roles[raw.topic]]
-        copy = RawMessages(raw.topic, raw.type, times, raw.data, raw.ends)
-        writer.write_raw(raw.topic, raw.type, times, copy, reader.definitions.get(raw.type))
+    for role, raw in block.raw.items():
+        definition = reader.definitions.get(raw.type)
+        writer.write_raw(raw.topic, raw.type, stamps[role], raw, definition)

@@ -16,8 +16,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..typing import Bytes, Floats, Ints
-from .messages import Topic
+from ..typing import Bools, Bytes, Floats, Ints
+from .messages import Topic, pack
 
 Input = Literal['auto', 'counts', 'imu']
 #: ``accel``, or the name of a thermometer.
@@ -92,7 +92,7 @@ class ImuColumns:
         )
         return cls(level, none, rate, unknown, unknown)
 
-    def take(self, rows: Ints | slice) -> ImuColumns:
+    def take(self, rows: Ints | Bools) -> ImuColumns:
         """Choose some messages."""
         return ImuColumns(*(getattr(self, one.name)[rows] for one in fields(self)))
 
@@ -111,12 +111,11 @@ class RawMessages:
     data: Bytes
     ends: Ints
 
-    def part(self, begin: int, end: int | None = None) -> RawMessages:
-        """Choose a run of them."""
-        ends = self.ends[begin:end]
-        start = int(self.ends[begin - 1]) if begin else 0
-        data = self.data[start : int(ends[-1]) if len(ends) else start]
-        return RawMessages(self.topic, self.type, self.log_ns[begin:end], data, ends - start)
+    def take(self, rows: Bools) -> RawMessages:
+        """Choose some messages."""
+        size = np.diff(self.ends, prepend=0)
+        packed = pack(self.data, (self.ends - size)[rows], size[rows])
+        return RawMessages(self.topic, self.type, self.log_ns[rows], *packed)
 
 
 class Readings(NamedTuple):
@@ -142,7 +141,7 @@ class Block:
     `accel`, shape (n, 3), is in counts per cycle, or m/s^2 where the input is sensor_msgs/Imu;
     `imu` is the rest of that message. A block ends where the samples' `frame_id` changes. The
     temperatures are by the name of the thermometer, empty for those that the bag lacks; `log_ns`
-    by role; `raw`, where asked for, has one entry for each topic.
+    by role, as `raw`, where asked for.
     """
 
     accel_stamp_ns: Ints
@@ -151,7 +150,7 @@ class Block:
     imu: ImuColumns | None
     temperatures: Mapping[str, Readings]
     log_ns: Mapping[Role, Ints]
-    raw: tuple[RawMessages, ...] = ()
+    raw: Mapping[Role, RawMessages] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the accelerometer messages."""
@@ -161,6 +160,27 @@ class Block:
     def n_messages(self) -> int:
         """Count the messages of all roles."""
         return sum(map(len, self.log_ns.values()))
+
+    def take(self, rows: Mapping[Role, Bools]) -> Block:
+        """Choose some messages of each role."""
+        own = rows['accel']
+        n_before = np.concatenate(([0], np.cumsum(own)))
+        return Block(
+            self.accel_stamp_ns[own],
+            self.accel[own],
+            self.frame_id,
+            self.imu and self.imu.take(own),
+            {
+                name: Readings(
+                    one.stamp_ns[rows[name]],
+                    one.celsius[rows[name]],
+                    n_before[one.after[rows[name]]],
+                )
+                for name, one in self.temperatures.items()
+            },
+            {role: log_ns[rows[role]] for role, log_ns in self.log_ns.items()},
+            {role: one.take(rows[role]) for role, one in self.raw.items()},
+        )
 
 
 def empty_block(names: Iterable[str]) -> Block:
@@ -212,9 +232,9 @@ def joined(blocks: Sequence[Block]) -> Block:
             np.concatenate(after),
         )
     imus = [block.imu for block in blocks if block.imu is not None]
-    raws: dict[str, list[RawMessages]] = {}
-    for raw in (raw for block in blocks for raw in block.raw):
-        raws.setdefault(raw.topic, []).append(raw)
+    raws: dict[Role, list[RawMessages]] = {}
+    for role, raw in (own for block in blocks for own in block.raw.items()):
+        raws.setdefault(role, []).append(raw)
     return Block(
         np.concatenate([block.accel_stamp_ns for block in blocks]),
         np.concatenate([block.accel for block in blocks]),
@@ -226,7 +246,7 @@ def joined(blocks: Sequence[Block]) -> Block:
         else None,
         temperatures,
         {role: np.concatenate([b.log_ns[role] for b in blocks]) for role in blocks[0].log_ns},
-        tuple(map(_joined_raw, raws.values())),
+        {role: _joined_raw(pieces) for role, pieces in raws.items()},
     )
 
 

@@ -84,7 +84,7 @@ class Decoder:
             rank, _, accel = found['accel']
         temperatures = dict.fromkeys(self._names, NO_READINGS)
         log_ns = dict.fromkeys(('accel', *self._names), no_ns)
-        raw = []
+        raw = {}
         for role, (own_rank, messages, (stamp_ns, numbers, _)) in found.items():
             log_ns[role] = messages.log_ns
             if role != 'accel':
@@ -93,7 +93,7 @@ class Decoder:
             if self._keep_raw and len(messages):
                 topic, kind, _ = self._feeds[role]
                 packed = pack(messages.data, messages.start, messages.size)
-                raw.append(RawMessages(topic, kind, messages.log_ns, *packed))
+                raw[role] = RawMessages(topic, kind, messages.log_ns, *packed)
         is_imu, numbers = self._is_imu, accel.numbers
         return Block(
             accel.stamp_ns,
@@ -102,7 +102,7 @@ class Decoder:
             ImuColumns(*(numbers[:, c] for c in _IMU_COLUMNS)) if is_imu else None,
             temperatures,
             log_ns,
-            tuple(raw),
+            raw,
         )
 
     def _found(self, messages: Messages, role: Role) -> _Found:

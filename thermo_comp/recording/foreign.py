@@ -23,7 +23,7 @@ _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 
 class ForeignFile:
     """
-    One file that `rosbags` reads, as `storage.BagFile`: ``.db3``, ``.mcap`` or a ROS 1 ``.bag``.
+    One file that `rosbags` reads, as `reader.BagFile`: ``.db3``, ``.mcap`` or a ROS 1 ``.bag``.
 
     `is_packed` where rosbag2 has compressed message by message; a `name` is what errors call it.
     Raises RecordingError for whatever `rosbags` cannot open.

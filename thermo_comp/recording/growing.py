@@ -10,24 +10,22 @@ before; so looks are as far apart as they take long.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import RecordingError
-from .columns import Block, Input, Readings, RecordingInfo, Role
+from .columns import Block, Input, RecordingInfo, Role
 from .reader import open_recording
 from .topics import Topics
 
 
 class News(NamedTuple):
-    """What has come: a block with its serialized messages, topics by role, and from which bag."""
+    """What has come: a block with its serialized messages, and from which bag."""
 
     block: Block
-    topics: Mapping[Role, str]
     info: RecordingInfo | None = None
 
 
@@ -66,14 +64,12 @@ def growing_blocks(
             with reader:
                 n_read: dict[Role, int] = {}
                 for block in reader.blocks(raw=True):
-                    known = {
-                        role: min(max(n_seen.get(role, 0) - n_read.get(role, 0), 0), len(log_ns))
-                        for role, log_ns in block.log_ns.items()
-                    }
+                    is_new = {}
                     for role, log_ns in block.log_ns.items():
+                        numbers = n_read.get(role, 0) + np.arange(len(log_ns))
+                        is_new[role] = numbers >= n_seen.get(role, 0)
                         n_read[role] = n_read.get(role, 0) + len(log_ns)
-                    new = _without(block, known, reader.topics)
-                    yield News(new, reader.topics, reader.info)
+                    yield News(block.take(is_new), reader.info)
                 n_seen = n_read
                 is_whole = reader.info.truncated is None and bool(n_seen)
         yield None
@@ -83,28 +79,3 @@ def growing_blocks(
 
 def _size(path: Path) -> int:
     return sum(one.stat().st_size for one in (path.iterdir() if path.is_dir() else [path]))
-
-
-def _without(block: Block, known: Mapping[Role, int], topics: Mapping[Role, str]) -> Block:
-    """Drop the first messages of each role."""
-    if not any(known.values()):
-        return block
-    n = known['accel']
-    roles = {topic: role for role, topic in topics.items()}
-    raw = [one.part(known[roles[one.topic]]) for one in block.raw]
-    return replace(
-        block,
-        accel_stamp_ns=block.accel_stamp_ns[n:],
-        accel=block.accel[n:],
-        imu=None if block.imu is None else block.imu.take(slice(n, None)),
-        temperatures={
-            name: Readings(
-                one.stamp_ns[known[name] :],
-                one.celsius[known[name] :],
-                np.maximum(one.after[known[name] :] - n, 0),
-            )
-            for name, one in block.temperatures.items()
-        },
-        log_ns={role: log_ns[known[role] :] for role, log_ns in block.log_ns.items()},
-        raw=tuple(one for one in raw if len(one.ends)),
-    )

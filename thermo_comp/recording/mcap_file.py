@@ -55,7 +55,7 @@ _new_stream: Any = ReadDataStream
 
 class McapFile:
     """
-    One open MCAP file, as `storage.BagFile`; `pool` reads ahead.
+    One open MCAP file, as `reader.BagFile`; `pool` reads ahead.
 
     Its `spans` hold messages, in the order of the file. Raises RecordingError for what is no MCAP
     file, or damaged other than at its end; a `name` is what errors call it.

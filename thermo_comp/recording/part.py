@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
 from math import inf
 from pathlib import Path
 
@@ -13,8 +12,7 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..typing import Bools, Ints
-from .columns import Block, RawMessages, Role
-from .messages import pack
+from .columns import Block
 from .topics import Part
 
 
@@ -22,14 +20,12 @@ class Cut:
     """
     Leaves out of blocks what is outside a part.
 
-    `topics` are those of the roles, by which serialized messages are told; `since_s` is where the
-    first sample that was kept stands, since the bag's first one.
+    `since_s` is where the first sample that was kept stands, since the bag's first one.
     """
 
-    def __init__(self, path: Path, part: Part, topics: Mapping[Role, str]) -> None:
+    def __init__(self, path: Path, part: Part) -> None:
         self._path = path
         self._part = part
-        self._roles = {topic: role for role, topic in topics.items()}
         self._first_ns: int | None = None
         self.since_s = 0.0
 
@@ -56,28 +52,9 @@ class Cut:
             )
 
     def _cut(self, block: Block) -> Block:
-        keep = self._is_inside(block.accel_stamp_ns)
-        by_role = {'accel': keep}
-        n_before = np.concatenate(([0], np.cumsum(keep)))
-        temperatures = {}
-        for name, one in block.temperatures.items():
-            own = by_role[name] = self._is_inside(one.stamp_ns)
-            temperatures[name] = one._replace(
-                stamp_ns=one.stamp_ns[own],
-                celsius=one.celsius[own],
-                after=n_before[one.after[own]],
-            )
-        if all(own.all() for own in by_role.values()):
-            return block
-        return replace(
-            block,
-            accel_stamp_ns=block.accel_stamp_ns[keep],
-            accel=block.accel[keep],
-            imu=block.imu and block.imu.take(np.flatnonzero(keep)),
-            temperatures=temperatures,
-            log_ns={role: log_ns[by_role[role]] for role, log_ns in block.log_ns.items()},
-            raw=tuple(_chosen(one, by_role[self._roles[one.topic]]) for one in block.raw),
-        )
+        inside = {name: self._is_inside(one.stamp_ns) for name, one in block.temperatures.items()}
+        inside['accel'] = self._is_inside(block.accel_stamp_ns)
+        return block if all(own.all() for own in inside.values()) else block.take(inside)
 
     def _is_inside(self, stamp_ns: Ints) -> Bools:
         if self._first_ns is None and not self._part.is_stamped:
@@ -89,9 +66,3 @@ class Cut:
             for limit, default in ((self._part.begin, -inf), (self._part.end, inf))
         )
         return (stamp_ns >= begin) & (stamp_ns < end)
-
-
-def _chosen(messages: RawMessages, keep: Bools) -> RawMessages:
-    size = np.diff(messages.ends, prepend=0)
-    data, ends = pack(messages.data, (messages.ends - size)[keep], size[keep])
-    return replace(messages, log_ns=messages.log_ns[keep], data=data, ends=ends)

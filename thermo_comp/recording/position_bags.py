@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import OutputError
 from ..files import MCAP, check_output
-from ..typing import Ints
+from ..typing import Bools, Ints
 from .columns import RawMessages
 from .growing import News
 from .topics import IMU, Topics
@@ -44,12 +44,11 @@ class _Piece:
 
     def split(self, stamp_ns: int) -> tuple[_Piece, _Piece]:
         """Part them where the first one is not older than a stamp."""
-        late = np.flatnonzero(self.stamp_ns >= stamp_ns)
-        at = int(late[0]) if len(late) else len(self.stamp_ns)
-        return (
-            _Piece(self.stamp_ns[:at], self.messages.part(0, at)),
-            _Piece(self.stamp_ns[at:], self.messages.part(at)),
-        )
+        late = np.maximum.accumulate(self.stamp_ns >= stamp_ns)
+        return self._take(~late), self._take(late)
+
+    def _take(self, rows: Bools) -> _Piece:
+        return _Piece(self.stamp_ns[rows], self.messages.take(rows))
 
 
 class PositionBags:
@@ -76,9 +75,7 @@ class PositionBags:
         block = news.block
         if news.info is not None and self._serial is None:
             self._serial = news.info.metadata.get('serial')
-        roles = {topic: role for role, topic in news.topics.items()}
-        for one in block.raw:
-            role = roles[one.topic]
+        for role, one in block.raw.items():
             if role == 'accel':
                 stamp_ns = block.accel_stamp_ns
                 name = _USUAL.imu if one.type == IMU else _USUAL.counts

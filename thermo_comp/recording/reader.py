@@ -10,9 +10,14 @@ Reading order
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Protocol, TypeVar
 
 from ..errors import RecordingError
 from .clock import without_jumps
@@ -24,13 +29,51 @@ from .columns import (
     Recording,
     RecordingInfo,
     Role,
+    count_topics,
     empty_block,
     gathered,
     joined,
 )
+from .decode import Decoder, Feed
+from .foreign import ForeignFile
+from .mcap_file import McapFile
+from .messages import Messages, Topic, pack
 from .part import Cut
-from .storage import Bag, loss, open_bag
-from .topics import Topics, select_topics
+from .rosbag2_metadata import Description, read_metadata
+from .topics import Topics, select_topics, shown
+from .unpack import expand, translated
+
+_Done = TypeVar('_Done')
+_N_LOADERS = 2
+
+
+class BagFile(Protocol):
+    """
+    One open file of a bag; `path` is what errors call it.
+
+    `topics` are by the number of their channel, `definitions` encoding and text by message type,
+    `start_ns` and `end_ns` the log times of the first and the last message; `truncated` says what
+    is missing.
+    """
+
+    path: Path
+    storage: str
+    topics: dict[int, Topic]
+    definitions: dict[str, tuple[str, str]]
+    metadata: dict[str, str]
+    start_ns: int | None
+    end_ns: int | None
+    truncated: str | None
+
+    def read(
+        self, channels: Collection[int], work: Callable[[Messages], _Done]
+    ) -> Iterator[_Done]:
+        """Read the messages of channels in reading order, and do some work on them."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
 
 
 class RecordingReader:
@@ -45,19 +88,69 @@ class RecordingReader:
     def __init__(
         self,
         path: Path,
-        bag: Bag,
         topics: Topics,
         input: Input,  # noqa: A002 - the parameter's public name
         require: Collection[Role],
     ) -> None:
-        selection = select_topics(path, bag.info.topics, topics, input, require)
-        self._bag = bag
+        self._stack = ExitStack()
+        self._files: list[BagFile] = []
+        try:
+            self.info = self._open(path)
+            self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
+            selection = select_topics(path, self.info.topics, topics, input, require)
+        except OSError as error:
+            self.close()
+            raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
+        except BaseException:
+            self.close()
+            raise
         self._names = selection.thermometers
         self.topics: Mapping[Role, str] = dict(selection.topics)
-        self.definitions = bag.definitions
-        self._cut = Cut(path, topics.part, self.topics)
         self._part = topics.part
-        self.info = replace(bag.info, input=selection.input, chosen=selection.chosen)
+        self._cut = Cut(path, topics.part)
+        self.info = replace(self.info, input=selection.input, chosen=selection.chosen)
+
+    def _open(self, path: Path) -> RecordingInfo:
+        """Open the files; those that rosbag2 has compressed as a whole are expanded beside."""
+        found, note = _described(path)
+        folder = ''
+        if found.compression == 'file':
+            folder = self._stack.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
+        self._stack.callback(self._close_files)
+        # Ends before the files that its threads read.
+        pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
+        self._stack.callback(pool.shutdown, wait=True, cancel_futures=True)
+        notes = [note]
+        for name in found.files:
+            file = name
+            if folder:
+                file = Path(folder, name.stem)
+                with translated(name):
+                    notes.append(expand(name, file))
+            is_packed = found.compression == 'message'
+            if found.storage == 'mcap' and not is_packed:
+                self._files.append(McapFile(file, name, pool))
+            else:
+                self._files.append(ForeignFile(file, name, is_packed=is_packed))
+        for one in self._files:
+            if one.truncated is not None:
+                front = f'{one.path.name}: ' if len(self._files) > 1 else ''
+                notes.append(front + one.truncated)
+        topics = count_topics(topic for one in self._files for topic in one.topics.values())
+        for topic, n_promised in found.counts.items():
+            notes.append(_loss(topic, topics.get(topic, ('', 0))[1], n_promised))
+        metadata = dict(found.custom)
+        for one in self._files:
+            metadata |= one.metadata
+        return RecordingInfo(
+            path,
+            self._files[0].storage,
+            topics,
+            min((f.start_ns for f in self._files if f.start_ns is not None), default=0),
+            max((f.end_ns for f in self._files if f.end_ns is not None), default=0),
+            '; '.join(filter(None, notes)) or None,
+            metadata,
+        )
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         """
@@ -71,17 +164,37 @@ class RecordingReader:
 
     def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         n_read = dict.fromkeys(self.topics, 0)
-        source = self._bag.blocks(self.topics, self._names, raw=raw)
-        for block in gathered(source, n_messages):
+        for block in gathered(self._decoded(raw), n_messages):
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
             if block.n_messages:
                 yield block
         for role, topic in self.topics.items():
-            missing = loss(topic, n_read[role], self.info.topics[topic][1])
-            if missing and missing not in (self.info.truncated or ''):
-                told = '; '.join(filter(None, (self.info.truncated, missing)))
+            loss = _loss(topic, n_read[role], self.info.topics[topic][1])
+            if loss and loss not in (self.info.truncated or ''):
+                told = '; '.join(filter(None, (self.info.truncated, loss)))
                 self.info = replace(self.info, truncated=told)
+
+    def _decoded(self, raw: bool) -> Iterator[Block]:
+        """Decode the topic of each role, in reading order."""
+        roles = {topic: role for role, topic in self.topics.items()}
+        for file in self._opened():
+            feeds: dict[Role, Feed] = {}
+            channels: dict[int, Role] = {}
+            for number, topic in file.topics.items():
+                if topic.name in roles:
+                    role = channels[number] = roles[topic.name]
+                    if topic.encoding not in {'cdr', 'ros1'}:
+                        raise _no_cdr(topic, file)
+                    feed = Feed(topic.name, topic.type, topic.encoding)
+                    if feeds.setdefault(role, feed) != feed:
+                        reason = 'its messages have several encodings'
+                        raise RecordingError(reason, file.path, shown(topic.name))
+            if channels:
+                decoder = Decoder(feeds, channels, self._names, raw)
+                with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
+                    for blocks in file.read(channels, decoder.blocks):
+                        yield from blocks
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
         """
@@ -110,11 +223,27 @@ class RecordingReader:
 
         Raises RecordingError for damaged data, or messages that are no CDR.
         """
-        yield from self._bag.raw(topics)
+        for file in self._opened():
+            own = {n: one for n, one in file.topics.items() if one.name in topics}
+            for topic in own.values():
+                if topic.encoding != 'cdr':
+                    raise _no_cdr(topic, file)
+            with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
+                for found in file.read(own, partial(_raw, own)) if own else ():
+                    yield from found
 
     def close(self) -> None:
-        """Close the files."""
-        self._bag.close()
+        """Close the files and remove what was expanded."""
+        self._stack.close()
+
+    def _close_files(self) -> None:
+        while self._files:
+            self._files.pop().close()
+
+    def _opened(self) -> Sequence[BagFile]:
+        if not self._files:
+            raise RecordingError('the recording is closed', self.info.path)
+        return self._files
 
     def __enter__(self) -> RecordingReader:
         """Give the open reader."""
@@ -139,16 +268,7 @@ def open_recording(
     where they are absent; the others' columns are just empty. Raises RecordingError for what is no
     bag, an empty or damaged one, a missing or ambiguous topic, a wrong message type.
     """
-    path = Path(path)
-    try:
-        bag = open_bag(path)
-    except OSError as error:
-        raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
-    try:
-        return RecordingReader(path, bag, topics or Topics(), input, require)
-    except BaseException:
-        bag.close()
-        raise
+    return RecordingReader(Path(path), topics or Topics(), input, require)
 
 
 def read_recording(
@@ -168,3 +288,55 @@ def inspect_recording(path: str | Path, topics: Topics | None = None) -> Recordi
     """Say what a bag holds without reading its messages; raises as `open_recording` does."""
     with open_recording(path, topics, require=()) as reader:
         return reader.info
+
+
+def _described(path: Path) -> tuple[Description, str | None]:
+    """Find the files of a bag, and what is missing beside them; RecordingError for no bag."""
+    if not path.exists():
+        raise RecordingError('no such file or directory', path)
+    if path.is_dir():
+        described = read_metadata(path)
+        if described is not None:
+            return described, None
+        for suffix in ('.mcap', '.db3'):
+            files = [one for one in path.iterdir() if one.suffix == suffix and one.is_file()]
+            if files:
+                note = 'metadata.yaml is missing, the recording was not finished'
+                return Description(suffix[1:], tuple(_in_split_order(files))), note
+        raise RecordingError('not a bag: the directory has no metadata.yaml', path)
+    if not path.is_file():
+        raise RecordingError('not a bag: neither a file nor a directory', path)
+    if path.suffix not in {'.mcap', '.db3', '.bag'}:
+        raise RecordingError('not a bag: expected a directory, .mcap, .db3 or .bag', path)
+    return Description(path.suffix[1:], (path,)), None
+
+
+def _in_split_order(files: Iterable[Path]) -> list[Path]:
+    """Sort the files of a split bag by the number at the end of their names."""
+
+    def number(file: Path) -> tuple[int, str]:
+        digits = file.stem.rpartition('_')[2]
+        return (int(digits) if digits.isascii() and digits.isdigit() else 0, file.name)
+
+    return sorted(files, key=number)
+
+
+def _raw(topics: Mapping[int, Topic], messages: Messages) -> list[RawMessages]:
+    found = []
+    for number, topic in topics.items():
+        one = messages.of_channels([number])
+        if len(one):
+            packed = pack(one.data, one.start, one.size)
+            found.append(RawMessages(topic.name, topic.type, one.log_ns, *packed))
+    return found
+
+
+def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
+    if n_read >= n_promised:
+        return None
+    return f'{shown(topic)}: {n_read} of the {n_promised} messages promised are there'
+
+
+def _no_cdr(topic: Topic, file: BagFile) -> RecordingError:
+    reason = f'its messages are encoded as {shown(topic.encoding)!r}, expected cdr'
+    return RecordingError(reason, file.path, shown(topic.name))

@@ -9,7 +9,7 @@ Written as ROS 2 Jazzy does it (version 9); any version is read.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any, Literal
@@ -163,9 +163,9 @@ class Description:
 
     storage: str
     files: tuple[Path, ...]
-    compression: Literal['', 'file', 'message']
-    custom: dict[str, str]
-    counts: dict[str, int]
+    compression: Literal['', 'file', 'message'] = ''
+    custom: dict[str, str] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
 
 
 def read_metadata(directory: Path) -> Description | None:

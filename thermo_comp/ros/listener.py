@@ -258,9 +258,7 @@ class LiveTopics(_Listener):
         )
         names = list(dict.fromkeys((*ROLES[1:], *(role for role in feeds if role != 'accel'))))
         decoder = Decoder(feeds, channels, names, True)
-        topics = {role: feed.topic for role, feed in feeds.items()}
-        for block in decoder.blocks(messages.in_order()):
-            yield News(block, topics)
+        yield from map(News, decoder.blocks(messages.in_order()))
 
     def _look(self) -> None:
         """Subscribe to what is published; say what is not."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -160,7 +160,7 @@ class _Player:
         started = time.monotonic()
         start_ns: int | None = None
         for block in reader.blocks(raw=True):
-            for log_ns, role, data in _in_order(block, reader.topics):
+            for log_ns, role, data in _in_order(block):
                 start_ns = log_ns if start_ns is None else start_ns
                 if self._rate:
                     self._pace(started, start_ns, log_ns)
@@ -213,9 +213,9 @@ class _Player:
             time.sleep(ACKNOWLEDGEMENT_NAP)
 
 
-def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, Role, bytes]]:
+def _in_order(block: Block) -> Iterator[tuple[int, Role, bytes]]:
     """Give a block's messages in the order of the bag: log time, role, bytes."""
-    messages = {one.topic: _split(one) for one in block.raw}
+    messages = {role: _split(one) for role, one in block.raw.items()}
     roles: list[Role] = [*block.temperatures, 'accel']
     places: list[Any] = [one.after - 0.5 for one in block.temperatures.values()]
     places.append(np.arange(len(block)))
@@ -224,7 +224,7 @@ def _in_order(block: Block, topics: Mapping[Role, str]) -> Iterator[tuple[int, R
     # Readings between the same two samples: by log time.
     for index in np.lexsort((log_ns, np.concatenate(places))).tolist():
         role = roles[which[index]]
-        yield int(log_ns[index]), role, next(messages[topics[role]])
+        yield int(log_ns[index]), role, next(messages[role])
 
 
 def _split(messages: RawMessages) -> Iterator[bytes]:
