@@ -103,7 +103,7 @@ class Desk:
         elif name == 'unit42':
             from fleet_helpers import write_unit
 
-            write_unit(path, 42)
+            write_unit(path, 42, 3)
         elif name == 'fleet':
             pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
             shutil.copytree(self._make('bags/unit42'), path / 'unit42')

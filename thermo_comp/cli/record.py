@@ -9,6 +9,7 @@ import shlex
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -71,16 +72,23 @@ def record(
     known = numbered_bags(output)
     bags = PositionBags(output, _take_known(out, test, known, serial))
     over = threading.Event()
-    try:
-        # A second signal ends the process at once.
-        with SignalWatch() as signals:
-            signals.on_signal(over.set)
-            if bag is None:
-                _listen(out, test, bags, reading, context.obj or (), over)
-            else:
-                _take(out, test, bags, growing_blocks(bag, **reading, wait=over.wait), tuple)
-    finally:
-        bags.close()
+    problems: Callable[[], Sequence[str]] = tuple
+    # A second signal ends the process at once.
+    with SignalWatch() as signals, closing(bags), ExitStack() as stack:
+        signals.on_signal(over.set)
+        if bag is not None:
+            news = growing_blocks(bag, **reading, wait=over.wait)
+        else:
+            options.require_ros()
+            from ..ros.listener import LiveTopics
+
+            live = stack.enter_context(LiveTopics(**reading, ros_args=context.obj or ()))
+            news, problems = live.blocks(over.wait), lambda: live.problems
+            out.line('listening; Ctrl-C ends it with whole bags')
+            sys.stdout.flush()  # whoever reads this through a pipe waits for it
+        _take(out, test, bags, news, problems)
+    if bag is None and live.n_lost:
+        out.note(f'{live.n_lost} messages were lost on the way')
     account = test.account()
     _say(out, account, output, [*known, *bags.written], offset)
     out.end(int(not account.is_complete and not over.is_set()))
@@ -113,26 +121,6 @@ def _take_known(
             test.begin()
             done(number)
     return serial
-
-
-def _listen(
-    out: Output,
-    test: Acquisition,
-    bags: PositionBags,
-    reading: options.Reading,
-    ros_args: Sequence[str],
-    over: threading.Event,
-) -> None:
-    """Record live topics."""
-    options.require_ros()
-    from ..ros.listener import LiveTopics
-
-    with LiveTopics(**reading, ros_args=ros_args) as live:
-        out.line('listening; Ctrl-C ends it with whole bags')
-        sys.stdout.flush()  # whoever reads this through a pipe waits for it
-        _take(out, test, bags, live.blocks(over.wait), lambda: live.problems)
-    if live.n_lost:
-        out.note(f'{live.n_lost} messages were lost on the way')
 
 
 def _take(
