@@ -27,7 +27,7 @@ from conftest import ROOT
 from report_helpers import certificate, fitted, write_bag
 
 from thermo_comp.report import live
-from thermo_comp.report.live import HOST, MOST_CLIENTS, LiveReport, LiveServer
+from thermo_comp.report.live import MOST_CLIENTS, LiveReport, LiveServer
 from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -85,12 +85,12 @@ def test_page_follows_the_file_and_outlives_a_bad_one(unit):
 def test_clients_that_say_nothing_grow_no_threads(unit, monkeypatch):
     # WHY: each of 900 half-open connections had a thread of its own, for half a minute. WHAT: some
     # are heard at a time, and dropped at the time-out, which is short here.
-    monkeypatch.setattr(live._Handler, 'timeout', 0.2)
+    monkeypatch.setattr(live._Handler, 'timeout', 0.1)
     with served(LiveReport(unit)) as server:
         before = threading.active_count()
         most, silent = 0, []
-        for number in range(300):
-            client = socket.create_connection((HOST, server.server_port), TIMEOUT_S)
+        for number in range(100):
+            client = socket.create_connection(server.server_address, TIMEOUT_S)
             if number % 2:
                 with suppress(ConnectionError):
                     client.sendall(b'GET / HT')
@@ -107,7 +107,7 @@ def test_clients_that_say_nothing_grow_no_threads(unit, monkeypatch):
 
 def test_a_client_that_goes_away_is_no_news(unit, capfd):
     with served(LiveReport(unit)) as server:
-        client = socket.create_connection((HOST, server.server_port))
+        client = socket.create_connection(server.server_address)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
         client.sendall(b'GET / HT')
         client.close()  # with a reset
@@ -134,16 +134,16 @@ def test_bag_is_read_once_and_judged_again(tmp_path):
     bag = write_bag(tmp_path / 'held_out.mcap')
     told = []
     report = LiveReport(unit, [bag], read=lambda info: told.append(info.path.name))
-    assert report._evidence().bags[0].name == 'held_out.mcap'
+    assert report.evidence().bags[0].name == 'held_out.mcap'
     ((_, opened),) = report._opened.values()
     save(unit, 'second note', one)
-    assert report._evidence().findings == ('second note',)
+    assert report.evidence().findings == ('second note',)
     ((_, again),) = report._opened.values()
     assert again is opened
     assert told == ['held_out.mcap']
     bag.unlink()
     write_bag(bag, 1)
-    report._evidence()
+    report.evidence()
     ((_, other),) = report._opened.values()
     assert other is not opened
 

@@ -31,9 +31,7 @@ from .figures import ReportFigure, drawn_figures, figures_of
 from .gather import evidence_of_bags
 from .page import render_page
 
-HOST = '127.0.0.1'
-_NAMES = ('127.0.0.1', 'localhost')
-_POLL_MS = 1000
+_HOST = '127.0.0.1'
 # A client that keeps a connection open without a word is let go after this [s].
 _CLIENT_TIMEOUT_S = 2.0
 #: So many are answered at once; who finds no place is let go, and a page asks again by itself.
@@ -46,7 +44,7 @@ setInterval(async () => {
     if (answer.ok && await answer.text() !== shown) location.reload();
     document.title = title;
   } catch (error) { document.title = "(not served any more) " + title; }
-}, %d);
+}, 1000);
 """
 
 
@@ -64,58 +62,52 @@ class LiveReport:
         read: Callable[[RecordingInfo], None] | None = None,
         **judging: Any,
     ) -> None:
-        self._calibration = calibration
-        self._bags = list(bags)
+        self._calibration, self._bags = calibration, list(bags)
         self._topics, self._input, self._read = topics, input, read
         self._judging = judging  # of `evidence_of_bags`
-        self._lock = threading.Lock()
         self._opened: dict[Path, tuple[str, ReducedBag]] = {}
-        self._version = ''
-        self._made: tuple[Evidence, list[tuple[ReportFigure, str]]] | None = None
-        self._notice = ''
+        self._lock = threading.Lock()
+        self._version = self._notice = ''
+        # While nothing good was seen yet: a page with the reason, which goes on asking.
+        self._evidence = Evidence(serial=calibration.name, unit='counts')
+        self._figures: list[tuple[ReportFigure, str]] = []
 
     def version(self) -> str:
         """Tell the state of the files: another text whenever one of them has changed."""
-        return _signature([self._calibration, *self._bags])
+        return _signature(self._calibration, *self._bags)
 
     def page(self) -> str:
         """Make the page, if the files have changed, and return it."""
         with self._lock:
             version = self.version()
             if version != self._version:
-                self._make(version)
-            # While nothing good was seen yet: a page with the reason, which goes on asking.
-            evidence = Evidence(serial=self._calibration.name, unit='counts')
+                self._version, self._notice = version, ''
+                try:
+                    evidence = self.evidence()
+                    self._figures = drawn_figures(figures_of(evidence))
+                    self._evidence = evidence
+                except (ThermoCompError, OSError, ValueError) as error:
+                    older = '\nThe page below is older.' if self._figures else ''
+                    self._notice = f'{error}{older}'
             return render_page(
-                *(self._made or (evidence, [])),
-                script=_SCRIPT % (version, _POLL_MS),
+                self._evidence,
+                self._figures,
+                script=_SCRIPT % version,
                 nonce=secrets.token_urlsafe(16),
                 notice=self._notice,
             )
 
-    def _make(self, version: str) -> None:
-        self._version = version
-        try:
-            evidence = self._evidence()
-            self._made = (evidence, drawn_figures(figures_of(evidence)))
-            self._notice = ''
-        except (ThermoCompError, OSError, ValueError) as error:
-            older = '' if self._made is None else '\nThe page below is older.'
-            self._notice = f'{error}{older}'
-
-    def _evidence(self) -> Evidence:
+    def evidence(self) -> Evidence:
+        """Judge the bags; those that have not changed are not read again."""
         calibration = load_calibration(self._calibration)
-        bags = []
         for path in self._bags:
-            signature = _signature([path])
-            known = self._opened.get(path)
-            if known is None or known[0] != signature:
+            signature = _signature(path)
+            if self._opened.get(path, ('',))[0] != signature:
                 bag = open_bag(path, self._topics, self._input, calibration=calibration)
+                self._opened[path] = (signature, bag)
                 if self._read is not None:
                     self._read(bag.info)
-                known = (signature, bag)
-                self._opened[path] = known
-            bags.append(known[1])
+        bags = [self._opened[path][1] for path in self._bags]
         return evidence_of_bags(bags, calibration, **self._judging)
 
 
@@ -128,29 +120,18 @@ class LiveServer(ThreadingHTTPServer):
 
     def __init__(self, report: LiveReport, port: int = 0) -> None:
         self.report = report
-        self._places = threading.BoundedSemaphore(MOST_CLIENTS)
-        super().__init__((HOST, port), _Handler)
+        self._most_threads = threading.active_count() + MOST_CLIENTS
+        super().__init__((_HOST, port), _Handler)
+        self.url = f'http://{_HOST}:{self.server_port}/'
 
     def verify_request(self, request: Any, client_address: Any) -> bool:  # noqa: ARG002
         """Take a client if there is a place for it."""
-        return self._places.acquire(blocking=False)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a client, and give its place to another."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._places.release()
+        return threading.active_count() < self._most_threads
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a client that went away."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
-
-    @property
-    def url(self) -> str:
-        """Where the page is."""
-        return f'http://{HOST}:{self.server_port}/'
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -161,9 +142,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with the page or with its version."""
-        name, _, port = self.headers.get('Host', '').partition(':')
+        port = self.server.server_port
         status, kind, text = HTTPStatus.NOT_FOUND, 'plain', 'nothing here\n'
-        if name not in _NAMES or port != str(self.server.server_port):
+        if self.headers.get('Host') not in (f'{_HOST}:{port}', f'localhost:{port}'):
             status, text = HTTPStatus.FORBIDDEN, 'another host\n'
         elif self.path == '/':
             status, kind, text = HTTPStatus.OK, 'html', self.server.report.page()
@@ -186,15 +167,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing: a request a second is no news."""
 
 
-def _signature(paths: Sequence[Path]) -> str:
-    return hashlib.sha256('\n'.join(map(_state, paths)).encode()).hexdigest()[:16]
-
-
-def _state(path: Path) -> str:
-    """Describe a file, or a bag's files, by what changes when somebody writes them."""
-    try:
-        files = sorted(path.iterdir()) if path.is_dir() else [path]
-        found = [(str(file), file.stat()) for file in files]
-    except OSError as error:
-        return f'{path}: {error.errno}'
-    return repr([(name, s.st_mtime_ns, s.st_size, s.st_ino) for name, s in found])
+def _signature(*paths: Path) -> str:
+    """Describe files, and those of bags, by what changes when somebody writes them."""
+    found: list[tuple[object, ...]] = []
+    for path in paths:
+        try:
+            files = sorted(path.iterdir()) if path.is_dir() else [path]
+            states = [(file, file.stat()) for file in files]
+            found += [(str(file), s.st_mtime_ns, s.st_size, s.st_ino) for file, s in states]
+        except OSError as error:  # noqa: PERF203 - each for itself
+            found.append((str(path), error.errno))
+    return hashlib.sha256(repr(found).encode()).hexdigest()[:16]

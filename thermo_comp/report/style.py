@@ -104,27 +104,17 @@ def svg(figure: Figure, name: str, label: str) -> str:
     """
     Write a figure as an SVG element of a page; `label` is for readers who do not see it.
 
-    The letters and digits of `name` make its ids unique. Round joints are the style sheet's.
+    The letters and digits of `name` make its ids unique.
     """
     buffer = io.StringIO()
     nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}
     figure.savefig(buffer, format='svg', metadata=nothing)
-    text = buffer.getvalue()
-    text = text[text.index('<svg') :]
-    for part in ('<metadata>.*?</metadata>', '<defs>\\s*<style.*?</style>\\s*</defs>'):
-        text = re.sub(part, '', text, flags=re.DOTALL)
-    text = re.sub(r'>\s+<', '><', text)
+    text = re.sub(r'>\s+<', '><', buffer.getvalue().replace('xlink:', ''))
     text = re.sub(r'\b(id="|href="#|url\(#)', rf'\g<1>{name}-', text)
     # Two decimals are a hundredth of a point.
-    text = re.sub(
-        r'( d="|points=")([^"]*)"',
-        lambda path: path[1] + re.sub(r'(\.\d\d)\d+', r'\1', path[2]).replace('\n', '') + '"',
-        text,
-    )
-    head, rest = text.split('>', 1)
-    head = re.sub(r' (width|height|version|xmlns:xlink)="[^"]*"', '', head)
-    rest = rest.replace('xlink:href', 'href')
-    return f'{head} role="img" aria-label="{escape(label)}">{rest}'.strip()
+    text = re.sub(r' d="[^"]*"', lambda path: re.sub(r'(\.\d\d)\d+|\n', r'\1', path[0]), text)
+    about = f'role="img" aria-label="{escape(label)}"'
+    return text[text.index('<svg') :].replace('<svg', f'<svg {about}', 1).strip()
 
 
 def png(figure: Figure) -> bytes:
