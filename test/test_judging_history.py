@@ -14,7 +14,7 @@ from builders import axis_set, calibration, regime_set
 from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.judging.history import drifts_of, history_of
-from thermo_comp.report.page import render_page
+from thermo_comp.report import render_report
 from thermo_comp.unit.calibration import AxisReference, Calibration, Source
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
@@ -86,4 +86,4 @@ def test_commands_tell_the_history(cli, tmp_path: Path) -> None:
     drawn = json.loads(cli('report', *given, '-o', page).stdout)
     assert drawn['history'] == told['history']
     assert 'What has drifted between the calibrations' in page.read_text(encoding='utf-8')
-    assert '<h2>History</h2>' not in render_page(evidence(), [])
+    assert '<h2>History</h2>' not in render_report(evidence(), figures=[])

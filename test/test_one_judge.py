@@ -11,7 +11,7 @@ import pytest
 from fleet_helpers import OPTIONS, write_unit
 from report_helpers import fitted, write_bag
 
-from thermo_comp.report.text import number
+from thermo_comp.report.html import number
 from thermo_comp.unit.calibration_file import save_calibration
 
 FACTS = (

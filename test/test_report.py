@@ -22,11 +22,16 @@ from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.fitting.reduction import Readings
 from thermo_comp.judging import open_bag
 from thermo_comp.recording import BagWriter
-from thermo_comp.report import Evidence, evidence_of_bags, evidence_of_fit, write_report
+from thermo_comp.report import (
+    Evidence,
+    evidence_of_bags,
+    evidence_of_fit,
+    render_report,
+    write_report,
+)
 from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.figures import figures_of, png_files
-from thermo_comp.report.page import render_page
-from thermo_comp.report.text import spelt
+from thermo_comp.report.html import spelt
 from thermo_comp.simulation import STANDARD_GRAVITY
 from thermo_comp.thermal.regime import Regime
 
@@ -71,7 +76,7 @@ def page_of(evidence: Evidence, folder: Path, **keys: object) -> Page:
 
 def words_of(evidence: Evidence) -> Page:
     """Return the page without its figures, whose drawing takes seconds."""
-    return Page(render_page(evidence, ()))
+    return Page(render_report(evidence, figures=[]))
 
 
 def bare() -> Evidence:

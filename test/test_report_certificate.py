@@ -17,10 +17,14 @@ from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.judging import open_bag
-from thermo_comp.report import CertificateInfo, evidence_of_bags, load_certificate_info
+from thermo_comp.report import (
+    CertificateInfo,
+    evidence_of_bags,
+    load_certificate_info,
+    render_report,
+)
 from thermo_comp.report.certificate import budget, combined, conformity_rule, results
-from thermo_comp.report.page import render_page
-from thermo_comp.report.text import rounded
+from thermo_comp.report.html import rounded
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 
@@ -74,7 +78,7 @@ def test_rounding_moves_neither_by_more_than_half_a_digit(value, expanded):
 
 def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
     info = load_certificate_info(lab(tmp_path), 'thermostatted-0001')
-    page = render_page(evidence(), [], info=info)
+    page = render_report(evidence(), figures=[], info=info)
     for text in (
         *('2026-017', 'Inertial Lab', '1 Street', 'L-1', 'A Customer', 'A. Person', 'ACME'),
         *('TRI-3', 'certificate 3 of 2025', '2e-05 m/s²', 'absolute gravimeter', '2026-03-01'),
@@ -102,7 +106,7 @@ def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
     ]
     places = [page.index(text) for text in order]
     assert places == sorted(places)
-    assert render_page(evidence(), []).count('class="blank"') == 18
+    assert render_report(evidence(), figures=[]).count('class="blank"') == 18
 
 
 @pytest.mark.parametrize(
@@ -204,8 +208,8 @@ def test_rule_of_conformity_names_the_limit():
 def test_simulated_bags_mark_every_page(tmp_path):
     calibration = fitted().calibration
     simulated = evidence_of_bags([open_bag(write_bag(tmp_path / 'sim.mcap'))], calibration)
-    assert 'class="simulated"' in render_page(simulated, [])
-    assert 'class="simulated"' not in render_page(evidence_of_bags([], calibration), [])
+    assert 'class="simulated"' in render_report(simulated, figures=[])
+    assert 'class="simulated"' not in render_report(evidence_of_bags([], calibration), figures=[])
 
 
 def test_command_takes_the_statements(cli, tmp_path):

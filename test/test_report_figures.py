@@ -42,9 +42,9 @@ from thermo_comp.report.figures_unit import (
     step_answer,
 )
 from thermo_comp.report.gather import shown_bag
+from thermo_comp.report.html import label_text, number
 from thermo_comp.report.page import position_error, schuler_peak
 from thermo_comp.report.style import drawing, svg
-from thermo_comp.report.text import label_text, number
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.gravity import MICRO_G

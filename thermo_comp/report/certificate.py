@@ -23,7 +23,7 @@ from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states
 from ..unit.schema import Bounds, NotNegative, SchemaError, build
 from .evidence import Evidence
-from .text import number, rounded
+from .html import number, rounded
 
 #: Coverage factor of an expanded uncertainty: 95 % of a normal distribution.
 COVERAGE = 2.0

@@ -15,8 +15,8 @@ from .evidence import Evidence
 from .figures_position import draw_every_position, draw_histograms, draw_positions
 from .figures_time import draw_dynamics, draw_gravity, draw_residuals, draw_temperatures
 from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_rates, draw_step
+from .html import label_text
 from .style import drawing, png, svg
-from .text import label_text
 
 
 @dataclass(frozen=True)

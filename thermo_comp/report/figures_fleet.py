@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..typing import Floats
+from .html import label_text
 from .style import (
     BLACK,
     DYNAMIC_LINE,
@@ -22,7 +23,6 @@ from .style import (
     log_axis,
     new_figure,
 )
-from .text import label_text
 
 # More names than these would lie over each other.
 _MOST_NAMES = 12

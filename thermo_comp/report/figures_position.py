@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..unit.gravity import MICRO_G, spoken
 from .evidence import LEFT_OUT, RAW, Evidence, Position, given
+from .html import number
 from .style import (
     BLACK,
     DYNAMIC_LINE,
@@ -25,7 +26,6 @@ from .style import (
     new_figure,
     time_unit,
 )
-from .text import number
 
 # Diameter of the ring of the position that the others tell the least of [pt].
 _RING = 22.0

@@ -17,6 +17,7 @@ from ..typing import Bools, Floats
 from ..unit.calibration import AXES
 from ..unit.gravity import MICRO_G
 from .evidence import RAW, Evidence, ShownBag, given
+from .html import number
 from .style import (
     AXIS_LINES,
     BOARD_LINE,
@@ -28,7 +29,6 @@ from .style import (
     new_figure,
     time_unit,
 )
-from .text import number
 
 # Where the drift's zero is taken: long enough for the windows' noise, short against any ramp.
 _ZERO_S = 120.0

@@ -20,6 +20,7 @@ from ..unit.gyroscope import MILLIDEGREE
 from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
 from ..unit.rate_triad import rate_triad
 from .evidence import CHOSEN, Evidence, given
+from .html import label_text, minus, number
 from .style import (
     AXIS_LINES,
     BLACK,
@@ -33,7 +34,6 @@ from .style import (
     new_figure,
     shared_legend,
 )
-from .text import label_text, minus, number
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from ..fitting import FitResult
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector, readings_in_order
 from ..fitting.verdict import Finding
-from ..judging import WINDOW_S, corrected_windows, judge_bags
+from ..judging import WINDOW_S, Judgement, corrected_windows, judge_bags
 from ..judging.history import history_of
 from ..judging.windows import usual_window
 from ..replay import check_unit
@@ -54,67 +55,79 @@ def evidence_of_bags(
     Raises CalibrationError for a calibration of another unit; RecordingError if samples are too
     slow for such windows.
     """
-    judgement = None
-    unit = 'counts'
-    if calibration is not None:
-        for bag in bags:
-            check_unit(calibration, bag.info, serial)
-        unit = calibration.unit.input
-        gravity = calibration.gravity_m_s2 if gravity is None else gravity
-        judgement = judge_bags(
-            bags, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
+    if calibration is None:
+        return _evidence(
+            bags,
+            None,
+            None,
+            serial=serial,
+            unit='m/s^2' if any(bag.info.input == 'imu' for bag in bags) else 'counts',
+            gravity=gravity,
+            windows=corrected_windows(bags, None, gravity=gravity, window_s=window_s),
         )
-        windows = None if judgement is None else judgement.windows
-    else:
-        if any(bag.info.input == 'imu' for bag in bags):
-            unit = 'm/s^2'
-        windows = corrected_windows(bags, None, gravity=gravity, window_s=window_s)
-    if calibration is not None:
-        serial = calibration.unit.serial
-    said = sorted({bag.source.serial for bag in bags if bag.source.serial})
-    return Evidence(
-        serial=serial or ', '.join(said) or 'unknown',
-        unit=unit,
+    for bag in bags:
+        check_unit(calibration, bag.info, serial)
+    gravity = calibration.gravity_m_s2 if gravity is None else gravity
+    judgement = judge_bags(
+        bags, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
+    )
+    return _evidence(
+        bags,
+        calibration,
+        judgement,
         gravity=gravity,
-        calibration=calibration,
-        bags=tuple(map(_facts, bags)),
-        shown=_shown(bags, calibration),
-        windows=windows,
-        judgement=judgement,
-        findings=() if calibration is None else _against(calibration),
-        history=() if calibration is None or not others else history_of([calibration, *others]),
-        is_simulated=_is_simulated(bags),
+        findings=_against(calibration),
+        history=history_of([calibration, *others]) if others else (),
     )
 
 
 def evidence_of_fit(result: FitResult, *, is_brief: bool = False) -> Evidence:
     """Gather what a fit has to show, on its own bags; a brief one lacks what only figures show."""
     calibration = result.calibration
-    shown = None if is_brief else _shown(result.bags, calibration)
-    judgement = judge_bags(result.bags, calibration, window_s=usual_window(result.bags))
     found = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
     against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
-    return Evidence(
-        serial=calibration.unit.serial,
-        unit=calibration.unit.input,
-        gravity=calibration.gravity_m_s2,
-        calibration=calibration,
-        bags=tuple(map(_facts, result.bags)),
-        shown=shown,
-        windows=None if judgement is None else judgement.windows,
-        judgement=judgement,
+    return _evidence(
+        result.bags,
+        calibration,
+        judge_bags(result.bags, calibration, window_s=usual_window(result.bags)),
+        is_brief=is_brief,
         steps=result.residuals,
         left_out={k: left_out[one] for k, one in enumerate(found) if one in left_out},
         findings=tuple(dict.fromkeys((*_against(calibration), *against))),
         checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
         is_fit=True,
-        is_simulated=_is_simulated(result.bags),
     )
 
 
-def _is_simulated(bags: Sequence[ReducedBag]) -> bool:
-    return any(_SIMULATED in bag.info.metadata for bag in bags)
+def _evidence(
+    bags: Sequence[ReducedBag],
+    calibration: Calibration | None,
+    judgement: Judgement | None,
+    *,
+    is_brief: bool = False,
+    **known: Any,
+) -> Evidence:
+    """Add what bags, calibration and judgement tell to what else is known."""
+    told: dict[str, Any] = {}
+    if calibration is not None:
+        told = {
+            'serial': calibration.unit.serial,
+            'unit': calibration.unit.input,
+            'gravity': calibration.gravity_m_s2,
+            'windows': None if judgement is None else judgement.windows,
+        }
+    known = told | known
+    said = sorted({bag.source.serial for bag in bags if bag.source.serial})
+    known['serial'] = known['serial'] or ', '.join(said) or 'unknown'
+    return Evidence(
+        calibration=calibration,
+        bags=tuple(map(_facts, bags)),
+        shown=None if is_brief else _shown(bags, calibration),
+        judgement=judgement,
+        is_simulated=any(_SIMULATED in bag.info.metadata for bag in bags),
+        **known,
+    )
 
 
 def _is_reservation(finding: Finding) -> bool:

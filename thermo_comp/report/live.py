@@ -29,7 +29,7 @@ from ..unit.calibration_file import load_calibration
 from .evidence import Evidence
 from .figures import ReportFigure, drawn_figures, figures_of
 from .gather import evidence_of_bags
-from .page import render_page
+from .page import render_report
 
 _HOST = '127.0.0.1'
 # A client that keeps a connection open without a word is let go after this [s].
@@ -89,9 +89,9 @@ class LiveReport:
                 except (ThermoCompError, OSError, ValueError) as error:
                     older = '\nThe page below is older.' if self._figures else ''
                     self._notice = f'{error}{older}'
-            return render_page(
+            return render_report(
                 self._evidence,
-                self._figures,
+                figures=self._figures,
                 script=_SCRIPT % version,
                 nonce=secrets.token_urlsafe(16),
                 notice=self._notice,

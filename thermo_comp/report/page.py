@@ -21,8 +21,7 @@ from .certificate import CertificateInfo, budget, combined, conformity_rule, res
 from .evidence import LEFT_OUT, Evidence
 from .figures import ReportFigure, drawn_figures, figures_of, png_files
 from .gather import evidence_of_fit
-from .html import render, utc
-from .text import spelt
+from .html import render, spelt, utc
 
 # Mean radius of the Earth [m]: GRS 80.
 _EARTH_RADIUS = 6.371e6
@@ -55,21 +54,22 @@ def write_report(
     return evidence
 
 
-def render_report(evidence: Evidence, info: CertificateInfo | None = None) -> str:
-    """Make a report for whoever writes it: the HTML document."""
-    return render_page(evidence, drawn_figures(figures_of(evidence)), info=info)
-
-
-def render_page(
+def render_report(
     evidence: Evidence,
-    figures: Sequence[tuple[ReportFigure, str]],
-    *,
     info: CertificateInfo | None = None,
+    *,
+    figures: Sequence[tuple[ReportFigure, str]] | None = None,
     script: str = '',
     nonce: str = '',
     notice: str = '',
 ) -> str:
-    """Write the page; `script` and `nonce` are a viewer's (see `html.render`), as is `notice`."""
+    """
+    Make the page, with figures that are drawn already if there are some.
+
+    `script` and `nonce` are a viewer's (see `html.render`), as is `notice`.
+    """
+    if figures is None:
+        figures = drawn_figures(figures_of(evidence))
     info = info or CertificateInfo()
     is_certificate = evidence.calibration is not None
     title = 'Thermal calibration certificate' if is_certificate else 'Thermal test record'
