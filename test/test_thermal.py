@@ -108,8 +108,7 @@ def test_no_transition_time_is_the_hard_switch_of_the_paper():
 
 
 def test_lost_case_is_replaced_by_the_boards_rate():
-    config = ThermalConfig(case_timeout_s=10.0, board_lag_s=600.0)
-    tracker = ThermalTracker(DetectorSettings(), None, config)
+    tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(case_timeout_s=10.0), 600.0)
     t = np.arange(0, 1000)
     board = 20.0 + 0.01 * t
     feed(tracker, board, board + 6.0)
@@ -143,7 +142,6 @@ def test_state_before_any_board_temperature_is_refused():
         ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or positive and finite'),
         ({'transition_time_s': math.nan}, '`transition_time_s`'),
         ({'case_timeout_s': 0.0}, '`case_timeout_s` must be positive'),
-        ({'board_lag_s': -5.0}, '`board_lag_s` must be positive'),
     ],
 )
 def test_config_refusals(values, message):

@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 
+from ..thermal.reading_queue import NEVER_NS
 from ..typing import Bools, Floats, Ints
 
 #: Fewer equal samples in a row than this are chance, however far they lie apart.
@@ -27,20 +28,19 @@ BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
 #: A rate is measured over so many seconds.
 _WINDOW_S: Final = 1.0
-_NEVER_NS: Final = 1 << 62
 
 
 class StuckCheck:
     """Counts equal samples in a row; beyond the time-out [s], if any, they are not believed."""
 
     def __init__(self, timeout_s: float) -> None:
-        self.limit_ns = round(timeout_s * 1e9) if timeout_s > 0.0 else _NEVER_NS
+        self.limit_ns = round(timeout_s * 1e9) if timeout_s > 0.0 else NEVER_NS
         self.reset()
 
     @property
     def is_on(self) -> bool:
         """Whether anything is watched."""
-        return self.limit_ns != _NEVER_NS
+        return self.limit_ns != NEVER_NS
 
     def reset(self) -> None:
         """Forget the last sample."""

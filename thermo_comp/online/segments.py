@@ -14,10 +14,11 @@ first segment that begins in each span of ten seconds of the stamps, and held.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from ..thermal.memory import BOARD_INPUT
-from ..thermal.reading_queue import ReadingQueue
+from ..thermal.reading_queue import NEVER_NS, ReadingQueue
 from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig
 from ..thermal.state import BOARD, ThermalState
@@ -35,9 +36,8 @@ SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000
 #: Samples this much faster than calibrated, relative, still have the calibrated noise.
 RATE_TOLERANCE: Final = 0.1
-#: Earlier and later than any stamp.
-EVER_NS: Final = -(1 << 62)
-FOREVER_NS: Final = 1 << 62
+#: Earlier than any stamp.
+EVER_NS: Final = -NEVER_NS
 #: A unit that no thermometer watches is taken to be at the reference, within this sd [K].
 UNMEASURED_SD_K: Final = 10.0
 
@@ -95,18 +95,14 @@ class ThermalSide:
         self._slow_key: int | None = None
         self._slow: list[float] = []
 
-    def _thermal_config(self) -> ThermalConfig:
-        return ThermalConfig(
-            self.correction.gentle_transition(self.config.transition_time_s),
-            self.config.case_timeout_s,
-            self.calibration.board_lag_s,
-            self.config.temperature_timeout_s,
-        )
-
     def _new_tracker(self) -> ThermalTracker:
         return ThermalTracker(
-            self.calibration.detector, self.correction.memory, self._thermal_config()
+            self.calibration.detector, self.correction.memory, *self._tracker_config()
         )
+
+    def _tracker_config(self) -> tuple[ThermalConfig, float]:
+        gentle_s = self.correction.gentle_transition(self.config.transition_time_s)
+        return replace(self.config, transition_time_s=gentle_s), self.calibration.board_lag_s
 
     def swap(self, calibration: Calibration, now_ns: int | None) -> None:
         """Take over another calibration; see `Compensator.swap`."""
@@ -115,7 +111,7 @@ class ThermalSide:
         self._use(calibration, self.config)
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         if calibration.detector == detector and self.correction.memory == old.spec:
-            old.reconfigure(self._thermal_config(), now_ns)
+            old.reconfigure(*self._tracker_config(), now_ns)
             return
         self.tracker = self._new_tracker()
         # It starts from the temperatures just seen, so that no sample is lost.
@@ -128,7 +124,7 @@ class ThermalSide:
         self.config = config
         self._timeout_ns = int(config.temperature_timeout_s * 1e9)
         self._forget_segment()
-        self.tracker.reconfigure(self._thermal_config(), now_ns)
+        self.tracker.reconfigure(*self._tracker_config(), now_ns)
 
     def reset(self) -> None:
         """Forget temperatures, regime and rate; what waits, and counters, stay."""
@@ -194,7 +190,7 @@ class ThermalSide:
     def fresh_until_ns(self) -> int:
         """The last stamp at which the board temperature is not too old; before any without one."""
         if not self._needs_temperature:
-            return FOREVER_NS
+            return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
         return EVER_NS if board_ns is None else board_ns + self._timeout_ns
 

@@ -14,16 +14,9 @@ from ..thermal.state import ThermalState
 
 
 @dataclass(frozen=True)
-class CompensatorConfig:
+class CompensatorConfig(ThermalConfig):
     """What the user sets beside the calibration; ValueError if a value is out of its range."""
 
-    #: Time over which the sets cross over after a switch [s], stretched where they differ much
-    #: (`Correction.gentle_transition`); 0 = the paper's hard switch.
-    transition_time_s: float = 30.0
-    #: Age of the board temperature at which nothing is published any more [s].
-    temperature_timeout_s: float = 60.0
-    #: Age of the case temperature at which the board decides the regime [s].
-    case_timeout_s: float = 30.0
     #: Time after which samples that are equal to the bit are not believed [s], and three exact
     #: zeros never are; 0 = any sample is believed.
     stuck_timeout_s: float = 2.0
@@ -35,12 +28,12 @@ class CompensatorConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""
+        super().__post_init__()
         refuse_outside(
             self,
-            positive=('temperature_timeout_s',),
+            positive=(),
             not_negative=('stuck_timeout_s', 'local_gravity_m_s2', 'gravity_tolerance_m_s2'),
         )
-        ThermalConfig(self.transition_time_s, self.case_timeout_s)
 
 
 #: The counters of samples that came in and did not go out.

@@ -110,22 +110,3 @@ def correct(state: State, measured: float, variance: float) -> tuple[State, floa
         innovation,
         spread,
     )
-
-
-def merge(one: State, other: State, share: float) -> tuple[float, float, float, float, float]:
-    """
-    Mix two states as `mix` does, but for the acceleration, which is asked for rarely:
-    temperature, rate; then P00, P01, P11.
-    """
-    t, v, _, p00, p01, _, p11, _, _ = one
-    u, w, _, r00, r01, _, r11, _, _ = other
-    u -= t
-    w -= v
-    apart = share * (1.0 - share)
-    return (
-        t + share * u,
-        v + share * w,
-        p00 + share * (r00 - p00) + apart * u * u,
-        p01 + share * (r01 - p01) + apart * u * w,
-        p11 + share * (r11 - p11) + apart * w * w,
-    )

@@ -122,22 +122,21 @@ class DetectorSettings:
 
 @dataclass(frozen=True)
 class ThermalConfig:
-    """
-    How the tracker behaves where the unit's calibration has no say [s]: cross-over of the sets, 0
-    = the paper's hard switch; age at which the case temperature is lost; the board's time constant
-    behind the case, for the gradient while it is; age of the board temperature at which the unit
-    is unmeasured, and only after which a sensor that has taken an impossible step starts anew.
-    """
+    """What the user sets of thermometers and sets; ValueError if a value is out of its range."""
 
+    #: Time over which the sets cross over after a switch [s], stretched where they differ much
+    #: (`Correction.gentle_transition`); 0 = the paper's hard switch.
     transition_time_s: float = 30.0
-    case_timeout_s: float = 30.0
-    board_lag_s: float = 900.0
+    #: Age of the board temperature at which nothing is published any more [s], and only after
+    #: which a sensor that has taken an impossible step starts anew.
     temperature_timeout_s: float = 60.0
+    #: Age of the case temperature at which the board decides the regime [s].
+    case_timeout_s: float = 30.0
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""
         refuse_outside(
             self,
-            positive=('case_timeout_s', 'board_lag_s', 'temperature_timeout_s'),
+            positive=('case_timeout_s', 'temperature_timeout_s'),
             not_negative=('transition_time_s',),
         )

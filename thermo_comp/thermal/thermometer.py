@@ -25,7 +25,7 @@ from __future__ import annotations
 from math import erf, exp, inf, nan, sqrt
 from typing import Final
 
-from .kalman import NOWHERE, State, correct, merge, mix, predict
+from .kalman import NOWHERE, State, correct, mix, predict
 from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovations beyond this limit count less ...
@@ -180,9 +180,15 @@ class Thermometer:
         self._quiet = quiet
         self._bent = bent
         self.bending = bending
-        (self.temperature, self.rate, self.var_temperature, self._covariance, self.var_rate) = (
-            merge(quiet, bent, bending)
-        )
+        # their mixture, but for the acceleration, which is asked for rarely
+        t, v, _, p00, p01, _, p11, _, _ = quiet
+        apart, dv = bent[0] - t, bent[1] - v
+        both = bending * (1.0 - bending)
+        self.temperature = t + bending * apart
+        self.rate = v + bending * dv
+        self.var_temperature = p00 + bending * (bent[3] - p00) + both * apart * apart
+        self._covariance = p01 + bending * (bent[4] - p01) + both * apart * dv
+        self.var_rate = p11 + bending * (bent[6] - p11) + both * dv * dv
         self.measured = measured
         self.measured_variance = noise
         if reading_c != self.reading:

@@ -34,16 +34,17 @@ class ThermalTracker:
         detector: DetectorSettings,
         memory: MemorySpec | None = None,
         config: ThermalConfig | None = None,
+        board_lag_s: float = 900.0,
     ) -> None:
         self.settings = detector
         self.spec = memory or MemorySpec()
-        self._configure(config or ThermalConfig())
+        self._configure(config or ThermalConfig(), board_lag_s)
         self.board = Thermometer(detector.board)
         #: The thermometers beside the board; the first, which is the case's, leads.
         self.sensors = [Thermometer(detector.case) for _ in self.spec.sensors]
         self.case = self.sensors[0]
         self.detector = RegimeDetector(detector)
-        self._board_check = SensorCheck(self.board, self.case, self.config.board_lag_s)
+        self._board_check = SensorCheck(self.board, self.case, board_lag_s)
         self._checks = [SensorCheck(sensor, self.board, 0.0) for sensor in self.sensors]
         #: What is wrong with each thermometer, by name.
         self.checks = {
@@ -55,8 +56,10 @@ class ThermalTracker:
         self._places = {name: k for k, name in enumerate(self.spec.sensors)}
         self._clear()
 
-    def _configure(self, config: ThermalConfig) -> None:
+    def _configure(self, config: ThermalConfig, board_lag_s: float) -> None:
         self.config = config
+        #: The board's time constant behind the case [s], for the gradient while this is lost.
+        self._board_lag_s = board_lag_s
         self._case_timeout_s = config.case_timeout_s
         #: How long nobody may have watched before the regime is not known any more [s].
         self._unwatched_s = max(UNWATCHED_SHARE * self.settings.case.lag_s, config.case_timeout_s)
@@ -81,13 +84,13 @@ class ThermalTracker:
         self.memory.forget()
         self._clear()
 
-    def reconfigure(self, config: ThermalConfig, stamp_ns: int | None) -> None:
+    def reconfigure(self, config: ThermalConfig, board_lag_s: float, stamp_ns: int | None) -> None:
         """Take over another configuration from a stamp on, without a step in the weight."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
-        self._configure(config)
-        self._board_check.lag_s = config.board_lag_s
+        self._configure(config, board_lag_s)
+        self._board_check.lag_s = board_lag_s
 
     def is_live(self, stamp_ns: int, place: int = 0) -> bool:
         """Whether a sensor, the leading one by default, is there and fresh enough at a stamp."""
@@ -248,7 +251,7 @@ class ThermalTracker:
 
     def _lost_gradient(self, stamp_ns: int, rate: float) -> tuple[float, float]:
         """Guess a gradient from the board's rate, while its sensor is lost."""
-        lag = self.config.board_lag_s
+        lag = self._board_lag_s
         gradient = lag * rate
         # Nor has anybody seen what the case did since the board was last read.
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
