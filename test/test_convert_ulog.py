@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert import write_log
-from thermo_comp.convert.ulog import read_ulog
+from thermo_comp.convert import read_ulog, write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import read_recording
 

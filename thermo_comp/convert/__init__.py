@@ -4,11 +4,10 @@
 Owns the way from other people's logs to bags: tables with a column map, PX4, ArduPilot, bags.
 """
 
+from .autopilot import read_dataflash, read_ulog
 from .bag import bag_log
 from .columns import ColumnMap, guess_columns, load_column_map, spoken_columns, table_log
-from .dataflash import read_dataflash
 from .log import ConversionReport, ForeignLog, write_log
-from .ulog import read_ulog
 
 __all__ = [
     'ColumnMap',

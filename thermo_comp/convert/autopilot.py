@@ -1,18 +1,35 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the logs of autopilots have in common: numbered IMUs, their thermometer and the baro's.
+Owns the logs of autopilots, behind the extras ``px4`` and ``ardupilot``: one IMU, one barometer.
 
 The thermometer inside the IMU sits with the converter and lags: it becomes the board temperature.
 The barometer beside it hardly heats itself and follows the surroundings: it becomes the case
 temperature, and the board's where the IMU has none. A simulator's log is refused: it has no noise,
 so nothing can be weighed by it.
+
+PX4's ULog (``.ulg``): ``sensor_accel`` holds what the driver read, before PX4's own thermal
+correction and calibration, with the temperature of the same chip. PX4 logs it at 1 Hz unless the
+logger's profile asks for more (``SDLOG_PROFILE``: thermal calibration). Where it is missing,
+``sensor_combined`` stands in: after PX4's calibration, and without a temperature.
+
+ArduPilot's DataFlash (``.BIN``): one message type per IMU in old logs (``IMU``, ``IMU2``), one
+with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. The
+readings are those after ArduPilot's own correction, so a log made with ``INS_TCALn_ENABLE = 1`` is
+refused: its thermal drift is already taken out.
+
+https://docs.px4.io/main/en/dev_log/ulog_file_format
+https://ardupilot.org/copter/docs/logmessages.html
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,18 +37,247 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
-from ..typing import Ints
-from .log import NO_STAMP, ForeignLog, Readings, thin
+from ..files import open_regular
+from ..typing import Bools, Floats, Ints
+from .log import NO_STAMP, SLOW_HZ, ForeignLog, Readings, thin
 from .units import find_stillness
 
 T = TypeVar('T')
+_Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
 #: No noise at all, but for the rounding of sums [parts of g].
 _NO_NOISE = 1e-6
+_TOPICS = (
+    *('sensor_accel', 'sensor_gyro', 'sensor_baro'),
+    *('sensor_combined', 'vehicle_air_data'),
+)
+_AXES = ('x', 'y', 'z')
+_PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
+_INFORMATION = {'px4_hardware': 'ver_hw', 'px4_software': 'ver_sw_release', 'px4_uuid': 'sys_uuid'}
+#: `accelerometer_timestamp_relative` of a message without an accelerometer.
+_NOT_THERE = 2**31 - 1
+_HEADER_BYTES = 3
+_VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
 
-def chosen(
+def read_ulog(
+    path: str | Path,
+    imu: int | None = None,
+    baro: int | None = None,
+    allow_compensated: bool = False,
+) -> ForeignLog:
+    """Read an IMU of a PX4 log."""
+    with open_regular(path) as file:
+        log = _read('pyulog', 'ULog', 'px4', 'a ULog file', path, file, list(_TOPICS))
+    by_topic: dict[str, dict[int, _Columns]] = {topic: {} for topic in _TOPICS}
+    for data in log.data_list:
+        # A damaged format may have lost its time stamp.
+        if len(data.data.get('timestamp', ())):
+            by_topic[data.name][int(data.multi_id)] = data.data
+    baros = {
+        number: Readings(_stamps(columns), _column(columns, name))
+        for topic, name in (
+            ('vehicle_air_data', 'baro_temp_celcius'),
+            ('sensor_baro', 'temperature'),
+        )
+        for number, columns in by_topic[topic].items()
+    }
+    metadata = {
+        key: str(log.msg_info_dict[name])
+        for key, name in _INFORMATION.items()
+        if name in log.msg_info_dict
+    }
+    if log.dropouts:
+        lost_ms = sum(int(dropout.duration) for dropout in log.dropouts)
+        metadata['px4_dropouts'] = f'{len(log.dropouts)}, {lost_ms} ms in all'
+    if log.file_corruption:
+        metadata['px4_corruption'] = 'parts of the file could not be read'
+    imus, compensated = {}, {}
+    for number, columns in by_topic['sensor_accel'].items():
+        stamp_ns = _stamps(columns)
+        is_slow = len(stamp_ns) > 1 and np.median(np.diff(stamp_ns[:100])) > 1e9 / SLOW_HZ
+        imus[number] = ForeignLog(
+            str(path),
+            stamp_ns,
+            _vectors(columns, _AXES),
+            _matched(stamp_ns, by_topic['sensor_gyro'].get(number)),
+            {'imu': Readings(stamp_ns, _column(columns, 'temperature'))},
+            serial=f'px4-accel-{int(columns["device_id"][0])}' if 'device_id' in columns else '',
+            metadata=metadata,
+            hint=_PROFILE if is_slow else '',
+        )
+    for number, columns in by_topic['sensor_combined'].items() if not imus else ():
+        stamp_ns, accel, gyro = _combined(columns)
+        metadata = {**metadata, 'px4_topic': 'sensor_combined'}
+        hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
+        imus[number] = ForeignLog(str(path), stamp_ns, accel, gyro, metadata=metadata, hint=hint)
+        if log.initial_parameters.get('TC_A_ENABLE') == 1:
+            compensated[number] = (
+                'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
+                f'thermal drift out of these readings; {_PROFILE}'
+            )
+    return _chosen(Path(path), imus, baros, compensated, imu, baro, allow_compensated)
+
+
+def _combined(columns: _Columns) -> tuple[Ints, Floats, Floats | None]:
+    relative = _column(columns, 'accelerometer_timestamp_relative')
+    is_there = np.isfinite(relative) & (relative != _NOT_THERE)
+    published = columns['timestamp'][is_there].astype(np.int64)
+    stamp_ns = _stamps_ns(published + relative[is_there].astype(np.int64))
+    # A message with news of the gyroscope alone repeats what the accelerometer said last.
+    is_new = np.concatenate((np.ones(len(stamp_ns[:1]), bool), np.diff(stamp_ns) != 0))
+    accel, gyro = (
+        _vectors(columns, [f'{name}[{axis}]' for axis in range(3)])[is_there][is_new]
+        for name in ('accelerometer_m_s2', 'gyro_rad')
+    )
+    return stamp_ns[is_new], accel, gyro if np.isfinite(gyro).all() else None
+
+
+def _stamps(columns: _Columns) -> Ints:
+    # When the sample was taken, where the log says it; older logs only say when it was published.
+    name = 'timestamp_sample' if 'timestamp_sample' in columns else 'timestamp'
+    return _stamps_ns(columns[name])
+
+
+def _column(columns: _Columns, name: str) -> Floats:
+    n = len(columns['timestamp'])
+    return np.asarray(columns.get(name, np.full(n, np.nan)), dtype=np.float64)
+
+
+def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
+    return np.column_stack([_column(columns, name) for name in names])
+
+
+def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
+    """Interpolate the rate to the accelerometer's stamps; None where it was logged sparsely."""
+    if columns is None:
+        return None
+    gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
+    use = gyro_ns != NO_STAMP
+    gyro_ns, gyro = gyro_ns[use], gyro[use]
+    if 2 * len(gyro_ns) < len(stamp_ns) or not np.isfinite(gyro).all():
+        return None
+    at, where = (stamp_ns - stamp_ns[0]) * 1e-9, (gyro_ns - stamp_ns[0]) * 1e-9
+    return np.column_stack([np.interp(at, where, gyro[:, i]) for i in range(3)])
+
+
+def read_dataflash(
+    path: str | Path,
+    imu: int | None = None,
+    baro: int | None = None,
+    allow_compensated: bool = False,
+) -> ForeignLog:
+    """Read an IMU of an ArduPilot log, counted from 0: the old type ``IMU2`` is 1."""
+    path = Path(path)
+    with open_regular(path) as file:
+        magic = file.read(2)
+    if magic != b'\xa3\x95':
+        raise RecordingError('not a DataFlash log: it does not begin with a3 95', path=path)
+    reader = _read(
+        'pymavlink.DFReader', 'DFReader_binary', 'ardupilot', 'a DataFlash log', path, str(path)
+    )
+    imus: dict[int, ForeignLog] = {}
+    baros: dict[int, Readings] = {}
+    try:
+        metadata = {}
+        if any(str(key).startswith('SIM_') for key in reader.params):
+            metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
+        for name in sorted(reader.name_to_id):
+            if not re.fullmatch(r'IMU\d?|BARO|BAR\d', name):
+                continue
+            columns, n_short = _messages(reader, name, path)
+            is_imu = name.startswith('IMU')
+            for number, stamp_ns, rows in _instances(name, columns):
+                celsius = columns.get('T', columns.get('Temp', np.full(len(rows), np.nan)))
+                readings = Readings(stamp_ns[rows], celsius[rows].astype(np.float64))
+                if not is_imu:
+                    baros[number] = readings
+                elif all(title in columns for title in _VECTORS):
+                    both = np.column_stack([columns[title][rows] for title in _VECTORS])
+                    accel, gyro = both.astype(np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
+                    imus[number] = ForeignLog(
+                        str(path),
+                        stamp_ns[rows],
+                        accel,
+                        gyro,
+                        {'imu': readings},
+                        n_short=n_short,
+                        metadata=metadata,
+                    )
+    finally:
+        reader.close()
+    compensated = {
+        number: f'{name} was 1: ArduPilot has already taken the thermal drift out of these '
+        'readings; set it to 0 and record again'
+        for number in imus
+        if reader.params.get(name := f'INS_TCAL{number + 1}_ENABLE') == 1.0
+    }
+    return _chosen(path, imus, baros, compensated, imu, baro, allow_compensated)
+
+
+def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
+    """Gather one message type: its columns, and how many of its messages were cut off."""
+    number = reader.name_to_id[name]
+    layout = reader.formats[number]
+    offsets = np.asarray(reader.offsets[number], dtype=np.int64)
+    whole = offsets[offsets + layout.len <= reader.data_len]
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)
+    # numpy calls numbers as struct does.
+    fields = [
+        (title, f'S{size or 1}' if code == 's' else f'<{code}')
+        for title, (size, code) in zip(layout.columns, codes, strict=False)
+    ]
+    if len(dict(fields)) < len(fields):
+        raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)
+    kind = np.dtype(fields)
+    if _HEADER_BYTES + kind.itemsize > layout.len:
+        raise RecordingError(f'damaged: the format of {name} is longer than it says', path=path)
+    raw = np.memmap(path, dtype=np.uint8, mode='r')
+    span = np.arange(_HEADER_BYTES, _HEADER_BYTES + kind.itemsize)
+    rows = np.ascontiguousarray(raw[whole[:, None] + span]).view(kind).ravel()
+    columns = {
+        title: rows[title] if factor is None else rows[title] * factor
+        for title, factor in zip(layout.columns, layout.msg_mults, strict=False)
+    }
+    return columns, len(offsets) - len(whole)
+
+
+def _instances(name: str, columns: _Columns) -> Iterator[tuple[int, Ints, Bools]]:
+    """Give number, stamps and rows of each sensor; of messages without a time, of none."""
+    if 'TimeUS' in columns:
+        stamp_ns = _stamps_ns(columns['TimeUS'])
+    elif 'TimeMS' in columns:
+        stamp_ns = _stamps_ns(columns['TimeMS'].astype(np.uint64) * np.uint64(1000))
+    else:
+        return
+    if 'I' in columns:
+        for number in np.unique(columns['I']):
+            yield int(number), stamp_ns, columns['I'] == number
+    elif len(stamp_ns):
+        # The second IMU's old type is IMU2: counted from 1, the first without its number.
+        number = int(name[-1]) - 1 if name[-1].isdigit() else 0
+        yield number, stamp_ns, np.ones(len(stamp_ns), dtype=np.bool_)
+
+
+def _read(module: str, name: str, extra: str, what: str, path: str | Path, *arguments: Any) -> Any:
+    """Let the library of an extra read a file."""
+    try:
+        read = getattr(import_module(module), name)
+    except ImportError as failure:
+        package = module.partition('.')[0]
+        raise RecordingError(
+            f"{what} needs {package}: pip install 'thermo_comp[{extra}]'", path=path
+        ) from failure
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        # They raise whatever a damaged file makes Python raise.
+        try:
+            return read(*arguments)
+        except Exception as failure:
+            raise RecordingError(f'not {what} ({failure})', path=path) from failure
+
+
+def _chosen(
     path: Path,
     imus: Mapping[int, ForeignLog],
     baros: Mapping[int, Readings],
@@ -66,7 +312,7 @@ def chosen(
     return replace(rows, temperatures=dict(named))
 
 
-def stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
+def _stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
     """
     Turn microseconds since the autopilot's start into stamps; `NO_STAMP` where the number is no
     time: beyond a century, from a damaged file.
