@@ -14,8 +14,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from struct import Struct
 from typing import Any
 
@@ -29,7 +30,6 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
-from ..errors import ThermoCompError
 from ..online.stamped_flag import STAMPED_TOPIC
 from ..recording import ROLES, BagWriter, Input, Role, Topics
 from ..recording.decode import Decoder, Feed
@@ -58,10 +58,11 @@ _STAMP = Struct('<iI')
 class _Listener:
     """A node whose subscriptions are emptied in a thread of its own, while the context lasts."""
 
-    _name: str
-
-    def __init__(self, ros_args: Sequence[str]) -> None:
-        self._ros_args = ros_args
+    def __init__(self, name: str, ros_args: Sequence[str]) -> None:
+        self._name, self._ros_args = name, ros_args
+        self._heard: dict[str, RawSubscription] = {}
+        #: What came: whence, messages, when each was received [ns].
+        self._waiting: SimpleQueue[tuple[str, list[bytes], list[int]]] = SimpleQueue()
 
     def __enter__(self) -> Any:
         """Open the subscriptions and start the thread."""
@@ -87,23 +88,23 @@ class _Listener:
             self._node.destroy_node()
             self._context.try_shutdown()
 
-    def _run(self) -> None:
-        self._loop.run(self._take)
-        self._take()
-
     def _open(self) -> None:
         """Subscribe."""
         raise NotImplementedError
 
+    def _run(self) -> None:
+        self._loop.run(self._take)
+        self._take()
+
     def _take(self) -> None:
-        """Empty the subscriptions."""
-        raise NotImplementedError
+        for name, subscription in self._heard.items():
+            messages, received_ns = subscription.drain()
+            if messages:
+                self._waiting.put((name, messages, received_ns))
 
 
 class Recorder(_Listener):
-    """Records topics into a bag that any rosbag2 tool opens."""
-
-    _name = 'thermo_comp_recorder'
+    """Records topics into a bag that any rosbag2 tool opens, whenever its caller looks."""
 
     def __init__(
         self,
@@ -113,11 +114,9 @@ class Recorder(_Listener):
         ros_args: Sequence[str] = (),
         overwrite: bool = False,
     ) -> None:
-        super().__init__(ros_args)
+        super().__init__('thermo_comp_recorder', ros_args)
         self._path, self._topics, self._overwrite = Path(path), topics, overwrite
-        self._changed = threading.Condition()
         self._counts = dict.fromkeys(topics, 0)
-        self._failure: ThermoCompError | None = None
         self._newest: dict[str, bytes] = {}
         self._newest_ns: int | None = None
         # What came before any stamp.
@@ -129,27 +128,25 @@ class Recorder(_Listener):
         super().__enter__()
         return self
 
-    def _open(self) -> None:
-        self._subscriptions = {
-            name: self._loop.subscribe(kind, name, _RELIABLE)
-            for name, kind in self._topics.items()
-        }
-
     def __exit__(self, *raised: object) -> None:
         """Stop; finish the bag, or drop it after an error."""
         self.close()
-        if raised[0] is None and self._failure is None:
-            self._writer.close()
+        if raised[0] is not None:
+            self._writer.abort()
             return
-        self._writer.abort()
-        if raised[0] is None and self._failure is not None:
-            raise self._failure
+        with self._writer:
+            _ = self.counts
+
+    def _open(self) -> None:
+        for name, kind in self._topics.items():
+            self._heard[name] = self._loop.subscribe(kind, name, _RELIABLE)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages recorded so far, by the relative topic name."""
-        with self._changed:
-            return dict(self._counts)
+        """Messages recorded so far, with what waits, by the relative topic name."""
+        for _ in range(self._waiting.qsize()):
+            self._record(*self._waiting.get())
+        return self._counts
 
     def newest(self, name: str) -> Any:
         """Return the newest message of a topic, be it recorded or not; None before any."""
@@ -161,63 +158,48 @@ class Recorder(_Listener):
     ) -> bool:
         """Wait until every topic has a publisher; False after the time-out or at a False."""
         deadline = time.monotonic() + timeout_s
-        while not all(one.count_publishers() for one in self._subscriptions.values()):
+        while not all(one.count_publishers() for one in self._heard.values()):
             if time.monotonic() > deadline or not while_true():
                 return False
             time.sleep(0.02)
         return True
 
     def wait_until(self, is_done: Callable[[Mapping[str, int]], bool], timeout_s: float) -> bool:
-        """Wait until the counts are as wanted; False after the time-out [s]."""
-        with self._changed:
-            self._changed.wait_for(
-                lambda: self._failure is not None or is_done(self._counts), timeout_s
-            )
-            return self._failure is None and is_done(self._counts)
+        """Record until the counts are as wanted; False after the time-out [s]."""
+        deadline = time.monotonic() + timeout_s
+        with suppress(Empty):
+            while not is_done(self.counts):
+                self._record(*self._waiting.get(timeout=max(0.0, deadline - time.monotonic())))
+            return True
+        return False
 
-    def _take(self) -> None:
-        """Write what has arrived, until that fails."""
-        new: dict[str, int] = {}
-        try:
-            for name, subscription in self._subscriptions.items():
-                fresh = subscription.drain()[0]
-                if fresh and self._failure is None:
-                    new[name] = self._write(name, fresh)
-        except ThermoCompError as error:
-            self._failure = error
-        if new or self._failure is not None:
-            with self._changed:
-                for name, n_messages in new.items():
-                    self._counts[name] += n_messages
-                self._changed.notify_all()
-
-    def _write(self, name: str, fresh: list[bytes]) -> int:
-        """Record messages and what came before any stamp; return how many."""
-        kind, self._newest[name] = self._topics[name], fresh[-1]
+    def _record(self, name: str, messages: list[bytes], _received_ns: list[int]) -> None:
+        """Write messages; those without a stamp once there is one."""
+        kind, self._newest[name] = self._topics[name], messages[-1]
+        early: dict[str, list[bytes]] = {}
         if kind is Imu:
-            log_ns = np.array([_STAMP.unpack_from(data, 4) for data in fresh]) @ (10**9, 1)
+            log_ns = np.array([_STAMP.unpack_from(data, 4) for data in messages]) @ (10**9, 1)
             self._newest_ns = int(log_ns[-1])
-        elif self._newest_ns is None:
-            self._early.setdefault(name, []).extend(fresh)
-            return 0
+            early, self._early = self._early, {}
+        elif self._newest_ns is not None:
+            log_ns = np.full(len(messages), self._newest_ns)
         else:
-            fresh = self._early.pop(name, []) + fresh
-            log_ns = np.full(len(fresh), self._newest_ns)
-        self._writer.write_raw(name, _type_name(kind), log_ns, fresh)
-        return len(fresh)
+            self._early.setdefault(name, []).extend(messages)
+            return
+        type_name = f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
+        self._writer.write_raw(name, type_name, log_ns, messages)
+        self._counts[name] += len(messages)
+        for other, held in early.items():
+            self._record(other, held, [])
 
 
 class LiveTopics(_Listener):
     """Listens to the node's inputs: a topic is subscribed to once somebody publishes it."""
 
-    _name = 'thermo_comp_record'
-
     def __init__(self, topics: Topics, input: Input, ros_args: Sequence[str] = ()) -> None:  # noqa: A002
-        super().__init__(ros_args)
+        super().__init__('thermo_comp_record', ros_args)
         self._topics, self._input = topics, input
         self._feeds: dict[Role, Feed] = {}
-        self._heard: dict[Role, RawSubscription] = {}
-        self._waiting: SimpleQueue[tuple[Role, list[bytes], list[int]]] = SimpleQueue()
         #: Why nothing comes, one sentence each.
         self.problems: tuple[str, ...] = ()
 
@@ -301,13 +283,3 @@ class LiveTopics(_Listener):
                 _CLASSES[kind], topic, _AS_OFFERED, is_hot=role == 'accel'
             )
         return role in self._heard
-
-    def _take(self) -> None:
-        for role, subscription in self._heard.items():
-            messages, received_ns = subscription.drain()
-            if messages:
-                self._waiting.put((role, messages, received_ns))
-
-
-def _type_name(message_type: Any) -> str:
-    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
