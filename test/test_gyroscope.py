@@ -27,7 +27,7 @@ from thermo_comp.unit.calibration_file import dump_calibration, parse_calibratio
 from thermo_comp.unit.functions import Polynomial
 from thermo_comp.unit.gravity import EARTH_RATE, STANDARD_GRAVITY
 from thermo_comp.unit.gyroscope import MILLIDEGREE, RateCurve
-from thermo_comp.unit.prediction import bias_and_scale, predicted_sd, ramp_states
+from thermo_comp.unit.prediction import bias_and_scale, ramp_states, sd_of_states
 from thermo_comp.unit.rate_triad import gyroscope_of, rate_triad
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
@@ -164,12 +164,12 @@ def test_file_and_triad_round_trip():
     states = ramp_states(triad, np.array([10.0, 20.0, 30.0]), 0.0, 0.0)
     bias, scale = bias_and_scale(triad, states)
     np.testing.assert_array_equal(scale, 1.0)
-    sd = predicted_sd(triad, np.array([20.0]), 0.0)
-    np.testing.assert_array_equal(sd.scale, 0.0)
+    sd_bias, sd_scale = sd_of_states(triad, states[1:2])
+    np.testing.assert_array_equal(sd_scale, 0.0)
     # At the reference: the bias as it stands there; its level's variance and the turn-on's.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
-        sd.bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5
+        sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5
     )
     with pytest.raises(ValueError, match='`calibration` must have a gyroscope'):
         rate_triad(calibration())

@@ -17,7 +17,7 @@ from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.posterior import posterior_of
-from thermo_comp.unit.prediction import predicted_sd, ramp_states, step_states
+from thermo_comp.unit.prediction import ramp_states, sd_of_states, step_states
 
 
 def slope_and_lag(variances: dict[int, float]):
@@ -37,23 +37,24 @@ def test_sd_by_hand():
     # x: level and slope of the static bias, level and slope of the dynamic one, the lag's weight;
     # then the scale's static and dynamic level.
     one = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
-    soak = predicted_sd(one, np.array([20.0, 30.0]), 0.0)
+    states = ramp_states(one, np.array([20.0, 30.0]), 0.0, np.inf)
+    bias, scale = sd_of_states(one, states)
     # sqrt(4e-4 + 100 * 1e-6) counts, 300 of them per m/s^2, and 30 um/s^2 that nothing explains.
     own = np.sqrt([4e-4, 5e-4]) / 300.0
-    assert soak.bias[:, 0] == pytest.approx(np.hypot(own, 3e-5), rel=1e-6)
-    assert soak.bias[:, 1] == pytest.approx([3e-5, 3e-5])
-    assert soak.scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
+    assert bias[:, 0] == pytest.approx(np.hypot(own, 3e-5), rel=1e-6)
+    assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
+    assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
     # 0.6 K/min for ever: 600 s behind are 6 K.
-    ramp = predicted_sd(one, np.array([25.0]), 0.01)
-    assert ramp.bias[0, 0] == pytest.approx(np.sqrt(9e-4 + 36e-6) / 300.0, rel=1e-6)
-    assert ramp.scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
+    bias, scale = sd_of_states(one, ramp_states(one, np.array([25.0]), 0.01, np.inf))
+    assert bias[0, 0] == pytest.approx(np.sqrt(9e-4 + 36e-6) / 300.0, rel=1e-6)
+    assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
 
 
 def test_what_is_known_has_no_sd():
     one = replace(rich_calibration(), posterior=None)
-    sd = predicted_sd(one, np.array([20.0]), 0.0)
-    assert sd.bias == pytest.approx(np.full((1, 3), 1e-5))
-    assert not sd.scale.any()
+    bias, scale = sd_of_states(one, ramp_states(one, np.array([20.0]), 0.0, np.inf))
+    assert bias == pytest.approx(np.full((1, 3), 1e-5))
+    assert not scale.any()
 
 
 @pytest.mark.parametrize('rate', [0.01, -0.02])

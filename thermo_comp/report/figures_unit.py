@@ -192,10 +192,10 @@ def curves(calibration: Calibration) -> list[Curve]:
         lasted_s = (temperature - begun) / rate if rate else 0.0
         states = ramp_states(calibration, temperature, rate, lasted_s)
         bias, scale = bias_and_scale(calibration, states)
-        sd = sd_of_states(calibration, states)
-        bias, sd_bias = (bias - bias_0) / MICRO_G, sd.bias / MICRO_G
+        sd_bias, sd_scale = sd_of_states(calibration, states)
+        bias, sd_bias = (bias - bias_0) / MICRO_G, sd_bias / MICRO_G
         look, scale = (line, hatch, marker), (scale / scale_0 - 1.0) * 1e6
-        found.append(Curve(name, *look, temperature, bias, sd_bias, scale, sd.scale * 1e6))
+        found.append(Curve(name, *look, temperature, bias, sd_bias, scale, sd_scale * 1e6))
     return found
 
 

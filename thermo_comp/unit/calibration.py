@@ -23,13 +23,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
+
 from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings
+from ..typing import Floats
 from .columns import Column
-from .extremes import extreme_values
 from .functions import TemperatureFunction, check_reference
 from .gyroscope import Gyroscope, RateSet
-from .posterior import Block, ParameterLayout, Posterior
+from .posterior import ParameterLayout, Posterior, lay_out
 from .schema import Bounds, NotNegative, Positive
 
 if TYPE_CHECKING:
@@ -42,6 +44,8 @@ FORMAT_VERSION = 2
 AXES = ('x', 'y', 'z')
 #: A scale function, with every term at its worst, must stay above this fraction of the reference.
 SMALLEST_RELATIVE_SCALE = 0.1
+#: At so many temperatures of its range a function is looked at.
+_GRID = 513
 
 Celsius = Annotated[float, Bounds(at_least=-273.15, below=1000.0)]
 Vector = tuple[float, float, float]
@@ -265,46 +269,23 @@ class Calibration:
             )
         self._check_misalignment()
         self._check_sensors()
-        for regime, regime_set in (('static', self.static), ('dynamic', self.dynamic)):
-            lower, upper = (
-                edge - self.reference_temperature_c for edge in regime_set.temperature_range_c
-            )
-            for axis, name in enumerate(AXES):
-                for prefix, curves in self._curves(regime):
-                    extremes = extreme_values(curves.axes()[axis].bias_function, lower, upper)
-                    if not all(map(math.isfinite, extremes)):
-                        raise ValueError(
-                            f'`{prefix}.{name}.bias_function` must be finite over its range'
-                        )
-                smallest = self._smallest_scale(regime, regime_set, axis)
-                if not smallest > SMALLEST_RELATIVE_SCALE:
-                    raise ValueError(
-                        f'`{regime}.{name}.scale_function` must stay above '
-                        f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {smallest:.4g}'
-                    )
-        expected = parameter_layout(self).n_parameters
-        if self.posterior is not None and self.posterior.n_parameters != expected:
-            raise ValueError(
-                f'`posterior.rest` must have one number per parameter ({expected}), '
-                f'got {self.posterior.n_parameters}'
-            )
-
-    def _curves(self, regime: str) -> Iterator[tuple[str, RegimeSet | RateSet]]:
-        yield regime, getattr(self, regime)
-        if self.gyroscope is not None:
-            yield f'gyroscope.{regime}', getattr(self.gyroscope, regime)
+        for regime in ('static', 'dynamic'):
+            self._check_curves(regime)
+        if self.posterior is not None:
+            self.posterior.check_size(parameter_layout(self).n_parameters)
 
     def _check_misalignment(self) -> None:
-        for row in range(3):
-            for column in range(3):
-                value = self.misalignment[row][column]
-                key = f'`misalignment[{row}][{column}]`'
-                if column == row and value != 1.0:
-                    raise ValueError(f'{key} must be 1, got {value:g}')
-                if column > row and value:
-                    raise ValueError(f'{key} must be 0 (M is lower triangular), got {value:g}')
-                if column < row and not abs(value) < 0.5:
-                    raise ValueError(f'{key} must be below 0.5 in magnitude, got {value:g}')
+        for row, values in enumerate(self.misalignment):
+            for column, value in enumerate(values):
+                is_good, rule = value == 1.0, '1'
+                if column > row:
+                    is_good, rule = not value, '0 (M is lower triangular)'
+                elif column < row:
+                    is_good, rule = abs(value) < 0.5, 'below 0.5 in magnitude'
+                if not is_good:
+                    raise ValueError(
+                        f'`misalignment[{row}][{column}]` must be {rule}, got {value:g}'
+                    )
 
     def _check_sensors(self) -> None:
         names = self.sensors
@@ -313,34 +294,42 @@ class Calibration:
                 '`sensors` must be different names, at least one, none of them board, '
                 f'got {list(names)}'
             )
-        responses: dict[str, tuple[Column, ...]] = {'response': self.response}
-        if self.gyroscope is not None:
-            responses['gyroscope.response'] = self.gyroscope.response
-        for key, response in responses.items():
+        own = self.gyroscope.response if self.gyroscope else ()
+        for key, response in (('response', self.response), ('gyroscope.response', own)):
             for k, term in enumerate(response):
-                of_sensor = term.is_of_gradient or term.kind == 'neighbour'
-                if of_sensor and term.sensor not in names:
+                if term.is_of_sensor and term.sensor not in names:
                     raise ValueError(
                         f'`{key}[{k}].sensor` must be one of sensors {list(names)}, '
                         f'got {term.sensor!r}'
                     )
 
-    def _smallest_scale(self, regime: str, regime_set: RegimeSet, axis: int) -> float:
-        """Lower bound of the relative scale over a set's ranges, every term at its worst."""
+    def _check_curves(self, regime: str) -> None:
+        """Check that a set's functions are finite over its ranges, with a scale far from 0."""
         reference = self.reference_temperature_c
-        lower, upper = (edge - reference for edge in regime_set.temperature_range_c)
-        result, _ = extreme_values(regime_set.axes()[axis].scale_function, lower, upper)
-        farthest = max(
-            abs(edge - reference) for one in self.regime_sets() for edge in one.temperature_range_c
-        )
-        for term in self.response:
-            if term.during in ('always', regime) and term.scale[axis]:
-                largest = max(abs(edge) for edge in term.range)
-                try:
-                    result -= largest * farthest**term.power * abs(term.scale[axis])
-                except OverflowError:
-                    result = -math.inf
-        return result if math.isfinite(result) else -math.inf
+        own = self.static if regime == 'static' else self.dynamic
+        t = np.linspace(*own.temperature_range_c, _GRID) - reference
+        edges = [edge for one in self.regime_sets() for edge in one.temperature_range_c]
+        farthest = max(abs(edge - reference) for edge in edges)
+        sets: dict[str, RegimeSet | RateSet] = {regime: own}
+        if self.gyroscope is not None:
+            sets[f'gyroscope.{regime}'] = getattr(self.gyroscope, regime)
+        for axis, name in enumerate(AXES):
+            for prefix, curves in sets.items():
+                if not math.isfinite(_smallest(curves.axes()[axis].bias_function, t)):
+                    raise ValueError(
+                        f'`{prefix}.{name}.bias_function` must be finite over its range'
+                    )
+            # Every term of the response at its worst.
+            smallest = _smallest(own.axes()[axis].scale_function, t)
+            for term in self.response:
+                if term.during in ('always', regime) and term.scale[axis]:
+                    largest = np.max(np.abs(term.range)) * np.float64(farthest) ** term.power
+                    smallest -= float(largest) * abs(term.scale[axis])
+            if not smallest > SMALLEST_RELATIVE_SCALE:
+                raise ValueError(
+                    f'`{regime}.{name}.scale_function` must stay above '
+                    f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {smallest:.4g}'
+                )
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
@@ -357,16 +346,15 @@ class Calibration:
     @property
     def needs_temperature(self) -> bool:
         """Whether temperature changes what it says; else it is constants, of the reference."""
-        curves = [axis for one in self.regime_sets() for axis in one.axes()]
-        weights = [axis.delta for axis in curves]
-        for axis in curves:
-            weights += axis.bias_function.free_coefficients
+        weights: list[float] = []
+        for axis in (one for part in self.regime_sets() for one in part.axes()):
+            weights += (axis.delta, *axis.bias_function.free_coefficients)
             weights += axis.scale_function.free_coefficients
-        if self.gyroscope is not None:
-            for rate in (*self.gyroscope.static.axes(), *self.gyroscope.dynamic.axes()):
+        own = self.gyroscope
+        if own is not None:
+            for rate in (*own.static.axes(), *own.dynamic.axes()):
                 weights += (rate.delta, *rate.bias_function.free_coefficients)
-        columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
-        return bool(columns) or any(weights)
+        return any(weights) or bool(self.response or (own and own.response))
 
     @property
     def has_uncertainty(self) -> bool:
@@ -380,19 +368,25 @@ class Calibration:
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
     """Say where each parameter of a calibration stands in its posterior."""
-    blocks = []
-    at = 0
-    for static, dynamic in zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True):
-        pairs: tuple[tuple[TemperatureFunction, TemperatureFunction], ...] = (
+    axes = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
+    pairs = [
+        pair
+        for static, dynamic in axes
+        for pair in (
             (static.bias_function, dynamic.bias_function),
             (static.scale_function, dynamic.scale_function),
         )
-        for of_static, of_dynamic in pairs:
-            middle = at + 1 + of_static.n_free
-            response = middle + 1 + of_dynamic.n_free
-            end = response + len(calibration.response)
-            blocks.append(Block(at, middle, response, end))
-            at = end
-    return ParameterLayout(
-        (blocks[0], blocks[2], blocks[4]), (blocks[1], blocks[3], blocks[5]), at, at + 3
-    )
+    ]
+    blocks = lay_out(pairs, len(calibration.response))
+    end = blocks[-1].end
+    return ParameterLayout(blocks[0::2], blocks[1::2], end, end + 3)
+
+
+def _smallest(function: TemperatureFunction, t: Floats) -> float:
+    """Find the smallest value over a range; -inf if any is not finite."""
+    try:
+        with np.errstate(all='ignore'):
+            values = function.value(t)
+    except OverflowError:
+        return -math.inf
+    return float(np.min(values)) if np.isfinite(values).all() else -math.inf

@@ -108,6 +108,11 @@ class Column:
         return self.kind in ('now', 'even', 'size') or (self.kind == 'square' and not self.tau_s)
 
     @property
+    def is_of_sensor(self) -> bool:
+        """Whether the value is made of `sensor`, now or before."""
+        return self.is_of_gradient or self.kind == 'neighbour'
+
+    @property
     def lag(self) -> tuple[str, float] | None:
         """Which lag of the memory the value is, or follows: input and time constant [s]."""
         if self.kind == 'neighbour':
@@ -159,7 +164,7 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     lags: set[tuple[str, float]] = set()
     plays: set[tuple[float, float]] = set()
     for column in columns:
-        if (column.is_of_gradient or column.kind == 'neighbour') and column.sensor not in sensors:
+        if column.is_of_sensor and column.sensor not in sensors:
             raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
         if column.lag:
             lags.add(column.lag)

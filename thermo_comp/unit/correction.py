@@ -92,16 +92,17 @@ class Curves:
         """Evaluate bias [input units] and relative scale at board temperatures, (2, 6, n)."""
         t = board - self._reference
         held = hold(t, *self._t_range)
-        result = self._functions.value(held)
+        result = self._functions.evaluate(held)
         result[:, :3] += self._levels
         if (held != t).any():
             here, edge = (hold(one, *self._t_range[:, ::-1]) for one in (t, held))
-            result += self._others.value(here) - self._others.value(edge)
+            result += self._others.evaluate(here) - self._others.evaluate(edge)
         return result
 
     def slopes(self, board: Floats) -> Floats:
         """Differentiate what `values` gives, by the board temperature [per K], (2, 6, n)."""
-        return self._functions.slope(hold(board - self._reference, *self._t_range))
+        held = hold(board - self._reference, *self._t_range)
+        return self._functions.evaluate(held, 'slope')
 
     def bases(self, board: Floats, row: int) -> list[list[Floats]]:
         """Give the regressors of each set's free coefficients of one of the six."""

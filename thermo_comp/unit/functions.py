@@ -253,38 +253,27 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 class Functions:
-    """Several rows of functions, each row at temperatures of its own; polynomials in one go."""
+    """Rows of functions, each row at temperatures of its own; if polynomials, all in one go."""
 
     def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
         self.rows = rows
-        self._others = [
-            (i, k, one)
-            for i, row in enumerate(rows)
-            for k, one in enumerate(row)
-            if not isinstance(one, Polynomial)
-        ]
-        own = [
-            one if isinstance(one, Polynomial) else Polynomial((0.0,)) for r in rows for one in r
-        ]
+        flat = [one for row in rows for one in row if isinstance(one, Polynomial)]
         shape = -1, len(rows), len(rows[0]), 1
-        self._values, self._slopes = (
-            np.array(list(zip_longest(*many, fillvalue=0.0))).reshape(shape)
-            for many in ([one.coefficients for one in own], [one.slopes for one in own])
-        )
+        self._tables = {
+            name: np.array(list(zip_longest(*many, fillvalue=0.0))).reshape(shape)
+            for name, many in (
+                ('value', [one.coefficients for one in flat]),
+                ('slope', [one.slopes for one in flat]),
+            )
+            if len(flat) == sum(map(len, rows))
+        }
 
-    def value(self, t: Floats) -> Floats:
-        """Evaluate at `t`, shape (n_rows, n) [K]: shape (n_rows, n_functions, n)."""
-        result = _horner(self._values, t[:, np.newaxis])
-        for i, k, function in self._others:
-            result[i, k] = function.value(t[i])
-        return result
-
-    def slope(self, t: Floats) -> Floats:
-        """Evaluate the derivatives at `t`, per K."""
-        result = _horner(self._slopes, t[:, np.newaxis])
-        for i, k, function in self._others:
-            result[i, k] = function.slope(t[i])
-        return result
+    def evaluate(self, t: Floats, name: str = 'value') -> Floats:
+        """Evaluate at `t`, shape (n_rows, n) [K], values or slopes, (n_rows, n_functions, n)."""
+        if self._tables:
+            return _horner(self._tables[name], t[:, np.newaxis])
+        pairs = zip(self.rows, t, strict=True)
+        return np.array([[getattr(one, name)(own) for one in row] for row, own in pairs])
 
 
 def _horner(coefficients: Floats | tuple[float, ...], t: Kelvins) -> Floats:

@@ -15,7 +15,7 @@ from typing import Annotated
 
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
-from .posterior import Posterior
+from .posterior import Posterior, lay_out
 from .schema import NotNegative, Positive
 
 #: A unit of angular rates [rad/s].
@@ -86,12 +86,7 @@ class Gyroscope:
     ] = None
 
     def __post_init__(self) -> None:
-        expected = sum(
-            2 + static.bias_function.n_free + dynamic.bias_function.n_free + len(self.response)
-            for static, dynamic in zip(self.static.axes(), self.dynamic.axes(), strict=True)
-        )
-        if self.posterior is not None and self.posterior.n_parameters != expected:
-            raise ValueError(
-                f'`posterior.rest` must have one number per parameter ({expected}), '
-                f'got {self.posterior.n_parameters}'
-            )
+        if self.posterior is not None:
+            axes = zip(self.static.axes(), self.dynamic.axes(), strict=True)
+            pairs = ((static.bias_function, dynamic.bias_function) for static, dynamic in axes)
+            self.posterior.check_size(lay_out(pairs, len(self.response))[-1].end)

@@ -9,14 +9,16 @@ Owns the covariance of all parameters of a calibration, as a factor that fits in
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..typing import Floats
+from .functions import TemperatureFunction
 from .schema import Bounds
 
 #: What single precision cannot tell from nothing, relative to a variance.
@@ -83,9 +85,16 @@ class Posterior:
         result: Floats = self.matrix @ self.matrix.T + np.diag(self.variances)
         return result
 
+    def check_size(self, expected: int) -> None:
+        """Raise ValueError, with the name of the key, if it is not of so many parameters."""
+        if self.n_parameters != expected:
+            raise ValueError(
+                f'`posterior.rest` must have one number per parameter ({expected}), '
+                f'got {self.n_parameters}'
+            )
 
-@dataclass(frozen=True)
-class Block:
+
+class Block(NamedTuple):
     """
     Where the parameters of the bias, or of the scale, of one axis stand among all.
 
@@ -99,8 +108,20 @@ class Block:
     end: int
 
 
-@dataclass(frozen=True)
-class ParameterLayout:
+def lay_out(
+    pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
+) -> list[Block]:
+    """List the blocks of pairs of a static and a dynamic function, one behind the other."""
+    blocks = [Block(0, 0, 0, 0)]
+    for static, dynamic in pairs:
+        begin = blocks[-1].end
+        middle = begin + 1 + static.n_free
+        response = middle + 1 + dynamic.n_free
+        blocks.append(Block(begin, middle, response, response + n_columns))
+    return blocks[1:]
+
+
+class ParameterLayout(NamedTuple):
     """
     The order of a calibration's parameters in its posterior.
 
@@ -108,8 +129,8 @@ class ParameterLayout:
     M[2][1] from `misalignment` on.
     """
 
-    bias: tuple[Block, Block, Block]
-    scale: tuple[Block, Block, Block]
+    bias: list[Block]
+    scale: list[Block]
     misalignment: int
     n_parameters: int
 

@@ -11,8 +11,6 @@ dynamic one in a ramp. Noise, and what the thermometers do not know, are left ou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..thermal.memory import BOARD_INPUT
@@ -21,29 +19,6 @@ from ..typing import Floats
 from .calibration import Calibration
 from .correction import Correction
 from .uncertainty import SlowUncertainty
-
-
-@dataclass(frozen=True)
-class PredictedSd:
-    """
-    How well bias and scale are known in some states.
-
-    bias: standard deviation of each axis' bias, what the sets leave unexplained included [m/s^2],
-        shape (n, 3)
-    scale: of each axis' relative scale, shape (n, 3)
-    """
-
-    bias: Floats
-    scale: Floats
-
-
-def predicted_sd(calibration: Calibration, temperature: Floats, rate: float) -> PredictedSd:
-    """
-    Predict the uncertainty in a soak, or in a ramp that has lasted for ever.
-
-    `temperature`: board temperatures, shape (n,). `rate`: rate of the board [K/s]; 0 in a soak.
-    """
-    return sd_of_states(calibration, ramp_states(calibration, temperature, rate, np.inf))
 
 
 def in_a_soak(
@@ -55,36 +30,35 @@ def in_a_soak(
     Returns bias [m/s^2] and its sd, scale [input units per m/s^2] and its relative sd.
     """
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
-    bias, scale = bias_and_scale(calibration, ramp_states(calibration, at, 0.0, 0.0))
-    sd = predicted_sd(calibration, at, 0.0)
-    return bias[0], sd.bias[0], scale[0], sd.scale[0]
-
-
-def sd_of_states(calibration: Calibration, states: Floats) -> PredictedSd:
-    """Predict the uncertainty of states, shape (n, width), as `ramp_states` gives them."""
-    correction = Correction(calibration)
-    slow = SlowUncertainty(calibration, correction)
-    forgotten = [0.0] * len(correction.memory.lags)
-    left = np.array(
-        [[axis.residual_sd_m_s2 for axis in part.axes()] for part in calibration.regime_sets()]
+    states = ramp_states(calibration, at, 0.0, 0.0)
+    (bias, scale), (sd_bias, sd_scale) = (
+        of_states(calibration, states) for of_states in (bias_and_scale, sd_of_states)
     )
-    variance = np.array([slow.at(state, forgotten) for state in states.tolist()]).reshape(-1, 3, 3)
-    unexplained = left[np.rint(states[:, WEIGHT]).astype(int)]
-    return PredictedSd(
-        np.sqrt(variance[:, :, 0] + unexplained**2), np.sqrt(np.maximum(variance[:, :, 2], 0.0))
-    )
+    return bias[0], sd_bias[0], scale[0], sd_scale[0]
 
 
 def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
     """
-    Evaluate bias and scale.
-
-    `states`: as `ramp_states` gives them, shape (n, width). Returns of each axis [m/s^2], shape
-    (n, 3). Returns of each axis [input units per m/s^2], shape (n, 3).
+    Evaluate bias [m/s^2] and scale [input units per m/s^2], shapes (n, 3), at states, shape
+    (n, width), as `ramp_states` gives them.
     """
     correction = Correction(calibration)
     bias, scale = correction.bias_scale(states.T)
     return (bias / correction.K).T, scale.T
+
+
+def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
+    """
+    Predict the standard deviation of the bias, with what the sets leave unexplained [m/s^2], and
+    of the relative scale, shapes (n, 3), at states, shape (n, width).
+    """
+    correction = Correction(calibration)
+    slow = SlowUncertainty(calibration, correction)
+    forgotten = [0.0] * len(correction.memory.lags)
+    variance = np.array([slow.at(state, forgotten) for state in states.tolist()]).reshape(-1, 3, 3)
+    unexplained = correction.curves.residuals[np.rint(states[:, WEIGHT]).astype(int), :, 0]
+    a, c = variance[:, :, 0] + unexplained, np.maximum(variance[:, :, 2], 0.0)
+    return np.sqrt(a), np.sqrt(c)
 
 
 def ramp_states(

@@ -10,8 +10,7 @@ a triad lives in memory alone.
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,12 +24,10 @@ from .calibration import (
     ResponseTerm,
     parameter_layout,
 )
-from .columns import Column
 from .functions import Polynomial
 from .gyroscope import Gyroscope, RateCurve, RateSet, RateTerm
-from .posterior import ParameterLayout, Posterior
+from .posterior import Posterior
 
-_COLUMN = [one.name for one in fields(Column)]
 _NIL = (0.0, 0.0, 0.0)
 
 
@@ -43,11 +40,10 @@ def rate_triad(calibration: Calibration) -> Calibration:
     own = calibration.gyroscope
     if own is None:
         raise ValueError('`calibration` must have a gyroscope')
-    one = Polynomial((1.0,))
 
     def regime(shared: RegimeSet, curves: RateSet) -> RegimeSet:
         x, y, z = (
-            AxisSet(curve.bias_function, one, curve.delta, sd)
+            AxisSet(curve.bias_function, Polynomial((1.0,)), curve.delta, sd)
             for curve, sd in zip(curves.axes(), own.residual_sd_rad_s, strict=True)
         )
         return replace(shared, x=x, y=y, z=z)
@@ -63,9 +59,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
         slow_noise_m_s2_sqrt_h=own.slow_noise_rad_s_sqrt_h,
         misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         misalignment_sd=_NIL,
-        response=tuple(
-            ResponseTerm(**_column(term), bias=term.bias, scale=_NIL) for term in own.response
-        ),
+        response=tuple(ResponseTerm(**vars(term), scale=_NIL) for term in own.response),
         provenance=Provenance(),
         evidence=(),
         posterior=None,
@@ -73,25 +67,26 @@ def rate_triad(calibration: Calibration) -> Calibration:
     )
     if own.posterior is None:
         return triad
-    layout = parameter_layout(triad)
-    rows = _bias_rows(layout)
-    matrix = np.zeros((layout.n_parameters, own.posterior.rank))
-    variances = np.zeros(layout.n_parameters)
+    rows, n = _bias_rows(triad), parameter_layout(triad).n_parameters
+    matrix, variances = np.zeros((n, own.posterior.rank)), np.zeros(n)
     matrix[rows], variances[rows] = own.posterior.matrix, own.posterior.variances
     return replace(triad, posterior=Posterior.of(matrix, variances))
 
 
 def gyroscope_of(triad: Calibration) -> Gyroscope:
     """Take the gyroscope out of a triad whose scale is 1."""
-    x, y, z = (axis.bias for axis in (triad.axes.x, triad.axes.y, triad.axes.z))
+    x, y, z = (axis.bias for axis in triad.axes)
     static, dynamic = (
         RateSet(*(RateCurve(axis.bias_function, axis.delta) for axis in one.axes()))
         for one in triad.regime_sets()
     )
     sx, sy, sz = (axis.residual_sd_m_s2 for axis in triad.static.axes())
+    terms = [vars(term).copy() for term in triad.response]
+    for keys in terms:
+        del keys['scale']
     posterior = triad.posterior
     if posterior is not None:
-        rows = _bias_rows(parameter_layout(triad))
+        rows = _bias_rows(triad)
         posterior = Posterior.of(posterior.matrix[rows], posterior.variances[rows])
     return Gyroscope(
         bias_rad_s=(x, y, z),
@@ -100,14 +95,11 @@ def gyroscope_of(triad: Calibration) -> Gyroscope:
         noise_density_rad_s_sqrt_hz=triad.noise_density_m_s2_sqrt_hz,
         slow_noise_rad_s_sqrt_h=triad.slow_noise_m_s2_sqrt_h,
         residual_sd_rad_s=(sx, sy, sz),
-        response=tuple(RateTerm(**_column(term), bias=term.bias) for term in triad.response),
+        response=tuple(RateTerm(**keys) for keys in terms),
         posterior=posterior,
     )
 
 
-def _column(term: Column) -> dict[str, Any]:
-    return {name: getattr(term, name) for name in _COLUMN}
-
-
-def _bias_rows(layout: ParameterLayout) -> list[int]:
-    return [row for block in layout.bias for row in range(block.static, block.end)]
+def _bias_rows(triad: Calibration) -> list[int]:
+    blocks = parameter_layout(triad).bias
+    return [row for block in blocks for row in range(block.static, block.end)]
