@@ -11,28 +11,25 @@ import numpy as np
 
 from ..errors import FitError
 from ..text import valid_serial
-from ..thermal.settings import ThermalConfig
-from ..typing import Floats
+from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..unit.calibration import Calibration, Unit
 from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
-from . import verdict
 from .assembly import UnitFacts, build_calibration
-from .coverage import LeastKnown, distinct_directions, least_known
+from .beginning import first_guess, regress
+from .coverage import LeastKnown, least_known
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
-from .learning import Learnt, learn
+from .learning import Learnt
 from .offset import about, centred, find_offset, with_notes
 from .options import FitOptions, sets_of
-from .posterior import Regression
-from .priors import constants_of, known_of, prior_columns, prior_sets, state_of
+from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
 from .sensors import learn_detector
 from .sources import FitSource
-from .start import ConstantCalibration, constant_calibration, position_means
-from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD, Prior, initial_state
-from .verdict import POSITIONS_NEEDED, Finding, enforce
-from .windows import CURVE, FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
+from .start import position_means
+from .verdict import Finding, enforce, judge_bags, judge_coverage, judge_result, judge_windows
+from .windows import FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
 
 Progress = Callable[[float], None]
 
@@ -42,12 +39,6 @@ _WINDOW_S = 60.0
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 # Stands in where the bags do not tell how far the board lags behind the case.
 _USUAL_BOARD_LAG_S = 900.0
-# Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
-_COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
-# What temperature does to a unit that no thermometer has seen, per K: a cheap sensor's data sheet.
-_UNSEEN_BIAS_SLOPE, _UNSEEN_SCALE_SLOPE = 5e-3, 2e-4
-# A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
-_OFFSET_SD, _SIGMA = 1e-6, 1e-5
 
 
 @dataclass(frozen=True)
@@ -121,11 +112,8 @@ def fit_bags(
 
 def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
     """Fit a calibration to bags in which no force is about zero."""
-    seen = [bool(len(bag.board.value)) for bag in bags]
-    if any(seen) and not all(seen):
-        name = bags[seen.index(False)].source.name
-        raise FitError(f'{name}: no board temperature, which the other bags have')
-    findings = enforce(verdict.judge_bags(bags, options), options)
+    _check_temperatures(bags)
+    findings = enforce(judge_bags(bags, options), options)
     known = options.prior
     detector = options.detector or (known.detector if known else learn_detector(bags))
     tell(0.55)
@@ -135,59 +123,38 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     else:
         sets = sets_of(options, bags)
         columns = () if options.model == 'golovach' else bank(sensors)
-    windows = thermal_windows(
-        bags,
-        columns,
-        sets,
-        detector,
-        ThermalConfig(),
-        options.reference_temperature,
-        _WINDOW_S,
-        sensors,
-    )
+
+    def table(detector: DetectorSettings) -> ThermalWindows:
+        return thermal_windows(
+            bags,
+            columns,
+            sets,
+            detector,
+            ThermalConfig(),
+            options.reference_temperature,
+            _WINDOW_S,
+            sensors,
+        )
+
+    windows = table(detector)
     start = first_guess(windows, options) if known is None else constants_of(known)
     up = start.force(position_means(windows.data))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     has_case = all(len(bag.case.value) for bag in bags)
-    findings += enforce(verdict.judge_windows(windows, up, has_case), options)
+    findings += enforce(judge_windows(windows, up, has_case), options)
     tell(0.7)
     nominal = start.scale
-    regression = Regression(windows.data, options.gravity, nominal)
-    inverse = np.linalg.inv(start.misalignment)
-    state = initial_state(
-        windows.data,
-        regression.n_bags,
-        start.bias / nominal,
-        np.ones(3),
-        np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
-        up,
-    )
-    prior = _wide_prior(windows, start, up, options)
-    if known is not None:
-        state = state_of(known, regression, up)
-        told = known_of(known, regression, state, sets, options.ageing)
-        prior = replace(
-            prior,
-            on_bias=np.ones(len(windows.data.groups)),
-            on_scale=windows.data.in_scale.astype(np.float64),
-            known=told,
-        )
-    forced = [
-        options.model == 'golovach' or group == CURVE or group in options.forced
-        for group in windows.data.groups
-    ]
-    learnt = learn(
-        regression,
-        state,
-        prior,
-        np.array(forced),
-        lambda part: tell(0.7 + 0.25 * part),
-        held=(prior.on_scale > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
-        # What the sets alone leave is a response, and no noise.
-        walks=bool(columns) and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
-    )
+    regression, learnt = regress(windows, start, up, sets, options, tell)
+    may_choose = has_case and known is None and options.detector is None
+    if may_choose and any(one.group == SET for one in learnt.worth):
+        # Only the sets feel when the regime closes: with the case, or with the board too.
+        earlier = replace(detector, closes='case')
+        others = table(earlier)
+        again, found = regress(others, start, up, sets, options, tell)
+        if found.posterior.log_evidence > learnt.posterior.log_evidence:
+            detector, windows, regression, learnt = earlier, others, again, found
     residuals, left_out = residual_rows(windows, regression, learnt)
-    findings += verdict.judge_result(
+    findings += judge_result(
         learnt.posterior.state.kappa * nominal,
         residuals,
         learnt.prior.offset_sd,
@@ -212,7 +179,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     least = least_known(calibration, learnt.posterior.state.up)
-    unseen = list(verdict.judge_coverage(least))
+    unseen = list(judge_coverage(least))
     findings += unseen
     calibration = with_notes(calibration, [f'{one.name}: {one.message}' for one in unseen])
     return FitResult(
@@ -234,73 +201,11 @@ def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
     return 'case', *sorted(set.intersection(*seen) - {'board', 'case'})
 
 
-def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Guess the triad without temperature: by its ellipsoid, or where that is not seen, a norm."""
-    means = position_means(windows.data)
-    gravity = options.gravity
-    norms = np.linalg.norm(means, axis=1)
-    if not norms.all():
-        raise FitError('the samples at rest are exactly zero: is it the right topic?')
-    if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
-        return constant_calibration(means, gravity, with_misalignment=False)
-    scale = float(np.median(norms)) / gravity
-    if options.input == 'm/s^2':
-        if abs(scale - 1.0) > 0.2:
-            raise FitError(
-                f'the samples at rest have norm {scale * gravity:.3g}, expected {gravity:.3g} '
-                'm/s^2: is the unit right?'
-            )
-        scale = 1.0
-    return ConstantCalibration(np.zeros(3), np.full(3, scale), np.eye(3))
-
-
-def _wide_prior(
-    windows: ThermalWindows, start: ConstantCalibration, up: Floats, options: FitOptions
-) -> Prior:
-    """Say what is known of any unit before its data are seen."""
-    groups = windows.data.groups
-    allowed = np.array([options.groups is None or group in options.groups for group in groups])
-    allowed &= windows.has_temperature
-    in_scale = windows.data.in_scale & allowed
-    # What a sensor does, its curve does first: the others begin as those of a good one.
-    is_curve = np.array([group == CURVE for group in groups])
-    wide = np.where(is_curve, max(1.0, _drift(windows, start) / _COLUMN_BIAS_SD), 1.0)
-    scale_wide = wide
-    n_directions = len(distinct_directions(up))
-    if n_directions == 1 and options.groups is None:
-        # In one attitude a lag looks like a tilt or a curve: the curve is what others can use.
-        allowed &= is_curve
-        in_scale &= is_curve
-    if n_directions < POSITIONS_NEEDED:
-        # Too few attitudes to tell it from the bias: the curve stays at its prior.
-        in_scale &= is_curve
-        scale_wide = np.ones(len(groups))
-    if options.model == 'golovach':
-        # The paper's sets stay whatever they earn: their prior says nothing.
-        wide, scale_wide = 50.0 * wide, 50.0 * scale_wide
-    on_bias = np.where(allowed, wide * _COLUMN_BIAS_SD, 0.0)
-    on_scale = np.where(in_scale, scale_wide * _COLUMN_SCALE_SD, 0.0)
-    if not windows.was_measured:
-        on_bias[0], on_scale[0] = _UNSEEN_BIAS_SLOPE, _UNSEEN_SCALE_SLOPE
-    return Prior(
-        bias_mean=start.bias / start.scale,
-        bias_sd=np.full(3, BIAS_SD),
-        scale_sd=SCALE_SD,
-        skew_sd=SKEW_SD,
-        on_bias=on_bias,
-        on_scale=on_scale,
-        offset_sd=_OFFSET_SD,
-        sigma=np.full(3, _SIGMA),
-        rho=np.zeros(3),
-    )
-
-
-def _drift(windows: ThermalWindows, start: ConstantCalibration) -> float:
-    """RMS of what the readings do within the positions, largest axis [m/s^2]."""
-    data = windows.data
-    reading = data.mean / start.scale
-    own = np.array([reading[data.position == p].mean(axis=0) for p in range(data.n_positions)])
-    return float(np.sqrt(np.mean((reading - own[data.position]) ** 2, axis=0)).max())
+def _check_temperatures(bags: Sequence[ReducedBag]) -> None:
+    seen = [bool(len(bag.board.value)) for bag in bags]
+    if any(seen) and not all(seen):
+        name = bags[seen.index(False)].source.name
+        raise FitError(f'{name}: no board temperature, which the other bags have')
 
 
 def board_lag(windows: ThermalWindows) -> float:

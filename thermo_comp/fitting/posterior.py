@@ -76,6 +76,21 @@ class _Equations:
     size: float
 
 
+@dataclass(frozen=True)
+class _Part:
+    """
+    What takes part: its place in the base, where come one, columns and their start states.
+
+    taken, moved, bias, scale: the columns; those that start states move, bias and scale have
+    """
+
+    base: Ints
+    taken: Ints
+    moved: Ints
+    bias: Ints
+    scale: Ints
+
+
 class Regression(Design):
     """The Gauss-Newton on the data of a fit; see `Design` for the parameters."""
 
@@ -110,40 +125,46 @@ class Regression(Design):
             ].T
         return _Equations(hessian, gradient, residual, white, size)
 
+    def _part(self, layout: Layout) -> _Part:
+        bias, scale = (np.flatnonzero(on[0] >= 0) for on in (layout.on_bias, layout.on_scale))
+        taken = np.union1d(bias, scale)
+        stays = np.isin(self.moved, taken)
+        behind = 1 + len(self.windows.groups) + np.flatnonzero(stays)
+        base = np.concatenate(([0], 1 + taken, behind))
+        return _Part(base, taken, self.moved[stays], bias, scale)
+
     def _block(
         self, state: State, prior: Prior, layout: Layout, p: int, axis: int, filtered: Floats
     ) -> tuple[Ints, Floats, Floats]:
         """Say what one axis in one position tells: places behind its own, Hessian, gradient."""
-        n_columns = len(self.windows.groups)
-        moved, lag = self.moved, self.windows.lag
         found = self._whitened(axis, float(prior.rho[axis]))
+        part = self._part(layout)
         A = state.inverse
         a = self.gravity * float(A[axis] @ state.up[p])
         kappa = float(state.kappa[axis])
-        used_b = np.flatnonzero(layout.on_bias[0] >= 0)
-        used_s = np.flatnonzero(layout.on_scale[0] >= 0)
         width = layout.axis.shape[1]
-        m0 = state.start[self._bags[p]]
         # How each unknown acts on the base: T; a weight takes its column along with what the
         # start states add to it.
-        T = np.zeros((self._base.shape[1], width + 6 + layout.start.shape[1]))
+        T = np.zeros((len(part.base), width + 6 + layout.start.shape[1]))
         scaled = np.zeros(len(T))
         scaled[0] = 1.0
-        scaled[1 : n_columns + 1] = state.on_scale[axis]
+        scaled[1 : len(part.taken) + 1] = state.on_scale[axis, part.taken]
         T[0, 1] = 1.0
-        at = np.arange(2, 2 + len(used_b))
-        T[1 + used_b, at] = 1.0
-        at_scale = np.arange(2 + len(used_b), width)
-        T[1 + used_s, at_scale] = kappa * a
-        if layout.start.shape[1]:
-            scaled[n_columns + 1 :] = state.on_scale[axis, moved] * m0[lag[moved]]
-            column = np.zeros((len(moved), n_columns))
-            column[np.arange(len(moved)), moved] = m0[lag[moved]]
-            T[n_columns + 1 :, at] = column[:, used_b]
-            T[n_columns + 1 :, at_scale] = kappa * a * column[:, used_s]
+        at = 2 + np.arange(len(part.bias))
+        at_scale = np.arange(2 + len(part.bias), width)
+        T[1 + np.searchsorted(part.taken, part.bias), at] = 1.0
+        T[1 + np.searchsorted(part.taken, part.scale), at_scale] = kappa * a
+        moved, lag = part.moved, self.windows.lag[part.moved]
+        if len(moved):
+            behind = np.arange(len(T) - len(moved), len(T))
+            m0 = state.start[self._bags[p], lag]
+            scaled[behind] = state.on_scale[axis, moved] * m0
+            T[behind[:, None], at] = np.where(moved[:, None] == part.bias, m0[:, None], 0.0)
+            T[behind[:, None], at_scale] = np.where(
+                moved[:, None] == part.scale, kappa * a * m0[:, None], 0.0
+            )
             weight = state.on_bias[axis] + kappa * a * state.on_scale[axis]
-            behind = n_columns + 1 + np.arange(len(moved))
-            T[behind, width + 6 + lag[moved]] = weight[moved]
+            T[behind, width + 6 + lag] = weight[moved]
         T[:, 0] = a * scaled
         turned = kappa * self.gravity * scaled
         for k, (row, source) in enumerate(_SKEW_ROWS):
@@ -152,8 +173,8 @@ class Regression(Design):
         T[:, width + 3 : width + 5] = np.outer(turned, A[axis] @ state.tangents[p])
         T[0, width + 5] = 1.0
         rows, variance = self._rows[p], float(prior.sigma[axis]) ** 2
-        G = T.T @ (found.grams[p] @ T) / variance
-        g = T.T @ (found.base[rows].T @ filtered[rows, axis]) / variance
+        G = T.T @ (found.grams[p][np.ix_(part.base, part.base)] @ T) / variance
+        g = T.T @ (found.base[rows].T @ filtered[rows, axis])[part.base] / variance
         other = np.concatenate(
             (
                 layout.skew,

@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""When the regime closes is chosen by evidence: by the unit, not by the chamber."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+from test_fitting import FACES, sources_of, stamps
+
+from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.simulation import (
+    STANDARD_GRAVITY,
+    Position,
+    Record,
+    arrays,
+    parse_cyclogram,
+    unit_preset,
+)
+from thermo_comp.thermal.settings import DetectorSettings
+from thermo_comp.thermal.state import WEIGHT
+from thermo_comp.thermal.tracker import ThermalTracker
+from thermo_comp.typing import Floats
+from thermo_comp.unit.gravity import MICRO_G
+
+Closes = Literal['board', 'case']
+#: Soaks long enough for the board to relax.
+PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min, 5@1.5 120min')
+#: What the dynamic set differs by in each axis, far above the 2 ug of a window.
+STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
+
+
+def weight(record: Record, closes: Closes) -> Floats:
+    """Weight of the dynamic set at each sample, by a detector that was told the sensors."""
+    tracker = ThermalTracker(replace(DetectorSettings(), closes=closes))
+    readings = sorted(
+        (stamp, name, value)
+        for name, times, values in (
+            ('board', record.board_time_s, record.board),
+            ('case', record.case_time_s, record.case),
+        )
+        for stamp, value in zip(stamps(times).tolist(), values.tolist(), strict=True)
+    )
+    at, result = 0, []
+    for stamp in stamps(record.time_s).tolist():
+        while at < len(readings) and readings[at][0] <= stamp:
+            tracker.read(readings[at][1], readings[at][0], readings[at][2])
+            at += 1
+        result.append(tracker.sample(stamp)[WEIGHT])
+    return np.array(result)
+
+
+@pytest.mark.parametrize('closes', ['board', 'case'])
+@pytest.mark.parametrize('model', ['response', 'golovach'])
+def test_evidence_says_when_the_regime_closes(closes: Closes, model: str) -> None:
+    unit = unit_preset('plain', 1).without_drift()
+    records = []
+    plan = [Position(f'bag{k}', PROGRAM, up) for k, up in enumerate(FACES)]
+    for record in arrays(unit, plan, 11, rate_hz=4.0):
+        step = np.outer(weight(record, closes), STEP * unit.scale_factor)
+        records.append(replace(record, counts=record.counts + step))
+    result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, model=model))  # type: ignore[arg-type]
+    assert result.calibration.detector.closes == closes
+    # What is left is where a set begins and ends: the fit's detector has learnt the sensors.
+    last = result.residuals[-1]
+    assert last.fitted.rms < 0.35 * last.one_set.rms
+    assert last.one_set.micro_g.rms > 25.0

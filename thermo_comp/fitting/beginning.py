@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns how the regression begins: a first guess, and what is known of any unit or of this one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ..errors import FitError
+from ..typing import Floats
+from .coverage import distinct_directions
+from .learning import Learnt, learn
+from .options import FitOptions
+from .posterior import Regression
+from .priors import known_of, state_of
+from .start import ConstantCalibration, constant_calibration, position_means
+from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD, Prior, initial_state
+from .verdict import POSITIONS_NEEDED
+from .windows import CURVE, SET, Sets, ThermalWindows
+
+# Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
+_COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
+# What temperature does to a unit that no thermometer has seen, per K: a cheap sensor's data sheet.
+_UNSEEN_BIAS_SLOPE, _UNSEEN_SCALE_SLOPE = 5e-3, 2e-4
+# A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
+_OFFSET_SD, _SIGMA = 1e-6, 1e-5
+
+
+def regress(
+    windows: ThermalWindows,
+    start: ConstantCalibration,
+    up: Floats,
+    sets: Sets,
+    options: FitOptions,
+    tell: Callable[[float], None],
+) -> tuple[Regression, Learnt]:
+    """Learn from the windows what is known of the unit, with or without a prior."""
+    known = options.prior
+    regression = Regression(windows.data, options.gravity, start.scale)
+    inverse = np.linalg.inv(start.misalignment)
+    state = initial_state(
+        windows.data,
+        regression.n_bags,
+        start.bias / start.scale,
+        np.ones(3),
+        np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
+        up,
+    )
+    prior = _wide_prior(windows, start, up, options)
+    if known is not None:
+        state = state_of(known, regression, up)
+        told = known_of(known, regression, state, sets, options.ageing)
+        prior = replace(
+            prior,
+            on_bias=np.ones(len(windows.data.groups)),
+            on_scale=windows.data.in_scale.astype(np.float64),
+            known=told,
+        )
+    forced = [
+        options.model == 'golovach' or group == CURVE or group in options.forced
+        for group in windows.data.groups
+    ]
+    learnt = learn(
+        regression,
+        state,
+        prior,
+        np.array(forced),
+        lambda part: tell(0.7 + 0.25 * part),
+        held=(prior.on_scale > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
+        # What the sets alone leave is a response, and no noise.
+        walks=windows.raw.shape[1] > 0
+        and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
+    )
+    return regression, learnt
+
+
+def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
+    """Guess the triad without temperature: by its ellipsoid, or where that is not seen, a norm."""
+    means = position_means(windows.data)
+    gravity = options.gravity
+    norms = np.linalg.norm(means, axis=1)
+    if not norms.all():
+        raise FitError('the samples at rest are exactly zero: is it the right topic?')
+    if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
+        return constant_calibration(means, gravity, with_misalignment=False)
+    scale = float(np.median(norms)) / gravity
+    if options.input == 'm/s^2':
+        if abs(scale - 1.0) > 0.2:
+            raise FitError(
+                f'the samples at rest have norm {scale * gravity:.3g}, expected {gravity:.3g} '
+                'm/s^2: is the unit right?'
+            )
+        scale = 1.0
+    return ConstantCalibration(np.zeros(3), np.full(3, scale), np.eye(3))
+
+
+def _wide_prior(
+    windows: ThermalWindows, start: ConstantCalibration, up: Floats, options: FitOptions
+) -> Prior:
+    """Say what is known of any unit before its data are seen."""
+    groups = windows.data.groups
+    allowed = np.array([options.groups is None or group in options.groups for group in groups])
+    allowed &= windows.has_temperature
+    in_scale = windows.data.in_scale & allowed
+    # What a sensor does, its curve does first: the others begin as those of a good one.
+    is_curve = np.array([group == CURVE for group in groups])
+    wide = np.where(is_curve, max(1.0, _drift(windows, start) / _COLUMN_BIAS_SD), 1.0)
+    scale_wide = wide
+    n_directions = len(distinct_directions(up))
+    if n_directions == 1 and options.groups is None:
+        # In one attitude a lag looks like a tilt or a curve: the curve is what others can use.
+        allowed &= is_curve
+        in_scale &= is_curve
+    if n_directions < POSITIONS_NEEDED:
+        # Too few attitudes to tell it from the bias: the curve stays at its prior.
+        in_scale &= is_curve
+        scale_wide = np.ones(len(groups))
+    if options.model == 'golovach':
+        # The paper's sets stay whatever they earn: their prior says nothing.
+        wide, scale_wide = 50.0 * wide, 50.0 * scale_wide
+    on_bias = np.where(allowed, wide * _COLUMN_BIAS_SD, 0.0)
+    on_scale = np.where(in_scale, scale_wide * _COLUMN_SCALE_SD, 0.0)
+    if not windows.was_measured:
+        on_bias[0], on_scale[0] = _UNSEEN_BIAS_SLOPE, _UNSEEN_SCALE_SLOPE
+    return Prior(
+        bias_mean=start.bias / start.scale,
+        bias_sd=np.full(3, BIAS_SD),
+        scale_sd=SCALE_SD,
+        skew_sd=SKEW_SD,
+        on_bias=on_bias,
+        on_scale=on_scale,
+        offset_sd=_OFFSET_SD,
+        sigma=np.full(3, _SIGMA),
+        rho=np.zeros(3),
+    )
+
+
+def _drift(windows: ThermalWindows, start: ConstantCalibration) -> float:
+    """RMS of what the readings do within the positions, largest axis [m/s^2]."""
+    data = windows.data
+    reading = data.mean / start.scale
+    own = np.array([reading[data.position == p].mean(axis=0) for p in range(data.n_positions)])
+    return float(np.sqrt(np.mean((reading - own[data.position]) ** 2, axis=0)).max())
