@@ -9,13 +9,13 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from test_fitting import FACES, sources_of, stamps
+from test_fitting import FACES, sources_of
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
     Position,
-    Record,
+    SimulatedRun,
     arrays,
     parse_cyclogram,
     unit_preset,
@@ -33,19 +33,19 @@ PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min, 5@1.5 120min')
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
-def weight(record: Record, closes: Closes) -> Floats:
+def weight(record: SimulatedRun, closes: Closes) -> Floats:
     """Weight of the dynamic set at each sample, by a detector that was told the sensors."""
     tracker = ThermalTracker(replace(DetectorSettings(), closes=closes))
     readings = sorted(
         (stamp, name, value)
-        for name, times, values in (
-            ('board', record.board_time_s, record.board),
-            ('case', record.case_time_s, record.case),
+        for name, stamps, values in (
+            ('board', record.board_stamp_ns, record.board),
+            ('case', record.case_stamp_ns, record.case),
         )
-        for stamp, value in zip(stamps(times).tolist(), values.tolist(), strict=True)
+        for stamp, value in zip(stamps.tolist(), values.tolist(), strict=True)
     )
     at, result = 0, []
-    for stamp in stamps(record.time_s).tolist():
+    for stamp in record.accel_stamp_ns.tolist():
         while at < len(readings) and readings[at][0] <= stamp:
             tracker.read(readings[at][1], readings[at][0], readings[at][2])
             at += 1
@@ -56,7 +56,7 @@ def weight(record: Record, closes: Closes) -> Floats:
 @pytest.mark.parametrize('closes', ['board', 'case'])
 @pytest.mark.parametrize('model', ['response', 'golovach'])
 def test_evidence_says_when_the_regime_closes(closes: Closes, model: str) -> None:
-    unit = unit_preset('plain', 1).without_drift()
+    unit = unit_preset('plain', 1)
     records = []
     plan = [Position(f'bag{k}', PROGRAM, up) for k, up in enumerate(FACES)]
     for record in arrays(unit, plan, 11, rate_hz=4.0):
