@@ -15,6 +15,7 @@ from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..unit.calibration import Calibration, Unit
 from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
+from . import verdict
 from .assembly import UnitFacts, build_calibration
 from .beginning import first_guess, regress
 from .coverage import LeastKnown, least_known
@@ -28,7 +29,7 @@ from .reduction import ReducedBag, reduce_source
 from .sensors import learn_detector
 from .sources import FitSource
 from .start import position_means
-from .verdict import Finding, enforce, judge_bags, judge_coverage, judge_result, judge_windows
+from .verdict import Finding, enforce
 from .windows import FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
 
 Progress = Callable[[float], None]
@@ -112,8 +113,11 @@ def fit_bags(
 
 def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
     """Fit a calibration to bags in which no force is about zero."""
-    _check_temperatures(bags)
-    findings = enforce(judge_bags(bags, options), options)
+    seen = [bool(len(bag.board.value)) for bag in bags]
+    if any(seen) and not all(seen):
+        name = bags[seen.index(False)].source.name
+        raise FitError(f'{name}: no board temperature, which the other bags have')
+    findings = enforce(verdict.judge_bags(bags, options), options)
     known = options.prior
     detector = options.detector or (known.detector if known else learn_detector(bags))
     tell(0.55)
@@ -141,7 +145,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     up = start.force(position_means(windows.data))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     has_case = all(len(bag.case.value) for bag in bags)
-    findings += enforce(judge_windows(windows, up, has_case), options)
+    findings += enforce(verdict.judge_windows(windows, up, has_case), options)
     tell(0.7)
     nominal = start.scale
     regression, learnt = regress(windows, start, up, sets, options, tell)
@@ -154,7 +158,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         if found.posterior.log_evidence > learnt.posterior.log_evidence:
             detector, windows, regression, learnt = earlier, others, again, found
     residuals, left_out = residual_rows(windows, regression, learnt)
-    findings += judge_result(
+    findings += verdict.judge_result(
         learnt.posterior.state.kappa * nominal,
         residuals,
         learnt.prior.offset_sd,
@@ -179,7 +183,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     least = least_known(calibration, learnt.posterior.state.up)
-    unseen = list(judge_coverage(least))
+    unseen = list(verdict.judge_coverage(least))
     findings += unseen
     calibration = with_notes(calibration, [f'{one.name}: {one.message}' for one in unseen])
     return FitResult(
@@ -199,13 +203,6 @@ def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
     """Name the thermometers beside the board that every bag has; the case leads, seen or not."""
     seen = ({name for name, one in bag.temperatures.items() if len(one.value)} for bag in bags)
     return 'case', *sorted(set.intersection(*seen) - {'board', 'case'})
-
-
-def _check_temperatures(bags: Sequence[ReducedBag]) -> None:
-    seen = [bool(len(bag.board.value)) for bag in bags]
-    if any(seen) and not all(seen):
-        name = bags[seen.index(False)].source.name
-        raise FitError(f'{name}: no board temperature, which the other bags have')
 
 
 def board_lag(windows: ThermalWindows) -> float:
