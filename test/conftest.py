@@ -49,7 +49,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 
 # How long an example takes is the machine's business, not a test's.
-settings.register_profile('usual', deadline=None)
+settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
 # For `make nightly`; tests that say how often they run are not touched.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)

@@ -86,42 +86,38 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
     keys: list[Any] = [None]
     has_document = False
     for n, event in enumerate(yaml.parse(text, Loader=_LOADER)):
+        mark: Any = event.start_mark
+        line = mark.line + 1
         if n > node_limit:
             raise PlainYamlError(f'more than {node_limit} keys and values')
         if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
             if event.tag not in (None, '!'):
-                raise PlainYamlError('YAML tags are not accepted', _line(event))
+                raise PlainYamlError('YAML tags are not accepted', line)
             holder = open_ones[-1]
-            value: Any = {}
+            value: Any = [] if isinstance(event, yaml.SequenceStartEvent) else {}
             if isinstance(event, yaml.ScalarEvent):
-                value = _scalar(event) if event.implicit[0] else event.value
-            elif isinstance(event, yaml.SequenceStartEvent):
-                value = []
+                value = _scalar(event.value, line) if event.implicit[0] else event.value
             if type(holder) is list:
                 holder.append(value)
-            elif keys[-1] is None:
-                if type(value) is not str:
-                    raise PlainYamlError(
-                        'not valid YAML', _line(event), f'a key must be a text, got {value!r:.40}'
-                    )
-                if value in holder:
-                    raise PlainYamlError(
-                        'not valid YAML', _line(event), f'the key {value!r:.60} stands twice'
-                    )
-                keys[-1] = value
-            else:
+            elif keys[-1] is not None:
                 holder[keys[-1]] = value
                 keys[-1] = None
+            elif type(value) is not str:
+                raise _invalid(line, f'a key must be a text, got {value!r:.40}')
+            elif value in holder:
+                raise _invalid(line, f'the key {value!r:.60} stands twice')
+            else:
+                keys[-1] = value
             if isinstance(event, yaml.CollectionStartEvent):
                 if len(open_ones) > depth_limit:
-                    raise PlainYamlError(f'nested deeper than {depth_limit}', _line(event))
+                    raise PlainYamlError(f'nested deeper than {depth_limit}', line)
                 open_ones.append(value)
                 keys.append(None)
         elif isinstance(event, yaml.CollectionEndEvent):
             open_ones.pop()
             keys.pop()
         elif isinstance(event, yaml.AliasEvent):
-            raise PlainYamlError('YAML aliases are not accepted', _line(event))
+            raise PlainYamlError('YAML aliases are not accepted', line)
         elif isinstance(event, yaml.DocumentStartEvent):
             if has_document:
                 raise PlainYamlError('expected one YAML document, found more')
@@ -129,22 +125,19 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
     return document[0] if document else None
 
 
-def _scalar(event: yaml.ScalarEvent) -> Any:
-    text: str = event.value
+def _scalar(text: str, line: int) -> Any:
     if text in _WORDS:
         return _WORDS[text]
     if text[0] not in '-+.0123456789':
         return text
     if _INTEGER.fullmatch(text):
         if len(text) > _INTEGER_DIGITS:
-            raise PlainYamlError(
-                'not valid YAML', _line(event), f'an integer of {len(text)} digits is not accepted'
-            )
+            raise _invalid(line, f'an integer of {len(text)} digits is not accepted')
         return int(text)
     if _FLOAT.fullmatch(text):
         return float(text.replace('.inf', 'inf').replace('.nan', 'nan'))
     return text
 
 
-def _line(event: Any) -> int:
-    return int(event.start_mark.line) + 1
+def _invalid(line: int, detail: str) -> PlainYamlError:
+    return PlainYamlError('not valid YAML', line, detail)

@@ -18,7 +18,7 @@ import typer
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import convert, demo, evaluate, fit, fleet, info, output, record, replay, report, simulate
+from . import bags, convert, demo, fit, fleet, judge, output, record, simulate
 from .options import expanded, option
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
@@ -55,8 +55,8 @@ def _top(
 
 
 for _command in (
-    *(record.record, fit.fit, fit.prior, evaluate.evaluate, replay.replay, replay.play, info.info),
-    *(report.report, report.view, convert.convert, convert.export, convert.import_),
+    *(record.record, fit.fit, fit.prior, judge.evaluate, bags.replay, bags.play, bags.info),
+    *(judge.report, judge.view, convert.convert, convert.export, convert.import_),
     *(simulate.simulate, demo.demo),
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))

@@ -62,7 +62,6 @@ def check_serial(serial: str | None) -> str | None:
 Force = Annotated[bool, option('Overwrite one of the same kind.', '--force', '-f')]
 Quiet = Annotated[bool, option('Print nothing but errors.', '--quiet', '-q')]
 NewCalibration = Annotated[Path, option('Calibration to write (YAML).', '--output', '-o')]
-Bag = Annotated[Path, argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')]
 JudgedBags = Annotated[list[Path] | None, argument('Bags to judge it on.', metavar='[BAG]...')]
 CertificateInfo = Annotated[
     Path | None, option('What the laboratory states: number, customer, ... (YAML).')
