@@ -78,24 +78,20 @@ class Content:
 def _write_px4(content: Content, number: int | None, device_id: int) -> str:
     """Write PX4 parameters, in QGroundControl's format; ``TC_An`` has n from 0."""
     instance = _within(number, 0)
-    values: list[tuple[str, float | int]] = []
+    lower, upper = content.range_c
+    lines = ['# Vehicle-Id Component-Id Name Value Type']
     for letter, bias, known_id in (('A', content.bias, device_id), ('G', content.rate_bias, 0)):
         if bias is None:
             continue
         prefix = f'TC_{letter}{instance}_'
-        values += [(f'TC_{letter}_ENABLE', 1), (f'{prefix}ID', known_id)]
-        for axis, cubic in enumerate(bias):
-            values += [(f'{prefix}X{power}_{axis}', value) for power, value in enumerate(cubic)]
-        edges = zip(('TREF', 'TMIN', 'TMAX'), (content.reference_c, *content.range_c), strict=True)
-        values += [(f'{prefix}{name}', value) for name, value in edges]
+        values = {f'X{power}_{axis}': bias[axis, power] for axis in range(3) for power in range(4)}
+        values |= {'TREF': content.reference_c, 'TMIN': lower, 'TMAX': upper}
+        lines += [f'1\t1\tTC_{letter}_ENABLE\t1\t6', f'1\t1\t{prefix}ID\t{known_id}\t6']
+        lines += [f'1\t1\t{prefix}{name}\t{value:.9g}\t9' for name, value in values.items()]
         if not known_id:
             content.notes.append(
                 f'{prefix}ID is 0: set it to the device id of the sensor, PX4 matches by it'
             )
-    kinds = [(f'{one}', 6) if isinstance(one, int) else (f'{one:.9g}', 9) for _, one in values]
-    lines = ['# Vehicle-Id Component-Id Name Value Type']
-    for (name, _), (value, kind) in zip(values, kinds, strict=True):
-        lines.append(f'1\t1\t{name}\t{value}\t{kind}')
     return '\n'.join(lines) + '\n'
 
 
@@ -129,11 +125,7 @@ def _read_px4(text: str, number: int | None) -> Content | None:
     found = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not found:
         return None
-    number = _choose(
-        found,
-        number,
-        lambda n: any(values.get(f'TC_A{n}_X{p}_{a}') for p in range(4) for a in range(3)),
-    )
+    number = _choose(found, number, lambda n: values.has(f'TC_A{n}_X'))
     if values.get('TC_A_ENABLE', 1.0) != 1.0:
         raise CalibrationError('is 0: the set is not in use', key='TC_A_ENABLE')
 
@@ -180,7 +172,7 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
         return bias
 
     # An autopilot that has learnt nothing of its gyroscope lists zeros.
-    has_rate = any(v for name, v in values.items() if name.startswith(f'{prefix}GYR'))
+    has_rate = values.has(f'{prefix}GYR')
     return Content(
         np.eye(3),
         cubics('ACC'),
@@ -204,6 +196,10 @@ class _Parameters(dict[str, float]):
             if value is None:
                 raise CalibrationError(f'{name[0]} has no value', key=name[0])
             self[name[0]] = float(value[0])
+
+    def has(self, prefix: str) -> bool:
+        """Tell whether one that begins so is other than 0."""
+        return any(value for name, value in self.items() if name.startswith(prefix))
 
     def __missing__(self, name: str) -> float:
         raise CalibrationError('is missing', key=name)
