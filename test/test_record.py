@@ -21,8 +21,7 @@ from conftest import ROOT, Cli
 from thermo_comp import simulation
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import BagWriter, RawMessages, Topics, open_recording
-from thermo_comp.recording.growing import growing_blocks
-from thermo_comp.recording.position_bags import numbered_bags
+from thermo_comp.recording.growing import growing_blocks, numbered_bags
 from thermo_comp.unit.calibration_file import load_calibration
 
 N_POSITIONS, SOAK_S, TURN_S, RATE = 9, 200.0, 20.0, 10.0

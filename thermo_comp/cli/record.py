@@ -25,8 +25,7 @@ from .output import Cell, Output, micro, picked
 
 if TYPE_CHECKING:
     from ..fitting.acquisition import Account, Acquisition, Position
-    from ..recording.growing import News
-    from ..recording.position_bags import PositionBags
+    from ..recording.growing import News, PositionBags
     from ..typing import Floats
 
 _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
@@ -64,8 +63,7 @@ def record(
       thermo_comp record held_out.mcap --positions 1 --soak 1h -o bags/unit44
     """
     from ..fitting.acquisition import Acquisition
-    from ..recording.growing import growing_blocks
-    from ..recording.position_bags import PositionBags, numbered_bags
+    from ..recording.growing import PositionBags, growing_blocks, numbered_bags
     from ..ros.process import SignalWatch
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)

@@ -1,25 +1,40 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a bag that somebody else is writing: what is new in it, again and again, until it is whole.
+Owns messages while they come: what is new in somebody else's bag, and numbered bags of ours.
 
-Each look reads the bag from its beginning, which any storage can, and passes over what was there
-before; so looks are as far apart as they take long.
+Each look reads a growing bag from its beginning, which any storage can, and passes over what was
+there before; so looks are as far apart as they take long. What comes becomes a folder of numbered
+bags, `01.mcap`, `02.mcap`, ... under the node's own names. Where one ends and the next begins is
+known a little late, so the newest messages are held back.
 """
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import RecordingError
-from .columns import Block, Input, RecordingInfo, Role
+from ..errors import OutputError, RecordingError
+from ..files import MCAP, check_output
+from ..typing import Bools, Ints
+from .columns import Block, Input, RawMessages, RecordingInfo, Role
 from .reader import open_recording
-from .topics import Topics
+from .topics import IMU, Topics
+from .writer import BagWriter
+
+_USUAL = Topics()
+# Little is lost with a process that is killed: half a minute at 100 Hz.
+_CHUNK_BYTES = 1 << 17
+_NAME = re.compile(r'(\d+)\.mcap')
+_PERIOD_S = 1.0
+#: A look may take this part of the time.
+_SHARE = 0.2
 
 
 class News(NamedTuple):
@@ -27,11 +42,6 @@ class News(NamedTuple):
 
     block: Block
     info: RecordingInfo | None = None
-
-
-_PERIOD_S = 1.0
-#: A look may take this part of the time.
-_SHARE = 0.2
 
 
 def growing_blocks(
@@ -79,3 +89,100 @@ def growing_blocks(
 
 def _size(path: Path) -> int:
     return sum(one.stat().st_size for one in (path.iterdir() if path.is_dir() else [path]))
+
+
+def numbered_bags(folder: Path) -> list[Path]:
+    """List the bags that a folder has, in the order of their numbers."""
+    found = [one for one in folder.glob('*.mcap') if _NAME.fullmatch(one.name)]
+    return sorted(found, key=lambda one: int(one.stem))
+
+
+class _Piece(NamedTuple):
+    """Messages of one topic, with their own stamps."""
+
+    stamp_ns: Ints
+    messages: RawMessages
+
+    def split(self, stamp_ns: int) -> tuple[_Piece, _Piece]:
+        """Part them where the first one is not older than a stamp."""
+        late = np.maximum.accumulate(self.stamp_ns >= stamp_ns)
+        return self._take(~late), self._take(late)
+
+    def _take(self, rows: Bools) -> _Piece:
+        return _Piece(self.stamp_ns[rows], self.messages.take(rows))
+
+
+class PositionBags:
+    """
+    Writes the bags; the next number is taken when its first message is written.
+
+    Raises OutputError where a bag cannot be written. `close` finishes the last one.
+    """
+
+    def __init__(self, folder: Path, serial: str | None) -> None:
+        self._folder, self._serial = folder, serial
+        self._number = max((int(one.stem) for one in numbered_bags(folder)), default=0)
+        check_output(self._path(self._number + 1), MCAP)
+        self._writer: BagWriter | None = None
+        self._held: list[_Piece] = []
+        #: Bags that were begun.
+        self.written: list[Path] = []
+
+    def _path(self, number: int) -> Path:
+        return self._folder / f'{number:02d}.mcap'
+
+    def add(self, news: News) -> None:
+        """Take the serialized messages."""
+        block = news.block
+        if news.info is not None and self._serial is None:
+            self._serial = news.info.metadata.get('serial')
+        for role, one in block.raw.items():
+            if role == 'accel':
+                stamp_ns = block.accel_stamp_ns
+                name = _USUAL.imu if one.type == IMU else _USUAL.counts
+            else:
+                stamp_ns, name = block.temperatures[role].stamp_ns, f'temperature/{role}'
+            self._held.append(_Piece(stamp_ns, replace(one, topic=name)))
+
+    def release(self, stamp_ns: int) -> None:
+        """Write what is older than a stamp."""
+        parts = [one.split(stamp_ns) for one in self._held]
+        self._held = [late for _, late in parts if len(late.stamp_ns)]
+        self._write([early for early, _ in parts if len(early.stamp_ns)])
+
+    def cut(self, stamp_ns: int) -> None:
+        """End the bag before a stamp."""
+        self.release(stamp_ns)
+        self._finish()
+
+    def close(self) -> None:
+        """Write what is held and end the last bag."""
+        held, self._held = self._held, []
+        self._write(held)
+        self._finish()
+
+    def _write(self, pieces: list[_Piece]) -> None:
+        if not pieces:
+            return
+        if self._writer is None:
+            self._number += 1
+            path = self._path(self._number)
+            metadata = {} if self._serial is None else {'serial': self._serial}
+            self._writer = BagWriter(
+                path, metadata=metadata, chunk_bytes=_CHUNK_BYTES, is_precious=True
+            )
+            self.written.append(path)
+        try:
+            for one in pieces:
+                raw = one.messages
+                self._writer.write_raw(raw.topic, raw.type, raw.log_ns, raw)
+            self._writer.flush()
+        except OutputError:
+            # It is said once, and not tried again.
+            self._writer, self._held = None, []
+            raise
+
+    def _finish(self) -> None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()

@@ -37,11 +37,12 @@ from mcap.records import (
 )
 
 from .. import __version__
+from ..errors import RecordingError
 from ..typing import Bytes
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .mcap_file import MAGIC, METADATA_NAME
 from .messages import Messages, join_messages, pack, scatter
-from .rosbag2_metadata import Definition, FileSummary, dump_yaml, information, offered_qos
+from .rosbag2_metadata import Definition, dump_yaml, information, offered_qos
 
 #: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
 _ZSTD_LEVEL = -1
@@ -93,12 +94,12 @@ class McapOutput:
         if metadata:
             self._put_metadata(METADATA_NAME, metadata)
 
-    def channel(self, topic: str, kind: str, definition: Definition) -> int | None:
-        """
-        Give the number of a topic's channel, made where it is new; None if its type is another.
-        """
+    def channel(self, topic: str, kind: str, definition: Definition) -> int:
+        """Give the number of a topic's channel, made where it is new."""
         if topic in self._channels:
-            return self._channels[topic].id if self._types[topic][0] == kind else None
+            if self._types[topic][0] != kind:
+                raise RecordingError(f'already written with another type than {kind}')
+            return self._channels[topic].id
         if kind not in self._schemas:
             number, text = len(self._schemas) + 1, definition.text.encode()
             self._schemas[kind] = Schema(number, text, definition.encoding, kind)
@@ -153,8 +154,12 @@ class McapOutput:
     def _pack(self, data: Bytes) -> tuple[Any, int]:
         return self._compress(data.data), zlib.crc32(data.data)
 
-    def finish(self) -> FileSummary:
-        """Write the last chunk, the summary and the footer; flush all to disk and close."""
+    def finish(self) -> dict[str, Any]:
+        """
+        Write the last chunk, the summary and the footer; flush all to disk and close.
+
+        Gives the `information` of rosbag2.
+        """
         for messages in self._tail:
             if len(messages):
                 self._close_chunk(messages)
@@ -163,14 +168,14 @@ class McapOutput:
             (topic, *self._types[topic], self._counts[channel.id])
             for topic, channel in self._channels.items()
         )
-        summary = FileSummary(self._name, self._start_ns or 0, self._end_ns, tuple(topics))
-        text = dump_yaml(information(summary, self._metadata)).strip()
-        self._put_metadata('rosbag2', {'serialized_metadata': text})
+        times = self._start_ns or 0, self._end_ns
+        found = information(self._name, *times, topics, self._metadata)
+        self._put_metadata('rosbag2', {'serialized_metadata': dump_yaml(found).strip()})
         self._put_record(DataEnd(data_section_crc=0))
         self._put_summary()
         os.fsync(self._stream.fileno())
         self.close()
-        return summary
+        return found
 
     def close(self) -> None:
         """Close the file as it is."""

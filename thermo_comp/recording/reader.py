@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Protocol, TypeVar
 
 from ..errors import RecordingError
-from .clock import without_jumps
+from .clock import Cut, without_jumps
 from .columns import (
     ROLES,
     Block,
@@ -38,7 +38,6 @@ from .decode import Decoder, Feed
 from .foreign import ForeignFile
 from .mcap_file import McapFile
 from .messages import Messages, Topic, pack
-from .part import Cut
 from .rosbag2_metadata import Description, read_metadata
 from .topics import Topics, select_topics, shown
 from .unpack import expand, translated
@@ -97,7 +96,8 @@ class RecordingReader:
         try:
             self.info = self._open(path)
             self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
-            selection = select_topics(path, self.info.topics, topics, input, require)
+            with translated(path):
+                selection = select_topics(self.info.topics, topics, input, require)
         except OSError as error:
             self.close()
             raise RecordingError(f'cannot be opened: {error.strerror}', path) from error

@@ -8,11 +8,12 @@ Written as ROS 2 Jazzy does it (version 9); any version is read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path, PurePath
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -23,23 +24,13 @@ from .topics import BOOL
 
 _VERSION = 9
 _MAX_BYTES = 1 << 24
-_COMPRESSIONS: dict[str, Literal['', 'file', 'message']] = {
-    'none': '',
-    'file': 'file',
-    'message': 'message',
-}
-
-
+_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 
 
-@dataclass(frozen=True, slots=True)
-class Definition:
+class Definition(NamedTuple):
     """
-    A message type's definition with all that it depends on.
-
-    `encoding` is ``ros2msg`` or ``ros2idl``; `type_hash` the REP 2016 hash (RIHS01), empty where
-    it is not known.
+    A message type's definition with all that it depends on; its hash (RIHS01) empty if not known.
     """
 
     encoding: str
@@ -67,10 +58,9 @@ def known_definition(kind: str) -> Definition:
 
 def offered_qos(kind: str) -> dict[str, Any]:
     """
-    Give the QoS profile that is recorded as offered, in the form of metadata version 9.
+    Give the QoS profile that is recorded as offered: reliable, so that any reader matches.
 
-    Reliable, so that any reader matches; flags (std_msgs/Bool) are transient local with depth 1: a
-    late reader gets the last one.
+    Flags (std_msgs/Bool) are transient local with depth 1: a late reader gets the last one.
     """
     is_flag = kind == BOOL
     return {
@@ -78,76 +68,65 @@ def offered_qos(kind: str) -> dict[str, Any]:
         'depth': 1 if is_flag else 10,
         'reliability': 'reliable',
         'durability': 'transient_local' if is_flag else 'volatile',
-        'deadline': dict(_INFINITE),
-        'lifespan': dict(_INFINITE),
+        'deadline': _INFINITE,
+        'lifespan': _INFINITE,
         'liveliness': 'automatic',
-        'liveliness_lease_duration': dict(_INFINITE),
+        'liveliness_lease_duration': _INFINITE,
         'avoid_ros_namespace_conventions': False,
     }
 
 
-@dataclass(frozen=True, slots=True)
-class FileSummary:
+def information(
+    name: str,
+    start_ns: int,
+    end_ns: int,
+    topics: Iterable[tuple[str, str, str, int]],
+    custom: Mapping[str, str],
+) -> dict[str, Any]:
     """
-    What stands in a finished MCAP file; first and last log time are 0 without messages.
+    Build the content of metadata.yaml, below its only key, of one finished MCAP file.
 
     Of each topic there are name, type, hash of the type and number of messages.
     """
-
-    name: str
-    start_ns: int
-    end_ns: int
-    topics: tuple[tuple[str, str, str, int], ...]
-
-
-def information(summary: FileSummary, custom: Mapping[str, str]) -> dict[str, Any]:
-    """Build the content of metadata.yaml below its only key."""
-    n_messages = sum(count for *_, count in summary.topics)
-    start = {'nanoseconds_since_epoch': summary.start_ns}
-    duration = {'nanoseconds': summary.end_ns - summary.start_ns}
+    counted: list[dict[str, Any]] = [
+        {
+            'topic_metadata': {
+                'name': topic,
+                'type': kind,
+                'serialization_format': 'cdr',
+                'offered_qos_profiles': [offered_qos(kind)],
+                'type_description_hash': type_hash,
+            },
+            'message_count': count,
+        }
+        for topic, kind, type_hash, count in topics
+    ]
+    times = {
+        'duration': {'nanoseconds': end_ns - start_ns},
+        'starting_time': {'nanoseconds_since_epoch': start_ns},
+        'message_count': sum(one['message_count'] for one in counted),
+    }
     return {
         'version': _VERSION,
         'storage_identifier': 'mcap',
-        'duration': duration,
-        'starting_time': start,
-        'message_count': n_messages,
-        'topics_with_message_count': [
-            {
-                'topic_metadata': {
-                    'name': name,
-                    'type': kind,
-                    'serialization_format': 'cdr',
-                    'offered_qos_profiles': [offered_qos(kind)],
-                    'type_description_hash': type_hash,
-                },
-                'message_count': count,
-            }
-            for name, kind, type_hash, count in summary.topics
-        ],
+        **times,
+        'topics_with_message_count': counted,
         'compression_format': '',
         'compression_mode': '',
-        'relative_file_paths': [summary.name],
-        'files': [
-            {
-                'path': summary.name,
-                'starting_time': dict(start),
-                'duration': dict(duration),
-                'message_count': n_messages,
-            }
-        ],
+        'relative_file_paths': [name],
+        'files': [{'path': name, **times}],
         'custom_data': dict(custom) or None,
         'ros_distro': 'jazzy',
     }
 
 
-def dump_metadata(summary: FileSummary, custom: Mapping[str, str]) -> str:
-    """Write the text of metadata.yaml."""
-    return dump_yaml({'rosbag2_bagfile_information': information(summary, custom)})
-
-
 def dump_yaml(content: Any) -> str:
     """Write YAML in block style with the keys in their order."""
-    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=10_000)
+    # Values that stand twice are written twice.
+    dumper: Any = type('Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
+    text: str = yaml.dump(
+        content, Dumper=dumper, sort_keys=False, allow_unicode=True, width=10_000
+    )
     return text
 
 
@@ -156,14 +135,13 @@ class Description:
     """
     What the reader needs of a metadata.yaml.
 
-    `files` are in their order, each directly in the bag's directory; `compression` is what rosbag2
-    itself has compressed one by one; `counts` are messages per topic, as the recorder counted
-    them.
+    `files` are in their order; `compression` is what rosbag2 itself has compressed one by one,
+    ``file``, ``message`` or nothing; `counts` are messages per topic, as the recorder counted.
     """
 
     storage: str
     files: tuple[Path, ...]
-    compression: Literal['', 'file', 'message'] = ''
+    compression: str = ''
     custom: dict[str, str] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
 
@@ -179,21 +157,26 @@ def read_metadata(directory: Path) -> Description | None:
         text = read_bounded(path, _MAX_BYTES)
     except FileNotFoundError:
         return None
-    except OSError as error:
-        raise RecordingError(f'cannot be read: {error.strerror}', path) from error
-    except ValueError as error:
-        raise RecordingError(f'cannot be read: {error}', path) from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, 'strerror', None) or error
+        raise RecordingError(f'cannot be read: {reason}', path) from error
     if not text.strip():
         return None
     try:
         content = load_plain_yaml(text, node_limit=_MAX_BYTES)['rosbag2_bagfile_information']
-        files = tuple(directory / PurePath(str(name)).name for name in _names(content))
+        names = content['relative_file_paths']
+        if not isinstance(names, list) or not names:
+            raise TypeError('no files')
+        files = tuple(directory / PurePath(str(name)).name for name in names)
+        counts: Counter[str] = Counter()
+        for one in content.get('topics_with_message_count') or ():
+            counts[str(one['topic_metadata']['name'])] += int(one['message_count'])
         description = Description(
             storage=str(content['storage_identifier']),
             files=files,
             compression=_COMPRESSIONS[str(content.get('compression_mode') or 'none').lower()],
             custom={str(k): str(v) for k, v in (content.get('custom_data') or {}).items()},
-            counts=_counts(content),
+            counts=counts,
         )
     except PlainYamlError as error:
         raise RecordingError('not valid YAML', path) from error
@@ -203,18 +186,3 @@ def read_metadata(directory: Path) -> Description | None:
     if missing:
         raise RecordingError(f'the file {missing[0]} of the bag is missing', directory)
     return description
-
-
-def _names(content: Any) -> list[Any]:
-    names = content['relative_file_paths']
-    if not isinstance(names, list) or not names:
-        raise TypeError('no files')
-    return names
-
-
-def _counts(content: Any) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for one in content.get('topics_with_message_count') or ():
-        name = str(one['topic_metadata']['name'])
-        counts[name] = counts.get(name, 0) + int(one['message_count'])
-    return counts

@@ -10,8 +10,7 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import isfinite
-from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple, cast
 
 from ..errors import RecordingError
 from .columns import Input, Role
@@ -135,8 +134,7 @@ def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
     return '' if _fits(name, wanted) else f'{shown(name)}, its {among} {kind}, is taken for {key}'
 
 
-@dataclass(frozen=True, slots=True)
-class Selection:
+class Selection(NamedTuple):
     """
     Which topics of a bag feed which role, as far as they have messages.
 
@@ -151,7 +149,6 @@ class Selection:
 
 
 def select_topics(
-    path: Path,
     present: Present,
     topics: Topics,
     input: Input,  # noqa: A002 - the parameter's public name
@@ -165,92 +162,70 @@ def select_topics(
     without messages, or of another type than expected.
     """
     if require and not any(count for _, count in present.values()):
-        raise RecordingError('the bag holds no messages', path)
+        raise RecordingError('the bag holds no messages')
     found: dict[Role, str] = {}
+    taken = None
     chosen = []
-    accel = _accel_key(path, present, topics, input)
-    keys: dict[Role, str | None] = {'accel': accel, 'board': 'board', 'case': 'case'}
-    for role, key in keys.items():
-        name = None if key is None else _find(path, present, topics, key)
-        if name is None or key is None:
+    inputs = ['counts', 'imu'] if input == 'auto' else [input]
+    for role, keys in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
+        names = {key: name for key in keys if (name := _find(present, topics, key)) is not None}
+        key = next((own for own, name in names.items() if present[name][1]), next(iter(names), ''))
+        if not key:
             if role in require:
-                wanted = [key] if key else ['counts', 'imu']
-                raise _missing(path, present, {one: getattr(topics, one) for one in wanted})
+                raise _missing(present, {own: getattr(topics, own) for own in keys})
             continue
-        _check_type(path, present, name, _TYPES[key])
+        name = _of_type(present, names[key], _TYPES[key])
         if present[name][1]:
             found[role] = name
+            taken = key if role == 'accel' else taken
             chosen.append(said_choice(name, key, getattr(topics, key)))
         elif role in require:
-            raise RecordingError('the topic has no messages', path, shown(name))
-    further = _further(path, present, topics, found, is_read=bool(require))
+            raise RecordingError('the topic has no messages', topic=shown(name))
+    further = _further(present, topics, found, is_read=bool(require))
     return Selection(
         {**found, **further},
         ('board', 'case', *further),
-        accel if 'accel' in found else None,
+        cast(Any, taken),
         '; '.join(filter(None, chosen)) or None,
     )
 
 
 def _further(
-    path: Path, present: Present, topics: Topics, found: Mapping[Role, str], *, is_read: bool
+    present: Present, topics: Topics, found: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
     """Find the other thermometers: those named, and any beside the board's or the case's."""
-    named = {}
+    both = {}
     for own, wanted in topics.further.items():
-        name = _match(path, present, wanted, f'temperature/{own}')
+        name = _match(present, wanted, f'temperature/{own}')
         if name is None and is_read:
-            raise _missing(path, present, {f'temperature/{own}': wanted})
+            raise _missing(present, {f'temperature/{own}': wanted})
         if name is not None:
-            _check_type(path, present, name, TEMPERATURE)
-            named[own] = name
+            both[own] = _of_type(present, name, TEMPERATURE)
     beside = found.get('board') or found.get('case') or ''
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'
-    beside_it = {
-        name.removeprefix(front): name
-        for name, (kind, count) in sorted(present.items())
-        if kind == TEMPERATURE
-        and count
-        and name not in {*found.values(), *named.values()}
-        and name.startswith(front)
-        and is_thermometer(name.removeprefix(front))
-    }
-    both = {**beside_it, **named}
-    return {own: both[own] for own in sorted(both)}
+    taken = {*found.values(), *both.values()}
+    for name, (kind, count) in present.items():
+        own = name.removeprefix(front)
+        is_beside = kind == TEMPERATURE and count and own != name and name not in taken
+        if is_beside and is_thermometer(own):
+            both.setdefault(own, name)
+    return dict(sorted(both.items()))
 
 
-def _accel_key(
-    path: Path,
-    present: Present,
-    topics: Topics,
-    input: Input,  # noqa: A002
-) -> Literal['counts', 'imu'] | None:
-    if input != 'auto':
-        return input
-    empty: Literal['counts', 'imu'] | None = None
-    for key in ('counts', 'imu'):
-        name = _find(path, present, topics, key)
-        if name is not None:
-            if present[name][1]:
-                return key
-            empty = empty or key
-    return empty
-
-
-def _check_type(path: Path, present: Present, name: str, expected: str) -> None:
+def _of_type(present: Present, name: str, expected: str) -> str:
     kind = present[name][0]
     if kind != expected:
-        raise RecordingError(
-            f'the topic has type {shown(kind)}, expected {expected}', path, shown(name)
-        )
+        reason = f'the topic has type {shown(kind)}, expected {expected}'
+        raise RecordingError(reason, topic=shown(name))
+    return name
 
 
 def _fits(name: str, wanted: str) -> bool:
     return f'/{name.strip("/")}'.endswith(f'/{wanted.strip("/")}')
 
 
-def _match(path: Path, present: Present, wanted: str, key: str) -> str | None:
+def _match(present: Present, wanted: str, key: str) -> str | None:
     """Find a topic by its name, or the only one that has the name behind a namespace."""
     bare = wanted.strip('/')
     exact = [name for name in present if name.strip('/') == bare]
@@ -261,15 +236,14 @@ def _match(path: Path, present: Present, wanted: str, key: str) -> str | None:
         raise RecordingError(
             f'several topics end in it: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
             f'choose one with --topic {key}=TOPIC',
-            path,
-            wanted,
+            topic=wanted,
         )
     return spaced[0] if spaced else None
 
 
-def _find(path: Path, present: Present, topics: Topics, key: str) -> str | None:
+def _find(present: Present, topics: Topics, key: str) -> str | None:
     wanted: str = getattr(topics, key)
-    name = _match(path, present, wanted, key)
+    name = _match(present, wanted, key)
     if name is not None:
         return name
     # A case is no board, and a bag without a case's thermometer is an ordinary one.
@@ -288,7 +262,7 @@ def _find(path: Path, present: Present, topics: Topics, key: str) -> str | None:
     return only[0] if len(only) == 1 else None
 
 
-def _missing(path: Path, present: Present, wanted: Mapping[str, str]) -> RecordingError:
+def _missing(present: Present, wanted: Mapping[str, str]) -> RecordingError:
     names = sorted(present)[:_MAX_LISTED]
     listed = ', '.join(f'{shown(name)} ({shown(present[name][0])})' for name in names)
     if len(present) > len(names):
@@ -296,6 +270,5 @@ def _missing(path: Path, present: Present, wanted: Mapping[str, str]) -> Recordi
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',
-        path,
-        ' or '.join(wanted.values()),
+        topic=' or '.join(wanted.values()),
     )

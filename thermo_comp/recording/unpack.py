@@ -3,8 +3,7 @@
 """
 Owns decompression within limits: of chunks, of the beginning of torn ones, of files, of messages.
 
-What a chunk or a frame claims about its size is only ever an upper limit: memory is taken for
-what the reader is willing to hold, and output beyond the claim is damage.
+What a chunk or a frame claims about its size is only ever an upper limit of what is taken for it.
 """
 
 from __future__ import annotations
@@ -58,11 +57,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 
 
 def expand(packed: Path, target: Path) -> str | None:
-    """
-    Decompress a ``.zstd`` file of rosbag2; say where it is unreadable, None where it is whole.
-
-    Raises DamagedError where it holds more than it may, or nothing; OSError as files do.
-    """
+    """Decompress a ``.zstd`` file of rosbag2; say where it is unreadable, None if it is whole."""
     with open_regular(packed) as source, target.open('wb') as file:
         size = packed.stat().st_size
         limit = size * _MAX_GROWTH + _FREE_GROWTH_BYTES
@@ -82,14 +77,11 @@ def expand(packed: Path, target: Path) -> str | None:
 
 def unpack_message(packed: bytes) -> bytes:
     """Decompress one message that rosbag2 has compressed by itself."""
-    try:
-        size = zstandard.frame_content_size(packed)
-        if size > _FREE_GROWTH_BYTES:
-            raise DamagedError(f'a message of {size} bytes')
-        decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
-        return decompressor.decompress(packed, max_output_size=_FREE_GROWTH_BYTES)
-    except zstandard.ZstdError as error:
-        raise DamagedError(f'zstd: {error}') from error
+    size = zstandard.frame_content_size(packed)
+    if size > _FREE_GROWTH_BYTES:
+        raise DamagedError(f'a message of {size} bytes')
+    decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
+    return decompressor.decompress(packed, max_output_size=_FREE_GROWTH_BYTES)
 
 
 def unpack_ros1_chunk(packed: bytes) -> bytes:
@@ -110,11 +102,7 @@ def unpack_ros1_chunk(packed: bytes) -> bytes:
 
 
 def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
-    """
-    Decompress a whole chunk that claims this size and CRC-32 (0 = none).
-
-    Raises DamagedError for an unknown compression, damaged bytes, a wrong size or checksum.
-    """
+    """Decompress a whole chunk that claims this size and CRC-32 (0 = none), or DamagedError."""
     data = packed
     if compression:
         pieces = []

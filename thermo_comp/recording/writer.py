@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Literal
 
@@ -20,11 +21,11 @@ from numpy.typing import ArrayLike
 
 from ..errors import OutputError, RecordingError
 from ..files import Draft, bag_kind
-from ..typing import Bytes, Floats, Ints
+from ..typing import Bytes, Ints
 from .columns import ImuColumns, RawMessages
 from .mcap_out import McapOutput
 from .messages import Messages
-from .rosbag2_metadata import Definition, dump_metadata, known_definition
+from .rosbag2_metadata import Definition, dump_yaml, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
 from .wire import N_NUMBERS, encode_stamped
 
@@ -33,6 +34,8 @@ Compression = Literal['none', 'lz4', 'zstd']
 #: The first stamp that no ROS message can hold; none is before 0 [ns].
 STAMP_END_NS = 2**31 * 10**9
 _AUTO_FLUSH_BYTES = 1 << 26
+#: Where among a message's numbers some stand, their name, values and how many they are.
+_Column = tuple[int, str, ArrayLike, int]
 
 
 class BagWriter:
@@ -69,7 +72,6 @@ class BagWriter:
         if compression not in {'zstd', 'lz4', 'none'}:
             raise ValueError(f'`compression` must be zstd, lz4 or none, got {compression!r}')
         self._path = Path(path)
-        self._metadata = dict(metadata or {})
         self._is_precious = is_precious
         self._batches: list[Messages] = []
         self._file: McapOutput | None = None
@@ -83,7 +85,7 @@ class BagWriter:
                 compression,
                 level,
                 chunk_bytes,
-                self._metadata,
+                dict(metadata or {}),
                 name,
             )
 
@@ -96,9 +98,8 @@ class BagWriter:
         log_ns: ArrayLike | None = None,
     ) -> None:
         """Write geometry_msgs/Vector3Stamped: counts per cycle, shape (n, 3)."""
-        stamps = _as_stamps(stamp_ns)
-        pieces = [(0, _as_numbers('xyz', xyz, len(stamps), 3))]
-        self._write_stamped(topic, VECTOR3_STAMPED, stamps, log_ns, frame_id, pieces)
+        columns = [(0, 'xyz', xyz, 3)]
+        self._write_stamped(topic, VECTOR3_STAMPED, stamp_ns, log_ns, frame_id, columns)
 
     def write_temperature(
         self,
@@ -107,17 +108,14 @@ class BagWriter:
         celsius: ArrayLike,
         log_ns: ArrayLike | None = None,
         frame_id: str = '',
-        variance: ArrayLike = 0.0,
     ) -> None:
-        """
-        Write sensor_msgs/Temperature: degC, shape (n,), and its variance [K^2], 0 for unknown.
-        """
-        stamps = _as_stamps(stamp_ns)
+        """Write sensor_msgs/Temperature: degC, shape (n,), of unknown variance."""
         column = np.asarray(celsius, np.float64)
-        if column.shape != stamps.shape:
-            raise ValueError(f'`celsius` must have {len(stamps)} values, got {column.shape}')
-        numbers = np.column_stack([column, np.broadcast_to(np.asarray(variance), column.shape)])
-        self._write_stamped(topic, TEMPERATURE, stamps, log_ns, frame_id, [(0, numbers)])
+        if column.shape != np.shape(stamp_ns):
+            n = np.size(stamp_ns)
+            raise ValueError(f'`celsius` must have {n} values, got {column.shape}')
+        columns = [(0, 'celsius', column.reshape(-1, 1), 1)]
+        self._write_stamped(topic, TEMPERATURE, stamp_ns, log_ns, frame_id, columns)
 
     def write_imu(
         self,
@@ -135,9 +133,7 @@ class BagWriter:
         Without `imu` neither orientation nor angular velocity is claimed: identity, zero rate, and
         -1 as first element of each covariance.
         """
-        stamps = _as_stamps(stamp_ns)
-        n = len(stamps)
-        columns: list[tuple[int, str, ArrayLike, int]] = [
+        columns: list[_Column] = [
             (25, 'linear_acceleration', linear_acceleration, 3),
             (28, 'linear_acceleration_covariance', linear_acceleration_covariance, 9),
         ]
@@ -146,14 +142,9 @@ class BagWriter:
             nothing[3], nothing[[4, 16]] = 1.0, -1.0
             columns.append((0, '', nothing, 25))
         else:
-            columns += [
-                (0, 'imu.orientation', imu.orientation, 4),
-                (4, 'imu.orientation_covariance', imu.orientation_covariance, 9),
-                (13, 'imu.angular_velocity', imu.angular_velocity, 3),
-                (16, 'imu.angular_velocity_covariance', imu.angular_velocity_covariance, 9),
-            ]
-        pieces = [(at, _as_numbers(name, value, n, width)) for at, name, value, width in columns]
-        self._write_stamped(topic, IMU, stamps, log_ns, frame_id, pieces)
+            places = zip((0, 4, 13, 16), fields(imu), (4, 9, 3, 9), strict=False)
+            columns += [(at, f'imu.{o.name}', getattr(imu, o.name), n) for at, o, n in places]
+        self._write_stamped(topic, IMU, stamp_ns, log_ns, frame_id, columns)
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
         """Write std_msgs/Bool."""
@@ -161,9 +152,9 @@ class BagWriter:
         flags = np.atleast_1d(np.asarray(values, np.bool_))
         if flags.shape != times.shape:
             raise ValueError(f'`values` must have {len(times)} values, got {flags.shape}')
-        payloads = np.zeros((len(times), 5), np.uint8)
-        payloads[:, 1], payloads[:, 4] = 1, flags
-        self._add_rows(self._channel(topic, BOOL), times, payloads)
+        rows = np.zeros((len(times), 5), np.uint8)
+        rows[:, 1], rows[:, 4] = 1, flags
+        self._add(topic, BOOL, times, rows.ravel(), np.full(len(rows), 5))
 
     def write_raw(
         self,
@@ -180,12 +171,11 @@ class BagWriter:
         by default that of ROS 2 Jazzy, RecordingError where that has none.
         """
         if isinstance(messages, RawMessages):
-            data, ends = messages.data, messages.ends
+            data, size = messages.data, np.diff(messages.ends, prepend=0)
         else:
             data = np.frombuffer(b''.join(messages), np.uint8)
-            ends = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
-        times = _as_times('log_ns', log_ns, len(ends))
-        self._add(self._channel(topic, type, definition), times, data, np.diff(ends, prepend=0))
+            size = np.fromiter(map(len, messages), np.int64, len(messages))
+        self._add(topic, type, _as_times('log_ns', log_ns, len(size)), data, size, definition)
 
     def flush(self) -> None:
         """Merge what is buffered in log-time order and hand it to the file."""
@@ -195,21 +185,19 @@ class BagWriter:
                 self._open_file().append(batches)
 
     def close(self) -> None:
-        """
-        Finish the bag and give it its name.
-
-        Raises OutputError where that fails, or somebody else was first; nothing is left of it
-        then.
-        """
+        """Finish the bag and give it its name; where that fails nothing is left: OutputError."""
         if self._file is None:
             return
         try:
             self.flush()
             with self._translated():
-                summary = self._file.finish()
+                found = self._file.finish()
                 if not self._is_file:
-                    text = dump_metadata(summary, self._metadata)
-                    _write_text(self._draft.partial / 'metadata.yaml', text)
+                    text = dump_yaml({'rosbag2_bagfile_information': found})
+                    with (self._draft.partial / 'metadata.yaml').open('wb') as file:
+                        file.write(text.encode())
+                        file.flush()
+                        os.fsync(file.fileno())
             self._draft.publish()
         except BaseException:
             self.abort()
@@ -240,39 +228,45 @@ class BagWriter:
         self,
         topic: str,
         kind: str,
-        stamp_ns: Ints,
+        stamp_ns: ArrayLike,
         log_ns: ArrayLike | None,
         frame_id: str,
-        pieces: Sequence[tuple[int, Floats]],
+        columns: Sequence[_Column],
     ) -> None:
-        times = stamp_ns if log_ns is None else _as_times('log_ns', log_ns, len(stamp_ns))
-        rows = encode_stamped(stamp_ns, frame_id, N_NUMBERS[kind], pieces)
-        self._add_rows(self._channel(topic, kind), times, rows)
+        stamps = _as_times('stamp_ns', stamp_ns)
+        if len(stamps) and int(np.max(stamps)) >= STAMP_END_NS:
+            raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))}')
+        times = stamps if log_ns is None else _as_times('log_ns', log_ns, len(stamps))
+        pieces = []
+        for at, name, values, width in columns:
+            numbers = np.asarray(values, np.float64)
+            if numbers.shape not in {(len(stamps), width), (width,)}:
+                raise ValueError(
+                    f'`{name}` must have shape ({len(stamps)}, {width}), got {numbers.shape}'
+                )
+            pieces.append((at, numbers))
+        rows = encode_stamped(stamps, frame_id, N_NUMBERS[kind], pieces)
+        self._add(topic, kind, times, rows.ravel(), np.full(len(rows), rows.shape[1]))
 
-    def _channel(self, topic: str, kind: str, definition: tuple[str, str] | None = None) -> int:
+    def _add(
+        self,
+        topic: str,
+        kind: str,
+        log_ns: Ints,
+        data: Bytes,
+        size: Ints,
+        definition: tuple[str, str] | None = None,
+    ) -> None:
         name = '/' + topic.strip('/')
-        if definition is None:
-            try:
-                known = known_definition(kind)
-            except RecordingError as error:
-                raise RecordingError(error.message, self._path, name) from error
-        else:
-            known = Definition(*definition, '')
-        with self._translated():
-            channel = self._open_file().channel(name, kind, known)
-        if channel is None:
-            raise RecordingError(
-                f'already written with another type than {kind}', self._path, name
-            )
-        return channel
-
-    def _add_rows(self, channel: int, log_ns: Ints, rows: Bytes) -> None:
-        self._add(channel, log_ns, rows.ravel(), np.full(len(rows), rows.shape[1]))
-
-    def _add(self, channel: int, log_ns: Ints, data: Bytes, size: Ints) -> None:
+        try:
+            known = Definition(*definition, '') if definition else known_definition(kind)
+            with self._translated():
+                number = self._open_file().channel(name, kind, known)
+        except RecordingError as error:
+            raise RecordingError(error.message, self._path, name) from error
         if len(log_ns):
-            numbers = np.full(len(log_ns), channel, np.uint16)
-            self._batches.append(Messages(data, np.cumsum(size) - size, size, numbers, log_ns))
+            channel = np.full(len(log_ns), number, np.uint16)
+            self._batches.append(Messages(data, np.cumsum(size) - size, size, channel, log_ns))
             if sum(len(one.data) for one in self._batches) > _AUTO_FLUSH_BYTES:
                 self.flush()
 
@@ -293,20 +287,6 @@ class BagWriter:
             ) from error
 
 
-def _as_stamps(stamp_ns: ArrayLike) -> Ints:
-    stamps = _as_times('stamp_ns', stamp_ns)
-    if len(stamps) and int(np.max(stamps)) >= STAMP_END_NS:
-        raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))}')
-    return stamps
-
-
-def _write_text(path: Path, text: str) -> None:
-    with path.open('w', encoding='utf-8') as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
     """Check a column of nanoseconds: `n` integers, none negative; ValueError for another."""
     times = np.atleast_1d(np.asarray(values))
@@ -320,11 +300,3 @@ def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
     if len(checked) and int(np.min(checked)) < 0:
         raise ValueError(f'`{name}` must not be negative, got {int(np.min(checked))}')
     return checked
-
-
-def _as_numbers(name: str, values: ArrayLike, n: int, width: int) -> Floats:
-    """Check a column of numbers, shape (n, width) or (width,) for the same in each row."""
-    numbers = np.asarray(values, np.float64)
-    if numbers.shape not in {(n, width), (width,)}:
-        raise ValueError(f'`{name}` must have shape ({n}, {width}), got {numbers.shape}')
-    return numbers
