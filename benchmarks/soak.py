@@ -40,7 +40,7 @@ HEAD = (b'\0\1\0\0', 7, b'sensor\0')
 STAMP = struct.Struct('<iI')
 SECOND_NS = 1_000_000_000
 READINGS_HZ = 10
-RELOAD_S, LATENCY_S = 2.0, 10.0
+RELOAD_S, LATENCY_S, REPORT_S = 2.0, 10.0, 0.25
 #: A ramp, a rest, the ramp back, a rest; lags short enough for the regime to follow.
 RAMP_S, REST_S, RAMP_K_S, CASE_LAG_S, BOARD_LAG_S = 30.0, 60.0, 0.1, 5.0, 10.0
 TIMEOUT_S = 30.0
@@ -177,7 +177,7 @@ class Soak:
         n_in = -1
         while n_in != int(self.account['samples in']):
             n_in = int(self.account['samples in'])
-            time.sleep(2.0)
+            time.sleep(2.0 * REPORT_S)
         self.n_sent_before, self.n_in_before = self.n_sent, n_in
         self.n_out_before, self.n_heard_before = int(self.account['samples out']), self.n_heard
         # The pause is one of the wall, not of the stamps.
@@ -223,7 +223,7 @@ class Soak:
             self.wait_for(is_settled, f'{n_sent} samples', 10.0)
         except SystemExit as error:
             print(error, file=sys.stderr)
-        time.sleep(1.5)
+        time.sleep(2.0 * REPORT_S)
         return {
             'seconds': seconds,
             'rate': self.rate,
@@ -313,9 +313,9 @@ def main() -> int:
     rclpy.init(args=[], context=context)
     with tempfile.TemporaryDirectory() as folder:
         paths = calibrations(arguments.rate, Path(folder))
-        with NodeProcess(
-            *lossless(), '--log-level', 'FATAL', '-p', f'calibration_file:={paths[0]}'
-        ) as node:
+        overrides = f'calibration_file:={paths[0]}', f'diagnostics_period:={REPORT_S}'
+        ros_args = [word for one in overrides for word in ('-p', one)]
+        with NodeProcess(*lossless(), '--log-level', 'FATAL', *ros_args) as node:
             soak = Soak(node, context, arguments.rate)
             try:
                 soak.meet()

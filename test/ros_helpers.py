@@ -55,6 +55,7 @@ class Peer:
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._news = threading.Condition()
+        self._clients: dict[str, Any] = {}
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
 
@@ -118,13 +119,15 @@ class Peer:
         )
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
-        client = self.node.create_client(kind, name)
+        # Kept: to find a service takes longer than its answer.
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
         assert client.wait_for_service(TIMEOUT), name
         future = client.call_async(request)
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
         assert done.wait(TIMEOUT), f'{name} did not answer'
-        self.node.destroy_client(client)
         return future.result()
 
     def set_parameters(self, **values: Any) -> list[SetParametersResult]:

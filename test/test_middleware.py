@@ -28,7 +28,7 @@ from thermo_comp.ros.round_trip import NodeProcess, lossless
 from thermo_comp.unit.calibration_file import save_calibration
 
 CYCLE_NS = 10_000_000
-N_SAMPLES = 500
+N_SAMPLES = 300
 #: After so many nobody hears any.
 N_TRIED = 5000
 OTHER = """\
@@ -146,7 +146,7 @@ def test_samples_do_not_wake_the_event_thread(
 def test_what_is_lost_on_the_way_is_repeated(
     peer: Peer, node_arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The receiver is stopped while three times as many samples are sent as its queue of shared
+    # The receiver is stopped while twice as many samples are sent as its queue of shared
     # memory holds (512).
     monkeypatch.delenv(VARIABLE, raising=False)
     command = [sys.executable, '-c', RECEIVER]
@@ -163,15 +163,15 @@ def test_what_is_lost_on_the_way_is_repeated(
             send(driver, first, first + 1, 0.01)
             first += 1
         receiver.send_signal(signal.SIGSTOP)
-        last = first + 1500
+        last = first + 1000
         send(driver, first, last, 0.001)
         receiver.send_signal(signal.SIGCONT)
         print((last - 1) * CYCLE_NS, file=receiver.stdin, flush=True)
         assert receiver.stdout.readline() == 'ready\n'
         reliable, best_effort = json.loads(receiver.stdout.readline())
     # All there and in order, and it was not for want of a loss.
-    assert reliable[-1500:] == [k * CYCLE_NS for k in range(first, last)]
-    assert len(set(best_effort) & set(reliable[-1500:])) < 1500
+    assert reliable[-1000:] == [k * CYCLE_NS for k in range(first, last)]
+    assert len(set(best_effort) & set(reliable[-1000:])) < 1000
 
 
 def test_where_the_profile_comes_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

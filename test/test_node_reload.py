@@ -16,7 +16,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import axis_set, calibration, regime_set
 from rcl_interfaces.srv import GetParameters
-from ros_helpers import SECOND_NS, TIMEOUT, Driver, Peer, stamp_of, standing
+from ros_helpers import SECOND_NS, TIMEOUT, Driver, Peer, node_in_thread, stamp_of, standing
 from sensor_msgs.msg import Imu
 
 from thermo_comp.ros.round_trip import NodeProcess, lossless
@@ -160,7 +160,7 @@ def test_a_reload_keeps_the_thermal_state(peer: Peer, tmp_path: Path) -> None:
     plain, biased = tmp_path / 'plain.yaml', tmp_path / 'biased.yaml'
     save_calibration(of_bias(1.0), plain)
     save_calibration(of_bias(1.0, static=bias, dynamic=bias), biased)
-    with NodeProcess(*lossless(), '-p', f'calibration_file:={plain}'):
+    with node_in_thread(*lossless(), '-p', f'calibration_file:={plain}'):
         flow = Flow(peer)
         flow.more(50)
         assert peer.set_parameters(calibration_file=str(biased))[0].successful
