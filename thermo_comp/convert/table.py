@@ -142,15 +142,12 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
     """
     first = list(islice(rows, _PREAMBLE_ROWS))
     is_row = [_n_cells(row) == width for _, row in first]
-    of_numbers = (
-        k
-        for k, (_, row) in enumerate(first)
-        if is_row[k] and 2 * sum(map(_is_number, row)) > width
-    )
-    begin = next(of_numbers, None)
-    if begin is None:
-        begin = is_row.index(True) if any(is_row) else 0
-        has_header = has_header is not False
+    is_first = [
+        is_row[k] and 2 * sum(map(_is_number, row)) > width for k, (_, row) in enumerate(first)
+    ]
+    if not any(is_first):
+        is_first, has_header = is_row, has_header is not False
+    begin = is_first.index(True) if any(is_first) else 0
     while begin and is_row[begin - 1]:
         begin -= 1
     if has_header is None:
