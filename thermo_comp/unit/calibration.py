@@ -30,9 +30,9 @@ from ..thermal.settings import DetectorSettings
 from ..typing import Floats
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
-from .gyroscope import Gyroscope, RateSet
+from .gyroscope import Gyroscope, RateCurve, RateSet
 from .posterior import ParameterLayout, Posterior, lay_out
-from .schema import Bounds, NotNegative, Positive
+from .schema import Bounds, NotNegative, Positive, check_ranges
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -129,10 +129,7 @@ class RegimeSet:
     z: AxisSet
 
     def __post_init__(self) -> None:
-        for name in ('temperature_range_c', 'rate_range_k_min'):
-            lower, upper = getattr(self, name)
-            if not lower < upper:
-                raise ValueError(f'`{name}` must be [lower, upper] with lower < upper')
+        check_ranges(self, 'temperature_range_c', 'rate_range_k_min')
 
     def axes(self) -> tuple[AxisSet, AxisSet, AxisSet]:
         """Return the three axes in order."""
@@ -309,26 +306,29 @@ class Calibration:
         own = self.static if regime == 'static' else self.dynamic
         t = np.linspace(*own.temperature_range_c, _GRID) - reference
         edges = [edge for one in self.regime_sets() for edge in one.temperature_range_c]
-        farthest = max(abs(edge - reference) for edge in edges)
+        farthest = np.max(np.abs(np.subtract(edges, reference)))
         sets: dict[str, RegimeSet | RateSet] = {regime: own}
         if self.gyroscope is not None:
             sets[f'gyroscope.{regime}'] = getattr(self.gyroscope, regime)
-        for axis, name in enumerate(AXES):
-            for prefix, curves in sets.items():
-                if not math.isfinite(_smallest(curves.axes()[axis].bias_function, t)):
+        for prefix, curves in sets.items():
+            axes: tuple[AxisSet | RateCurve, ...] = curves.axes()
+            for name, axis in zip(AXES, axes, strict=True):
+                if not math.isfinite(_smallest(axis.bias_function, t)):
                     raise ValueError(
                         f'`{prefix}.{name}.bias_function` must be finite over its range'
                     )
+        smallest = np.array([_smallest(axis.scale_function, t) for axis in own.axes()])
+        with np.errstate(all='ignore'):
             # Every term of the response at its worst.
-            smallest = _smallest(own.axes()[axis].scale_function, t)
             for term in self.response:
-                if term.during in ('always', regime) and term.scale[axis]:
-                    largest = np.max(np.abs(term.range)) * np.float64(farthest) ** term.power
-                    smallest -= float(largest) * abs(term.scale[axis])
-            if not smallest > SMALLEST_RELATIVE_SCALE:
+                if term.during in ('always', regime):
+                    largest = max(map(abs, term.range)) * farthest**term.power
+                    smallest -= np.abs(np.multiply(term.scale, largest))
+        for name, least in zip(AXES, smallest.tolist(), strict=True):
+            if not least > SMALLEST_RELATIVE_SCALE:
                 raise ValueError(
                     f'`{regime}.{name}.scale_function` must stay above '
-                    f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {smallest:.4g}'
+                    f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {least:.4g}'
                 )
 
     def correct(

@@ -42,7 +42,7 @@ from ..thermal.memory import BOARD_INPUT, MemorySpec
 from ..thermal.state import BOARD, RATE, WEIGHT, Layout
 from ..typing import Floats
 from .functions import by_element, hold
-from .schema import Bounds, NotNegative
+from .schema import Bounds, NotNegative, check_ranges
 
 #: A range that holds nothing back, of any value.
 UNBOUNDED: Final = (-1000.0, 1000.0)
@@ -91,11 +91,7 @@ class Column:
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:
-        lower, upper = self.range
-        if not lower < upper:
-            raise ValueError(
-                f'`range` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
-            )
+        check_ranges(self, 'range')
         for key, kinds in (('tau_s', ('board', 'neighbour')), ('width_k', ('even', 'play'))):
             if self.kind in kinds and not getattr(self, key) > 0.0:
                 raise ValueError(

@@ -14,10 +14,11 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import operator
 import re
 import types
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import (
@@ -25,7 +26,6 @@ from typing import (
     Any,
     Literal,
     NoReturn,
-    TypeGuard,
     TypeVar,
     Union,
     get_args,
@@ -33,11 +33,15 @@ from typing import (
     get_type_hints,
 )
 
+from ..text import counted
+
 #: Longer than any key that there is.
 _LONGEST_NAME = 60
 _NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)', re.DOTALL)
 _WORDS: dict[Any, str] = {str: 'text', int: 'integer', float: 'number', bool: 'true or false'}
-_JSON_TYPES: dict[Any, str] = {str: 'string', int: 'integer', float: 'number', bool: 'boolean'}
+_JSON_TYPES: dict[Any, str] = {
+    str: 'string', int: 'integer', float: 'number', bool: 'boolean', type(None): 'null',
+}  # fmt: skip
 
 Value = TypeVar('Value')
 
@@ -51,6 +55,16 @@ class SchemaError(ValueError):
         super().__init__(f'{key}: {message}' if key else message)
 
 
+#: When a bound is kept, what is said where it is not, and its word in JSON Schema.
+_RULES: dict[str, tuple[Callable[[Any, Any], bool], str, str]] = {
+    'above': (operator.gt, 'be greater than', 'exclusiveMinimum'),
+    'at_least': (operator.ge, 'be at least', 'minimum'),
+    'below': (operator.lt, 'be less than', 'exclusiveMaximum'),
+    'shortest': (operator.ge, 'have at least', 'minLength'),
+    'longest': (operator.le, 'have at most', 'maxLength'),
+}
+
+
 @dataclass(frozen=True)
 class Bounds:
     """Where a number must lie, or how long a text must be."""
@@ -58,36 +72,25 @@ class Bounds:
     above: float | None = None
     at_least: float | None = None
     below: float | None = None
-    shortest: int = 0
+    shortest: int | None = None
     longest: int | None = None
 
     def fault(self, value: Any) -> str | None:
         """Say what is expected of a value that does not comply."""
-        if isinstance(value, str):
-            if len(value) < self.shortest:
-                s = '' if self.shortest == 1 else 's'
-                return f'must have at least {self.shortest} character{s}'
-            if self.longest is not None and len(value) > self.longest:
-                return f'must have at most {self.longest} characters'
-            return None
-        if self.above is not None and not value > self.above:
-            return f'must be greater than {self.above:g}'
-        if self.at_least is not None and not value >= self.at_least:
-            return f'must be at least {self.at_least:g}'
-        if self.below is not None and not value < self.below:
-            return f'must be less than {self.below:g}'
+        is_text = isinstance(value, str)
+        for name, limit in self._given():
+            is_kept, said, _ = _RULES[name]
+            if not is_kept(len(value) if is_text else value, limit):
+                shown = counted(limit, 'character') if is_text else f'{limit:g}'
+                return f'must {said} {shown}'
         return None
 
     def keywords(self) -> dict[str, float]:
         """Return the same in the words of JSON Schema."""
-        words = {
-            'exclusiveMinimum': self.above,
-            'minimum': self.at_least,
-            'exclusiveMaximum': self.below,
-            'minLength': self.shortest or None,
-            'maxLength': self.longest,
-        }
-        return {word: value for word, value in words.items() if value is not None}
+        return {_RULES[name][2]: limit for name, limit in self._given()}
+
+    def _given(self) -> list[tuple[str, Any]]:
+        return [(name, limit) for name, limit in vars(self).items() if limit is not None]
 
 
 Positive = Annotated[float, Bounds(above=0.0)]
@@ -120,6 +123,16 @@ def naming(key: str) -> Iterator[None]:
         raise SchemaError(_joined(key, named['key']), named['rest']) from error
 
 
+def check_ranges(value: object, *keys: str) -> None:
+    """Raise ValueError, with the name of the key, if a range of a dataclass does not rise."""
+    for key in keys:
+        lower, upper = getattr(value, key)
+        if not lower < upper:
+            raise ValueError(
+                f'`{key}` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
+            )
+
+
 def plain(value: Any) -> Any:
     """Turn dataclasses and tuples into mappings and lists: the reverse of `build`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -143,9 +156,9 @@ def json_schema(cls: type) -> dict[str, Any]:
 
 
 def _build(hint: Any, data: Any, key: str) -> Any:
-    if hint is float or hint is int or hint is str or hint is bool:
+    if hint in _WORDS:
         return _scalar(hint, data, key)
-    if _is_dataclass(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return _object(hint, data, key)
     origin, arguments = _parts(hint)
     if origin is Annotated:
@@ -164,11 +177,6 @@ def _build(hint: Any, data: Any, key: str) -> Any:
     return _either(arguments, data, key)
 
 
-def _is_dataclass(hint: Any) -> TypeGuard[type]:
-    return dataclasses.is_dataclass(hint)
-
-
-@lru_cache(maxsize=256)
 def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     if get_origin(hint) is Annotated:
         return Annotated, (hint.__origin__, *hint.__metadata__)
@@ -190,21 +198,14 @@ def _fields(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
 
 
 def _scalar(hint: type, data: Any, key: str) -> Any:
-    kind = type(data)
-    if hint is float and kind is int and math.isfinite(_as_float(data)):
-        return float(data)
-    if kind is not hint:
+    if hint is float and type(data) is int:
+        with suppress(OverflowError):
+            return float(data)
+    if type(data) is not hint:
         _refuse(key, f'must be a valid {_WORDS[hint]}', data)
-    if hint is float and not math.isfinite(data):
+    if isinstance(data, float) and not math.isfinite(data):
         _refuse(key, 'must be a finite number', data)
     return data
-
-
-def _as_float(value: int) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf
 
 
 def _object(cls: type, data: Any, key: str) -> Any:
@@ -230,16 +231,11 @@ def _object(cls: type, data: Any, key: str) -> Any:
 def _sequence(arguments: tuple[Any, ...], data: Any, key: str) -> tuple[Any, ...]:
     if not isinstance(data, list):
         _refuse(key, 'must be a list', data)
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        hints = arguments[:1] * len(data)
-    elif len(data) != len(arguments):
-        raise SchemaError(key, f'must have {len(arguments)} entries, got {len(data)}')
-    else:
-        hints = arguments
-    return tuple(
-        _build(hint, item, f'{key}[{i}]')
-        for i, (hint, item) in enumerate(zip(hints, data, strict=True))
-    )
+    hints = arguments[:1] * len(data) if arguments[-1] is Ellipsis else arguments
+    if len(data) != len(hints):
+        raise SchemaError(key, f'must have {len(hints)} entries, got {len(data)}')
+    pairs = enumerate(zip(hints, data, strict=True))
+    return tuple(_build(hint, item, f'{key}[{i}]') for i, (hint, item) in pairs)
 
 
 def _either(arguments: tuple[Any, ...], data: Any, key: str) -> Any:
@@ -248,24 +244,20 @@ def _either(arguments: tuple[Any, ...], data: Any, key: str) -> Any:
     hints = [hint for hint in arguments if hint is not type(None)]
     if len(hints) == 1:
         return _build(hints[0], data, key)
-    if not all(_is_dataclass(hint) for hint in hints):
-        for hint in hints:
-            if type(data) is hint:
-                return data
-        _refuse(key, f'must be a valid {_choice(sorted(_WORDS[hint] for hint in hints))}', data)
+    if hints[0] in _WORDS:
+        if type(data) not in hints:
+            words = sorted(_WORDS[hint] for hint in hints)
+            _refuse(key, f'must be a valid {_choice(words)}', data)
+        return data
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
-    kinds = {_kind(hint): hint for hint in hints}
+    kinds = {get_args(_fields(hint)[0]['kind'])[0]: hint for hint in hints}
     if 'kind' not in data:
         raise SchemaError(_joined(key, 'kind'), 'this key is missing')
     kind = data['kind']
     if not isinstance(kind, str) or kind not in kinds:
         _refuse(_joined(key, 'kind'), f'must be {_choice([repr(one) for one in kinds])}', kind)
     return _object(kinds[kind], data, key)
-
-
-def _kind(cls: Any) -> str:
-    return str(get_args(_fields(cls)[0]['kind'])[0])
 
 
 def _refuse(key: str, expected: str, data: Any) -> NoReturn:
@@ -291,11 +283,9 @@ def _choice(words: list[str]) -> str:
 def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     if hint in _JSON_TYPES:
         return {'type': _JSON_TYPES[hint]}
-    if _is_dataclass(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         _define(hint, definitions)
         return {'$ref': f'#/$defs/{hint.__name__}'}
-    if hint is type(None):
-        return {'type': 'null'}
     origin, arguments = _parts(hint)
     if origin is Annotated:
         result = _schema(arguments[0], definitions)
@@ -305,25 +295,24 @@ def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     if origin is Literal:
         one = len(arguments) == 1
         return {'const': arguments[0]} if one else {'enum': list(arguments), 'type': 'string'}
-    if origin is tuple:
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return {'type': 'array', 'items': _schema(arguments[0], definitions)}
-        items = [_schema(one, definitions) for one in arguments]
-        n = len(items)
-        return {'type': 'array', 'prefixItems': items, 'minItems': n, 'maxItems': n}
-    return {'anyOf': [_schema(one, definitions) for one in arguments]}
+    if origin is not tuple:
+        return {'anyOf': [_schema(one, definitions) for one in arguments]}
+    if arguments[-1] is Ellipsis:
+        return {'type': 'array', 'items': _schema(arguments[0], definitions)}
+    items = [_schema(one, definitions) for one in arguments]
+    return {'type': 'array', 'prefixItems': items, 'minItems': len(items), 'maxItems': len(items)}
 
 
 def _define(cls: Any, definitions: dict[str, Any]) -> None:
     if cls.__name__ in definitions:
         return
-    result: dict[str, Any] = {
+    hints, required = _fields(cls)
+    # It stands before those that it holds.
+    result = definitions[cls.__name__] = {
         'type': 'object',
         'description': inspect.cleandoc(cls.__doc__),
         'additionalProperties': False,
     }
-    definitions[cls.__name__] = result
-    hints, required = _fields(cls)
     result['properties'] = {name: _schema(hint, definitions) for name, hint in hints.items()}
     for field in dataclasses.fields(cls):
         if field.name not in required:

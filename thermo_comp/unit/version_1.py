@@ -11,17 +11,16 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..typing import Floats
 from .calibration import AXES, FORMAT_VERSION, AxisSet, Calibration, ResponseTerm, parameter_layout
 from .posterior import posterior_of
-from .schema import Positive, SchemaError, build, naming
+from .schema import Positive, SchemaError, build, check_ranges, naming
 
-Regime = Literal['static', 'dynamic']
-REGIMES: tuple[Regime, Regime] = ('static', 'dynamic')
+REGIMES = ('static', 'dynamic')
 _NEW_KEYS = ('sensors', 'response', 'posterior', 'evidence', 'slow_noise_m_s2_sqrt_h', 'gyroscope')
 _Part = TypeVar('_Part')
 
@@ -51,20 +50,19 @@ class _OfAxis:
     memory: _Memory = _Memory()
     covariance: tuple[tuple[float, ...], ...] = ()
 
-    def __post_init__(self) -> None:
-        if len(self.memory.bias) != len(self.memory.scale):
-            raise ValueError(
-                '`memory` must have as many bias as scale coefficients, '
-                f'got {len(self.memory.bias)} and {len(self.memory.scale)}'
-            )
-
-    @property
-    def weights(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def weights(self, n_lags: int) -> list[tuple[float, ...]]:
         """Return the coefficients of gradient, rate and lags on the bias and on the scale."""
-        return (
-            (self.gradient.bias, self.rate.bias, *self.memory.bias),
-            (self.gradient.scale, self.rate.scale, *self.memory.scale),
-        )
+        sizes = len(self.memory.bias), len(self.memory.scale)
+        if sizes not in ((0, 0), (n_lags, n_lags)):
+            raise ValueError(
+                '`memory` must have as many bias as scale coefficients, one per '
+                f'memory_time_constants_s ({n_lags}), got {sizes[0]} and {sizes[1]}'
+            )
+        nil = (0.0,) * (n_lags - sizes[0])
+        return [
+            (self.gradient.bias, self.rate.bias, *self.memory.bias, *nil),
+            (self.gradient.scale, self.rate.scale, *self.memory.scale, *nil),
+        ]
 
 
 @dataclass(frozen=True)
@@ -75,10 +73,7 @@ class _OfSet:
     memory_range_k: tuple[float, float] = (-50.0, 50.0)
 
     def __post_init__(self) -> None:
-        for name in ('gradient_range_k', 'memory_range_k'):
-            lower, upper = getattr(self, name)
-            if not lower < upper:
-                raise ValueError(f'`{name}` must be [lower, upper] with lower < upper')
+        check_ranges(self, 'gradient_range_k', 'memory_range_k')
 
 
 @dataclass(frozen=True)
@@ -99,41 +94,34 @@ def read_version_1(data: dict[str, Any]) -> Calibration:
             raise SchemaError(key, 'unknown key in a file of version 1')
     data = deepcopy(data)
     lags = _cut(data, _OfFile).memory_time_constants_s
-    terms: list[ResponseTerm] = []
-    sets: list[tuple[Regime, _OfSet, list[_OfAxis]]] = [
-        (regime, _cut(data, _OfSet, regime), [_cut(data, _OfAxis, regime, one) for one in AXES])
-        for regime in REGIMES
-    ]
+    edges = [_cut(data, _OfSet, regime) for regime in REGIMES]
+    axes = [[_cut(data, _OfAxis, regime, one) for one in AXES] for regime in REGIMES]
     calibration = build(Calibration, {**data, 'format_version': FORMAT_VERSION})
-    for regime, edges, axes in sets:
-        for name, axis in zip(AXES, axes, strict=True):
-            if len(axis.memory.bias) not in (0, len(lags)):
-                raise SchemaError(
-                    f'{regime}.{name}.memory',
-                    f'must have one coefficient per memory_time_constants_s ({len(lags)}), '
-                    f'got {len(axis.memory.bias)}',
-                )
-        terms += _terms(regime, edges, axes, lags, calibration)
+    terms: list[ResponseTerm] = []
+    for regime, ranges, own in zip(REGIMES, edges, axes, strict=True):
+        weights = []
+        for name, axis in zip(AXES, own, strict=True):
+            with naming(f'{regime}.{name}'):
+                weights.append(axis.weights(len(lags)))
+        of_rate = [edge / 60.0 for edge in getattr(calibration, regime).rate_range_k_min]
+        regressors = [
+            ('now', 0.0, ranges.gradient_range_k),
+            ('rate', 0.0, of_rate),
+            *(('board', tau, ranges.memory_range_k) for tau in lags),
+        ]
+        for (kind, tau, limits), by_axis in zip(regressors, np.transpose(weights), strict=True):
+            bias, scale = by_axis.tolist()
+            keys = {'group': kind, 'kind': kind, 'tau_s': tau, 'during': regime}
+            keys |= {'range': list(limits), 'bias': bias, 'scale': scale}
+            terms.append(build(ResponseTerm, keys))
+    is_known = any(axis.covariance for own in axes for axis in own)
+    # Of a term without weight something may be known all the same.
+    used = tuple(term for term in terms if is_known or any(term.bias + term.scale))
     with naming(''):
-        calibration = replace(calibration, response=tuple(terms))
-    matrix = _matrix(calibration, sets)
-    # A term without weight is a term all the same where something is known of its uncertainty.
-    layout = parameter_layout(calibration)
-    blocks = (*layout.bias, *layout.scale)
-    unused = [
-        k
-        for k, term in enumerate(terms)
-        if not any(term.bias + term.scale)
-        and not any(matrix[one.response + k, one.response + k] for one in blocks)
-    ]
-    used = tuple(term for k, term in enumerate(terms) if k not in unused)
-    if not any(axis.covariance for _, _, axes in sets for axis in axes):
-        return replace(calibration, response=used)
-    gone = [one.response + k for one in blocks for k in unused]
-    posterior = posterior_of(
-        np.delete(np.delete(matrix, gone, axis=0), gone, axis=1), tolerance=0.0
-    )
-    return replace(calibration, response=used, posterior=posterior)
+        calibration = replace(calibration, response=used)
+    if not is_known:
+        return calibration
+    return replace(calibration, posterior=posterior_of(_matrix(calibration, axes), tolerance=0.0))
 
 
 def _cut(data: dict[str, Any], part: type[_Part], *path: str) -> _Part:
@@ -141,54 +129,19 @@ def _cut(data: dict[str, Any], part: type[_Part], *path: str) -> _Part:
     values: Any = data
     for name in path:
         values = values.get(name) if isinstance(values, dict) else None
-    taken = {}
-    if isinstance(values, dict):
-        names = [field.name for field in fields(part)]  # type: ignore[arg-type]
-        taken = {name: values.pop(name) for name in names if name in values}
+    names = [field.name for field in fields(part)]  # type: ignore[arg-type]
+    has = isinstance(values, dict)
+    taken = {name: values.pop(name) for name in names if has and name in values}
     return build(part, taken, '.'.join(path))
 
 
-def _terms(
-    regime: Regime,
-    edges: _OfSet,
-    axes: list[_OfAxis],
-    lags: tuple[float, ...],
-    calibration: Calibration,
-) -> list[ResponseTerm]:
-    """List a set's terms: gradient, rate, then one per lag, those without weight as well."""
-    lower, upper = getattr(calibration, regime).rate_range_k_min
-    regressors: list[tuple[Literal['now', 'rate', 'board'], float, tuple[float, float]]] = [
-        ('now', 0.0, edges.gradient_range_k),
-        ('rate', 0.0, (lower / 60.0, upper / 60.0)),
-        *(('board', tau, edges.memory_range_k) for tau in lags),
-    ]
-    result = []
-    for k, (kind, tau, limits) in enumerate(regressors):
-        bias, scale = (
-            [weights[k] if k < len(weights) else 0.0 for weights in part]
-            for part in zip(*(axis.weights for axis in axes), strict=True)
-        )
-        result.append(
-            ResponseTerm(
-                kind,
-                kind,
-                tau_s=tau,
-                during=regime,
-                range=limits,
-                bias=(bias[0], bias[1], bias[2]),
-                scale=(scale[0], scale[1], scale[2]),
-            )
-        )
-    return result
-
-
-def _matrix(calibration: Calibration, sets: list[tuple[Regime, _OfSet, list[_OfAxis]]]) -> Floats:
+def _matrix(calibration: Calibration, axes: list[list[_OfAxis]]) -> Floats:
     """Put the covariances of the sets and of the misalignment where they belong."""
     layout = parameter_layout(calibration)
     matrix = np.zeros((layout.n_parameters, layout.n_parameters))
     n_terms = len(calibration.response) // 2
-    for number, (regime, _, axes) in enumerate(sets):
-        for a, (name, axis) in enumerate(zip(AXES, axes, strict=True)):
+    for number, (regime, own) in enumerate(zip(REGIMES, axes, strict=True)):
+        for a, (name, axis) in enumerate(zip(AXES, own, strict=True)):
             if not axis.covariance:
                 continue
             axis_set: AxisSet = getattr(getattr(calibration, regime), name)
@@ -200,11 +153,10 @@ def _matrix(calibration: Calibration, sets: list[tuple[Regime, _OfSet, list[_OfA
                 level = getattr(block, regime)
                 first_term = block.response + number * n_terms
                 places += range(level, level + 1 + function.n_free)
-                places += range(first_term, first_term + len(axis.weights[0]))
+                places += range(first_term, first_term + 2 + len(axis.memory.bias))
             with naming(f'{regime}.{name}'):
                 matrix[np.ix_(places, places)] = _full(axis.covariance, len(places))
-    first = layout.misalignment
-    diagonal = range(first, first + 3)
+    diagonal = range(layout.misalignment, layout.n_parameters)
     matrix[diagonal, diagonal] = np.square(calibration.misalignment_sd)
     return matrix
 
@@ -217,7 +169,6 @@ def _full(rows: tuple[tuple[float, ...], ...], expected: int) -> Floats:
         )
     matrix = np.zeros((expected, expected))
     for i, row in enumerate(rows):
-        matrix[i, : i + 1] = row
-        matrix[: i + 1, i] = row
+        matrix[i, : i + 1] = matrix[: i + 1, i] = row
     posterior_of(matrix)
     return matrix
