@@ -18,7 +18,7 @@ from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.thermal.plausibility import STILL_READINGS, Fault, still_readings
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig, ThermometerSettings
-from thermo_comp.thermal.state import GRADIENT, VAR_BOARD, VAR_GRADIENT
+from thermo_comp.thermal.state import BOARD, GRADIENT, VAR_BOARD, VAR_GRADIENT
 from thermo_comp.thermal.tracker import ThermalTracker
 
 LAG = MemorySpec(lags=(('board', 900.0),))
@@ -62,13 +62,13 @@ def test_a_step_of_40_degrees_is_no_temperature():
 def test_a_step_that_stays_is_a_new_beginning_after_the_time_out():
     tracker = tracker_of(memory=LAG, temperature_timeout_s=20.0)
     now = soak(tracker, seconds=4000)
-    assert tracker.state_at(now * SECOND_NS).is_settled
+    assert tracker.is_settled(now * SECOND_NS)
     taken = [tracker.read('board', (now + k) * SECOND_NS, 60.0 + 0.01 * k) for k in range(30)]
     # The last good reading came a second before: what is older than 20 s is 19 readings later.
     assert taken == [False] * 20 + [True] * 10
-    state = tracker.state_at((now + 29) * SECOND_NS)
-    assert state.board == pytest.approx(60.2, abs=0.1)
-    assert not state.is_settled
+    end_ns = (now + 29) * SECOND_NS
+    assert tracker.sample(end_ns)[BOARD] == pytest.approx(60.2, abs=0.1)
+    assert not tracker.is_settled(end_ns)
 
 
 def test_a_small_step_is_believed_with_doubt():
@@ -244,6 +244,6 @@ def test_a_regime_that_nobody_watched_is_unknown():
 def test_a_jump_of_the_clock_forgets_the_memory():
     tracker = tracker_of(memory=LAG)
     now = soak(tracker, seconds=6000)
-    assert tracker.state_at(now * SECOND_NS).is_settled
+    assert tracker.is_settled(now * SECOND_NS)
     soak(tracker, seconds=2, start_s=now + 86400)
-    assert not tracker.state_at((now + 86402) * SECOND_NS).is_settled
+    assert not tracker.is_settled((now + 86402) * SECOND_NS)

@@ -11,6 +11,7 @@ from builders import SECOND_NS
 from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
+from thermo_comp.thermal.state import GRADIENT, MEMORY_SETTLED_SD, VAR_GRADIENT, Layout
 from thermo_comp.thermal.tracker import LOST_GRADIENT_RELATIVE_SD, ThermalTracker
 
 TAU_S = 900.0
@@ -32,23 +33,23 @@ def test_memory_of_a_ramp_is_the_closed_form(step_s):
     soak_s, ramp_s, rate = 6000, 1800, 0.5 / 60.0
     t = np.arange(0, soak_s + ramp_s + 1, step_s)
     feed(tracker, 20.0 + rate * np.maximum(t - soak_s, 0.0), step_s=step_s)
-    state = tracker.state_at(int(t[-1]) * SECOND_NS)
+    end_ns = int(t[-1]) * SECOND_NS
     expected = rate * TAU_S * (1.0 - math.exp(-ramp_s / TAU_S))
     # The thermometer needs some readings to bend into the ramp: m remembers at most that lag,
     # tens of mK, of a value of 6.5 K.
-    assert state.lags[0] == pytest.approx(expected, abs=0.05)
-    assert state.is_settled
+    assert tracker.sample(end_ns)[Layout(LAG).first_lag] == pytest.approx(expected, abs=0.05)
+    assert tracker.is_settled(end_ns)
 
 
 def test_memory_start_is_unknown_and_settles():
     tracker = ThermalTracker(DetectorSettings(), LAG)
     feed(tracker, np.full(10, 20.0))
-    assert not tracker.state_at(10 * SECOND_NS).is_settled
+    assert not tracker.is_settled(10 * SECOND_NS)
+    # 3 K for a lag of an hour are 1.5 K for one of 900 s: 50 mK after 3.4 of them, 3061 s.
     feed(tracker, np.full(5000, 20.0), start_s=10)
-    state = tracker.state_at(5010 * SECOND_NS)
-    # 3 K for a lag of an hour are 1.5 K for one of 900 s; after 5010 s: 1.5 exp(-5.6) = 6 mK.
-    assert math.sqrt(state.var_lags[0]) == pytest.approx(1.5 * math.exp(-5010 / TAU_S), rel=1e-3)
-    assert state.is_settled
+    settled_s = TAU_S * math.log(1.5 / MEMORY_SETTLED_SD)
+    assert not tracker.is_settled(round((settled_s - 10.0) * 1e9))
+    assert tracker.is_settled(round((settled_s + 10.0) * 1e9))
 
 
 def test_state_does_not_depend_on_when_it_is_asked_for():
@@ -61,7 +62,7 @@ def test_state_does_not_depend_on_when_it_is_asked_for():
         other.read('board', k * SECOND_NS, celsius)
         other.read('case', k * SECOND_NS, celsius + 1.0)
         other.sample(k * SECOND_NS + 123)
-        other.state_at(k * SECOND_NS + 456_000_000)
+        other.is_settled(k * SECOND_NS + 456_000_000)
     at = 3000 * SECOND_NS
     assert one.sample(at) == other.sample(at)
 
@@ -112,28 +113,12 @@ def test_lost_case_is_replaced_by_the_boards_rate():
     t = np.arange(0, 1000)
     board = 20.0 + 0.01 * t
     feed(tracker, board, board + 6.0)
-    assert tracker.state_at(999 * SECOND_NS).gradient == pytest.approx(6.0, abs=0.05)
+    assert tracker.sample(999 * SECOND_NS)[GRADIENT] == pytest.approx(6.0, abs=0.05)
     feed(tracker, 20.0 + 0.01 * np.arange(1000, 1100), start_s=1000)
-    state = tracker.state_at(1099 * SECOND_NS)
+    state = tracker.sample(1099 * SECOND_NS)
     # lag times rate, the closed form of a first-order lag in a ramp.
-    assert state.gradient == pytest.approx(600.0 * 0.01, abs=0.1)
-    assert math.sqrt(state.var_gradients['case']) >= LOST_GRADIENT_RELATIVE_SD * 5.9
-
-
-def test_reset_is_a_new_tracker():
-    tracker = ThermalTracker(DetectorSettings(), LAG)
-    fresh = ThermalTracker(DetectorSettings(), LAG)
-    board = 20.0 + 0.01 * np.arange(500)
-    feed(tracker, board, board + 2.0)
-    tracker.reset()
-    feed(tracker, board, board + 2.0)
-    feed(fresh, board, board + 2.0)
-    assert tracker.sample(500 * SECOND_NS) == fresh.sample(500 * SECOND_NS)
-
-
-def test_state_before_any_board_temperature_is_refused():
-    with pytest.raises(ValueError, match='needs a board temperature'):
-        ThermalTracker(DetectorSettings()).state_at(0)
+    assert state[GRADIENT] == pytest.approx(600.0 * 0.01, abs=0.1)
+    assert math.sqrt(state[VAR_GRADIENT]) >= LOST_GRADIENT_RELATIVE_SD * 5.9
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,7 @@ class Compensator:
 
     def _forget_samples(self) -> None:
         self.thermal.reset()
-        self.stuck.reset()
+        self.stuck = StuckCheck(self.config.stuck_timeout_s)
         self.gravity = self._gravity_check()
 
     def take_flags(self) -> list[tuple[int, bool]]:

@@ -35,19 +35,15 @@ class StuckCheck:
 
     def __init__(self, timeout_s: float) -> None:
         self.limit_ns = round(timeout_s * 1e9) if timeout_s > 0.0 else NEVER_NS
-        self.reset()
+        #: The sample that the run began with and its stamp.
+        self.run = (nan, nan, nan, 0)
+        #: How often it has come again.
+        self.n_same = 0
 
     @property
     def is_on(self) -> bool:
         """Whether anything is watched."""
         return self.limit_ns != NEVER_NS
-
-    def reset(self) -> None:
-        """Forget the last sample."""
-        #: The sample that the run began with and its stamp.
-        self.run = (nan, nan, nan, 0)
-        #: How often it has come again.
-        self.n_same = 0
 
     def again(self, stamp_ns: int) -> bool:
         """Count one more equal sample; say whether it is too many."""
@@ -92,10 +88,6 @@ class RateCheck:
     def __init__(self, cycle_s: float) -> None:
         self._cycle_s = cycle_s
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin to count."""
         self.is_too_fast = False
         self.ratio = 1.0
         self._level = 0.0

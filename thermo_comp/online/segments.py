@@ -21,7 +21,7 @@ from ..thermal.memory import BOARD_INPUT
 from ..thermal.reading_queue import NEVER_NS, ReadingQueue
 from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig
-from ..thermal.state import BOARD, ThermalState
+from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, ThermalState
 from ..thermal.tracker import ThermalTracker
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction
@@ -128,8 +128,8 @@ class ThermalSide:
 
     def reset(self) -> None:
         """Forget temperatures, regime and rate; what waits, and counters, stay."""
-        self.tracker.reset()
-        self.rate.reset()
+        self.tracker = self._new_tracker()
+        self.rate = RateCheck(self.calibration.unit.cycle_time_s)
         self._forget_segment()
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
@@ -176,14 +176,17 @@ class ThermalSide:
         return self.tracker.sample(stamp_ns)
 
     def state_at(self, stamp_ns: int) -> ThermalState:
-        """Thermal state at a stamp, with names; ValueError before it is known."""
-        if not self.is_unmeasured:
-            return self.tracker.state_at(stamp_ns)
-        nil = dict.fromkeys(self.calibration.sensors, 0.0)
-        board, variance, *_ = self.sample(stamp_ns)
-        regime = self.tracker.detector
+        """Thermal state at a stamp, once it is known, for diagnostics."""
+        flat, detector = self.sample(stamp_ns), self.tracker.detector
         return ThermalState(
-            board, variance, 0.0, nil, nil, 0.0, regime.regime, regime.direction, (), (), ()
+            flat[BOARD],
+            flat[VAR_BOARD],
+            flat[RATE],
+            flat[GRADIENT],
+            flat[WEIGHT],
+            detector.regime,
+            detector.direction,
+            self.is_unmeasured or self.tracker.is_settled(stamp_ns),
         )
 
     @property

@@ -70,10 +70,6 @@ class ChangeDetector:
         self._quantum = sensor.quantum_c
         self._has_cells = sensor.has_cells
         self._by_edges = sensor.has_wide_cells
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         self._stamp_ns: int | None = None
         self._n_restarts = -1
         self._filters: list[tuple[float, float, float, float, float]] = []

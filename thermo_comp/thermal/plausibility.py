@@ -219,10 +219,6 @@ class LeadCheck:
         self._board = board
         self._quanta = case.settings.quantum_c + board.settings.quantum_c
         self._margin = LEAD_K + 2.0 * self._quanta
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the calm and the ramps."""
         self.is_reversed = False
         self.doubt = 0.0
         self._calm: tuple[float, float] | None = None

@@ -55,7 +55,6 @@ class RegimeDetector:
         self._dwell_ns = round(settings.dwell_s * 1e9)
         self._turn_ns = self._dwell_ns // 2
         self._asks_board = settings.closes == 'board'
-        self._forget_ns = round(1e9 * max(settings.case.lag_s, settings.board.lag_s))
         test = (
             settings.smallest_ramp_k_min / 60.0,
             settings.ripple_c,
@@ -65,21 +64,12 @@ class RegimeDetector:
         self._board_change = ChangeDetector(settings.board, *test)
         self._case_calm = _CalmTest(settings, settings.case)
         self._board_calm = _CalmTest(settings, settings.board)
-        self.reset()
-
-    def reset(self) -> None:
-        """Back to unknown, as after time has jumped back."""
         self.regime = Regime.UNKNOWN
         self.direction = 0
-        self._stamp_ns: int | None = None
         self._calm_ns: int | None = None
         self._held_until_ns: int | None = None
         self._turning_ns: int | None = None
         self._is_grown = False
-        self._case_change.reset()
-        self._board_change.reset()
-        self._case_calm.reset()
-        self._board_calm.reset()
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
         """Decide after a used reading of the leading sensor, the case if it is not None."""
@@ -91,9 +81,6 @@ class RegimeDetector:
             lead, change = board, self._board_change
         else:
             return self.regime
-        if self._stamp_ns is not None and stamp_ns - self._stamp_ns > self._forget_ns:
-            self.reset()
-        self._stamp_ns = stamp_ns
         regime = self.regime
         is_dynamic = regime is Regime.DYNAMIC
         departure = change.update(
@@ -184,9 +171,6 @@ class _CalmTest:
         self._still_ns = round(
             1e9 * max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
         )
-        self.reset()
-
-    def reset(self) -> None:
         self._stamp_ns: int | None = None
         self._mean = 0.0
 

@@ -35,33 +35,18 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class ThermalState:
-    """The thermal state at one stamp."""
+    """What diagnostics tell of the thermal state at one stamp."""
 
     #: Board temperature [degC], its variance [K^2] and its rate [K/s].
     board: float
     var_board: float
     rate: float
-    #: T_sensor - T_board [K] of each sensor, and the part of its variance that does not come from
-    #: the board.
-    gradients: dict[str, float]
-    var_gradients: dict[str, float]
+    #: T_sensor - T_board of the leading sensor [K].
+    gradient: float
     #: Weight of the dynamic set, 0..1.
     weight: float
     regime: Regime
     #: -1 cooling, +1 heating, 0 neither.
     direction: int
-    #: T_board minus its lags and the lags of the gradients [K], what is not known of them [K^2],
-    #: and the plays less their inputs [K], in the order of the tracker's spec.
-    lags: tuple[float, ...]
-    var_lags: tuple[float, ...]
-    plays: tuple[float, ...]
-
-    @property
-    def gradient(self) -> float:
-        """Gradient of the leading sensor [K]."""
-        return next(iter(self.gradients.values()))
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether the memory has forgotten that its start was not seen."""
-        return all(variance < MEMORY_SETTLED_SD**2 for variance in self.var_lags)
+    #: Whether the memory has forgotten that its start was not seen.
+    is_settled: bool

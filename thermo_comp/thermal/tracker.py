@@ -17,7 +17,7 @@ from .memory import BOARD_INPUT, LagBank, MemorySpec, ThermalMemory, start_covar
 from .plausibility import Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
-from .state import BOARD, GRADIENT, RATE, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout, ThermalState
+from .state import GRADIENT, MEMORY_SETTLED_SD, VAR_BOARD, VAR_GRADIENT, Layout
 from .thermometer import Thermometer
 
 #: While a sensor is lost its gradient is guessed from the board's rate, this well.
@@ -43,7 +43,6 @@ class ThermalTracker:
         #: The thermometers beside the board; the first, which is the case's, leads.
         self.sensors = [Thermometer(detector.case) for _ in self.spec.sensors]
         self.case = self.sensors[0]
-        self.detector = RegimeDetector(detector)
         self._board_check = SensorCheck(self.board, self.case, board_lag_s)
         self._checks = [SensorCheck(sensor, self.board, 0.0) for sensor in self.sensors]
         #: What is wrong with each thermometer, by name.
@@ -51,10 +50,19 @@ class ThermalTracker:
             BOARD_INPUT: self._board_check,
             **dict(zip(self.spec.sensors, self._checks, strict=True)),
         }
-        self.lead = LeadCheck(self.case, self.board, detector.relaxed_rate_k_min)
         self.memory = ThermalMemory(self.spec)
         self._places = {name: k for k, name in enumerate(self.spec.sensors)}
-        self._clear()
+        #: Stamp of the newest reading that was used, None before the first.
+        self.updated_ns: int | None = None
+        self._decided_ns: int | None = None
+        self._weight = 0.0
+        self._weight_ns = 0
+        self._target = 0.0
+        self._begin_watch()
+
+    def _begin_watch(self) -> None:
+        self.detector = RegimeDetector(self.settings)
+        self.lead = LeadCheck(self.case, self.board, self.settings.relaxed_rate_k_min)
 
     def _configure(self, config: ThermalConfig, board_lag_s: float) -> None:
         self.config = config
@@ -62,27 +70,11 @@ class ThermalTracker:
         self._board_lag_s = board_lag_s
         self._case_timeout_s = config.case_timeout_s
         #: How long nobody may have watched before the regime is not known any more [s].
-        self._unwatched_s = max(UNWATCHED_SHARE * self.settings.case.lag_s, config.case_timeout_s)
-
-    def _clear(self) -> None:
-        #: Stamp of the newest reading that was used, None before the first.
-        self.updated_ns: int | None = None
-        self._decided_ns: int | None = None
-        self._weight = 0.0
-        self._weight_ns = 0
-        self._target = 0.0
-
-    def reset(self) -> None:
-        """Forget everything: time has jumped, or a new recording begins."""
-        self.board.reset()
-        for sensor in self.sensors:
-            sensor.reset()
-        for check in self.checks.values():
-            check.reset()
-        self.detector.reset()
-        self.lead.reset()
-        self.memory.forget()
-        self._clear()
+        lag_s, longest_s = (
+            self.settings.case.lag_s,
+            max(self.settings.case.lag_s, self.settings.board.lag_s),
+        )
+        self._unwatched_s = min(max(UNWATCHED_SHARE * lag_s, config.case_timeout_s), longest_s)
 
     def reconfigure(self, config: ThermalConfig, board_lag_s: float, stamp_ns: int | None) -> None:
         """Take over another configuration from a stamp on, without a step in the weight."""
@@ -185,8 +177,7 @@ class ThermalTracker:
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
         if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s:
             # Nobody has seen whether a ramp began or ended meanwhile.
-            self.detector.reset()
-            self.lead.reset()
+            self._begin_watch()
         regime = self.detector.update(stamp_ns, case, board)
         target = 1.0 if regime is Regime.DYNAMIC else 0.0
         if target != self._target:
@@ -262,31 +253,13 @@ class ThermalTracker:
         )
         return gradient, variance
 
-    def state_at(self, stamp_ns: int) -> ThermalState:
-        """Thermal state at a stamp, with names; ValueError before the board's first reading."""
-        if self.board.stamp_ns is None:
-            raise ValueError('`state_at` needs a board temperature first')
-        flat = self.sample(stamp_ns)
+    def is_settled(self, stamp_ns: int) -> bool:
+        """Whether the memory has forgotten that its start was not seen."""
         layout = Layout(self.spec)
-        lags = flat[layout.first_lag : layout.first_play : 2]
-        extra = flat[layout.first_lag + 1 : layout.first_play : 2]
-        gradients = flat[GRADIENT : layout.first_lag : 2]
-        variances = flat[VAR_GRADIENT : layout.first_lag : 2]
+        extra = self.sample(stamp_ns)[layout.first_lag + 1 : layout.first_play : 2]
         start = start_covariance(self.spec.lags).diagonal().tolist()
         shares = self.memory.start_shares(stamp_ns)
-        return ThermalState(
-            board=flat[BOARD],
-            var_board=flat[VAR_BOARD],
-            rate=flat[RATE],
-            gradients=dict(zip(self.spec.sensors, gradients, strict=True)),
-            var_gradients=dict(zip(self.spec.sensors, variances, strict=True)),
-            weight=flat[WEIGHT],
-            regime=self.detector.regime,
-            direction=self.detector.direction,
-            lags=lags,
-            var_lags=tuple(
-                variance * share * share + more
-                for variance, share, more in zip(start, shares, extra, strict=True)
-            ),
-            plays=flat[layout.first_play :],
+        return all(
+            variance * share * share + more < MEMORY_SETTLED_SD**2
+            for variance, share, more in zip(start, shares, extra, strict=True)
         )
