@@ -7,14 +7,13 @@ Owns the look at a recording before a fit: how long, how fast, how warm, how sti
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
-from ..typing import Ints
-from .columns import Readings, RecordingInfo
+from .columns import Block, Readings, RecordingInfo
 from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 from .topics import Topics
@@ -48,7 +47,7 @@ class ThermometerSurvey:
         return self.highest - self.lowest
 
 
-@dataclass(frozen=True)
+@dataclass
 class Survey:
     """
     What a recording holds, as far as a fit is concerned.
@@ -58,16 +57,47 @@ class Survey:
     """
 
     info: RecordingInfo
-    n: int
-    rate_hz: float
-    duration_s: float
-    n_gaps: int
-    longest_gap_s: float
-    n_backwards: int
-    n_not_finite: int
-    n_still: int
-    still_s: float
-    thermometers: Mapping[str, ThermometerSurvey]
+    n: int = 0
+    n_gaps: int = 0
+    longest_gap_s: float = 0.0
+    n_backwards: int = 0
+    n_not_finite: int = 0
+    n_still: int = 0
+    still_s: float = 0.0
+    thermometers: Mapping[str, ThermometerSurvey] = field(default_factory=dict)
+    _step_ns: float = 0.0
+    _first_ns: int = 0
+    _last_ns: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last."""
+        return (self._last_ns - self._first_ns) * 1e-9
+
+    @property
+    def rate_hz(self) -> float:
+        """By the usual interval; NaN where there is none."""
+        return 1e9 / self._step_ns if self._step_ns else float('nan')
+
+    def add(self, block: Block) -> None:
+        """Count the samples, their gaps and their disorder while they stream by."""
+        stamp_ns = block.accel_stamp_ns
+        self.n_not_finite += int((~np.isfinite(block.accel).all(axis=1)).sum())
+        if len(stamp_ns) and not self.n:
+            self._first_ns = self._last_ns = int(stamp_ns[0])
+            self.n, stamp_ns = 1, stamp_ns[1:]
+        if not len(stamp_ns):
+            return
+        steps = np.diff(stamp_ns, prepend=self._last_ns)
+        self.n += len(stamp_ns)
+        self._last_ns = int(stamp_ns[-1])
+        rising = steps[steps > 0]
+        self.n_backwards += len(steps) - len(rising)
+        if not self._step_ns and len(rising):
+            self._step_ns = float(np.median(rising))
+        gaps = rising[rising > _GAP_INTERVALS * self._step_ns]
+        self.n_gaps += len(gaps)
+        self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
 
     @property
     def findings(self) -> list[str]:
@@ -125,83 +155,30 @@ def survey_recording(
     `progress` is called with the fraction read. Raises RecordingError if it cannot be read.
     """
     with open_recording(path, topics, require=()) as reader:
+        survey = Survey(reader.info)
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         cells = CellAccumulator(_CELL_S, None)
-        stamps = _Stamps()
-        n_not_finite = 0
         # A thermal test has few readings beside its samples.
         readings: dict[str, list[Readings]] = {}
         for block in reader.blocks():
-            stamps.add(block.accel_stamp_ns)
-            n_not_finite += int((~np.isfinite(block.accel).all(axis=1)).sum())
+            survey.add(block)
             rate = None if block.imu is None else block.imu.angular_velocity
             cells.add(block.accel_stamp_ns, block.accel, rate)
             for name, one in block.temperatures.items():
                 readings.setdefault(name, []).append(one)
             if progress is not None and total:
-                progress(stamps.n / total)
-        info = reader.info
-    still: list[tuple[int, int]] = []
-    still_s = 0.0
-    if stamps.n > 1:
+                progress(survey.n / total)
+        survey.info = reader.info
+    if survey.n > 1:
         reduced = cells.finish()
         still = still_intervals(reduced, _MIN_REST_S)
         # whole cells: the first and the last may reach beyond the samples
         still_s = sum((upper - lower) * reduced.cell_s for lower, upper in still)
-        still_s = min(still_s, stamps.duration_s)
-    return Survey(
-        info=info,
-        n=stamps.n,
-        rate_hz=1e9 / stamps.step_ns if stamps.step_ns else float('nan'),
-        duration_s=stamps.duration_s,
-        n_gaps=stamps.n_gaps,
-        longest_gap_s=stamps.longest_gap_s,
-        n_backwards=stamps.n_backwards,
-        n_not_finite=n_not_finite,
-        n_still=len(still),
-        still_s=still_s,
-        thermometers={
-            name: survey for name, own in readings.items() if (survey := survey_thermometer(own))
-        },
-    )
-
-
-class _Stamps:
-    """Counts gaps and disorder while the stamps stream by."""
-
-    def __init__(self) -> None:
-        self.n = 0
-        self.n_backwards = 0
-        self.n_gaps = 0
-        self.longest_gap_s = 0.0
-        self.step_ns = 0.0
-        self._first_ns: int | None = None
-        self._last_ns = 0
-
-    def add(self, stamp_ns: Ints) -> None:
-        if not len(stamp_ns):
-            return
-        if self._first_ns is None:
-            self._first_ns = self._last_ns = int(stamp_ns[0])
-            self.n = 1
-            stamp_ns = stamp_ns[1:]
-        steps = np.diff(np.concatenate(([self._last_ns], stamp_ns)))
-        self.n += len(stamp_ns)
-        if not len(steps):
-            return
-        self._last_ns = int(stamp_ns[-1])
-        rising = steps[steps > 0]
-        self.n_backwards += len(steps) - len(rising)
-        if not self.step_ns and len(rising):
-            self.step_ns = float(np.median(rising))
-        gaps = rising[rising > _GAP_INTERVALS * self.step_ns]
-        self.n_gaps += len(gaps)
-        self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
-
-    @property
-    def duration_s(self) -> float:
-        return 0.0 if self._first_ns is None else (self._last_ns - self._first_ns) * 1e-9
+        survey.n_still, survey.still_s = len(still), min(still_s, survey.duration_s)
+    found = {name: survey_thermometer(own) for name, own in readings.items()}
+    survey.thermometers = {name: one for name, one in found.items() if one is not None}
+    return survey
 
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:

@@ -99,8 +99,9 @@ class CellAccumulator:
         self._start_ns = 0
         self._last_ns: int | None = None
         self._shift = np.zeros(3)
-        self._ids: list[Ints] = []
-        self._sums: list[Floats] = []
+        # Number, samples, time, sums and sums of squares of each cell; the last one is open.
+        self._ids: list[Ints] = [np.empty(0, np.int64)]
+        self._sums: list[Floats] = [np.empty((0, 8))]
         self._n_dropped = 0
         self._n_saturated = 0
         self._is_integer = True
@@ -108,9 +109,6 @@ class CellAccumulator:
         self._middle = 0.0
         self._quantum = np.zeros(3)
         self._n_looked_at = 0
-        self._width = 8
-        self._open = np.zeros((0, self._width))
-        self._open_id = -1
 
     def add(self, stamp_ns: Ints, samples: Floats, rate: Floats | None = None) -> None:
         """Take the next samples, shape (n, 3), in file order, and the gyroscope's rates."""
@@ -134,7 +132,7 @@ class CellAccumulator:
             return
         if self._last_ns is None:
             self._begin(stamp_ns, samples)
-            self._width = 8 if rate is None else 14
+            self._sums = [np.empty((0, 8 if rate is None else 14))]
         self._last_ns = int(stamp_ns[-1])
         if self._n_looked_at < _QUANTUM_SAMPLES:
             found = _quantum_of(samples[: _QUANTUM_SAMPLES - self._n_looked_at])
@@ -146,23 +144,24 @@ class CellAccumulator:
 
     def finish(self) -> Cells:
         """Return all cells so far, the last one as it is."""
-        n_open = int(self._open_id >= 0)
-        index = np.concatenate([*self._ids, np.full(n_open, self._open_id)])
-        sums = np.concatenate([*self._sums, self._open[:n_open]])
-        if n_open:
-            # Whoever asks again asks for little more.
-            self._ids, self._sums = [index[:-1]], [sums[:-1]]
+        index, sums = np.concatenate(self._ids), np.concatenate(self._sums)
+        # Whoever asks again asks for little more.
+        self._ids, self._sums = [index], [sums]
         count = sums[:, 0]
-        mean, variance = _moments(count, sums[:, 2:5], sums[:, 5:8])
-        rate = rate_variance = np.zeros_like(mean)
-        if self._width > 8:
-            rate, rate_variance = _moments(count, sums[:, 8:11], sums[:, 11:14])
+        total, square = np.split(sums[:, 2:], 2, axis=1)
+        mean = total / count[:, None]
+        spread = np.maximum(square - count[:, None] * mean**2, 0.0)
+        variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
+        # The gyroscope's, where there is one.
+        rate, rate_variance = (
+            one[:, 3:] if one.shape[1] > 3 else np.zeros((len(one), 3)) for one in (mean, variance)
+        )
         return Cells(
             start_ns=self._start_ns,
             time=sums[:, 1] / count + index * (self._cell_ns * 1e-9),
             count=count.astype(np.int64),
-            mean=mean + self._shift,
-            variance=variance,
+            mean=mean[:, :3] + self._shift,
+            variance=variance[:, :3],
             index=index,
             cell_s=self._cell_ns * 1e-9,
             n_dropped=self._n_dropped,
@@ -192,34 +191,21 @@ class CellAccumulator:
         since = stamp_ns - self._start_ns
         ids = since // self._cell_ns
         first = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
-        columns = np.zeros((len(since), self._width))
+        columns = np.zeros((len(since), self._sums[0].shape[1]))
+        n = columns.shape[1] // 2 - 1
         columns[:, 0] = 1.0
         columns[:, 1] = (since - ids * self._cell_ns) * 1e-9
         columns[:, 2:5] = samples - self._shift
-        columns[:, 5:8] = columns[:, 2:5] ** 2
-        if self._width > 8 and rate is not None:
-            columns[:, 8:11] = np.where(np.abs(rate) < _LARGEST, rate, 0.0)
-            columns[:, 11:14] = columns[:, 8:11] ** 2
+        if n > 3 and rate is not None:
+            columns[:, 5:8] = np.where(np.abs(rate) < _LARGEST, rate, 0.0)
+        columns[:, 2 + n :] = columns[:, 2 : 2 + n] ** 2
         sums = np.add.reduceat(columns, first, axis=0)
         ids = ids[first]
-        if self._open_id >= 0:
-            if ids[0] == self._open_id:
-                sums[0] += self._open[0]
-            else:
-                self._ids.append(np.array([self._open_id]))
-                self._sums.append(self._open)
-        self._open_id = int(ids[-1])
-        self._open = sums[-1:].copy()
-        if len(ids) > 1:
-            self._ids.append(ids[:-1])
-            self._sums.append(sums[:-1].copy())
-
-
-def _moments(count: Floats, total: Floats, square: Floats) -> tuple[Floats, Floats]:
-    """Mean and variance of each cell's samples, from their sums."""
-    mean = total / count[:, None]
-    spread = np.maximum(square - count[:, None] * mean**2, 0.0)
-    return mean, spread / np.maximum(count[:, None] - 1.0, 1.0)
+        if len(self._ids[-1]) and ids[0] == self._ids[-1][-1]:
+            sums[0] += self._sums[-1][-1]
+            self._ids[-1], self._sums[-1] = self._ids[-1][:-1], self._sums[-1][:-1]
+        self._ids.append(ids)
+        self._sums.append(sums)
 
 
 def _part_of(window_s: float, least: float) -> float:
