@@ -149,11 +149,12 @@ class ThermalNetwork:
                         slope[i, j] += sign * other * link.exponent * size / self.capacity[name]
         return flow, slope
 
-    def settled(self, air: float, drive: Floats) -> Floats:
-        """Return the whole state after an endless soak under a constant drive, shape (k,)."""
-        A, b, _ = self.system()
+    def settled(self, air: float, power: Floats | None = None) -> Floats:
+        """Return the state after an endless soak under constant powers, shape (k,)."""
+        A, b, p = self.system()
+        drive = p if power is None else power
         if not self.is_convective:
-            return np.asarray(-np.linalg.inv(A) @ (b * air + drive), dtype=np.float64)
+            return np.asarray(np.linalg.solve(A, -b * air - drive), dtype=np.float64)
         # Newton's steps; the flow is convex, so some fifty reach the last digit from anywhere.
         state = np.full(len(b), air + 1.0)
         for _ in range(50):
@@ -161,15 +162,9 @@ class ThermalNetwork:
             state = state - np.linalg.solve(A + slope, A @ state + b * air + drive + flow)
         return state
 
-    def _still(self, air: float) -> Floats:
-        A, b, p = self.system()
-        if self.is_convective:
-            return self.settled(air, p)
-        return np.asarray(np.linalg.solve(A, -b * air - p), dtype=np.float64)
-
     def equilibrium(self, air: float) -> Floats:
         """Return the temperatures [degC] of the parts after an endless soak, shape (n_parts,)."""
-        return self._still(air)[: len(self.nodes)]
+        return self.settled(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:
         """Return the air temperature whose endless soak brings a part to a temperature."""
@@ -181,7 +176,7 @@ class ThermalNetwork:
 
     def heater_power(self, air: float) -> float:
         """Return what the thermostat spends in an endless soak, W; 0 without one."""
-        return 0.0 if self.thermostat is None else float(self._still(air)[len(self.nodes)])
+        return 0.0 if self.thermostat is None else float(self.settled(air)[len(self.nodes)])
 
 
 class ThermalResponse:
@@ -217,15 +212,12 @@ class ThermalResponse:
         drive = np.tile(p, (len(self._time) - 1, 1))
         if power is not None:
             drive[:, : len(network.nodes)] += np.asarray(power) / list(network.capacity.values())
-        if is_warm:
-            state = network.settled(air[0], drive[0])
-        else:
-            # Parts and set point begin with the air, the integral with nothing.
-            state = np.full(len(p), air[0])
-            state[len(network.nodes) : len(p) - 1] = 0.0
+        # Parts and set point begin with the air, the integral with nothing.
+        cold = np.full(len(p), air[0])
+        cold[len(network.nodes) : len(p) - 1] = 0.0
         self._integrated: list[Any] = []
         if network.is_convective:
-            self._integrate(air, drive, state)
+            self._integrate(air, drive, network.settled(air[0], drive[0]) if is_warm else cold)
             return
         inverse = np.linalg.inv(A)
         rate, modes = np.linalg.eig(A)
@@ -242,6 +234,7 @@ class ThermalResponse:
         # Amplitude of each mode at the start of each interval.
         jump = (self._alpha[1:] - self._alpha[:-1] - self._beta[:-1] * length[:-1, None]) @ unmix.T
         amplitude = np.empty((len(length), len(rate)), dtype=complex)
+        state = -inverse @ (b * air[0] + drive[0]) if is_warm else cold
         amplitude[0] = unmix @ (state - self._alpha[0])
         for k in range(1, len(length)):
             decayed = np.exp(rate * length[k - 1]) * amplitude[k - 1]
