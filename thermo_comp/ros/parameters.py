@@ -102,13 +102,10 @@ class NodeConfig:
 
     def compensator_config(self) -> CompensatorConfig:
         """Return the part that the compensator takes."""
+        # There the names say the units.
+        names = {one.name: one.name.removesuffix('_m_s2') for one in fields(CompensatorConfig)}
         return CompensatorConfig(
-            transition_time_s=self.transition_time,
-            temperature_timeout_s=self.temperature_timeout,
-            case_timeout_s=self.case_timeout,
-            stuck_timeout_s=self.stuck_timeout,
-            local_gravity_m_s2=self.local_gravity,
-            gravity_tolerance_m_s2=self.gravity_tolerance,
+            **{name: getattr(self, own.removesuffix('_s')) for name, own in names.items()}
         )
 
 
@@ -193,30 +190,24 @@ def parameters_help() -> str:
 
 def _checked(name: str, value: Any) -> Any:
     """Return a value in its parameter's type; ParameterError where it does not fit."""
-    entry = _TABLE[name]
-    if isinstance(entry.default, str):
+    metadata, rule, got = _TABLE[name].metadata, '', f'{value!r:.60}'
+    if isinstance(_TABLE[name].default, str):
+        longest, choices = metadata['longest'], metadata['choices']
         if not isinstance(value, str):
-            raise ParameterError(
-                f'parameter `{name}` must be a string, got {value!r:.60} '
-                f'({type(value).__name__}); quote it: \'"{value!s:.60}"\''
-            )
-        longest = entry.metadata['longest']
-        if not (value.isprintable() and len(value) <= longest):
-            raise ParameterError(
-                f'parameter `{name}` must be one printable line of at most {longest} '
-                f'characters, got {len(value)}: {value!r:.60}'
-            )
-        choices = entry.metadata['choices']
-        if choices and value not in choices:
-            raise ParameterError(
-                f'parameter `{name}` must be one of {", ".join(choices)}, got {value!r:.60}'
-            )
-        return value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ParameterError(f'parameter `{name}` must be a number, got {value!r:.60}')
-    lower, upper = entry.metadata['bounds']
-    if not (math.isfinite(value) and lower <= value <= upper):
-        raise ParameterError(
-            f'parameter `{name}` must be between {lower:g} and {upper:g}, got {value:g}'
-        )
-    return float(value)
+            rule = 'a string'
+            got += f' ({type(value).__name__}); quote it: \'"{value!s:.60}"\''
+        elif not (value.isprintable() and len(value) <= longest):
+            rule = f'one printable line of at most {longest} characters'
+            got = f'{len(value)}: {got}'
+        elif choices and value not in choices:
+            rule = f'one of {", ".join(choices)}'
+    elif isinstance(value, bool) or not isinstance(value, int | float):
+        rule = 'a number'
+    else:
+        lower, upper = metadata['bounds']
+        if not (math.isfinite(value) and lower <= value <= upper):
+            rule, got = f'between {lower:g} and {upper:g}', f'{value:g}'
+        value = float(value)
+    if rule:
+        raise ParameterError(f'parameter `{name}` must be {rule}, got {got}')
+    return value

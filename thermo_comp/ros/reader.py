@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from ..errors import CalibrationError
 from ..files import read_bounded
@@ -115,14 +116,12 @@ class Reader:
 
     def read(self, name: str, directory: str) -> LoadedCalibration:
         """Do what the function `read` does, there."""
-        process = self._process = self._process or _start()
-        questions, answers = cast('IO[bytes]', process.stdin), cast('IO[bytes]', process.stdout)
         try:
-            pickle.dump((name, directory), questions)
-            questions.flush()
-            # From our own process: its own classes and nothing else.
-            answer: LoadedCalibration | CalibrationError = pickle.load(answers)  # noqa: S301
-        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            if self._process is None:
+                self._start()
+            self._pipe.send((name, directory))
+            answer: LoadedCalibration | CalibrationError = self._pipe.recv()
+        except (OSError, EOFError) as error:
             self.close()
             raise CalibrationError(
                 'cannot be read: the process that reads it ended', name
@@ -131,36 +130,34 @@ class Reader:
             raise answer
         return answer
 
+    def _start(self) -> None:
+        self._pipe, theirs = Pipe()
+        # The very package that runs here; a Ctrl-C is for the node, with whom this ends.
+        code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and words
+                [sys.executable, '-c', f'{code}; serve({theirs.fileno()})'],
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+
     def close(self) -> None:
         """End the process."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()
-            # What is left to be asked may find nobody any more.
-            with suppress(BrokenPipeError), process:
-                pass
+            process.wait()
+            self._pipe.close()
 
 
-def serve() -> None:
+def serve(handle: int) -> None:
     """Read what the process is asked for, until nobody can ask any more."""
     os.nice(NICENESS)
-    with suppress(EOFError, BrokenPipeError):
+    pipe = Connection(handle)
+    with suppress(EOFError, OSError):
         while True:
-            name, directory = pickle.load(sys.stdin.buffer)  # noqa: S301 - from the node
             try:
-                answer: LoadedCalibration | CalibrationError = read(name, directory)
+                answer: LoadedCalibration | CalibrationError = read(*pipe.recv())
             except CalibrationError as error:
                 answer = error
-            pickle.dump(answer, sys.stdout.buffer)
-            sys.stdout.buffer.flush()
-
-
-def _start() -> subprocess.Popen[bytes]:
-    # The very package that runs here; a Ctrl-C is for the node, with whom this ends.
-    code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()'
-    return subprocess.Popen(  # noqa: S603 - our own interpreter and words
-        [sys.executable, '-c', code],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        start_new_session=True,
-    )
+            pipe.send(answer)

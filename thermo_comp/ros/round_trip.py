@@ -59,22 +59,20 @@ class NodeProcess:
 
     def __enter__(self) -> NodeProcess:
         """Start the process."""
-        self._folder = tempfile.TemporaryDirectory(prefix='thermo_comp_')
-        self._log = Path(self._folder.name, 'log')
+        self._log = tempfile.TemporaryFile()
         command = [sys.executable, '-m', 'thermo_comp.ros.node', '--ros-args', *self._ros_args]
         # The very package that runs here, wherever it lies.
         paths = [str(Path(__file__).resolve().parents[2]), os.environ.get('PYTHONPATH', '')]
         environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, paths))}
-        with self._log.open('wb') as log:
-            self.process = subprocess.Popen(  # noqa: S603  this interpreter, this package
-                command, stdout=log, stderr=log, env=environment
-            )
+        self.process = subprocess.Popen(  # noqa: S603  this interpreter, this package
+            command, stdout=self._log, stderr=self._log, env=environment
+        )
         return self
 
     def __exit__(self, *_: object) -> None:
         """End the process as a launch system does."""
         self.stop()
-        self._folder.cleanup()
+        self._log.close()
 
     @property
     def is_alive(self) -> bool:
@@ -84,7 +82,8 @@ class NodeProcess:
     @property
     def said(self) -> str:
         """What it has written to its standard output and error."""
-        return self._log.read_text(encoding='utf-8', errors='replace').strip()
+        # Without moving the place where it writes.
+        return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         """Send a signal, wait for the end, return the exit code."""
