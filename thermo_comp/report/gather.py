@@ -213,7 +213,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         tracker.read(*reading)
         b, c = tracker.board, tracker.case
         lead = b if c.stamp_ns is None else c
-        curve = (lead.acceleration, lead.var_acceleration)
+        curve = lead.acceleration
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *curve))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     end = (end_ns - start_ns) * 1e-9
