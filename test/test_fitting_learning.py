@@ -12,7 +12,7 @@ from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, width
 
 from thermo_comp.fitting.learning import Learnt, _downweight, _longer_gain, _within, learn
 from thermo_comp.fitting.posterior import Regression
-from thermo_comp.fitting.unknowns import Prior
+from thermo_comp.fitting.unknowns import Known, Prior
 from thermo_comp.fitting.worth import group_worth
 from thermo_comp.typing import Bools, Floats
 
@@ -258,3 +258,25 @@ def test_a_longer_memory_promises_what_it_brings() -> None:
 def test_how_bags_begin_is_learnt(start_sd: float, lower: float, upper: float) -> None:
     _, found = learnt_of(Truth(start_sd=start_sd), 18, 9)
     assert lower <= found.prior.start_share <= upper
+
+
+@pytest.mark.parametrize('away', [0.0, 30.0])
+def test_what_is_known_beforehand_is_believed_as_far_as_the_data_do(
+    calm: tuple[Regression, Learnt, Truth], away: float
+) -> None:
+    # WHY: siblings, or a unit's last calibration, may be nearer to this unit than they look, or
+    # farther. WHAT: of a narrow and a wide knowledge the evidence takes the one that is true.
+    regression, found, truth = calm
+    layout = regression.layout(wide(truth))
+    mean = regression.vector(found.posterior.state, layout)[: layout.n_unit].copy()
+    sd = np.full(layout.n_unit, 1e-5)
+    mean[layout.on_bias[:, 0]] += away * sd[0]
+    knowns = [Known(mean, np.diag((part * sd) ** -2.0)) for part in (1.0, 100.0)]
+    prior = replace(wide(truth), known=knowns[-1])
+    told = learn(regression, found.posterior.state, prior, knowns=knowns)
+    assert told.prior.known is knowns[int(away > 0.0)]
+    curve = regression.vector(told.posterior.state, layout)[layout.on_bias[:, 0]]
+    true = regression.vector(found.posterior.state, layout)[layout.on_bias[:, 0]]
+    # The same data say it: the two differ by less than each is uncertain.
+    sd = np.sqrt(told.posterior.variance[layout.on_bias[:, 0]])
+    assert np.abs(curve - true).max() < 2.0 * sd.max() < 1e-5

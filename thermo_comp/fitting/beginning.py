@@ -51,15 +51,15 @@ def regress(
         np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
         up,
     )
-    prior = _wide_prior(windows, start, up, options)
+    prior, knowns = _wide_prior(windows, start, up, options), []
     if known is not None:
         state = state_of(known, regression, up)
-        told = known_of(known, regression, state, sets, options.ageing)
+        knowns = known_of(known, regression, state, sets, options.ageing)
         prior = replace(
             prior,
             on_bias=np.ones(len(windows.data.groups)),
             on_scale=windows.data.in_scale.astype(np.float64),
-            known=told,
+            known=knowns[-1],
         )
     forced = [
         options.model == 'golovach' or group == CURVE or group in options.forced
@@ -75,6 +75,7 @@ def regress(
         # What the sets alone leave is a response, and no noise.
         walks=windows.raw.shape[1] > 0
         and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
+        knowns=knowns,
     )
     return regression, learnt
 

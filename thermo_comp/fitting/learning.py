@@ -18,7 +18,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import GroupEvidence
 from .posterior import Posterior, Regression
-from .unknowns import Prior, State
+from .unknowns import Known, Prior, State
 from .worth import earned, group_worth, mode_of, places_of, told_of, widths_of
 
 # Of the three weights of a column, what the data must tell under a wide prior to be asked.
@@ -83,9 +83,12 @@ def learn(
     tell: Callable[[float], None] | None = None,
     held: Bools | None = None,
     walks: bool = True,
+    knowns: Sequence[Known] = (),
 ) -> Learnt:
     """
     Find widths, noises and columns by the evidence.
+
+    `knowns`: what may be known beforehand, for `prior.known`.
 
     `forced`: columns that stay whatever they earn, shape (m,). `held`: columns of the scale that
     keep their width, and their place: the data cannot tell them from those of the bias, shape
@@ -118,6 +121,14 @@ def learn(
         tell(0.7)
         if not asks or _longer_gain(regression, posterior, prior, allowed, reach) < _LONGER_EARNED:
             break
+    if knowns:
+        tried = [
+            regression.solve(posterior.state, replace(prior, known=one), n_steps=3)
+            for one in knowns
+        ]
+        best = int(np.argmax([one.log_evidence for one in tried]))
+        prior = replace(prior, known=knowns[best])
+        posterior, prior = _settle(regression, tried[best].state, prior, fixed)
     while True:
         idle = _idle(posterior, prior, {'bias': kept, 'scale': kept | held})
         if not any(idle.values()):
@@ -168,9 +179,7 @@ def _longer_gain(
 
 
 def _idle(posterior: Posterior, prior: Prior, kept: dict[str, Bools]) -> dict[str, list[int]]:
-    """
-    Find the columns that do not earn their place: the least first, the others then without it.
-    """
+    """Find the columns that earn no place: the least first, the others then without it."""
     mode, covariance = mode_of(posterior), posterior.covariance
     asked = []
     for part in ('bias', 'scale'):
@@ -268,7 +277,9 @@ def _settle(
         offset_sd, skew_sd = prior.offset_sd, prior.skew_sd
         told_offset, power = _told_of(posterior, vector, posterior.layout.offset)
         if told_offset > 0.3:
-            least = max(0.03 * _position_sd(regression, prior), prior.least_offset_sd)
+            per_position = len(regression.windows.time) / regression.windows.n_positions
+            of_mean = float(np.mean(prior.sigma)) / np.sqrt(per_position)
+            least = max(0.03 * of_mean, prior.least_offset_sd)
             offset_sd = max(np.sqrt(power / told_offset), least)
             if told_offset > 1.0:
                 change = max(change, float(np.abs(np.log(offset_sd / prior.offset_sd))))
@@ -295,9 +306,7 @@ def _settle(
 
 
 def _smallest(regression: Regression, prior: Prior, part: str) -> float:
-    """
-    Return a width that the data cannot tell from 0; a column that stays all the same keeps it.
-    """
+    """Return a width that is as good as 0; a column that stays all the same keeps it."""
     sd = 1e-2 * float(np.mean(prior.sigma) / np.sqrt(len(regression.windows.time)))
     return sd if part == 'bias' else sd / (regression.gravity or 1.0)
 
@@ -322,11 +331,6 @@ def _start_share(regression: Regression, posterior: Posterior) -> float:
     power = float(np.einsum('bi,ij,bj->', start, regression.start_information, start))
     # The run-time prior counts for one: a single bag must not be sure of itself.
     return float(min((power + 1.0) / (told + 1.0), 1.0))
-
-
-def _position_sd(regression: Regression, prior: Prior) -> float:
-    n = len(regression.windows.time) / regression.windows.n_positions
-    return float(np.mean(prior.sigma) / np.sqrt(n))
 
 
 def _sigma(posterior: Posterior, prior: Prior) -> Floats:

@@ -40,9 +40,10 @@ from .windows import Sets
 
 #: A population needs so many units to have a scatter.
 UNITS_NEEDED = 3
-#: What siblings do not have in common may lie in other directions than those few units show: this
-#: part of the scatter counts for each parameter by itself.
-_ALONE = 0.5
+# What siblings do not have in common may lie in other directions than those few units show: this
+# part of the scatter counts for each parameter by itself, and parts of it more may be added.
+_ALONE = 0.01
+_MORE_ALONE = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 # Correlations are believed to this part of a variance.
 _EXACT = 1e-6
 
@@ -125,11 +126,12 @@ def state_of(calibration: Calibration, regression: Regression, up: Floats) -> St
 
 def known_of(
     calibration: Calibration, regression: Regression, state: State, sets: Sets, ageing: Ageing
-) -> Known:
+) -> list[Known]:
     """
-    Turn a calibration into the prior of a regression on its columns.
+    Turn a calibration into the prior of a regression on its columns: several, for the evidence.
 
-    Raises FitError if the calibration makes no claim.
+    Each takes more of every parameter's variance for its own. Raises FitError if the calibration
+    makes no claim.
     """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an import makes no claim to build on')
@@ -147,17 +149,17 @@ def known_of(
             covariance[np.ix_(levels, levels)] += sd * sd
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
-    covariance[np.diag_indices_from(covariance)] += _EXACT * floor
-    prior = regression.plain_prior()
-    layout = regression.layout(prior)
+    layout = regression.layout(regression.plain_prior())
     to_file = file_parameters(regression, layout, state, sets, K, range(len(calibration.response)))
-    root = np.sqrt(np.diag(covariance))
-    scaled = to_file / root[:, None]
-    correlation = covariance / np.outer(root, root)
-    precision = scaled.T @ np.linalg.solve(correlation, scaled)
-    return Known(
-        regression.vector(state, layout)[: layout.n_unit], (precision + precision.T) / 2.0
-    )
+    root = np.sqrt(floor)
+    scaled, correlation = to_file / root[:, None], covariance / np.outer(root, root)
+    mean = regression.vector(state, layout)[: layout.n_unit]
+    result = []
+    for more in _MORE_ALONE:
+        wider = correlation + (_EXACT + more) * np.eye(len(root))
+        precision = scaled.T @ np.linalg.solve(wider, scaled)
+        result.append(Known(mean, (precision + precision.T) / 2.0))
+    return result
 
 
 def population(calibrations: Sequence[Calibration]) -> Calibration:
