@@ -20,7 +20,7 @@ from builders import rich_calibration
 from conftest import Cli, parsed
 
 from thermo_comp.cli import output
-from thermo_comp.cli.app import app, split_ros_arguments
+from thermo_comp.cli.app import app, split_arguments
 from thermo_comp.recording import BagWriter, inspect_recording, read_recording
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -194,8 +194,8 @@ class TestPlay:
 
     def test_ros_arguments_end_where_ros_says(self) -> None:
         words = ['play', 'a', '--ros-args', '-r', 'x:=y', '--', '-q']
-        assert split_ros_arguments(words) == (['play', 'a', '-q'], ['-r', 'x:=y'])
-        assert split_ros_arguments(['info', '--', 'a']) == (['info', '--', 'a'], [])
+        assert split_arguments(words) == (['play', 'a', '-q'], ['-r', 'x:=y'])
+        assert split_arguments(['info', '--', 'a']) == (['info', '--', 'a'], [])
 
 
 class TestReport:

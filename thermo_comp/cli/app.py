@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def run(arguments: list[str]) -> int:
     """Run a command line without the program's name and return its exit code."""
-    arguments, ros_arguments = split_ros_arguments(_with_topics(arguments))
+    arguments, ros_arguments = split_arguments(arguments)
     if not arguments:
         app(['--help'], prog_name='thermo_comp', standalone_mode=False)
         return 2
@@ -109,33 +109,27 @@ def run(arguments: list[str]) -> int:
     return code if isinstance(code, int) else 0
 
 
-def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
+def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
     """
-    Take out what stands between ``--ros-args`` and ``--`` (or the end), as ROS 2 does: own, ROS's.
+    Give a command's own arguments and ROS's, which stand behind ``--ros-args`` up to ``--``.
+
+    ``--counts-topic T`` and its like, the spelling of 0.1, become ``--topic counts=T``.
     """
     own: list[str] = []
     ros: list[str] = []
-    target = own
-    for argument in arguments:
+    target, given = own, iter(arguments)
+    for argument in given:
+        old = _OLD_TOPIC.fullmatch(argument)
         if argument == '--ros-args':
             target = ros
         elif argument == '--' and target is ros:
             target = own
+        elif old and target is own:
+            topic = next(given, '') if old[2] is None else old[2]
+            own += ['--topic', f'{old[1]}={topic}']
         else:
             target.append(argument)
     return own, ros
-
-
-def _with_topics(arguments: list[str]) -> list[str]:
-    """Read ``--counts-topic T`` and its like, the spelling of 0.1, as ``--topic counts=T``."""
-    given, said = iter(arguments), []
-    for argument in given:
-        if old := _OLD_TOPIC.fullmatch(argument):
-            topic = next(given, '') if old[2] is None else old[2]
-            said += ['--topic', f'{old[1]}={topic}']
-        else:
-            said.append(argument)
-    return said
 
 
 def _unexpected(failure: Exception) -> int:

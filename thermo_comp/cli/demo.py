@@ -141,8 +141,7 @@ def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
         for name, chosen in _MODELS.items():
             calibrations[name] = fit(bags, gravity=STANDARD_GRAVITY, **chosen)
             done(len(calibrations))
-    for name, file in (('node', 'unit.yaml'), ('one set', 'one_set.yaml')):
-        save_calibration(calibrations[name], output / file)
+    save_calibration(calibrations['node'], output / 'unit.yaml')
     return calibrations
 
 
@@ -153,21 +152,14 @@ def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool
     from ..recording import Topics, read_recording
     from ..replay import replay
 
+    def columns(path: Path) -> tuple[Any, ...]:
+        found = read_recording(path, Topics(imu=_OUTPUT), 'imu', require=['accel']).columns
+        beside = found.imu and found.imu.linear_acceleration_covariance
+        return found.accel_stamp_ns, found.accel, beside
+
     with TemporaryDirectory(prefix='thermo_comp-') as folder:
-        offline = replay(bag, calibration, Path(folder) / 'offline.mcap').output
-        live, own = (
-            read_recording(path, Topics(imu=_OUTPUT), 'imu', require=['accel']).columns
-            for path in (recorded, offline)
-        )
-    return (
-        live.imu is not None
-        and own.imu is not None
-        and np.array_equal(own.accel_stamp_ns, live.accel_stamp_ns)
-        and np.array_equal(own.accel, live.accel)
-        and np.array_equal(
-            own.imu.linear_acceleration_covariance, live.imu.linear_acceleration_covariance
-        )
-    )
+        offline = columns(replay(bag, calibration, Path(folder) / 'offline.mcap').output)
+    return all(map(np.array_equal, columns(recorded), offline))
 
 
 def _say(out: Output, result: Evaluation) -> None:

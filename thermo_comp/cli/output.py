@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -207,20 +206,15 @@ def picked(value: object, names: str) -> dict[str, Any]:
     return {name: getattr(value, name) for name in names.split()}
 
 
-def plain(value: Any) -> Any:
-    """Return a value in JSON's types: arrays as lists, dataclasses as objects, NaN as null."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+def plain(data: object) -> Any:
+    """Return data in JSON's types: arrays as lists, dataclasses as objects, NaN as null."""
+    return json.loads(json.dumps(data, default=_plainer), parse_constant=lambda _: None)
+
+
+def _plainer(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain(item) for item in value]
-    if isinstance(value, (bool, type(None))):
-        return value
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    if hasattr(value, 'tolist'):  # numpy arrays and scalars, without importing numpy
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return int(value) if isinstance(value, int) else str(value)
+        return dict(value)
+    # numpy's arrays and scalars, without importing it
+    return value.tolist() if hasattr(value, 'tolist') else str(value)
