@@ -92,11 +92,11 @@ def test_specimens_differ_and_return() -> None:
 class _Campaign:
     """Minute means of runs in several positions, with the known forces."""
 
-    def __init__(self, unit: UnitModel, program: Cyclogram, seed: int, n: int = 9) -> None:
+    def __init__(self, unit: UnitModel, program: Cyclogram, seed: int, ups: Floats) -> None:
         self.unit, truth = unit, None
         self.columns: list[dict[str, Floats]] = []
         counts, force = [], []
-        for k, up in enumerate(positions(9, seed)[:n]):
+        for k, up in enumerate(ups):
             run = simulate(unit, program, up, rate_hz=RATE_HZ, seed=100 * seed + k, like=truth)
             truth = run.truth
             n = len(run.counts) // int(RATE_HZ * MINUTE)
@@ -192,8 +192,8 @@ def test_what_each_description_can_reach() -> None:
     }
     for name, rows in bounds.items():
         unit = unit_preset(name, 1)
-        fitted = _Campaign(unit, parse_cyclogram('paper'), 1)
-        seen = _Campaign(unit, parse_cyclogram('held-out'), 2, n=4)
+        fitted = _Campaign(unit, parse_cyclogram('paper'), 1, positions(6, 1))
+        seen = _Campaign(unit, parse_cyclogram('held-out'), 2, positions(9, 2)[:4])
         for kind, (low, high) in rows.items():
             error = _norm_error(kind, fitted, seen)
             print(f'{name} {kind}: {error:.2f} ug')
@@ -203,8 +203,8 @@ def test_what_each_description_can_reach() -> None:
 
 def test_mems_is_limited_by_its_noise() -> None:
     unit = unit_preset('mems', 1)
-    fitted = _Campaign(unit, parse_cyclogram('paper'), 1)
-    seen = _Campaign(unit, parse_cyclogram('held-out'), 2, n=4)
+    fitted = _Campaign(unit, parse_cyclogram('paper'), 1, positions(6, 1))
+    seen = _Campaign(unit, parse_cyclogram('held-out'), 2, positions(9, 2)[:4])
     floor = np.sqrt(np.mean(np.square(unit.noise_density)) / MINUTE)
     assert _norm_error('raw', fitted, seen) > 500.0
     # Creep of a few ug/K and the converter's rounding stand beside the white noise.
