@@ -7,9 +7,8 @@ bags; ``export`` and ``import``, a calibration into their files and back.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -98,9 +97,8 @@ def convert(
         '--topic': names or None,
         '--unit': None if unit == 'm/s^2' else unit,
     }
-    read = _reader(out, log, given)
     with out.progress('converting') as done:
-        report = write_log(read(), output, force, done)
+        report = write_log(_read(out, log, given), output, force, done)
     _say(out, report)
     out.told([(log, report.chosen, report.missing)])
     out.end()
@@ -128,13 +126,13 @@ def as_bags(
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
             bags[path].parent.mkdir()
-            read = _reader(out, path, {'--columns': columns, '--rate-hz': rate_hz})
-            write_log(read(), bags[path])
+            given = {'--columns': columns, '--rate-hz': rate_hz}
+            write_log(_read(out, path, given), bags[path])
         yield [bags.get(path, path) for path in paths]
 
 
-def _reader(out: Output, path: Path, given: Mapping[str, Any]) -> Callable[[], ForeignLog]:
-    """Choose what reads an input, by its name; refuse options that it has no use for."""
+def _read(out: Output, path: Path, given: Mapping[str, Any]) -> ForeignLog:
+    """Read a table, log or bag, which its name tells; refuse options that it has no use for."""
     from .. import convert
 
     kind = _kind_of(path)
@@ -146,21 +144,21 @@ def _reader(out: Output, path: Path, given: Mapping[str, Any]) -> Callable[[], F
         names = said.get('--topic', {})
         if not names.keys() <= {'imu', 'board', 'case'}:
             raise options.usage('--topic: of a bag, imu, board and case are converted')
-        return partial(convert.bag_log, path, **names, unit=said.get('--unit', 'm/s^2'))
+        return convert.bag_log(path, **names, unit=said.get('--unit', 'm/s^2'))
     if kind == 'log':
         read = convert.read_ulog if path.suffix.lower() == '.ulg' else convert.read_dataflash
         imu, baro, is_allowed = (said.get(flag) for flag in _OPTIONS['log'])
-        return partial(read, path, imu, baro, bool(is_allowed))
+        return read(path, imu, baro, bool(is_allowed))
     columns, rate_hz = said.get('--columns'), said.get('--rate-hz')
     if columns is not None and rate_hz is not None:
         raise options.usage('--rate-hz: a column map says that')
     if columns is not None:
-        return partial(convert.table_log, path, convert.load_column_map(columns))
+        return convert.table_log(path, convert.load_column_map(columns))
     if path.suffix.lower() in ('.parquet', '.pq'):
         raise options.usage('a Parquet table needs --columns MAP')
     guessed = convert.guess_columns(path, rate_hz)
     out.line(f'{path}: taken as {convert.spoken_columns(guessed)}; --columns says otherwise')
-    return partial(convert.table_log, path, guessed)
+    return convert.table_log(path, guessed)
 
 
 def _say(out: Output, report: ConversionReport) -> None:
