@@ -99,7 +99,7 @@ def assert_same(live: Path, offline: Path) -> None:
     assert different.tolist() == []
     assert found.imu is not None
     assert expected.imu is not None
-    for name in ImuColumns.__dataclass_fields__:
+    for name in ImuColumns._fields:
         assert getattr(found.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
     # The k-th flag belongs to the k-th case reading: equal flags are equal switch times.
     assert (len(flags), flags) == (len(expected_flags), expected_flags)

@@ -104,7 +104,7 @@ def test_cut_inside_a_compressed_chunk_gives_a_prefix(tmp_path: Path, compressio
     messages = regular_messages(24)
     path = tmp_path / 'bag.mcap'
     counts: list[int] = []
-    for cut in every_cut(content, position, length):
+    for cut in [*every_cut(content, position, length)[::3], len(content) - 1]:
         path.write_bytes(content[:cut])
         recording = read(path)
         counts.append(recording.info.n_messages)
@@ -185,7 +185,7 @@ def test_a_torn_directory_says_which_file(tmp_path: Path) -> None:
     assert 'no message is' in str(info.truncated)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(
     data=st.data(),
     compression=st.sampled_from(['none', 'lz4', 'zstd', 'unchunked']),

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,7 @@ from .recording import (
     open_recording,
 )
 from .recording.table_out import TABLES, WriteRows, table_writer
+from .typing import Ints
 from .unit.calibration import Calibration
 
 OUTPUT_TOPIC = 'imu/data_raw'
@@ -50,12 +51,9 @@ BLOCK_MESSAGES = 1 << 15
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
 
-@dataclass(frozen=True)
-class CorrectedBlock:
+class CorrectedBlock(NamedTuple):
     """
-    One block of a recording and what the compensator made of it.
-
-    A flag is the stamp of a case reading and the regime at it (True = dynamic).
+    One block of a recording, and what the compensator made of it: flags are stamp and regime.
     """
 
     block: Block
@@ -115,16 +113,6 @@ def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
     return ('accel', 'board') if any(one.needs_temperature for one in calibrations) else ('accel',)
 
 
-def corrected_blocks(
-    compensator: Compensator, blocks: Iterable[Block]
-) -> Iterable[CorrectedBlock]:
-    """Run blocks, in file order, through a compensator; its counters go on counting."""
-    for block in blocks:
-        rate = None if block.imu is None else block.imu.angular_velocity
-        corrected = process_block(compensator, block, rate)
-        yield CorrectedBlock(block, corrected, compensator.take_flags())
-
-
 def replay(
     path: str | Path,
     calibration: Calibration,
@@ -144,13 +132,10 @@ def replay(
     Correct a recording and write what the node would publish.
 
     The output is a bag, ``*.mcap`` or a rosbag2 directory; or ``*.csv`` or ``*.parquet``, a table
-    of the corrected samples. `input` is by default what the calibration is for, `serial` as in
-    `check_unit`; an empty `frame_id` keeps the input's. `keep_inputs` copies the input messages
-    beside the output, at their own stamps; `all_topics` these and every other topic, at their log
-    times, but none that bears an output's name. `progress` is called with the fraction done.
-
-    Raises RecordingError if the recording cannot be read, OutputError if the output may not or
-    cannot be written, CalibrationError if the calibration is for another unit.
+    of the corrected samples. An empty `frame_id` keeps the input's. `keep_inputs` copies the input
+    messages at their stamps; `all_topics` these and every other topic at their log times, but none
+    that bears an output's name. `progress` is called with the fraction done. Raises
+    RecordingError, OutputError, and CalibrationError if the calibration is for another unit.
     """
     compensator = Compensator(calibration, config)
     wanted = input_for(calibration, input)
@@ -170,22 +155,18 @@ def replay(
             sink = _rows_of(table_writer(output, metadata, overwrite=overwrite))
         else:
             bag = BagWriter(output, metadata=metadata, overwrite=overwrite)
-            others = _others(reader) if all_topics else ()
-            sink = _messages_of(bag, reader, metadata['serial'], frame_id, others)
+            sink = _messages_of(bag, reader, metadata['serial'], frame_id, all_topics)
         with sink as write:
-            blocks = reader.blocks(raw=is_raw, n_messages=BLOCK_MESSAGES)
-            for item in corrected_blocks(compensator, blocks):
-                write(item)
-                flags += item.flags
+            for block in reader.blocks(raw=is_raw, n_messages=BLOCK_MESSAGES):
+                rate = None if block.imu is None else block.imu.angular_velocity
+                corrected = process_block(compensator, block, rate)
+                new = compensator.take_flags()
+                write(CorrectedBlock(block, corrected, new))
+                flags += new
                 if progress is not None:
                     progress(compensator.counters.n_in / max(total, 1))
-        return ReplayResult(
-            info=reader.info,
-            output=Path(output),
-            counters=compensator.counters,
-            n_flags=len(flags),
-            switches=switches(flags),
-        )
+        counters = compensator.counters
+        return ReplayResult(reader.info, Path(output), counters, len(flags), switches(flags))
 
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
@@ -199,21 +180,22 @@ def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
 
 @contextmanager
 def _messages_of(
-    bag: BagWriter,
-    reader: RecordingReader,
-    serial: str,
-    frame_id: str,
-    others: Iterable[RawMessages],
+    bag: BagWriter, reader: RecordingReader, serial: str, frame_id: str, all_topics: bool
 ) -> Iterator[WriteBlock]:
     """Write blocks as the node's messages, and beside them what was recorded until then."""
-    following = iter(others)
+    taken = {OUTPUT_TOPIC, REGIME_TOPIC, STAMPED_TOPIC}
+    taken |= {topic.strip('/') for topic in reader.topics.values()}
+    others = {topic for topic in reader.info.topics if topic.strip('/') not in taken}
+    following = reader.raw(others if all_topics else ())
     one = next(following, None)
 
-    def copy(until_ns: float) -> None:
+    def copy(raw: RawMessages, times: Ints) -> None:
+        writer.write_raw(raw.topic, raw.type, times, raw, reader.definitions.get(raw.type))
+
+    def copy_others(until_ns: float) -> None:
         nonlocal one
         while one is not None and one.log_ns[0] <= until_ns:
-            definition = reader.definitions.get(one.type)
-            writer.write_raw(one.topic, one.type, one.log_ns, one, definition)
+            copy(one, one.log_ns)
             one = next(following, None)
 
     def write(item: CorrectedBlock) -> None:
@@ -233,14 +215,17 @@ def _messages_of(
             writer.write_bool(REGIME_TOPIC, times, np.array(values))
             stamped = [stamped_flag(*flag, serial) for flag in item.flags]
             writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
-        _write_inputs(writer, block, reader)
+        # Their log time becomes their stamp, as that of the outputs is.
+        for role, raw in block.raw.items():
+            is_accel = role == 'accel'
+            copy(raw, block.accel_stamp_ns if is_accel else block.temperatures[role].stamp_ns)
         if len(block):
-            copy(block.log_ns['accel'][-1])
+            copy_others(block.log_ns['accel'][-1])
         writer.flush()
 
     with bag as writer:
         yield write
-        copy(inf)
+        copy_others(inf)
 
 
 @contextmanager
@@ -282,24 +267,7 @@ def _imu_of(item: CorrectedBlock) -> ImuColumns | None:
     is_rate = before[:, :1] != -1.0
     covariance = np.zeros_like(before)
     covariance[:, ::4] = corrected.angular_rate_variance
-    return replace(
-        imu,
+    return imu._replace(
         angular_velocity=np.where(is_rate, corrected.angular_rate, imu.angular_velocity),
         angular_velocity_covariance=np.where(is_rate, covariance, before),
     )
-
-
-def _others(reader: RecordingReader) -> Iterator[RawMessages]:
-    """Read the topics that are neither inputs nor outputs."""
-    taken = {OUTPUT_TOPIC, REGIME_TOPIC, STAMPED_TOPIC}
-    taken |= {topic.strip('/') for topic in reader.topics.values()}
-    return reader.raw({topic for topic in reader.info.topics if topic.strip('/') not in taken})
-
-
-def _write_inputs(writer: BagWriter, block: Block, reader: RecordingReader) -> None:
-    """Copy the inputs; their log time becomes their stamp, as that of the outputs is."""
-    stamps = {name: one.stamp_ns for name, one in block.temperatures.items()}
-    stamps['accel'] = block.accel_stamp_ns
-    for role, raw in block.raw.items():
-        definition = reader.definitions.get(raw.type)
-        writer.write_raw(raw.topic, raw.type, stamps[role], raw, definition)

@@ -66,11 +66,7 @@ class Span:
 
 
 def parse_chunk_head(head: bytes, position: int) -> tuple[Span, str, int, int]:
-    """
-    Read the first bytes of the chunk at this place of the file.
-
-    Gives its span, the compression, where in the record the packed bytes begin, and the checksum.
-    """
+    """Read the head of the chunk at this place: its span, compression, begin of data, checksum."""
     try:
         found = _CHUNK_HEAD.unpack_from(head)
         opcode, content, start_ns, end_ns, size, checksum, n_name = found
@@ -132,11 +128,7 @@ def _load_chunk(read_at: ReadAt, span: Span, on_record: OnRecord) -> Messages:
 
 
 def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
-    """
-    Find all messages of a whole chunk, with the message index records behind it as a hint.
-
-    Raises DamagedError where the bytes are no sequence of records.
-    """
+    """Find all messages of a whole chunk, with the message index records behind it as a hint."""
     messages = _indexed(data, index, on_record)
     if messages is None:
         messages, end, reason = walk(data, on_record)

@@ -31,11 +31,7 @@ _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
 def without_jumps(blocks: Iterable[Block]) -> Iterator[Block]:
-    """
-    Take the jumps out of the stamps of blocks: behind a jump all are moved, by the same.
-
-    Raises RecordingError for stamps that jump all the time, or hold hardly a message a minute.
-    """
+    """Move stamps behind a jump, all by the same; RecordingError for stamps that are no clock."""
     last_ns: int | None = None
     offset = 0
     n_jumps = n_messages = span_ns = 0
@@ -82,11 +78,7 @@ def without_jumps(blocks: Iterable[Block]) -> Iterator[Block]:
 
 
 class Cut:
-    """
-    Leaves out of blocks what is outside a part.
-
-    `since_s` is where the first sample that was kept stands, since the bag's first one.
-    """
+    """Leaves out of blocks what is outside a part; `since_s` is where it begins in the bag."""
 
     def __init__(self, path: Path, part: Part) -> None:
         self._path = path

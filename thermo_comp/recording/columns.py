@@ -10,7 +10,7 @@ A column is a numpy array with one row per message. All times are integer nanose
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -68,8 +68,7 @@ def count_topics(channels: Iterable[Topic]) -> dict[str, tuple[str, int]]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class ImuColumns:
+class ImuColumns(NamedTuple):
     """
     What a sensor_msgs/Imu carries beside its stamp and its linear acceleration.
 
@@ -94,16 +93,11 @@ class ImuColumns:
 
     def take(self, rows: Ints | Bools) -> ImuColumns:
         """Choose some messages."""
-        return ImuColumns(*(getattr(self, one.name)[rows] for one in fields(self)))
+        return ImuColumns(*(one[rows] for one in self))
 
 
-@dataclass(frozen=True, slots=True)
-class RawMessages:
-    """
-    Serialized messages of one topic, as they stand in the bag.
-
-    `data` are their bytes, one after the other, `ends` where each ends, shape (n,).
-    """
+class RawMessages(NamedTuple):
+    """Serialized messages of one topic, behind each other in `data`, each up to its `ends`."""
 
     topic: str
     type: str
@@ -119,11 +113,7 @@ class RawMessages:
 
 
 class Readings(NamedTuple):
-    """
-    What one thermometer said, shape (m,) each.
-
-    `after` counts how many of the block's accelerometer messages stand before each reading.
-    """
+    """What one thermometer said, shape (m,), `after` so many of the samples of its block."""
 
     stamp_ns: Ints
     celsius: Floats
@@ -190,8 +180,7 @@ def empty_block(names: Iterable[str]) -> Block:
     return Block(NO_READINGS.stamp_ns, np.empty((0, 3)), '', None, temperatures, log_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class Recording:
+class Recording(NamedTuple):
     """A whole bag in memory, as one block with the `frame_id` of the first sample."""
 
     info: RecordingInfo
@@ -224,38 +213,25 @@ def joined(blocks: Sequence[Block]) -> Block:
     begins = np.cumsum([0, *map(len, blocks)])
     temperatures = {}
     for name in blocks[0].temperatures:
-        each = [block.temperatures[name] for block in blocks]
-        after = [one.after + begin for one, begin in zip(each, begins, strict=False)]
-        temperatures[name] = Readings(
-            np.concatenate([one.stamp_ns for one in each]),
-            np.concatenate([one.celsius for one in each]),
-            np.concatenate(after),
-        )
+        stamps, celsius, afters = zip(*(block.temperatures[name] for block in blocks), strict=True)
+        moved = [after + begin for after, begin in zip(afters, begins, strict=False)]
+        temperatures[name] = Readings(*map(np.concatenate, (stamps, celsius, moved)))
     imus = [block.imu for block in blocks if block.imu is not None]
-    raws: dict[Role, list[RawMessages]] = {}
-    for role, raw in (own for block in blocks for own in block.raw.items()):
-        raws.setdefault(role, []).append(raw)
+    raws = {}
+    for role in dict.fromkeys(role for block in blocks for role in block.raw):
+        pieces = [block.raw[role] for block in blocks if role in block.raw]
+        ats = np.cumsum([0, *(len(one.data) for one in pieces)])
+        raws[role] = pieces[0]._replace(
+            log_ns=np.concatenate([one.log_ns for one in pieces]),
+            data=np.concatenate([one.data for one in pieces]),
+            ends=np.concatenate([one.ends + at for one, at in zip(pieces, ats, strict=False)]),
+        )
     return Block(
         np.concatenate([block.accel_stamp_ns for block in blocks]),
         np.concatenate([block.accel for block in blocks]),
         next((block.frame_id for block in blocks if len(block)), ''),
-        ImuColumns(
-            *(np.concatenate([getattr(imu, own.name) for imu in imus]) for own in fields(imus[0]))
-        )
-        if imus
-        else None,
+        ImuColumns(*map(np.concatenate, zip(*imus, strict=True))) if imus else None,
         temperatures,
         {role: np.concatenate([b.log_ns[role] for b in blocks]) for role in blocks[0].log_ns},
-        {role: _joined_raw(pieces) for role, pieces in raws.items()},
-    )
-
-
-def _joined_raw(pieces: Sequence[RawMessages]) -> RawMessages:
-    begins = np.cumsum([0, *(len(one.data) for one in pieces)])
-    return RawMessages(
-        pieces[0].topic,
-        pieces[0].type,
-        np.concatenate([one.log_ns for one in pieces]),
-        np.concatenate([one.data for one in pieces]),
-        np.concatenate([one.ends + at for one, at in zip(pieces, begins, strict=False)]),
+        raws,
     )

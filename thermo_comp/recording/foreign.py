@@ -8,38 +8,26 @@ Owns every storage that is not plain MCAP: sqlite3, ROS 1 and packed messages, t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from ..errors import RecordingError
-from .messages import Messages, Topic
+from .messages import BagFile, Done, Messages, Topic, Work
 from .unpack import translated, unpack_message, unpack_ros1_chunk
 
-_Done = TypeVar('_Done')
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 
 
-class ForeignFile:
-    """
-    One file that `rosbags` reads, as `reader.BagFile`: ``.db3``, ``.mcap`` or a ROS 1 ``.bag``.
-
-    `is_packed` where rosbag2 has compressed message by message; a `name` is what errors call it.
-    Raises RecordingError for whatever `rosbags` cannot open.
-    """
+class ForeignFile(BagFile):
+    """One file that `rosbags` reads; `is_packed` where each message is compressed by itself."""
 
     def __init__(self, path: Path, name: Path, *, is_packed: bool = False) -> None:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
 
-        self.path = name
-        self.truncated: str | None = None
-        self.metadata: dict[str, str] = {}
-        self.definitions: dict[str, tuple[str, str]] = {}
-        self.topics: dict[int, Topic] = {}
-        self.start_ns: int | None = None
-        self.end_ns: int | None = None
+        super().__init__(name)
         self._is_packed = is_packed
         is_ros1 = path.suffix == '.bag'
         self.storage = {'.bag': 'ros1', '.mcap': 'mcap'}.get(path.suffix, 'sqlite3')
@@ -64,9 +52,7 @@ class ForeignFile:
                         one.msgdef.data,
                     )
 
-    def read(
-        self, channels: Collection[int], work: Callable[[Messages], _Done]
-    ) -> Iterator[_Done]:
+    def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
         """Read the messages of channels in reading order, and do some work on them."""
         yield from map(work, self._messages(channels))
 

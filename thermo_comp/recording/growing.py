@@ -14,7 +14,6 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -142,7 +141,7 @@ class PositionBags:
                 name = _USUAL.imu if one.type == IMU else _USUAL.counts
             else:
                 stamp_ns, name = block.temperatures[role].stamp_ns, f'temperature/{role}'
-            self._held.append(_Piece(stamp_ns, replace(one, topic=name)))
+            self._held.append(_Piece(stamp_ns, one._replace(topic=name)))
 
     def release(self, stamp_ns: int) -> None:
         """Write what is older than a stamp."""

@@ -17,11 +17,12 @@ import os
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future
+from contextlib import ExitStack
 from dataclasses import replace
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -32,7 +33,7 @@ from mcap.stream_reader import StreamReader
 from ..errors import RecordingError
 from ..files import open_regular
 from .chunks import HEAD_BYTES, PREFIX, Span, load, parse_chunk_head
-from .messages import Messages, Topic, join_messages
+from .messages import BagFile, Done, Messages, Topic, Work, join_messages
 from .unpack import MAX_CHUNK_BYTES, DamagedError, translated
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -48,59 +49,33 @@ _N_AHEAD = 8
 _AHEAD_BYTES = 1 << 26
 #: Messages of overlapping chunks that are held back at most [bytes].
 _MAX_HELD_BYTES = 1 << 26
-_Done = TypeVar('_Done')
 # Versions of mcap differ in what of it is typed.
 _new_stream: Any = ReadDataStream
 
 
-class McapFile:
-    """
-    One open MCAP file, as `reader.BagFile`; `pool` reads ahead.
-
-    Its `spans` hold messages, in the order of the file. Raises RecordingError for what is no MCAP
-    file, or damaged other than at its end; a `name` is what errors call it.
-    """
-
-    storage = 'mcap'
+class McapFile(BagFile):
+    """One open MCAP file; its `spans` hold messages, in their order; `pool` reads ahead."""
 
     def __init__(self, path: Path, name: Path, pool: Executor) -> None:
-        self.path = name
+        super().__init__(name)
         self.spans: list[Span] = []
-        self.topics: dict[int, Topic] = {}
-        self.definitions: dict[str, tuple[str, str]] = {}
-        self.start_ns: int | None = None
-        self.end_ns: int | None = None
-        self.metadata: dict[str, str] = {}
-        self.truncated: str | None = None
         self._pool = pool
         self._counts: Counter[int] = Counter()
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
-        try:
-            self._file = open_regular(path)
-        except OSError as error:
-            raise RecordingError(f'cannot be opened: {error.strerror}', name) from error
-        self._size = os.fstat(self._file.fileno()).st_size
-        try:
-            with translated(name):
-                self._map()
-        except BaseException:
-            self.close()
-            raise
+        with translated(name), ExitStack() as opened:
+            self._file = opened.enter_context(open_regular(path))
+            self._size = os.fstat(self._file.fileno()).st_size
+            self._map()
+            opened.pop_all()
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def read(
-        self, channels: Collection[int], work: Callable[[Messages], _Done]
-    ) -> Iterator[_Done]:
-        """
-        Read the messages of channels in reading order, and do some work on them.
-
-        What one thread has decompressed it works on, too, where it can: then the bytes are in its
-        processor's cache.
-        """
+    def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
+        """Read the messages of channels in reading order, and do some work on them."""
+        # What a thread has decompressed it works on, too: it has the bytes in its cache.
         if all(one.end_ns <= other.start_ns for one, other in pairwise(self.spans)):
             yield from self._ahead(self.spans, lambda span: work(self._load(span, channels)))
             return
@@ -110,14 +85,11 @@ class McapFile:
         loaded = self._ahead(spans, lambda span: self._load(span, channels))
         yield from map(work, _in_order(zip(order, loaded, following, strict=True)))
 
-    def _ahead(self, spans: Iterable[Span], work: Callable[[Span], _Done]) -> Iterator[_Done]:
-        """
-        Read, decompress and work ahead in threads; most of it needs no interpreter lock.
-
-        The pool is not this generator's own: one that is given up is closed by the garbage
-        collector, anywhere, where waiting for a thread may be a deadlock.
-        """
-        waiting: deque[tuple[int, Future[_Done]]] = deque()
+    def _ahead(self, spans: Iterable[Span], work: Callable[[Span], Done]) -> Iterator[Done]:
+        """Read, decompress and work ahead in threads; most of it needs no interpreter lock."""
+        # The pool is not this generator's own: one that is given up is closed by the garbage
+        # collector, anywhere, where waiting for a thread may be a deadlock.
+        waiting: deque[tuple[int, Future[Done]]] = deque()
         try:
             for span in spans:
                 while waiting and (
@@ -336,12 +308,9 @@ class McapFile:
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """
-    Merge stretches that overlap, given with their numbers and the first log time of what follows.
-
-    Once the next one begins at time t, whatever was read before t is final. So only the messages
-    of chunks that overlap at one instant are ever held back.
-    """
+    """Merge stretches, given with their numbers and the first log time of what follows."""
+    # Once the next one begins at time t, whatever was read before t is final. So only the messages
+    # of chunks that overlap at one instant are ever held back.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:
         held[row] = piece

@@ -21,20 +21,9 @@ from typing import Any, Literal
 import lz4.frame
 import numpy as np
 import zstandard
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
 
 from .. import __version__
 from ..errors import RecordingError
@@ -76,12 +65,12 @@ class McapOutput:
         self._compression = '' if compression == 'none' else compression
         self._compress = _compressor(compression, level)
         self._chunk_bytes = chunk_bytes
-        self._schemas: dict[str, Schema] = {}
-        self._channels: dict[str, Channel] = {}
+        self._schemas: dict[str, records.Schema] = {}
+        self._channels: dict[str, records.Channel] = {}
         self._types: dict[str, tuple[str, str]] = {}
         self._counts: dict[int, int] = {}
-        self._chunks: list[ChunkIndex] = []
-        self._metadata_index: list[MetadataIndex] = []
+        self._chunks: list[records.ChunkIndex] = []
+        self._metadata_index: list[records.MetadataIndex] = []
         self._tail: list[Messages] = []
         self._packing: deque[tuple[Messages, Future[tuple[Any, int]]]] = deque()
         self._pool = ThreadPoolExecutor(1, 'recording')
@@ -90,7 +79,7 @@ class McapOutput:
         self._at = 0
         self._stream = path.open('xb', buffering=0)
         self._put(MAGIC)
-        self._put_record(Header('ros2', f'thermo_comp {__version__}'))
+        self._put_record(records.Header('ros2', f'thermo_comp {__version__}'))
         if metadata:
             self._put_metadata(METADATA_NAME, metadata)
 
@@ -102,9 +91,9 @@ class McapOutput:
             return self._channels[topic].id
         if kind not in self._schemas:
             number, text = len(self._schemas) + 1, definition.text.encode()
-            self._schemas[kind] = Schema(number, text, definition.encoding, kind)
+            self._schemas[kind] = records.Schema(number, text, definition.encoding, kind)
             self._put_record(self._schemas[kind])
-        channel = Channel(
+        channel = records.Channel(
             id=len(self._channels) + 1,
             topic=topic,
             message_encoding='cdr',
@@ -155,11 +144,7 @@ class McapOutput:
         return self._compress(data.data), zlib.crc32(data.data)
 
     def finish(self) -> dict[str, Any]:
-        """
-        Write the last chunk, the summary and the footer; flush all to disk and close.
-
-        Gives the `information` of rosbag2.
-        """
+        """Write the last chunk, the summary and the footer; gives the `information` of rosbag2."""
         for messages in self._tail:
             if len(messages):
                 self._close_chunk(messages)
@@ -171,7 +156,7 @@ class McapOutput:
         times = self._start_ns or 0, self._end_ns
         found = information(self._name, *times, topics, self._metadata)
         self._put_metadata('rosbag2', {'serialized_metadata': dump_yaml(found).strip()})
-        self._put_record(DataEnd(data_section_crc=0))
+        self._put_record(records.DataEnd(data_section_crc=0))
         self._put_summary()
         os.fsync(self._stream.fileno())
         self.close()
@@ -188,9 +173,9 @@ class McapOutput:
             view = view[self._stream.write(view) :]
         self._at += len(data)
 
-    def _put_record(self, *records: McapRecord) -> bytes:
+    def _put_record(self, *new: records.McapRecord) -> bytes:
         builder = _new_builder()
-        for record in records:
+        for record in new:
             record.write(builder)
         data: bytes = builder.end()
         self._put(data)
@@ -198,8 +183,8 @@ class McapOutput:
 
     def _put_metadata(self, name: str, content: Mapping[str, str]) -> None:
         begin = self._at
-        self._put_record(Metadata(name, dict(content)))
-        self._metadata_index.append(MetadataIndex(begin, self._at - begin, name))
+        self._put_record(records.Metadata(name, dict(content)))
+        self._metadata_index.append(records.MetadataIndex(begin, self._at - begin, name))
 
     def _put_chunk(self, messages: Messages, packed: Any, checksum: int) -> None:
         log_ns, channel = messages.log_ns, messages.channel
@@ -222,7 +207,7 @@ class McapOutput:
             index_head = (Opcode.MESSAGE_INDEX, 6 + own.nbytes, number, own.nbytes)
             self._put(struct.pack('<BQHI', *index_head) + own.tobytes())
         self._chunks.append(
-            ChunkIndex(
+            records.ChunkIndex(
                 chunk_length=chunk_length,
                 chunk_start_offset=begin,
                 compression=self._compression,
@@ -237,7 +222,7 @@ class McapOutput:
 
     def _put_summary(self) -> None:
         begin = self._at
-        statistics = Statistics(
+        statistics = records.Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
@@ -251,7 +236,7 @@ class McapOutput:
         kinds, topics = self._schemas.values(), self._channels.values()
         body = self._put_record(*kinds, *topics, statistics, *self._chunks, *self._metadata_index)
         footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 20, begin, 0)
-        self._put_record(Footer(begin, 0, zlib.crc32(footer_head, zlib.crc32(body))))
+        self._put_record(records.Footer(begin, 0, zlib.crc32(footer_head, zlib.crc32(body))))
         self._put(MAGIC)
 
 

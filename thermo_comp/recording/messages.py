@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +44,9 @@ def field(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
         (len(rows),), kind, rows.data, offset=offset, strides=(rows.itemsize,)
     )
     return view
+
+
+Done = TypeVar('Done')
 
 
 class Topic(NamedTuple):
@@ -131,3 +136,36 @@ def pack(data: Bytes, start: Ints, size: Ints, room: int = 0) -> tuple[Bytes, In
         own = np.flatnonzero(size == each)
         scatter(packed, ends[own] - each, gather(data, start[own], each))
     return packed, ends
+
+
+#: What is done with messages while their bytes are at hand.
+Work: TypeAlias = Callable[[Messages], Done]
+
+
+class BagFile(ABC):
+    """
+    One open file of a bag; `path` is what errors call it.
+
+    `topics` are by the number of their channel, `definitions` encoding and text by message type,
+    `start_ns` and `end_ns` the log times of the first and the last message; `truncated` says what
+    is missing.
+    """
+
+    storage = 'mcap'
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.topics: dict[int, Topic] = {}
+        self.definitions: dict[str, tuple[str, str]] = {}
+        self.metadata: dict[str, str] = {}
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+        self.truncated: str | None = None
+
+    @abstractmethod
+    def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
+        """Read the messages of channels in reading order, and do some work on them."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the file."""

@@ -27,11 +27,7 @@ _GAP_INTERVALS = 5.0
 
 @dataclass(frozen=True)
 class ThermometerSurvey:
-    """
-    One thermometer's readings in a few numbers: degC, and largest mean rates over two minutes.
-
-    `quantum` is the smallest step between neighbouring readings that differ.
-    """
+    """One thermometer: degC, largest mean rates over two minutes, smallest step of readings."""
 
     n: int
     rate_hz: float
@@ -102,34 +98,36 @@ class Survey:
     @property
     def findings(self) -> list[str]:
         """What stands between this recording and a fit, each with the next step."""
-        found = []
-        if self.info.truncated:
-            found.append(f'cut off: {self.info.truncated}')
-        if self.n == 0:
-            found.append(
-                'no accelerometer samples: record accel/counts or imu/uncompensated, or name '
-                'yours with --topic counts=TOPIC or --topic imu=TOPIC'
-            )
         board = self.thermometers.get('board')
-        if board is None:
-            found.append(
+        said = (
+            (self.info.truncated, f'cut off: {self.info.truncated}'),
+            (
+                not self.n,
+                'no accelerometer samples: record accel/counts or imu/uncompensated, or name '
+                'yours with --topic counts=TOPIC or --topic imu=TOPIC',
+            ),
+            (
+                board is None,
                 'no board temperature: a thermal fit needs temperature/board, or name yours with '
-                '--topic board=TOPIC'
-            )
-        else:
-            found += thermal_findings(board)
-        if 'case' not in self.thermometers:
-            found.append(
+                '--topic board=TOPIC',
+            ),
+            *((True, one) for one in (thermal_findings(board) if board else ())),
+            (
+                'case' not in self.thermometers,
                 'no case temperature: the regime will follow the slower board sensor; name yours '
-                'with --topic case=TOPIC'
-            )
-        if self.n and not self.n_still:
-            found.append('it never rests for 3 s: the fit works on positions at rest')
-        if self.n_backwards:
-            found.append(f'{self.n_backwards} stamps do not rise: those samples are left out')
-        if self.n_gaps:
-            found.append(f'{self.n_gaps} gaps, the longest {self.longest_gap_s:.3g} s')
-        return found
+                'with --topic case=TOPIC',
+            ),
+            (
+                self.n and not self.n_still,
+                'it never rests for 3 s: the fit works on positions at rest',
+            ),
+            (
+                self.n_backwards,
+                f'{self.n_backwards} stamps do not rise: those samples are left out',
+            ),
+            (self.n_gaps, f'{self.n_gaps} gaps, the longest {self.longest_gap_s:.3g} s'),
+        )
+        return [text for is_so, text in said if is_so]
 
 
 def thermal_findings(board: ThermometerSurvey) -> list[str]:
@@ -149,11 +147,7 @@ def thermal_findings(board: ThermometerSurvey) -> list[str]:
 def survey_recording(
     path: str | Path, topics: Topics | None = None, progress: Callable[[float], None] | None = None
 ) -> Survey:
-    """
-    Read a recording once, in bounded memory, and describe it.
-
-    `progress` is called with the fraction read. Raises RecordingError if it cannot be read.
-    """
+    """Read a recording once, in bounded memory; `progress` gets the fraction read."""
     with open_recording(path, topics, require=()) as reader:
         survey = Survey(reader.info)
         topic = reader.topics.get('accel')

@@ -10,14 +10,13 @@ Reading order
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Protocol, TypeVar
 
 from ..errors import RecordingError
 from .clock import Cut, without_jumps
@@ -37,42 +36,12 @@ from .columns import (
 from .decode import Decoder, Feed
 from .foreign import ForeignFile
 from .mcap_file import McapFile
-from .messages import Messages, Topic, pack
+from .messages import BagFile, Messages, Topic, pack
 from .rosbag2_metadata import Description, read_metadata
 from .topics import Topics, select_topics, shown
 from .unpack import expand, translated
 
-_Done = TypeVar('_Done')
 _N_LOADERS = 2
-
-
-class BagFile(Protocol):
-    """
-    One open file of a bag; `path` is what errors call it.
-
-    `topics` are by the number of their channel, `definitions` encoding and text by message type,
-    `start_ns` and `end_ns` the log times of the first and the last message; `truncated` says what
-    is missing.
-    """
-
-    path: Path
-    storage: str
-    topics: dict[int, Topic]
-    definitions: dict[str, tuple[str, str]]
-    metadata: dict[str, str]
-    start_ns: int | None
-    end_ns: int | None
-    truncated: str | None
-
-    def read(
-        self, channels: Collection[int], work: Callable[[Messages], _Done]
-    ) -> Iterator[_Done]:
-        """Read the messages of channels in reading order, and do some work on them."""
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
 
 
 class RecordingReader:
@@ -197,11 +166,7 @@ class RecordingReader:
                         yield from blocks
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
-        """
-        Read the bag for whoever walks its time: jumps of its clock are taken out, see `clock`.
-
-        Raises RecordingError as `blocks` does, and for stamps that are no clock.
-        """
+        """Read the bag for whoever walks its time: without the jumps of its clock."""
         try:
             if self._part.is_whole or self._part.is_stamped:
                 yield from without_jumps(self.blocks())
@@ -218,11 +183,7 @@ class RecordingReader:
         return self._cut.since_s
 
     def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
-        """
-        Read topics, by the bag's own names, as they are, about in order of log time.
-
-        Raises RecordingError for damaged data, or messages that are no CDR.
-        """
+        """Read topics, by the bag's own names, as they are, about in order of log time."""
         for file in self._opened():
             own = {n: one for n, one in file.topics.items() if one.name in topics}
             for topic in own.values():

@@ -83,11 +83,7 @@ def information(
     topics: Iterable[tuple[str, str, str, int]],
     custom: Mapping[str, str],
 ) -> dict[str, Any]:
-    """
-    Build the content of metadata.yaml, below its only key, of one finished MCAP file.
-
-    Of each topic there are name, type, hash of the type and number of messages.
-    """
+    """Build what stands in metadata.yaml; topics are name, type, hash of the type and count."""
     counted: list[dict[str, Any]] = [
         {
             'topic_metadata': {
@@ -147,11 +143,7 @@ class Description:
 
 
 def read_metadata(directory: Path) -> Description | None:
-    """
-    Read the metadata.yaml of a bag; None where it is missing or empty: the recorder was killed.
-
-    Raises RecordingError for what is no metadata of a bag, or names files that are not there.
-    """
+    """Read the metadata.yaml of a bag; None if it is missing or empty: the recorder was killed."""
     path = directory / 'metadata.yaml'
     try:
         text = read_bounded(path, _MAX_BYTES)

@@ -82,9 +82,7 @@ class CellAccumulator:
     Reduces samples to cells while they stream by.
 
     Cells of `cell_s` are longer where one would hold fewer than 30 samples. `full_scale` is where
-    a sample is saturated. `window_s` is what a whole number of cells is to last [s]; where even
-    one cell of that length would hold too few samples, a cell lasts one of `STRETCHES` times as
-    long.
+    a sample is saturated. A whole number of cells lasts `window_s`, or one of `STRETCHES` of them.
     """
 
     _MIN_SAMPLES = 30

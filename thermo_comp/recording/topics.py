@@ -38,11 +38,7 @@ Present = Mapping[str, tuple[str, int]]
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """
-    From `begin` to before `end`, by default all of a bag.
-
-    Both are seconds since the bag's first sample or, from 1e8 on, stamps: seconds since 1970.
-    """
+    """From `begin` to before `end`: seconds since the bag's first sample; from 1e8 on stamps."""
 
     begin: float | None = None
     end: float | None = None
@@ -157,9 +153,8 @@ def select_topics(
     """
     Find the topics of the accelerometer and of the thermometers.
 
-    With ``auto`` the counts are taken where the bag has them, else the Imu messages. Raises
-    RecordingError for an empty bag, and for a topic that is required but missing, ambiguous or
-    without messages, or of another type than expected.
+    RecordingError for an empty bag, and for a topic that is ambiguous, of another type, or missing
+    or without messages where it is required.
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages')

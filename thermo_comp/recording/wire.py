@@ -45,11 +45,7 @@ class Stamped(NamedTuple):
 
 
 def decode_stamped(messages: Messages, kind: str) -> Stamped:
-    """
-    Decode messages that are a header and float64 numbers; `kind` is a key of `N_NUMBERS`.
-
-    Raises RecordingError for bytes that are no message of that type.
-    """
+    """Decode messages that are a header and float64 numbers; `kind` is a key of `N_NUMBERS`."""
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
     if not n:
         return Stamped(size, np.empty((0, n_numbers)), np.empty(0, 'S1'))

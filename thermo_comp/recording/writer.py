@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import fields
 from pathlib import Path
 from typing import Literal
 
@@ -142,8 +141,8 @@ class BagWriter:
             nothing[3], nothing[[4, 16]] = 1.0, -1.0
             columns.append((0, '', nothing, 25))
         else:
-            places = zip((0, 4, 13, 16), fields(imu), (4, 9, 3, 9), strict=False)
-            columns += [(at, f'imu.{o.name}', getattr(imu, o.name), n) for at, o, n in places]
+            places = zip((0, 4, 13, 16), imu._fields, imu, (4, 9, 3, 9), strict=False)
+            columns += [(at, f'imu.{name}', one, width) for at, name, one, width in places]
         self._write_stamped(topic, IMU, stamp_ns, log_ns, frame_id, columns)
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
