@@ -163,22 +163,22 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
     slow = SlowUncertainty(judged, Correction(judged))
     nobody = [0.0] * len(Correction(unit).memory.lags)
     draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
-    for weight in (0.0, 0.3):
-        _, state, _ = states[-1]
-        state = (*state[:3], weight, *state[4:])
-        nominal = Correction(unit).bias_scale(state)
-        scatter = []
-        for d in draws.tolist():
-            bias, scale = (Correction(drawn(unit, layout, d)).bias_scale(state) - nominal) / 300.0
-            levels = [
-                (1.0 - weight) * d[block.static] + weight * d[block.dynamic]
-                for block in layout.scale
-            ]
-            scatter.append(np.column_stack((bias, scale + levels)))
-        scatter = np.array(scatter)
+    # The same state in the static regime, and while the sets cross over.
+    weights = np.array([0.0, 0.3])
+    pair = np.repeat(np.array([states[-1][1]]), 2, axis=0).T
+    pair[3] = weights
+    nominal = Correction(unit).bias_scale(pair)
+    scatter = []
+    for d in draws.tolist():
+        moved = (Correction(drawn(unit, layout, d)).bias_scale(pair) - nominal) / 300.0
+        for axis, block in enumerate(layout.scale):
+            moved[1, axis] += (1.0 - weights) * d[block.static] + weights * d[block.dynamic]
+        scatter.append(moved)
+    scatter = np.array(scatter)
+    for k, state in enumerate(pair.T.tolist()):
         for axis, (a, b, c) in enumerate(np.reshape(slow.at(state, nobody), (3, 3))):
             for x in (-9.8, 0.0, 9.8):
-                found = np.var(scatter[:, axis, 0] + scatter[:, axis, 1] * x)
+                found = np.var(scatter[:, 0, axis, k] + scatter[:, 1, axis, k] * x)
                 # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %: 4 sigma.
                 assert a + b * x + c * x * x == pytest.approx(found, rel=0.33)
 
@@ -238,7 +238,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     # Squares of lags bend: the spread is asked for where they are straight.
     small = 0.05
     moved[first : first + 2 * len(lags) : 2] += small * (draws * np.array(shares)).T
-    found = Correction(wide).bias_scale(tuple(moved))
+    found = Correction(wide).bias_scale(moved)
     for axis, (a, b, c) in enumerate(np.reshape(slow, (3, 3))):
         bias, scale = found[:, axis]
         for x in (-9.8, 0.0, 9.8):

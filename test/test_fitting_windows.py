@@ -209,7 +209,7 @@ def result(request: pytest.FixtureRequest) -> FitResult:
     return fit(sources(9), replace(OPTIONS, static_curve=request.param, groups=groups))
 
 
-def states_of(windows: ThermalWindows, calibration: Calibration) -> tuple[Floats, ...]:
+def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:
     """States that have the windows' raw columns in their places."""
     columns = calibration.response
     spec = memory_of(columns)
@@ -225,7 +225,7 @@ def states_of(windows: ThermalWindows, calibration: Calibration) -> tuple[Floats
         states[:, place] = plain.get((kind, 'case', tau, 0.0), 0.0)
     for place in layout.gradients.values():
         states[:, place] = windows.gradient
-    return tuple(states.T)
+    return states.T
 
 
 def test_the_file_corrects_as_the_regression(result: FitResult) -> None:

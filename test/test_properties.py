@@ -69,7 +69,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place: Any, value: Any
     for key in way:
         branch = branch[key]
     branch[last] = value
-    content = yaml.safe_dump(tree, allow_unicode=True).encode()
+    content = yaml.dump(tree, Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
     refusal: CalibrationError | None = None
     try:
         found = parse_calibration(content, 'unit.yaml')

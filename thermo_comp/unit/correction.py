@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..thermal.memory import BOARD_INPUT, MemorySpec
-from ..thermal.state import BOARD, RATE, UNKNOWN, VAR_BOARD, WEIGHT, Layout
+from ..thermal.state import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT
 from ..typing import Floats
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
@@ -152,27 +152,24 @@ class Correction:
         self.misalignment = (M[1][0], M[2][0], M[2][1], *variances)
 
     def _find_felt(self) -> None:
-        """Find which numbers of a state can be wrong, and which columns are made of each."""
-        layout, places = Layout(self.memory), self.table.places
-        lags = {place: lag for lag, place in layout.lags.items()}
-        gradients = set(layout.gradients.values())
-        # Plays are taken to follow their input, so they feel nothing.
-        by_place = [k for k in np.argsort(places) if places[k] in lags or places[k] in gradients]
-        self._felt_columns = np.array(by_place, np.int64)
-        self.felt_places, self._felt_starts = np.unique(places[by_place], return_index=True)
+        """Find which columns are made of each gradient and each lag, the numbers felt if wrong."""
+        # Gradients and lags stand in pairs with their variances. Plays are taken to follow their
+        # input, so they feel nothing.
+        pair = (self.table.places - GRADIENT) // 2
+        n_pairs = len(self.memory.sensors) + len(self.memory.lags)
+        self._felt_variances = slice(VAR_GRADIENT, GRADIENT + 2 * n_pairs, 2)
+        columns = np.argsort(pair, kind='stable')
+        self._felt_columns = columns[(pair[columns] >= 0) & (pair[columns] < n_pairs)]
+        self._felt, self._felt_starts = np.unique(pair[self._felt_columns], return_index=True)
         # ``T - L`` rises with T, ``g = T_s - T`` falls; the lag of a gradient does neither.
-        on_board = {**dict.fromkeys(gradients, -1.0)}
-        on_board |= {place: float(name == BOARD_INPUT) for place, (name, _) in lags.items()}
-        signs = [on_board[place] for place in self.felt_places.tolist()]
+        signs = [-1.0 for _ in self.memory.sensors]
+        signs += [float(name == BOARD_INPUT) for name, _ in self.memory.lags]
         self._signs = np.array(signs)[:, np.newaxis, np.newaxis]
 
-    def bias_scale(self, states: npt.ArrayLike) -> Floats:
-        """Evaluate bias and scale of the three axes, shape (2, 3) for one state, or (2, 3, n)."""
-        table = np.asarray(states, dtype=np.float64)
-        columns = table.reshape(len(table), -1)
-        sets, phi = self.curves.values(columns[BOARD]), self.table.values(columns)
-        found = self._blended(sets, columns[WEIGHT], phi)
-        return found.reshape(2, 3, *table.shape[1:])
+    def bias_scale(self, states: Floats) -> Floats:
+        """Evaluate bias and scale of the three axes, shape (2, 3, n)."""
+        sets, phi = self.curves.values(states[BOARD]), self.table.values(states)
+        return self._blended(sets, states[WEIGHT], phi).reshape(2, 3, -1)
 
     def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
         result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
@@ -216,12 +213,13 @@ class Correction:
         )
 
     def felt(self, states: Floats, factors: Floats) -> Floats:
-        """Differentiate bias and relative scale by each number of `felt_places`, (p, 6, n)."""
-        slopes = (self.table.slopes(states) * factors)[self._felt_columns]
-        if not len(slopes):
-            return np.empty((0, 6, states.shape[1]))
-        each = self._W[:, self._felt_columns] * slopes
-        return np.asarray(np.add.reduceat(each, self._felt_starts, axis=1).swapaxes(0, 1))
+        """Differentiate bias and relative scale by gradients and lags, shape (p, 6, n)."""
+        columns = self._felt_columns
+        result = np.zeros((len(self._signs), 6, states.shape[1]))
+        if len(columns):
+            each = self._W[:, columns] * (self.table.slopes(states) * factors)[columns]
+            result[self._felt] = np.add.reduceat(each, self._felt_starts, axis=1).swapaxes(0, 1)
+        return result
 
     def line(
         self,
@@ -283,7 +281,7 @@ class Correction:
         excess, _, relative = self.curves.excess(states)
         outside = rest * relative[0] + weight * relative[1]
         shares = np.array([rest + unknown * weight, weight + unknown * rest])
-        variances = (shares * (states[VAR_BOARD] + excess * excess), states[self.felt_places + 1])
+        variances = (shares * (states[VAR_BOARD] + excess * excess), states[self._felt_variances])
         felt = self.felt(states, factors[0])
         # The response hangs on the board's temperature through the powers of t and what is felt.
         on_board = self._weigh(raw * factors[1], in_order(self._signs * felt, 0))

@@ -13,6 +13,7 @@ exponentials).
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -44,18 +45,29 @@ def by_element(function: Callable[[float], float], x: Kelvins) -> Floats:
     return np.array([function(v) for v in np.ravel(x).tolist()]).reshape(np.shape(x))
 
 
-class _Family:
+class _Family(ABC):
     """What the families have in common."""
 
     @property
+    @abstractmethod
     def free_coefficients(self) -> tuple[float, ...]:
         """The free coefficients, in the order of `basis`."""
-        raise NotImplementedError
 
     @property
     def n_free(self) -> int:
         """Number of free coefficients."""
         return len(self.free_coefficients)
+
+    def value(self, t: Kelvins) -> Floats:
+        """Evaluate at `t` [K]."""
+        return self._evaluate(np.asarray(t))
+
+    def slope(self, t: Kelvins) -> Floats:
+        """Evaluate the derivative at `t`, per K."""
+        return self._evaluate(np.asarray(t), is_slope=True)
+
+    @abstractmethod
+    def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats: ...
 
 
 @dataclass(frozen=True)
@@ -86,13 +98,8 @@ class Polynomial(_Family):
         """Return the same function with other free coefficients."""
         return replace(self, coefficients=(self.coefficients[0], *values))
 
-    def value(self, t: Kelvins) -> Floats:
-        """Evaluate at `t` [K]."""
-        return _horner(self.coefficients, t)
-
-    def slope(self, t: Kelvins) -> Floats:
-        """Evaluate the derivative at `t`, per K."""
-        return _horner(self.slopes, t)
+    def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
+        return _horner(self.slopes if is_slope else self.coefficients, t)
 
     @property
     def slopes(self) -> tuple[float, ...]:
@@ -156,31 +163,22 @@ class CubicSpline(_Family):
 
     @cached_property
     def _cardinal_pieces(self) -> list[Floats]:
-        units = np.eye(len(self.knots_k))
-        return [
-            _natural_pieces(self.knots_k, unit)
-            for knot, unit in zip(self.knots_k, units, strict=True)
-            if knot != 0.0
-        ]
+        units = zip(self.knots_k, np.eye(len(self.knots_k)), strict=True)
+        return [_natural_pieces(self.knots_k, unit) for knot, unit in units if knot]
 
-    def value(self, t: Kelvins) -> Floats:
-        """Evaluate at `t` [K]."""
-        return self._evaluate(self._pieces, t)
-
-    def slope(self, t: Kelvins) -> Floats:
-        """Evaluate the derivative at `t`, per K."""
-        return self._evaluate(self._pieces, t, 1)
+    def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
+        return self._along(self._pieces, t, is_slope=is_slope)
 
     def basis(self, t: Kelvins) -> list[Floats]:
         """Evaluate the derivatives with respect to the free values: the cardinal splines."""
-        return [self._evaluate(pieces, t) for pieces in self._cardinal_pieces]
+        return [self._along(pieces, np.asarray(t)) for pieces in self._cardinal_pieces]
 
-    def _evaluate(self, pieces: Floats, t: Kelvins, order: int = 0) -> Floats:
+    def _along(self, pieces: Floats, t: Floats, *, is_slope: bool = False) -> Floats:
         knots = np.array(self.knots_k)
-        held = hold(np.asarray(t), knots[0], knots[-1])
+        held = hold(t, knots[0], knots[-1])
         where = np.clip(np.searchsorted(knots, held, side='right') - 1, 0, len(knots) - 2)
         h, (a, b, c, d) = held - knots[where], pieces[:, where]
-        if order:
+        if is_slope:
             return np.asarray((3.0 * d * h + 2.0 * c) * h + b)
         return np.asarray(((d * h + c) * h + b) * h + a)
 
@@ -229,19 +227,12 @@ class Exponential(_Family):
         at_reference = self.constant + math.fsum(self.amplitudes)
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
-    def value(self, t: Kelvins) -> Floats:
-        """Evaluate at `t` [K]."""
-        result = np.asarray(t) * 0.0 + self.constant
+    def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
+        result = t * 0.0 + (0.0 if is_slope else self.constant)
         for amplitude, e_fold in zip(self.amplitudes, self.e_fold_k, strict=True):
-            result = result + amplitude * by_element(math.exp, t / e_fold)
-        return result
-
-    def slope(self, t: Kelvins) -> Floats:
-        """Evaluate the derivative at `t`, per K."""
-        result = np.asarray(t) * 0.0
-        for amplitude, e_fold in zip(self.amplitudes, self.e_fold_k, strict=True):
-            result = result + amplitude / e_fold * by_element(math.exp, t / e_fold)
-        return result
+            factor = amplitude / e_fold if is_slope else amplitude
+            result = result + factor * by_element(math.exp, t / e_fold)
+        return np.asarray(result)
 
     def basis(self, t: Kelvins) -> list[Floats]:
         """Evaluate the derivatives with respect to the amplitudes at a fixed reference value."""
@@ -276,11 +267,11 @@ class Functions:
         return np.array([[getattr(one, name)(own) for one in row] for row, own in pairs])
 
 
-def _horner(coefficients: Floats | tuple[float, ...], t: Kelvins) -> Floats:
-    result = np.asarray(t) * 0.0 + coefficients[-1]
+def _horner(coefficients: Floats | tuple[float, ...], t: Floats) -> Floats:
+    result = t * 0.0 + coefficients[-1]
     for one in coefficients[-2::-1]:
         result = result * t + one
-    return result
+    return np.asarray(result)
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:

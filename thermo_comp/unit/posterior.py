@@ -48,7 +48,7 @@ class Posterior:
     ]
 
     def __post_init__(self) -> None:
-        n, size = len(self.variances), self._factor.size
+        n, size = self.n_parameters, len(_decoded('factor', self.factor))
         if size != n * self.rank:
             raise ValueError(
                 f'`factor` must hold {n} x {self.rank} numbers (`rest` x `rank`), got {size}'
@@ -66,19 +66,15 @@ class Posterior:
         """Number of parameters."""
         return len(self.variances)
 
-    @property
+    @cached_property
     def matrix(self) -> Floats:
         """The factor, shape (n_parameters, rank)."""
-        return self._factor.reshape(-1, self.rank)
+        return _decoded('factor', self.factor).reshape(self.n_parameters, self.rank)
 
     @cached_property
     def variances(self) -> Floats:
         """The variances that stand on the diagonal beside the factor, shape (n_parameters,)."""
         return _decoded('rest', self.rest)
-
-    @cached_property
-    def _factor(self) -> Floats:
-        return _decoded('factor', self.factor)
 
     def covariance(self) -> Floats:
         """Return the covariance matrix, shape (n_parameters, n_parameters)."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..thermal.memory import start_covariance
-from ..thermal.state import BOARD, WEIGHT, Layout
+from ..thermal.state import BOARD, WEIGHT
 from ..typing import Floats
 from .calibration import Calibration, parameter_layout
 from .correction import Correction
@@ -26,16 +26,8 @@ class SlowUncertainty:
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
         self._K = correction.K[:, 0].tolist()
-        lags = correction.memory.lags
-        root = np.linalg.cholesky(start_covariance(lags))
-        place_of = list(Layout(correction.memory).lags.values())
-        #: Which of what is felt are lags, and these by index into the memory's.
-        found = [
-            (k, place_of.index(p)) for k, p in enumerate(correction.felt_places) if p in place_of
-        ]
-        self._felt = [k for k, _ in found]
-        self._lags = [lag for _, lag in found]
-        self._root = np.asarray(root, dtype=np.float64)[self._lags]
+        self._n_sensors = len(correction.memory.sensors)
+        self._root = np.asarray(np.linalg.cholesky(start_covariance(correction.memory.lags)))
         self._blocks: list[tuple[Floats, Floats, Floats, Floats]] = []
         posterior = calibration.posterior
         if posterior is None:
@@ -57,8 +49,8 @@ class SlowUncertainty:
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         phi = table.held(table.raw(states)) * factors
-        felt = self._correction.felt(states, factors)[self._felt, :, 0]
-        moved = felt * np.array(start_shares)[self._lags, np.newaxis]
+        felt = self._correction.felt(states, factors)[self._n_sensors :, :, 0]
+        moved = felt * np.array(start_shares)[:, np.newaxis]
         result: list[float] = []
         for axis, K in enumerate(self._K):
             bias, scale = ((self._root * moved[:, [row]]).sum(axis=0) for row in (axis, axis + 3))
