@@ -306,12 +306,12 @@ def test_noise_declared_too_small_is_learnt():
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))
-    assert thermometer.noise_factor == pytest.approx(25.0, rel=0.2)
+    assert math.sqrt(thermometer._noise_scale) == pytest.approx(25.0, rel=0.2)
     assert np.mean((out[1000:, 0] - 20.0) ** 2 / out[1000:, 2]) < 2.0
 
 
 def test_noise_declared_rightly_stays():
-    assert settled(0.005, 4000).noise_factor == pytest.approx(1.0, abs=0.15)
+    assert math.sqrt(settled(0.005, 4000)._noise_scale) == pytest.approx(1.0, abs=0.15)
 
 
 def test_a_frozen_sensor_shows_by_its_last_change():

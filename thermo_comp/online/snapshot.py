@@ -26,9 +26,10 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         stamp_ns = tracker.updated_ns
     counters = replace(compensator.counters)
     ahead_s = 0.0 if stamp_ns is None else thermal.queue.ahead(stamp_ns)
+    faults = {name: (check.fault, check.step) for name, check in tracker.checks.items()}
     board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
     if stamp_ns is None or (board_ns is None and not thermal.is_unmeasured):
-        return CompensatorStatus(counters, stamp_ns, pending_ahead_s=ahead_s)
+        return CompensatorStatus(counters, stamp_ns, faults=faults, pending_ahead_s=ahead_s)
     board_age = math.inf if board_ns is None else (stamp_ns - board_ns) * 1e-9
     # Half the time-out at the latest, so that a warning always comes before the error.
     stale_after = compensator.config.temperature_timeout_s / 2.0
@@ -36,7 +37,6 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     if usual < stale_after:
         stale_after = max(usual, SHORTEST_STALE_S)
     state = thermal.sample(stamp_ns)
-    board, case = (tracker.checks[name] for name in thermal.inputs[:2])
     is_dynamic = tracker.detector.regime == Regime.DYNAMIC
     excess = thermal.correction.excess(state, is_dynamic=is_dynamic)
     return CompensatorStatus(
@@ -52,13 +52,8 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         excess.temperature,
         excess.rate * 60.0,
         gradient_excess_k=excess.gradient,
-        board_fault=board.fault,
-        case_fault=case.fault,
-        board_step_k=board.step,
-        case_step_k=case.step,
+        faults=faults,
         is_lead_reversed=tracker.lead.is_reversed,
-        rate_ratio=thermal.rate.ratio,
-        is_too_fast=thermal.is_too_fast,
         gravity=compensator.gravity.result,
         is_refuted=compensator.gravity.is_refuted,
         rate_bias_sd=_rate_bias_sd(compensator),

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import inf
 from operator import attrgetter
 
@@ -120,16 +121,10 @@ class CompensatorStatus:
     rate_excess_k_min: float = 0.0
     #: T_case - T_board beyond the calibrated range [K], signed.
     gradient_excess_k: float = 0.0
-    #: What is wrong with the sensors' readings, and the size of a step that is not believed [K].
-    board_fault: Fault = Fault.NONE
-    case_fault: Fault = Fault.NONE
-    board_step_k: float = 0.0
-    case_step_k: float = 0.0
+    #: By thermometer what is wrong with its readings, and the size of a step not believed [K].
+    faults: Mapping[str, tuple[Fault, float]] = field(default_factory=dict)
     #: Whether the board has led the case in a ramp: the two topics are swapped, most likely.
     is_lead_reversed: bool = False
-    #: Samples per calibrated cycle, and whether they are too many to be conversions.
-    rate_ratio: float = 1.0
-    is_too_fast: bool = False
     #: |f| - g while the platform stands; None before it has stood.
     gravity: GravityResidual | None = None
     #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.

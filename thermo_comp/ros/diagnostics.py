@@ -164,8 +164,7 @@ class Reporter:
         values |= {
             'board age [s]': f'{status.board_age_s:.3f}',
             'case age [s]': f'{status.case_age_s:.3f}',
-            'board fault': status.board_fault.value,
-            'case fault': status.case_fault.value,
+            **{f'{name} fault': fault.value for name, (fault, _) in status.faults.items()},
             'gradient excess [K]': f'{status.gradient_excess_k:.3f}',
             'temperature excess [K]': f'{status.temperature_excess_k:.3f}',
             'rate excess [K/min]': f'{status.rate_excess_k_min:.3f}',
@@ -252,10 +251,7 @@ def _findings(
     for name, (level, text) in _RISEN.items():
         if new[name]:
             yield level, f'{new[name]} {text.format(full_scale=unit.full_scale)}'
-    for name, fault, step in (
-        ('board', status.board_fault, status.board_step_k),
-        ('case', status.case_fault, status.case_step_k),
-    ):
+    for name, (fault, step) in status.faults.items():
         if fault == Fault.STILL:
             yield _WARN, f'{name} temperature stands still to the bit, its uncertainty grows'
         elif fault == Fault.FROZEN:

@@ -245,11 +245,6 @@ class Thermometer:
         state = mix(self._quiet, self._bent, self.bending, 0.0)[0]
         return state[2], state[8]
 
-    @property
-    def noise_factor(self) -> float:
-        """Noise found / noise declared, at least 1."""
-        return sqrt(self._noise_scale)
-
     def _start(self, stamp_ns: int, reading_c: float) -> None:
         self.reset()
         self.stamp_ns = self.changed_ns = stamp_ns
