@@ -58,13 +58,19 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 #: Files that take longest, the longest first: whoever works in parallel begins with them, so that
 #: no worker is left alone with one at the end (`make test` keeps this order).
 _LONG = (
-    *('test_cli_help', 'test_report', 'test_faults', 'test_priors', 'test_fault_process'),
-    *('test_fleet_run', 'test_fitting', 'test_docs', 'test_cli_demo', 'test_degenerate'),
-    *('test_gyroscope', 'test_third_thermometer', 'test_fault_files', 'test_plausibility'),
-    *('test_compensator', 'test_least_known', 'test_allow', 'test_report_live'),
-    *('test_regime', 'test_player', 'test_one_judge', 'test_judging_history', 'test_correction'),
-    *('test_node_defence', 'test_node_parity', 'test_recording_write', 'test_replay'),
-    *('test_cli', 'test_fitting_learning', 'test_fitting_posterior'),
+    *('test_gyroscope', 'test_cli_help', 'test_third_thermometer', 'test_real_data'),
+    *('test_report_certificate', 'test_offset', 'test_fitting_windows', 'test_record'),
+    *('test_docs', 'test_cli_demo', 'test_fleet_unit', 'test_node_startup'),
+    *('test_fitting_learning', 'test_convert', 'test_simulation_presets', 'test_readme'),
+    *('test_priors', 'test_properties', 'test_text', 'test_recording_damage'),
+    *('test_report_figures', 'test_stillness', 'test_cli_errors', 'test_recording_walk'),
+    *('test_fault_files', 'test_allow', 'test_faults', 'test_cli', 'test_degenerate'),
+    *('test_layers', 'test_rests', 'test_compensator', 'test_sample_checks', 'test_report'),
+    *('test_judging', 'test_report_live', 'test_one_position', 'test_recording_promises'),
+    *('test_fitting_posterior', 'test_recording_read', 'test_fault_process'),
+    *('test_node_reload', 'test_ins', 'test_middleware', 'test_regime', 'test_least_known'),
+    *('test_one_judge', 'test_fleet_run', 'test_plausibility', 'test_fleet_summary'),
+    *('test_acquisition', 'test_thermometer'),
 )
 
 

@@ -174,11 +174,11 @@ class Draft:
         """Give the finished output its name; OutputError if somebody else was first."""
         with _told(self._path):
             if self.partial.is_dir():
-                _sync_directory(self.partial)
+                _sync(self.partial)
                 self._publish_folder()
             else:
                 self._publish_file()
-            _sync_directory(self._target.parent)
+            _sync(self._target.parent)
 
     def drop(self) -> None:
         """Remove what was written so far."""
@@ -231,8 +231,7 @@ def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterato
     try:
         with _told(path):
             yield draft.partial
-            with draft.partial.open('rb') as file:
-                os.fsync(file.fileno())
+            _sync(draft.partial)
         draft.publish()
     except BaseException:
         draft.drop()
@@ -247,8 +246,8 @@ def write_atomically(
         partial.write_bytes(content)
 
 
-def _sync_directory(path: Path) -> None:
-    """Flush a directory's entries to disk."""
+def _sync(path: Path) -> None:
+    """Flush a file, or a directory's entries, to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
