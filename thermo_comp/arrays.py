@@ -238,7 +238,7 @@ def fit(
 
     items = [recordings] if isinstance(recordings, (str, Path, Columns)) else list(recordings)
     paths = [item for item in items if not isinstance(item, Columns)]
-    sources, kind = fit_sources(paths, serial=options.get('serial'))
+    sources, kind = fit_sources(paths)
     if paths:
         options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
     for one in items:

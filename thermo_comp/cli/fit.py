@@ -102,7 +102,7 @@ def fit(
         raise options.usage('--certificate-info fills the page of --report: give that, too')
     # Until the command ends.
     bags = context.with_resource(as_bags(out, bags, columns, rate_hz))
-    sources, kind = fit_sources(bags, **reading, serial=serial)
+    sources, kind = fit_sources(bags, **reading)
     info = None
     if certificate_info is not None:
         from ..report import load_certificate_info

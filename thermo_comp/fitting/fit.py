@@ -215,11 +215,12 @@ def board_lag(windows: ThermalWindows) -> float:
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     """Find the unit's serial; FitError if the bags name different ones, or it is none."""
-    serials = {source.serial for source in sources if source.serial}
+    serials = {source.serial: source.name for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
-        raise FitError(f'the bags are of different units: {", ".join(sorted(serials))}')
+        said = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))
+        raise FitError(f'the bags are of different units: {said}')
     try:
-        return valid_serial(options.serial or (serials.pop() if serials else 'unknown'))
+        return valid_serial(options.serial or next(iter(serials), 'unknown'))
     except ValueError as mistake:
         raise FitError(str(mistake)) from mistake
 

@@ -54,31 +54,24 @@ def fit_sources(
     paths: Sequence[str | Path],
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
-    serial: str | None = None,
 ) -> tuple[list[FitSource], Input]:
     """
     Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
 
-    Raises RecordingError if one cannot be read or lacks a topic. Raises FitError if some hold
-    counts and some Imu messages, or they are of different units.
+    Raises RecordingError if one cannot be read or lacks a topic; FitError if some hold counts and
+    some Imu messages.
     """
     sources: list[FitSource] = []
     kinds: dict[str, str] = {}
-    serials: dict[str, str] = {}
     for path in map(Path, paths):
         source, info = recording_source(path, topics, input)
         kinds[info.input or 'counts'] = str(path)
-        if source.serial:
-            serials[source.serial] = str(path)
         sources.append(replace(source, sha256=digest(path)))
     if len(kinds) > 1:
         raise FitError(
             f'{kinds["counts"]} holds counts, {kinds["imu"]} Imu messages: leave one kind out, or '
             'choose with --input where a bag has both'
         )
-    if serial is None and len(serials) > 1:
-        found = ', '.join(f'{path} of {unit}' for unit, path in sorted(serials.items()))
-        raise FitError(f'the bags are of different units: {found}')
     return sources, 'imu' if 'imu' in kinds else 'counts'
 
 
