@@ -4,20 +4,17 @@
 Owns the fit: bags of a thermal test -> still positions -> regression -> calibration, with proof.
 """
 
-from .evidence import PositionReport, ResidualRow
+from .evidence import ResidualRow
 from .fit import FitResult, fit, fit_bags, reduce_bag
 from .gravity import normal_gravity, resolve_gravity
 from .options import FitOptions
 from .reduction import ReducedBag
 from .sources import FitSource
-from .verdict import Finding
 
 __all__ = [
-    'Finding',
     'FitOptions',
     'FitResult',
     'FitSource',
-    'PositionReport',
     'ReducedBag',
     'ResidualRow',
     'fit',

@@ -4,19 +4,14 @@
 
 from .evaluation import Evaluation, evaluate, judge_bags, open_bag
 from .judgement import Judgement, judge
-from .rates import RateJudgement
-from .shifts import AxisShift
-from .verdicts import SECTIONS, Section, Verdict
+from .verdicts import SECTIONS, Verdict
 from .windows import WINDOW_S, Windows, corrected_windows
 
 __all__ = [
     'SECTIONS',
     'WINDOW_S',
-    'AxisShift',
     'Evaluation',
     'Judgement',
-    'RateJudgement',
-    'Section',
     'Verdict',
     'Windows',
     'corrected_windows',
