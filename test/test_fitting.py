@@ -332,5 +332,5 @@ def test_saturated_samples_are_refused(rng: np.random.Generator) -> None:
 def test_bags_of_two_units_are_refused(rng: np.random.Generator) -> None:
     bags = [replace(source, serial=f's{k % 2}') for k, source in enumerate(faces(9.81, 0.0, rng))]
     options = FitOptions(gravity=9.81, input='m/s^2')
-    with pytest.raises(FitError, match='different units: s0, s1'):
+    with pytest.raises(FitError, match='different units: face4 of s0, face5 of s1'):
         fit(bags, options)

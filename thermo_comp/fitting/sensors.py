@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
+from operator import itemgetter
 
 import numpy as np
 
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
 from ..thermal.tracker import ThermalTracker
-from ..typing import Bools, Floats, Ints
+from ..typing import Bools, Floats
 from .reduction import NO_READINGS, Readings, ReducedBag
 
 # Below this no thermometer is worth believing, and the recursion would follow rounding errors.
@@ -176,14 +178,13 @@ def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
     return float(np.clip(max(clean * lag_s, hidden), *_RIPPLE_RANGE_C))
 
 
-def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> tuple[list[str], Ints, Floats]:
+def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:
     """Thermometer, stamp and value of each reading; of equal stamps in the order of `inputs`."""
-    found = [bag.temperatures.get(name, NO_READINGS) for name in inputs]
-    stamps = np.concatenate([one.stamp_ns for one in found])
-    order = np.argsort(stamps, kind='stable')
-    names = np.repeat(inputs, [len(one.value) for one in found])[order]
-    values = np.concatenate([one.value for one in found])[order]
-    return names.tolist(), stamps[order], values
+    found: list[tuple[str, int, float]] = []
+    for name in inputs:
+        one = bag.temperatures.get(name, NO_READINGS)
+        found += zip(repeat(name), one.stamp_ns.tolist(), one.value.tolist(), strict=False)
+    return sorted(found, key=itemgetter(1))
 
 
 def thermal_states(
@@ -194,18 +195,15 @@ def thermal_states(
 
     Returns, too, when the grid begins, since the bag's first sample [s].
     """
-    names, stamps, values = readings_in_order(bag, ('board', *tracker.spec.sensors))
+    readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
+    reading = next(readings, None)
     step_ns = round(step_s * 1e9)
     begin = max(int(bag.board.stamp_ns[0]), bag.start_ns)
-    grid = np.arange(begin, max(bag.end_ns, begin) + step_ns, step_ns)
-    # Readings up to and including a grid stamp come first, as they do online.
-    due = np.searchsorted(stamps, grid, side='right')
     rows = []
-    reading = 0
-    stamp_list, value_list = stamps.tolist(), values.tolist()
-    for stamp, stop in zip(grid.tolist(), due.tolist(), strict=True):
-        while reading < stop:
-            tracker.read(names[reading], stamp_list[reading], value_list[reading])
-            reading += 1
-        rows.append(tracker.sample(stamp))
+    for stamp_ns in range(begin, max(bag.end_ns, begin) + step_ns, step_ns):
+        # Readings up to and including a grid stamp come first, as they do online.
+        while reading is not None and reading[1] <= stamp_ns:
+            tracker.read(*reading)
+            reading = next(readings, None)
+        rows.append(tracker.sample(stamp_ns))
     return (begin - bag.start_ns) * 1e-9, np.array(rows)

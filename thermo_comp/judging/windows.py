@@ -267,8 +267,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # A window's mean is no sample: what looks for stuck or too large ones would misread it.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    names, stamps, values = readings_in_order(bag, compensator.thermal.inputs)
-    readings = zip(names, stamps.tolist(), values.tolist(), strict=True)
+    readings = iter(readings_in_order(bag, compensator.thermal.inputs))
     reading = next(readings, None)
     for row in sums:
         stamp_ns = bag.start_ns + round(float(row['time']) * 1e9)

@@ -207,9 +207,9 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
     """Run thermometers and detector over a bag's readings, as the node would."""
     tracker = ThermalTracker(detector)
     start_ns, end_ns = _span_ns(bag)
-    names, stamps, values = readings_in_order(bag, (BOARD_INPUT, 'case'))
+    readings = readings_in_order(bag, (BOARD_INPUT, 'case'))
     rows, flags = [], []
-    for reading in zip(names, stamps.tolist(), values.tolist(), strict=True):
+    for reading in readings:
         tracker.read(*reading)
         b, c = tracker.board, tracker.case
         lead = b if c.stamp_ns is None else c
@@ -217,7 +217,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *curve))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     end = (end_ns - start_ns) * 1e-9
-    time: Floats = np.asarray((stamps - start_ns) * 1e-9, dtype=np.float64)
+    time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
     # Of several at once the last one holds, and equal ones after each other are one stretch.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),
