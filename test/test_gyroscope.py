@@ -67,14 +67,14 @@ def unit():
 
 @pytest.fixture(scope='module')
 def fitted(unit):
-    """Fit a MEMS unit, whose gyroscope drifts with parts that no column is, to six positions."""
-    records = arrays(unit, plan('chamber-9', 2)[:6], 2)
+    """Fit a MEMS unit, whose gyroscope drifts with parts that no column is, to nine positions."""
+    records = arrays(unit, plan('chamber-9', 2), 2)
     return fit([source_of(one, unit.scale_factor) for one in records], OPTIONS)
 
 
 @pytest.fixture(scope='module')
 def held_out(unit):
-    return arrays(unit, plan('held-out', 2), 99)
+    return arrays(unit, plan('held-out', 2)[:2], 99)
 
 
 def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
@@ -98,7 +98,7 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
         claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
         assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
     np.testing.assert_allclose(own.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
-    # Of 6 positions with a turn-on of 2 mdeg/s, and of the Earth's rate as the prior has it.
+    # Of 9 positions with a turn-on of 2 mdeg/s, and of the Earth's rate as the prior has it.
     assert np.mean(own.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
@@ -240,6 +240,9 @@ def reduced(unit, records):
 
 def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, held_out)
+    # A third of it has ramps and soaks enough to show what is wrong.
+    thirds = [replace(one, n_whole=one.n_whole // 3) for one in bags[0].intervals]
+    short = [replace(bags[0], intervals=tuple(thirds))]
     judged = judge_bags(bags, calibration)
     rate = judged.rate
     assert rate.kind is Verdict.VALID
@@ -255,14 +258,14 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     # A gyroscope of another unit is found out, and so is one that claims nothing.
     own = calibration.gyroscope
     other = replace(own, response=(), static=own.dynamic, dynamic=own.dynamic, posterior=None)
-    wrong = judge_bags(bags[:1], replace(calibration, gyroscope=other))
+    wrong = judge_bags(short, replace(calibration, gyroscope=other))
     assert wrong.is_valid
     assert wrong.rate.kind is Verdict.RECALIBRATE
     assert wrong.exit_code == 1
-    assert judge_bags(bags[:1], replace(calibration, gyroscope=None)).rate is None
+    assert judge_bags(short, replace(calibration, gyroscope=None)).rate is None
     # One that claims nothing, as an import, is not shown to be wrong.
     silent = replace(other, residual_sd_rad_s=(0.0, 0.0, 0.0))
-    unknown = judge_bags(bags[:1], replace(calibration, gyroscope=silent))
+    unknown = judge_bags(short, replace(calibration, gyroscope=silent))
     assert unknown.rate.kind is Verdict.NO_CLAIM
     assert np.isnan(unknown.rate.sections['all'].claimed_rms)
     assert unknown.exit_code == 0

@@ -13,7 +13,7 @@ from position_helpers import START_NS
 
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.coverage import rough_centre
-from thermo_comp.fitting.offset import about
+from thermo_comp.fitting.fit import about
 from thermo_comp.simulation import positions
 
 GRAVITY = 9.80665
