@@ -145,7 +145,9 @@ def reduce_source(
         cells.add(block.accel_stamp_ns, block.accel, rate)
         for name, (reading_ns, celsius, _) in block.temperatures.items():
             own = readings.setdefault(name, [NO_READINGS])
-            own.append(_thinned(reading_ns, celsius, own[-1].stamp_ns[-1:]))
+            new = _thinned(reading_ns, celsius, own[-1].stamp_ns[-1:])
+            if len(new.stamp_ns):
+                own.append(new)
         n_samples += len(block.accel_stamp_ns)
     found, reader = cells.finish(), source.reader()
     ranges = _rests(found, min_rest_s, still_sd)
