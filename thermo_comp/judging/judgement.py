@@ -235,15 +235,8 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     freedom, left = len(sd) - 6, float(np.sum((misses - seen @ found) ** 2))
     excess = max(1.0, left / freedom) if freedom > 0 else 1.0
     spread = np.sqrt(np.diag(np.linalg.pinv(seen.T @ seen)) * excess)
-    return tuple(
-        AxisShift(
-            float(found[i]) * gravity,
-            float(spread[i]) * gravity,
-            float(found[3 + i]),
-            float(spread[3 + i]),
-        )
-        for i in range(3)
-    )
+    bias, scale = (np.stack((found[k], spread[k]), axis=1) for k in (slice(3), slice(3, 6)))
+    return tuple(AxisShift(*row) for row in np.hstack((bias * gravity, scale)).tolist())
 
 
 def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
