@@ -141,6 +141,7 @@ class Acquisition:
         while (begin_ns := self._turn(cells)) is not None:
             begins.append(max(begin_ns, self.settled_ns))
             self._close(begins[-1])
+            self._accumulator.forget(begins[-1])
             cells = self._cells()
         margin_ns = round((self._rest_s + 3.0 * max(cells.cell_s, _CELL_S)) * 1e9)
         self.settled_ns = max(self.settled_ns, self._newest_ns - margin_ns)

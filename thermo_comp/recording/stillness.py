@@ -140,6 +140,14 @@ class CellAccumulator:
             self._is_integer = bool((samples == np.rint(samples)).all())
         self._accumulate(stamp_ns, samples, None if rate is None else rate[use])
 
+    def forget(self, stamp_ns: int) -> None:
+        """Drop the cells before a stamp, once there are any."""
+        if self._open_id >= 0:
+            n = np.searchsorted(
+                self.finish().index[:-1], (stamp_ns - self._start_ns) // self._cell_ns
+            )
+            self._ids, self._sums = [self._ids[0][n:]], [self._sums[0][n:]]
+
     def finish(self) -> Cells:
         """Return all cells so far, the last one as it is."""
         index, sums = np.concatenate(self._ids), np.concatenate(self._sums)
