@@ -244,6 +244,8 @@ class Acquisition:
         hole, hole_deg = coverage.farthest(seen)
         n_good = sum(not one.reason for one in positions)
         thermometers = _together([one.surveys for one in rests])
+        missing = self._n_wanted - n_good
+        findings = [f'{missing} of {self._n_wanted} positions are missing'] * (missing > 0)
         return Account(
             tuple(positions),
             n_good,
@@ -257,7 +259,7 @@ class Acquisition:
             thermometers,
             now,
             is_still,
-            self._findings(n_good, thermometers),
+            (*findings, *thermal_findings(thermometers)),
         )
 
     def _reason(self, rest: _Rest, up: Floats, noise: float, before: Sequence[Position]) -> str:
@@ -289,20 +291,6 @@ class Acquisition:
         is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
         last = cells.mean[-2:-1] if len(cells.count) > 1 else cells.mean
         return self._directions(last)[0], is_still
-
-    def _findings(self, n_good: int, thermometers: Surveys) -> tuple[str, ...]:
-        found = []
-        missing = self._n_wanted - n_good
-        if missing > 0:
-            found.append(f'{missing} of {self._n_wanted} positions are missing')
-        board = thermometers.get('board')
-        if board is None:
-            found.append('no board temperature: the constants hold at the temperature of the test')
-        else:
-            found += thermal_findings(board)
-        if 'case' not in thermometers:
-            found.append('no case temperature: the regime will follow the slower board sensor')
-        return tuple(found)
 
 
 def _noise(cells: Cells, ranges: Sequence[tuple[int, int]]) -> float:

@@ -98,7 +98,6 @@ class Survey:
     @property
     def findings(self) -> list[str]:
         """What stands between this recording and a fit, each with the next step."""
-        board = self.thermometers.get('board')
         said = (
             (self.info.truncated, f'cut off: {self.info.truncated}'),
             (
@@ -106,17 +105,7 @@ class Survey:
                 'no accelerometer samples: record accel/counts or imu/uncompensated, or name '
                 'yours with --topic counts=TOPIC or --topic imu=TOPIC',
             ),
-            (
-                board is None,
-                'no board temperature: a thermal fit needs temperature/board, or name yours with '
-                '--topic board=TOPIC',
-            ),
-            *((True, one) for one in (thermal_findings(board) if board else ())),
-            (
-                'case' not in self.thermometers,
-                'no case temperature: the regime will follow the slower board sensor; name yours '
-                'with --topic case=TOPIC',
-            ),
+            *((True, one) for one in thermal_findings(self.thermometers)),
             (
                 self.n and not self.n_still,
                 'it never rests for 3 s: the fit works on positions at rest',
@@ -130,17 +119,28 @@ class Survey:
         return [text for is_so, text in said if is_so]
 
 
-def thermal_findings(board: ThermometerSurvey) -> list[str]:
-    """Say what of span and ramps is missing."""
+def thermal_findings(thermometers: Mapping[str, ThermometerSurvey]) -> list[str]:
+    """Say what of thermometers, span and ramps is missing."""
     found = []
-    if board.span < ADVISED_SPAN_K:
-        found.append(f'board temperature spans {board.span:.1f} K: {ADVISED_SPAN_K:g} are advised')
-    for name, rate in (
-        ('heating', board.steepest_heating_k_min),
-        ('cooling', -board.steepest_cooling_k_min),
-    ):
-        if rate < RAMP_K_MIN:
-            found.append(f'no {name} ramp: the dynamic set would not know {name}')
+    board = thermometers.get('board')
+    if board is None:
+        found.append(
+            'no board temperature: a thermal fit needs temperature/board, or name yours with '
+            '--topic board=TOPIC'
+        )
+    else:
+        heating, cooling = board.steepest_heating_k_min, -board.steepest_cooling_k_min
+        if board.span < ADVISED_SPAN_K:
+            advised = f'{ADVISED_SPAN_K:g} are advised'
+            found.append(f'board temperature spans {board.span:.1f} K: {advised}')
+        for name, rate in (('heating', heating), ('cooling', cooling)):
+            if rate < RAMP_K_MIN:
+                found.append(f'no {name} ramp: the dynamic set would not know {name}')
+    if 'case' not in thermometers:
+        found.append(
+            'no case temperature: the regime will follow the slower board sensor; name yours '
+            'with --topic case=TOPIC'
+        )
     return found
 
 
