@@ -141,12 +141,10 @@ class CellAccumulator:
         self._accumulate(stamp_ns, samples, None if rate is None else rate[use])
 
     def forget(self, stamp_ns: int) -> None:
-        """Drop the cells before a stamp, once there are any."""
-        if self._open_id >= 0:
-            n = np.searchsorted(
-                self.finish().index[:-1], (stamp_ns - self._start_ns) // self._cell_ns
-            )
-            self._ids, self._sums = [self._ids[0][n:]], [self._sums[0][n:]]
+        """Drop the cells before a stamp."""
+        index = self.finish().index
+        n = np.searchsorted(index, (stamp_ns - self._start_ns) // max(self._cell_ns, 1))
+        self._ids, self._sums = [index[n:]], [self._sums[0][n:]]
 
     def finish(self) -> Cells:
         """Return all cells so far, the last one as it is."""
