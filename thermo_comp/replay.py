@@ -13,7 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from math import inf
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -171,11 +173,7 @@ def replay(
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
     """Keep the first flag (stamp, regime) and each that differs from the one before."""
-    changes: list[tuple[int, bool]] = []
-    for stamp_ns, is_dynamic in flags:
-        if not changes or changes[-1][1] != is_dynamic:
-            changes.append((stamp_ns, is_dynamic))
-    return changes
+    return [next(run) for _, run in groupby(flags, key=itemgetter(1))]
 
 
 @contextmanager

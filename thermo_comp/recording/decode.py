@@ -13,21 +13,13 @@ import numpy as np
 from ..errors import RecordingError
 from ..typing import Ints
 from .columns import NO_READINGS, Block, ImuColumns, RawMessages, Readings, Role
-from .messages import Messages, pack
+from .messages import Messages, Topic, pack
 from .topics import IMU, shown
 from .wire import Stamped, as_cdr, decode_stamped
 
 #: The columns of sensor_msgs/Imu among its numbers, as `ImuColumns` has them.
 _IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
 _IMU_ACCELERATION = slice(25, 28)
-
-
-class Feed(NamedTuple):
-    """What feeds a role: a topic, its message type and its encoding."""
-
-    topic: str
-    type: str
-    encoding: str
 
 
 class _Found(NamedTuple):
@@ -42,13 +34,13 @@ class Decoder:
     """
     Turns messages into blocks.
 
-    `channels` has the role of each channel that is read; the others are passed over. `names` are
-    all thermometers, `keep_raw` keeps the serialized messages too.
+    `feeds` are the topics of the roles, `channels` has the role of each channel that is read.
+    `names` are all thermometers, `keep_raw` keeps the serialized messages too.
     """
 
     def __init__(
         self,
-        feeds: Mapping[Role, Feed],
+        feeds: Mapping[Role, Topic],
         channels: Mapping[int, Role],
         names: Collection[str],
         keep_raw: bool,
@@ -91,7 +83,7 @@ class Decoder:
                 after = np.searchsorted(rank, own_rank).astype(np.int64)
                 temperatures[role] = Readings(stamp_ns, numbers[:, 0], after)
             if self._keep_raw and len(messages):
-                topic, kind, _ = self._feeds[role]
+                topic, kind, *_ = self._feeds[role]
                 packed = pack(messages.data, messages.start, messages.size)
                 raw[role] = RawMessages(topic, kind, messages.log_ns, *packed)
         is_imu, numbers = self._is_imu, accel.numbers
@@ -114,4 +106,4 @@ class Decoder:
                 own = as_cdr(own, feed.type)
             return _Found(rank, own, decode_stamped(own, feed.type))
         except RecordingError as error:
-            raise RecordingError(error.message, topic=shown(feed.topic)) from error
+            raise RecordingError(error.message, topic=shown(feed.name)) from error

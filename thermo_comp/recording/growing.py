@@ -21,7 +21,7 @@ import numpy as np
 
 from ..errors import OutputError, RecordingError
 from ..files import MCAP, check_output
-from ..typing import Bools, Ints
+from ..typing import Ints
 from .columns import Block, Input, RawMessages, RecordingInfo, Role
 from .reader import open_recording
 from .topics import IMU, Topics
@@ -96,19 +96,8 @@ def numbered_bags(folder: Path) -> list[Path]:
     return sorted(found, key=lambda one: int(one.stem))
 
 
-class _Piece(NamedTuple):
-    """Messages of one topic, with their own stamps."""
-
-    stamp_ns: Ints
-    messages: RawMessages
-
-    def split(self, stamp_ns: int) -> tuple[_Piece, _Piece]:
-        """Part them where the first one is not older than a stamp."""
-        late = np.maximum.accumulate(self.stamp_ns >= stamp_ns)
-        return self._take(~late), self._take(late)
-
-    def _take(self, rows: Bools) -> _Piece:
-        return _Piece(self.stamp_ns[rows], self.messages.take(rows))
+#: Messages of one topic, with their own stamps.
+_Piece = tuple[Ints, RawMessages]
 
 
 class PositionBags:
@@ -141,13 +130,19 @@ class PositionBags:
                 name = _USUAL.imu if one.type == IMU else _USUAL.counts
             else:
                 stamp_ns, name = block.temperatures[role].stamp_ns, f'temperature/{role}'
-            self._held.append(_Piece(stamp_ns, one._replace(topic=name)))
+            self._held.append((stamp_ns, one._replace(topic=name)))
 
     def release(self, stamp_ns: int) -> None:
         """Write what is older than a stamp."""
-        parts = [one.split(stamp_ns) for one in self._held]
-        self._held = [late for _, late in parts if len(late.stamp_ns)]
-        self._write([early for early, _ in parts if len(early.stamp_ns)])
+        early: list[_Piece] = []
+        late: list[_Piece] = []
+        for stamps, one in self._held:
+            is_late = np.maximum.accumulate(stamps >= stamp_ns)
+            for rows, part in ((~is_late, early), (is_late, late)):
+                if rows.any():
+                    part.append((stamps[rows], one.take(rows)))
+        self._held = late
+        self._write(early)
 
     def cut(self, stamp_ns: int) -> None:
         """End the bag before a stamp."""
@@ -172,8 +167,7 @@ class PositionBags:
             )
             self.written.append(path)
         try:
-            for one in pieces:
-                raw = one.messages
+            for _, raw in pieces:
                 self._writer.write_raw(raw.topic, raw.type, raw.log_ns, raw)
             self._writer.flush()
         except OutputError:

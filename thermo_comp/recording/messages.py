@@ -55,7 +55,7 @@ class Topic(NamedTuple):
     name: str
     type: str
     encoding: str
-    n_messages: int
+    n_messages: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ from .columns import (
     gathered,
     joined,
 )
-from .decode import Decoder, Feed
+from .decode import Decoder
 from .foreign import ForeignFile
 from .mcap_file import McapFile
 from .messages import BagFile, Messages, Topic, pack
@@ -148,15 +148,14 @@ class RecordingReader:
         """Decode the topic of each role, in reading order."""
         roles = {topic: role for role, topic in self.topics.items()}
         for file in self._opened():
-            feeds: dict[Role, Feed] = {}
+            feeds: dict[Role, Topic] = {}
             channels: dict[int, Role] = {}
             for number, topic in file.topics.items():
                 if topic.name in roles:
                     role = channels[number] = roles[topic.name]
                     if topic.encoding not in {'cdr', 'ros1'}:
                         raise _no_cdr(topic, file)
-                    feed = Feed(topic.name, topic.type, topic.encoding)
-                    if feeds.setdefault(role, feed) != feed:
+                    if feeds.setdefault(role, topic)[:3] != topic[:3]:
                         reason = 'its messages have several encodings'
                         raise RecordingError(reason, file.path, shown(topic.name))
             if channels:

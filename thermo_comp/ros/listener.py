@@ -32,9 +32,9 @@ from std_msgs.msg import Bool
 
 from ..online.stamped_flag import STAMPED_TOPIC
 from ..recording import ROLES, BagWriter, Input, Role, Topics
-from ..recording.decode import Decoder, Feed
+from ..recording.decode import Decoder
 from ..recording.growing import News
-from ..recording.messages import Messages
+from ..recording.messages import Messages, Topic
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
 from .waitloop import RawSubscription, WaitLoop
 
@@ -199,7 +199,7 @@ class LiveTopics(_Listener):
     def __init__(self, topics: Topics, input: Input, ros_args: Sequence[str] = ()) -> None:  # noqa: A002
         super().__init__('thermo_comp_record', ros_args)
         self._topics, self._input = topics, input
-        self._feeds: dict[Role, Feed] = {}
+        self._feeds: dict[Role, Topic] = {}
         #: Why nothing comes, one sentence each.
         self.problems: tuple[str, ...] = ()
 
@@ -278,7 +278,7 @@ class LiveTopics(_Listener):
         if any(one.topic_type != kind for one in offers):
             problems.append(f'{name} has the type {offers[0].topic_type}, expected {kind}')
         elif offers:
-            self._feeds[role] = Feed(name, kind, 'cdr')
+            self._feeds[role] = Topic(name, kind, 'cdr')
             self._heard[role] = self._loop.subscribe(
                 _CLASSES[kind], topic, _AS_OFFERED, is_hot=role == 'accel'
             )
