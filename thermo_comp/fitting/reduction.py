@@ -134,7 +134,7 @@ def reduce_source(
     where a recording has so many short ones that they tell bias and scale, how short, and how
     quiet beside the quietest, is what tells these best.
     """
-    cells = CellAccumulator(cell_s, full_scale, window_s)
+    cells = CellAccumulator(min(cell_s, window_s), full_scale, window_s)
     readings: dict[str, list[Readings]] = {}
     n_samples = 0
     has_rate = True

@@ -27,7 +27,6 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .judgement import Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 
-_CELL_S = 0.5
 # A unit at rest scatters by no more than this many times what its calibration says of its noise.
 _NOISES = 4.0
 _BOARD: tuple[Role, ...] = ('board',)
@@ -59,7 +58,6 @@ def open_bag(
     What is read, what is saturated and what a rest scatters by is as the `calibration` says, else
     the usual. Raises RecordingError if it cannot be read or has no board temperature.
     """
-    sum_s = sum_length(window_s)
     if calibration is not None:
         input = input_for(calibration, input)  # noqa: A001 - as above
     source, info = recording_source(path, topics, input, require=require, progress=progress)
@@ -71,8 +69,7 @@ def open_bag(
         still_sd = max(still_sd, _NOISES / np.sqrt(calibration.unit.cycle_time_s) * density)
     bag = reduce_source(
         replace(source, sha256=digest(Path(path))),
-        window_s=sum_s,
-        cell_s=min(_CELL_S, sum_s),
+        window_s=sum_length(window_s),
         still_sd=still_sd,
         full_scale=full_scale,
     )

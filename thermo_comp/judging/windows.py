@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
+from ..fitting import reduction
 from ..fitting.priors import constants_of
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import readings_in_order
@@ -37,8 +38,6 @@ from ..unit.metrics import norm_residual
 
 #: Length of a window unless the user says otherwise [s].
 WINDOW_S = 60.0
-# The sums that windows are made of are no longer than this [s]: the thermal state moves little.
-_LONGEST_SUM_S = 10.0
 # Less than this beyond a calibrated range, in half ranges, is its edge: thermometers have noise.
 _EDGE = 0.02
 # A sum of fewer than this part of the usual samples does not last as long.
@@ -103,10 +102,10 @@ class Windows:
 
 
 def sum_length(window_s: float) -> float:
-    """Choose the longest part of a window up to ten seconds; raises ValueError if not positive."""
+    """Choose the longest part of a window in which the thermal state moves little."""
     if not 0.0 < window_s < np.inf:
         raise ValueError(f'`window_s` must be positive, got {window_s:g}')
-    return window_s / float(np.ceil(window_s / _LONGEST_SUM_S))
+    return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
