@@ -6,7 +6,6 @@ Owns the small thermal tests that the report's tests look at: simulated, so that
 
 from __future__ import annotations
 
-import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from builders import ArrayBlock
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.recording import BagWriter
-from thermo_comp.report import Evidence, evidence_of_fit, write_report
+from thermo_comp.report import Evidence, evidence_of_fit, render_report
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
     SimulatedRun,
@@ -37,6 +36,7 @@ def run(position: int = 0) -> SimulatedRun:
         parse_cyclogram(PROGRAM),
         positions(N_POSITIONS, 0)[position],
         rate_hz=RATE_HZ,
+        temperature_rate_hz=0.4,
         seed=position,
     )
 
@@ -74,11 +74,8 @@ def evidence() -> Evidence:
 
 @cache
 def certificate() -> str:
-    """Write the page of that fit; drawing takes seconds, so it is done once."""
-    with tempfile.TemporaryDirectory() as folder:
-        page = Path(folder) / 'page.html'
-        write_report(evidence(), page)
-        return page.read_text(encoding='utf-8')
+    """Make the page of that fit; drawing takes seconds, so it is done once."""
+    return render_report(evidence())
 
 
 def write_bag(path: Path, position: int = 0, frame_id: str = 'imu_link', **metadata: str) -> Path:

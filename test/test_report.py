@@ -30,8 +30,10 @@ from thermo_comp.report import (
     write_report,
 )
 from thermo_comp.report.evidence import LEFT_OUT
-from thermo_comp.report.figures import figures_of, png_files
+from thermo_comp.report.figures import figures_of
+from thermo_comp.report.figures_position import draw_positions
 from thermo_comp.report.html import spelt
+from thermo_comp.report.style import drawing
 from thermo_comp.simulation import STANDARD_GRAVITY
 from thermo_comp.thermal.regime import Regime
 
@@ -116,7 +118,7 @@ def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
     assert not re.search(r'\bnan\b', page.text)
 
 
-def test_certificate_says_what_the_other_positions_say_of_each(tmp_path):
+def test_certificate_says_what_the_other_positions_say_of_each():
     # One micro-g for the first position, two for the next and so on; the last cannot do without.
     rms = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(len(fitted().positions))]
     rms[-1] = np.nan
@@ -127,7 +129,9 @@ def test_certificate_says_what_the_other_positions_say_of_each(tmp_path):
     found = evidence_of_fit(replace(fitted(), positions=positions))
     shown = [one.residual_rms.get(LEFT_OUT) for one in found.positions]
     assert shown == [*rms[:-1], None]
-    page = page_of(found, tmp_path)
+    with drawing():
+        draw_positions(found).draw_without_rendering()
+    page = words_of(found)
     assert 'left out, µg RMS' in page.text
     assert 'Left out: with what the other positions say' in page.text
 
@@ -260,16 +264,16 @@ def test_bag_is_read_in_bounded_memory(tmp_path):
 
 
 def test_figures_as_png(tmp_path):
-    files = png_files(evidence())
-    names = [one.name for one in figures_of(evidence())]
-    assert list(files) == [f'{i}_{name}.png' for i, name in enumerate(names, 1)]
-    assert all(content.startswith(b'\x89PNG') for content in files.values())
     folder = tmp_path / 'new' / 'figures'
     write_report(bare(), tmp_path / 'page.html', figures=folder)
+    # Those that need no bags; every other one is drawn for the page.
+    names = [one.name for one in figures_of(evidence())]
     without_bags = [name for name in names if name in ('functions', 'step', 'hysteresis')]
-    assert [path.name for path in sorted(folder.iterdir())] == [
+    files = sorted(folder.iterdir())
+    assert [path.name for path in files] == [
         f'{i}_{name}.png' for i, name in enumerate(without_bags, 1)
     ]
+    assert all(path.read_bytes().startswith(b'\x89PNG') for path in files)
 
 
 def test_page_is_written_atomically(tmp_path):

@@ -9,6 +9,7 @@ import os
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any
 
 from .. import __version__
@@ -28,15 +29,11 @@ def dask_setup(_worker: object) -> None:
 
 def require_libraries() -> None:
     """Raise FleetError at once if a library of the extra `fleet` is not installed."""
-    try:
-        import distributed
-        import fsspec
-        import pyarrow as pa
-    except ImportError as error:
-        raise FleetError(
-            f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({error.name} is not installed)"
-        ) from error
-    del distributed, fsspec, pa
+    for name in ('distributed', 'fsspec', 'pyarrow'):
+        if find_spec(name) is None:
+            raise FleetError(
+                f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({name} is not installed)"
+            )
 
 
 @contextmanager

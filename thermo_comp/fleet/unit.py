@@ -21,6 +21,8 @@ from ..unit.calibration_file import dump_calibration
 from .table import FAILED, REFUSED, Cell, fitted_cells, row_of
 from .units import FoundUnit, Storage
 
+_UNIT_OF: dict[str | None, Literal['counts', 'm/s^2']] = {'counts': 'counts', 'imu': 'm/s^2'}
+
 
 @dataclass(frozen=True)
 class FleetOptions:
@@ -76,23 +78,19 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
     began = time.process_time()
     storage = Storage(url)
     hashes = dict.fromkeys(unit.bags, '')
-    kinds: dict[Literal['counts', 'm/s^2'], str] = {}
-    bags: list[ReducedBag] = []
-    problems, chosen = [], []
+    # Of a bag its sufficient statistics are kept, some kilobytes per hour.
+    bags: dict[str, ReducedBag] = {}
+    problems = []
     is_final = True
     for name, files in unit.bags.items():
-        # Of a bag its sufficient statistics are kept, some kilobytes per hour.
         try:
             with storage.here(name, files) as path:
                 hashes[name] = digest(path)
                 source, info = recording_source(
                     path, options.topics, options.input, require=('accel', 'board')
                 )
-                source = replace(source, sha256=hashes[name])
-                how = replace(options.fit, input='m/s^2' if info.input == 'imu' else 'counts')
-                chosen.append(info.chosen)
-                bags.append(reduce_bag(source, how))
-                kinds[how.input] = name
+                how = replace(options.fit, input=_UNIT_OF[info.input])
+                bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
         except RecordingError as error:  # noqa: PERF203 - no bag stops the others
             # Named as the fleet does, wherever it lies.
             problems.append(': '.join(one for one in (name, error.topic, error.message) if one))
@@ -102,44 +100,45 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
             is_final = False
         except FitError as error:
             problems.append(str(error))
-    serials = sorted({bag.source.serial for bag in bags if bag.source.serial})
-    lots = [lot for bag in bags if (lot := bag.info.metadata.get('lot'))]
+    infos = [bag.info for bag in bags.values()]
+    serials = sorted({serial for info in infos if (serial := info.metadata.get('serial'))})
     serial = serials[0] if serials else unit.name.rpartition('/')[2]
     row = started_row(
         unit,
         serial=serial,
-        lot=lots[0] if lots else unit.lot,
+        lot=next((lot for info in infos if (lot := info.metadata.get('lot'))), unit.lot),
         n_left_out=len(problems),
-        n_torn=sum(bool(bag.info.truncated) for bag in bags),
+        n_torn=sum(bool(info.truncated) for info in infos),
         left_out='; '.join(problems),
-        chosen='; '.join(dict.fromkeys(filter(None, chosen))),
+        chosen='; '.join(dict.fromkeys(info.chosen for info in infos if info.chosen)),
         prior=options.prior_sha256,
     )
-    outcome = UnitOutcome(row, hashes, is_final)
+    calibration = page = ''
     try:
         if len(serials) > 1:
             raise FitError(f'the bags are of different units: {", ".join(serials)}')
         if not bags:
             raise ThermoCompError('none of its bags can be used')
+        kinds = {_UNIT_OF[bag.info.input]: name for name, bag in bags.items()}
         if len(kinds) > 1:
             said = ', '.join(f'{name} holds {kind}' for kind, name in sorted(kinds.items()))
             raise FitError(f'{said}: choose one with --input')
         how = replace(options.fit, input=next(iter(kinds)), serial=serial)
-        outcome = _fitted(outcome, bags, how, options.certificates)
+        row, calibration, page = _fitted(row, list(bags.values()), how, options.certificates)
     except FitError as refusal:
         row.update(verdict=REFUSED, problem=one_line(str(refusal)))
     except ThermoCompError as failure:
         row.update(verdict=FAILED, problem=one_line(str(failure)))
-    outcome.row['cpu_s'] = time.process_time() - began
-    return outcome
+    row['cpu_s'] = time.process_time() - began
+    return UnitOutcome(row, hashes, is_final, calibration, page)
 
 
 def _fitted(
-    outcome: UnitOutcome, bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
-) -> UnitOutcome:
+    row: dict[str, Cell], bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
+) -> tuple[dict[str, Cell], str, str]:
+    """Fit bags; give the whole row, the calibration and the certificate."""
     from ..report import evidence_of_fit, render_report
 
-    row = outcome.row
     result = fit_bags(bags, how)
     calibration = dump_calibration(result.calibration)
     lost = [f'{bag.source.name}: {bag.info.truncated}' for bag in bags if bag.info.truncated]
@@ -147,14 +146,13 @@ def _fitted(
         lost.append(f'{row["n_left_out"]} of {row["n_bags"]} bags are left out: {row["left_out"]}')
     evidence = evidence_of_fit(result, is_brief=not has_page)
     evidence = replace(evidence, findings=(*evidence.findings, *lost))
-    cells = {
+    known = {
         **fitted_cells(result, evidence.judgement),
         'reservations': '; '.join(evidence.findings),
         'calibration_sha256': _sha256(calibration),
     }
     page = render_report(evidence) if has_page else ''
-    row = row_of(**(row | cells))
-    return replace(outcome, row=row, calibration=calibration, certificate=page)
+    return row_of(**(row | known)), calibration, page
 
 
 def _sha256(text: str) -> str:

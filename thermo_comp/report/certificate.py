@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime as dt
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -130,8 +130,7 @@ def load_certificate_info(path: str | Path, serial: str | None = None) -> Certif
     return info
 
 
-@dataclass(frozen=True)
-class Contribution:
+class Contribution(NamedTuple):
     """One line of the uncertainty budget: a standard uncertainty of |f| [m/s^2]."""
 
     name: str
@@ -140,8 +139,7 @@ class Contribution:
     basis: str
 
 
-@dataclass(frozen=True)
-class Result:
+class Result(NamedTuple):
     """One line of the results, with its expanded uncertainty (k = 2), rounded as such are."""
 
     quantity: str
@@ -212,27 +210,29 @@ def results(
     known = COVERAGE if calibration.has_uncertainty else np.nan
     by_gravity = (info.gravity.standard_uncertainty_m_s2 or 0.0) / calibration.gravity_m_s2
     scale_sd = np.hypot(scale_sd, by_gravity) * np.abs(scale)
+    below = ((1, 0), (2, 0), (2, 1))
+    said = {
+        'scale factor {}': (AXES, scale, scale_sd, f'{unit} per m/s²'),
+        'bias {}': (AXES, bias / MICRO_G, bias_sd / MICRO_G, 'µg'),
+        'misalignment {}': (
+            [AXES[i] + AXES[j] for i, j in below],
+            1e6 * np.array([calibration.misalignment[i][j] for i, j in below]),
+            1e6 * np.array(calibration.misalignment_sd),
+            'µrad',
+        ),
+    }
     found = [
-        Result(f'{name} {axis}', *rounded(value, known * sd), of)
-        for name, values, sds, of in (
-            ('scale factor', scale, scale_sd, f'{unit} per m/s²'),
-            ('bias', bias / MICRO_G, bias_sd / MICRO_G, 'µg'),
-        )
-        for axis, value, sd in zip(AXES, values.tolist(), sds.tolist(), strict=True)
+        Result(name.format(part), *rounded(float(value), float(known * sd)), of)
+        for name, (parts, values, sds, of) in said.items()
+        for part, value, sd in zip(parts, values, sds, strict=True)
     ]
-    for k, (row, column) in enumerate(((1, 0), (2, 0), (2, 1))):
-        said = rounded(
-            1e6 * calibration.misalignment[row][column],
-            float(known * 1e6 * calibration.misalignment_sd[k]),
-        )
-        found.append(Result(f'misalignment {AXES[row]}{AXES[column]}', *said, 'µrad'))
     if contributions and evidence.judgement is not None:
         expanded_ug = COVERAGE * combined(contributions) / MICRO_G
         for name in ('static', 'dynamic'):
             one = evidence.judgement.sections[name]
             if one.n:
-                said = rounded(one.mean / MICRO_G, expanded_ug if known > 0.0 else np.nan)
-                found.append(Result(f'mean of |f| − g, {name}', *said, 'µg'))
+                texts = rounded(one.mean / MICRO_G, expanded_ug if known > 0.0 else np.nan)
+                found.append(Result(f'mean of |f| − g, {name}', *texts, 'µg'))
     return found
 
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -122,8 +122,7 @@ def _draw_less_line(
     return slope
 
 
-@dataclass(frozen=True)
-class SoakMeasurements:
+class SoakMeasurements(NamedTuple):
     """
     What each soak of each position measured against the calibration, shapes (n,) and (n, 3).
 
@@ -151,8 +150,7 @@ def soak_measurements(evidence: Evidence) -> SoakMeasurements:
     return SoakMeasurements(mean[:, 0], error / MICRO_G, scale * 1e6)
 
 
-@dataclass(frozen=True)
-class Curve:
+class Curve(NamedTuple):
     """
     Bias [micro-g] and scale [ppm] over the board temperature in one thermal state, against a soak
     at the reference, shapes (n, 3); line, hatch and marker are how it is drawn.

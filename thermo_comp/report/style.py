@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from html import escape
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
@@ -58,7 +57,6 @@ _RC: dict[str, Any] = {
     'axes.spines.right': False,
     'axes.grid': True,
     'axes.axisbelow': True,
-    'axes.unicode_minus': True,
     'grid.color': '#DDDDDD',
     'grid.linewidth': 0.5,
     'xtick.labelsize': 8,
@@ -74,25 +72,18 @@ _RC: dict[str, Any] = {
     'hatch.linewidth': 0.5,
     # Names in figures come from files that others wrote: a dollar sign is a dollar sign.
     'text.parse_math': False,
-    'text.usetex': False,
     'svg.fonttype': 'none',
     'svg.hashsalt': 'thermo_comp',
     # Of many points in one pixel those at its ends are drawn.
-    'path.simplify': True,
     'path.simplify_threshold': 0.5,
 }
 _PNG_DPI = 160
 _WIDTH = 7.1
 
 
-@contextmanager
-def drawing() -> Iterator[None]:
+def drawing() -> AbstractContextManager[None]:
     """Draw in the report's style, whatever the user's matplotlib settings are."""
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        settings: Any = mpl.rcParams
-        settings.update(_RC)
-        yield
+    return style.context(_RC, after_reset=True)
 
 
 def new_figure(height: float) -> Figure:
