@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
@@ -179,21 +179,14 @@ def _topics(
         return Topics.named(names, part)
 
 
-class Reading(TypedDict):
-    """What is read of a bag, as the library takes it."""
-
-    topics: Topics
-    input: Literal['auto', 'counts', 'imu']
-
-
-def _reading(*, input_: InputOption = 'auto', names: TopicNames) -> Reading:
+def _reading(*, input_: InputOption = 'auto', names: TopicNames) -> dict[str, Any]:
     return {'topics': _topics(names), 'input': input_}
 
 
 TopicsPart = Annotated['Topics', Given(_topics)]
 
 
-def _reading_part(*, input_: InputOption = 'auto', topics: TopicsPart) -> Reading:
+def _reading_part(*, input_: InputOption = 'auto', topics: TopicsPart) -> dict[str, Any]:
     return {'topics': topics, 'input': input_}
 
 
@@ -216,15 +209,6 @@ def _place(
 Place = Annotated[float | None, Given(_place)]
 
 
-class Judging(TypedDict):
-    """What a calibration is judged by, as the library takes it."""
-
-    gravity: float | None
-    window_s: float
-    tolerance: float | None
-    serial: str | None
-
-
 def _judging(
     gravity: Place,
     window: Annotated[float, option('Length of a window at rest, in s.', metavar='S')] = 60.0,
@@ -232,7 +216,7 @@ def _judging(
         str | None, option('Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.')
     ] = None,
     serial: Serial = None,
-) -> Judging:
+) -> dict[str, Any]:
     return {
         'gravity': gravity,
         'window_s': positive(window, '--window'),
@@ -285,9 +269,9 @@ def _fitting(
 
 
 Out = Annotated[Output, Given(_output)]
-ReadingOptions = Annotated[Reading, Given(_reading)]
-ReadingPart = Annotated[Reading, Given(_reading_part)]
-JudgingOptions = Annotated[Judging, Given(_judging)]
+ReadingOptions = Annotated[dict[str, Any], Given(_reading)]
+ReadingPart = Annotated[dict[str, Any], Given(_reading_part)]
+JudgingOptions = Annotated[dict[str, Any], Given(_judging)]
 FittingOptions = Annotated[dict[str, Any], Given(_fitting)]
 
 
