@@ -73,7 +73,7 @@ def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng: np.random.
     for k in range(n):
         stamp = k * step * SECOND
         memory.board_step(stamp, float(board[k]))
-        for bank_, gradient in zip(memory.neighbours, gradients, strict=True):
+        for bank_, gradient in zip(list(memory.banks.values())[1:], gradients, strict=True):
             bank_.step(stamp, float(gradient[k]))
         row = memory.at(stamp, float(board[k]), [float(g[k]) for g in gradients])
         if k % 100 == 99:

@@ -151,6 +151,6 @@ def test_the_start_fades_with_each_time_constant():
     memory = ThermalMemory(MemorySpec(lags=(('board', 60.0), ('board', 600.0), ('case', 600.0))))
     assert memory.start_shares(5) == [1.0, 1.0, 1.0]
     memory.board_step(0, 20.0)
-    memory.neighbours[0].step(300 * SECOND_NS, 2.0)
+    memory.banks['case'].step(300 * SECOND_NS, 2.0)
     found = memory.start_shares(600 * SECOND_NS)
     assert found == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])

@@ -106,7 +106,7 @@ class ThermalSide:
 
     def swap(self, calibration: Calibration, now_ns: int | None) -> None:
         """Take over another calibration; see `Compensator.swap`."""
-        old, sensors = self.tracker, self.inputs
+        old = self.tracker
         detector = self.calibration.detector
         self._use(calibration, self.config)
         self.queue.keep(lambda entry: entry[2] in self.inputs)
@@ -115,7 +115,7 @@ class ThermalSide:
             return
         self.tracker = self._new_tracker()
         # It starts from the temperatures just seen, so that no sample is lost.
-        for name, sensor in zip(sensors, (old.board, *old.sensors), strict=True):
+        for name, sensor in old.thermometers.items():
             if name in self.inputs and sensor.stamp_ns is not None:
                 self.tracker.read(name, sensor.stamp_ns, sensor.temperature)
 

@@ -47,7 +47,7 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         math.inf if case_ns is None else (stamp_ns - case_ns) * 1e-9,
         board_age > stale_after,
         board_age > compensator.config.temperature_timeout_s,
-        not tracker.is_live(stamp_ns),
+        not tracker.is_live(stamp_ns, tracker.case),
         excess.relative,
         excess.temperature,
         excess.rate * 60.0,

@@ -177,8 +177,9 @@ class ThermalMemory:
 
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
-        self.board = LagBank(spec.taus(BOARD_INPUT))
-        self.neighbours = [LagBank(spec.taus(name)) for name in spec.sensors]
+        #: The lags of each input, by its name.
+        self.banks = {name: LagBank(spec.taus(name)) for name in spec.inputs}
+        self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
         #: Of each play the lag that it follows, -1 for the board itself, and its half-width.
         self._inputs = [self.board.taus.index(tau) if tau else -1 for tau, _ in spec.plays]
@@ -187,8 +188,7 @@ class ThermalMemory:
 
     def forget(self) -> None:
         """Forget everything; each play begins anew in its middle."""
-        self.board.forget()
-        for bank in self.neighbours:
+        for bank in self.banks.values():
             bank.forget()
         self._held = []
 
@@ -204,16 +204,15 @@ class ThermalMemory:
 
     def note_jump(self, change: float) -> None:
         """Doubt everything by a change of the board temperature that was none."""
-        self.board.note_jump(change)
-        for bank in self.neighbours:
+        for bank in self.banks.values():
             bank.note_jump(change)
 
     def at(self, stamp_ns: int, board: float, gradients: list[float]) -> list[float]:
         """Give (lag [K], extra variance [K^2]) per lag, then each play less its input [K]."""
         lagging, variances = self.board.at(stamp_ns, board)
         values, extra = lagging, variances
-        for bank, gradient in zip(self.neighbours, gradients, strict=True):
-            if bank.taus:
+        for name, gradient in zip(self.spec.sensors, gradients, strict=True):
+            if (bank := self.banks[name]).taus:
                 behind, more = bank.at(stamp_ns, gradient)
                 values = values + [gradient - m for m in behind]
                 extra = extra + more
@@ -229,7 +228,7 @@ class ThermalMemory:
 
     def start_shares(self, stamp_ns: int) -> list[float]:
         """Say what is left at a stamp of each lag's start, 1 to 0, in the order of the spec."""
-        banks = (self.board, *self.neighbours)
+        banks = self.banks.values()
         return [share for bank in banks for share in bank.start_shares(stamp_ns)]
 
 

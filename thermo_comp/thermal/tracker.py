@@ -13,7 +13,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import Final
 
-from .memory import BOARD_INPUT, LagBank, MemorySpec, ThermalMemory, start_covariance
+from .memory import BOARD_INPUT, MemorySpec, ThermalMemory, start_covariance
 from .plausibility import Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
@@ -40,18 +40,16 @@ class ThermalTracker:
         self.spec = memory or MemorySpec()
         self._configure(config or ThermalConfig(), board_lag_s)
         self.board = Thermometer(detector.board)
-        #: The thermometers beside the board; the first, which is the case's, leads.
-        self.sensors = [Thermometer(detector.case) for _ in self.spec.sensors]
-        self.case = self.sensors[0]
-        self._board_check = SensorCheck(self.board, self.case, board_lag_s)
-        self._checks = [SensorCheck(sensor, self.board, 0.0) for sensor in self.sensors]
-        #: What is wrong with each thermometer, by name.
+        beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
+        self.thermometers = {BOARD_INPUT: self.board, **beside}
+        #: The first of those beside the board: it leads.
+        self.case = beside[self.spec.sensors[0]]
+        #: What is wrong with each thermometer.
         self.checks = {
-            BOARD_INPUT: self._board_check,
-            **dict(zip(self.spec.sensors, self._checks, strict=True)),
+            BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
+            **{name: SensorCheck(one, self.board, 0.0) for name, one in beside.items()},
         }
         self.memory = ThermalMemory(self.spec)
-        self._places = {name: k for k, name in enumerate(self.spec.sensors)}
         #: Stamp of the newest reading that was used, None before the first.
         self.updated_ns: int | None = None
         self._decided_ns: int | None = None
@@ -82,12 +80,12 @@ class ThermalTracker:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self._configure(config, board_lag_s)
-        self._board_check.lag_s = board_lag_s
+        self.checks[BOARD_INPUT].lag_s = board_lag_s
 
-    def is_live(self, stamp_ns: int, place: int = 0) -> bool:
-        """Whether a sensor, the leading one by default, is there and fresh enough at a stamp."""
-        seen = self.sensors[place].stamp_ns
-        return seen is not None and (stamp_ns - seen) * 1e-9 <= self._case_timeout_s
+    def is_live(self, stamp_ns: int, sensor: Thermometer) -> bool:
+        """Whether a sensor is there and fresh enough at a stamp."""
+        seen_ns = sensor.stamp_ns
+        return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self._case_timeout_s
 
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
         """
@@ -95,55 +93,42 @@ class ThermalTracker:
         regime; False for one that is not finite, not newer than the last, an outlier, or not
         plausible.
         """
-        if name == BOARD_INPUT:
-            return self._read_board(stamp_ns, celsius)
-        return self._read_sensor(self._places[name], stamp_ns, celsius)
-
-    def _read_board(self, stamp_ns: int, celsius: float) -> bool:
-        board, memory = self.board, self.memory
-        patience_s = self.config.temperature_timeout_s
-        if not self._use(board, self._board_check, memory, stamp_ns, celsius, patience_s):
+        sensor, check = self.thermometers[name], self.checks[name]
+        if not self._use(name, sensor, check, stamp_ns, celsius):
             return False
-        if not memory.is_empty:
-            memory.board_step(stamp_ns, board.temperature)
-            self._guess_gradients(stamp_ns)
-        for other in self._checks:
-            other.watch_other()
-        if not self.is_live(stamp_ns):
-            self._decide(stamp_ns, None)
-        return True
-
-    def _guess_gradients(self, stamp_ns: int) -> None:
-        """Let the lags of a gradient go on while its sensor is lost."""
-        for place, bank in enumerate(self.memory.neighbours):
-            if bank.taus and bank.stamp_ns is not None and not self.is_live(stamp_ns, place):
-                gradient, variance = self._lost_gradient(stamp_ns, self.board.rate)
-                bank.step(stamp_ns, gradient, sqrt(variance))
-
-    def _read_sensor(self, place: int, stamp_ns: int, celsius: float) -> bool:
-        sensor, check = self.sensors[place], self._checks[place]
-        bank = self.memory.neighbours[place]
-        if not self._use(sensor, check, bank, stamp_ns, celsius, self.config.case_timeout_s):
-            return False
+        if sensor is self.board:
+            self._follow_board(stamp_ns)
+            return True
+        bank = self.memory.banks[name]
         if bank.taus and self.board.stamp_ns is not None:
             bank.step(stamp_ns, sensor.temperature - self.board.at(stamp_ns)[0])
-        if place == 0:
-            self._board_check.watch_other()
-            detector = self.detector
-            if check.fault is not Fault.STILL or detector.regime is not Regime.DYNAMIC:
+        if sensor is self.case:
+            self.checks[BOARD_INPUT].watch_other()
+            if check.fault is not Fault.STILL or self.detector.regime is not Regime.DYNAMIC:
                 # One that stands still does not tell that a ramp has ended.
                 self._decide(stamp_ns, sensor)
-            self.lead.update(detector.regime is Regime.STATIC)
+            self.lead.update(self.detector.regime is Regime.STATIC)
         return True
 
+    def _follow_board(self, stamp_ns: int) -> None:
+        board, memory = self.board, self.memory
+        if not memory.is_empty:
+            memory.board_step(stamp_ns, board.temperature)
+            for name, bank in memory.banks.items():
+                sensor = self.thermometers[name]
+                if sensor is board or not bank.taus or bank.stamp_ns is None:
+                    continue
+                if not self.is_live(stamp_ns, sensor):
+                    # The lags of a gradient go on while its sensor is lost.
+                    gradient, variance = self._lost_gradient(stamp_ns, board.rate)
+                    bank.step(stamp_ns, gradient, sqrt(variance))
+        for name in self.spec.sensors:
+            self.checks[name].watch_other()
+        if not self.is_live(stamp_ns, self.case):
+            self._decide(stamp_ns, None)
+
     def _use(
-        self,
-        sensor: Thermometer,
-        check: SensorCheck,
-        memory: ThermalMemory | LagBank,
-        stamp_ns: int,
-        celsius: float,
-        patience_s: float,
+        self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
         """Let a thermometer have a reading; the memory doubts a jump, and forgets over a gap."""
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
@@ -151,6 +136,8 @@ class ThermalTracker:
         if is_anew:
             # One that has stayed for long where it cannot have come to begins again.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
+            is_board = sensor is self.board
+            patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s
             if check.fault != Fault.STEP or age_s <= patience_s:
                 return False
             check.reset()
@@ -162,7 +149,8 @@ class ThermalTracker:
         has_restarted = sensor.n_restarts != n_restarts
         if before_ns is not None and (is_new or has_restarted):
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
-            if isinstance(memory, ThermalMemory) and (is_anew or is_gap):
+            memory = self.memory if sensor is self.board else self.memory.banks[name]
+            if memory is self.memory and (is_anew or is_gap):
                 memory.forget()
             if is_new or not is_gap:
                 change = sensor.temperature - before
@@ -216,8 +204,9 @@ class ThermalTracker:
         )
         state = [board, var_board, rate, self.weight_at(stamp_ns), 0.0 if is_known else 1.0]
         gradients = []
-        for place, sensor in enumerate(self.sensors):
-            if self.is_live(stamp_ns, place):
+        for name in self.spec.sensors:
+            sensor = self.thermometers[name]
+            if self.is_live(stamp_ns, sensor):
                 celsius, _, variance = sensor.at(stamp_ns)
                 gradient = celsius - board
             else:
@@ -231,9 +220,9 @@ class ThermalTracker:
         return tuple(state)
 
     def _add_doubt(self, stamp_ns: int, state: list[float]) -> None:
-        state[VAR_BOARD] += self._board_check.doubt(stamp_ns)
-        for place, check in enumerate(self._checks):
-            state[VAR_GRADIENT + 2 * place] += check.doubt(stamp_ns)
+        state[VAR_BOARD] += self.checks[BOARD_INPUT].doubt(stamp_ns)
+        for place, name in enumerate(self.spec.sensors):
+            state[VAR_GRADIENT + 2 * place] += self.checks[name].doubt(stamp_ns)
         if self.lead.is_reversed:
             # What is called the case may be the board.
             state[VAR_BOARD] += state[GRADIENT] * state[GRADIENT]
