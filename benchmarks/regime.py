@@ -11,7 +11,6 @@ alarms, about one in 20 h, which is more than ours has. Seeded: one command, one
 
     python benchmarks/regime.py --quick            # seconds
     python benchmarks/regime.py --workers 2        # some minutes
-    python benchmarks/regime.py regret             # what a wrong flag costs, alone
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ from multiprocessing.pool import Pool
 from pathlib import Path
 
 import numpy as np
-from regime_figures import plot_regret, plot_rules
-from regime_regret import judge_unit, regret_table, switch_table
+from regime_figures import plot_rules
 from regime_rules import RIVALS, SENSORS, Scene, known_signature_delays, read, temperatures
 from regime_runs import (
     OURS,
@@ -40,7 +38,6 @@ from regime_runs import (
     tuned,
 )
 
-from thermo_comp.simulation import UNIT_NAMES
 from thermo_comp.thermal.regime import Regime
 
 SOAK_H = 5.0
@@ -276,23 +273,11 @@ def part_cost(_pool: Pool, _arguments: argparse.Namespace) -> Tables:
     yield 'Cost', cost_table()
 
 
-def part_regret(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Put simulated units under the flag."""
-    jobs = [(name, arguments.seed) for name in UNIT_NAMES]
-    units = pool.map(judge_unit, jobs, chunksize=1)
-    yield 'Regret of the flag, two sets of the model golovach', regret_table(units)
-    yield 'Crossing over', switch_table(units)
-    if arguments.figures:
-        plot_regret(units, arguments.figures)
-
-
-REGRET = 'regret'
 PARTS: dict[str, Callable[[Pool, argparse.Namespace], Tables]] = {
     'onset': part_onset,
     'soak': part_soak,
     'matrix': part_matrix,
     'cost': part_cost,
-    REGRET: part_regret,
 }
 
 
@@ -313,7 +298,7 @@ def main() -> None:
     parser.add_argument('--figures', metavar='FOLDER', type=Path, help='draw there, too')
     parser.add_argument('--json', metavar='FILE', help='every table, machine-readable')
     arguments = parser.parse_args()
-    parts = arguments.parts or [part for part in PARTS if not (arguments.quick and part == REGRET)]
+    parts = arguments.parts or [*PARTS]
     if not set(parts) <= set(PARTS):
         parser.error(f'parts are {", ".join(PARTS)}')
     figures: dict[str, Rows] = {}

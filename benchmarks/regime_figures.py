@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from regime_regret import PROGRAMS, Unit
 
 from thermo_comp.typing import Bools, Floats
 
@@ -46,27 +45,6 @@ def plot_rules(
         axes.grid(visible=True, color='#e4e4e4')
         axes.set_axisbelow(True)
     save(figure, folder / 'regime_rules.png')
-
-
-def plot_regret(units: list[Unit], folder: Path) -> None:
-    """Draw the error in truth of one unseen bag of each unit under the three flags."""
-    figure = Figure(figsize=(9.0, 2.3 * len(units)), dpi=110, layout='constrained')
-    for axes, unit in zip(figure.subplots(len(units), 1, sharex=True), units, strict=True):
-        bag = next(one for one in unit.bags if one.program == PROGRAMS[1])
-        minutes = bag.time / 60.0
-        axes.fill_between(
-            minutes, 0.0, 1.0, where=bag.flag == 1, color='#e8e8e8', lw=0,
-            transform=axes.get_xaxis_transform(),
-        )  # fmt: skip
-        axes.plot(minutes, bag.static, color=BLUE, lw=1.0, label='static set')
-        axes.plot(minutes, bag.dynamic, color=RED, lw=1.0, ls='--', label='dynamic set')
-        axes.plot(minutes, bag.ours, color='black', lw=1.6, ls=':', label='under our flag (grey)')
-        axes.set_ylabel('|f| - g, µg')
-        axes.set_title(unit.name, loc='left', fontsize=10)
-    lines = figure.axes[0].get_lines()
-    figure.legend(handles=lines, loc='outside upper right', fontsize=8, frameon=False, ncols=3)
-    figure.axes[-1].set_xlabel('time, min')
-    save(figure, folder / 'regime_regret.png')
 
 
 def save(figure: Figure, path: Path) -> None:
