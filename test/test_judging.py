@@ -177,6 +177,16 @@ class TestWindows:
         # 240 windows: the RMS of a standard normal is 1 within 3 / sqrt(2 * 240).
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.14)
 
+    def test_a_noisy_unit_rests_as_its_calibration_says(self, tmp_path: Path) -> None:
+        # WHY: the ceiling of 50 mg held for a unit that is known to scatter by 100, too.
+        bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
+        density = 0.1 * GRAVITY * np.sqrt(0.1)
+        unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
+        knows = calibration(unit=unit, noise_density_m_s2_sqrt_hz=(density,) * 3)
+        assert len(judged(bag, knows).windows) >= 8
+        with pytest.raises(RecordingError, match='no window of 60 s at rest'):
+            judged(bag, calibration())
+
     def test_gravity_is_that_of_the_place(self, tmp_path: Path) -> None:
         bag = resting(tmp_path / 'bag', 20.0)
         found = judged(bag, calibration(), gravity=GRAVITY + 1e-3)
