@@ -24,7 +24,7 @@ from thermo_comp.errors import FleetError
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet import COLUMNS, FleetOptions, fit_fleet, read_parquet
 from thermo_comp.fleet.cluster import connected, outcome_of
-from thermo_comp.fleet.results import Results
+from thermo_comp.fleet.run import Results
 from thermo_comp.fleet.table import is_valid
 from thermo_comp.fleet.units import Storage, find_units
 from thermo_comp.recording import Topics

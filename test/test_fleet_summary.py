@@ -15,7 +15,7 @@ from conftest import ROOT
 
 from thermo_comp.errors import FleetError
 from thermo_comp.fleet.page import render_fleet
-from thermo_comp.fleet.results import Results
+from thermo_comp.fleet.run import Results
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
 from thermo_comp.fleet.table import COLUMNS, Row, read_parquet, row_of, to_csv, to_parquet
 
