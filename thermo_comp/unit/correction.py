@@ -104,11 +104,17 @@ class Curves:
         held = hold(board - self._reference, *self._t_range)
         return self._functions.evaluate(held, 'slope')
 
-    def bases(self, board: Floats, row: int) -> list[list[Floats]]:
-        """Give the regressors of each set's free coefficients of one of the six."""
-        held = hold(board - self._reference, *self._t_range)
-        functions = [one[row] for one in self._functions.rows]
-        return [one.basis(t) for one, t in zip(functions, held, strict=True)]
+    def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
+        """Give what multiplies each parameter of each of the six, in the posterior's order."""
+        held = hold(states[BOARD] - self._reference, *self._t_range)
+        weight = states[WEIGHT]
+        result = []
+        for functions in zip(*self._functions.rows, strict=True):
+            found = []
+            for share, t, one in zip((1.0 - weight, weight), held, functions, strict=True):
+                found += [share, *(share * value for value in one.basis(t))]
+            result.append(np.array([*found, *phi]))
+        return result
 
 
 class Correction:

@@ -51,14 +51,14 @@ class SlowUncertainty:
         phi = table.held(table.raw(states)) * factors
         felt = self._correction.felt(states, factors)[self._n_sensors :, :, 0]
         moved = felt * np.array(start_shares)[:, np.newaxis]
+        regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
         result: list[float] = []
         for axis, K in enumerate(self._K):
             bias, scale = ((self._root * moved[:, [row]]).sum(axis=0) for row in (axis, axis + 3))
             v = _products(bias / K, scale)
             if self._blocks:
                 of_bias, var_bias, of_scale, var_scale = self._blocks[axis]
-                on_bias = self._regressors(states, phi, axis) / K
-                on_scale = self._regressors(states, phi, axis + 3)
+                on_bias, on_scale = regressors[axis] / K, regressors[axis + 3]
                 v += _products((of_bias * on_bias).sum(axis=0), (of_scale * on_scale).sum(axis=0))
                 v[0] += (var_bias * on_bias[:, 0] ** 2).sum()
                 v[2] += (var_scale * on_scale[:, 0] ** 2).sum()
@@ -76,23 +76,13 @@ class SlowUncertainty:
         """
         columns = states.T
         phi = self._correction.table.values(columns)
+        regressors = self._correction.curves.regressors(columns, phi)
         whole, away = np.zeros((2, len(states), 3))
         for axis, (rows, variances, _, _) in enumerate(self._blocks):
-            felt = self._regressors(columns, phi, axis).T / self._K[axis]
+            felt = regressors[axis].T / self._K[axis]
             for result, one in ((whole, felt), (away, felt - mean_of(felt))):
                 result[:, axis] = ((one @ rows) ** 2).sum(axis=1) + one**2 @ variances
         return whole, away
-
-    def _regressors(self, states: Floats, phi: Floats, row: int) -> Floats:
-        """
-        Give what multiplies each parameter of a row's bias or scale, in the posterior's order.
-        """
-        correction, weight = self._correction, states[WEIGHT]
-        found: list[Floats] = []
-        bases = correction.curves.bases(states[BOARD], row)
-        for share, basis in zip((1.0 - weight, weight), bases, strict=True):
-            found += [share, *(share * one for one in basis)]
-        return np.vstack((*found, phi))
 
 
 def _products(bias: Floats, scale: Floats) -> Floats:
