@@ -55,15 +55,8 @@ class RegimeDetector:
         self._dwell_ns = round(settings.dwell_s * 1e9)
         self._turn_ns = self._dwell_ns // 2
         self._asks_board = settings.closes == 'board'
-        test = (
-            settings.smallest_ramp_k_min / 60.0,
-            settings.ripple_c,
-            settings.false_alarms_per_hour / 3600.0,
-        )
-        self._case_change = ChangeDetector(settings.case, *test)
-        self._board_change = ChangeDetector(settings.board, *test)
-        self._case_calm = _CalmTest(settings, settings.case)
-        self._board_calm = _CalmTest(settings, settings.board)
+        self._case = _Watch(settings, settings.case)
+        self._board = _Watch(settings, settings.board)
         self.regime = Regime.UNKNOWN
         self.direction = 0
         self._calm_ns: int | None = None
@@ -74,11 +67,11 @@ class RegimeDetector:
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
         """Decide after a used reading of the leading sensor, the case if it is not None."""
         if case is not None:
-            lead, change = case, self._case_change
+            lead, change = case, self._case.change
             if not self._asks_board:
                 board = None
         elif board is not None:
-            lead, change = board, self._board_change
+            lead, change = board, self._board.change
         else:
             return self.regime
         regime = self.regime
@@ -89,9 +82,8 @@ class RegimeDetector:
         if not lead.is_ready:
             return regime
 
-        is_calm = self._case_calm.update(stamp_ns, case, self._case_change, change.swing)
-        if not self._board_calm.update(stamp_ns, board, self._board_change, change.swing):
-            is_calm = False
+        is_calm = self._case.is_calm(stamp_ns, case, change.swing)
+        is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
             # An onset is seen before the rate is large: until then only its own end ends it.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
@@ -153,14 +145,21 @@ class RegimeDetector:
         self._held_until_ns = stamp_ns + hold_ns
 
 
-class _CalmTest:
+class _Watch:
     """
-    Is the rate of one sensor surely below the relaxed rate, now and half a lag ahead?
+    What is seen of one sensor: a change, and whether it is calm: is its rate surely below the
+    relaxed rate, now and half a lag ahead?
 
     Ahead: a rate that moves away from its mean over the last quarter of a lag will go on to do so.
     """
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
+        self.change = ChangeDetector(
+            sensor,
+            settings.smallest_ramp_k_min / 60.0,
+            settings.ripple_c,
+            settings.false_alarms_per_hour / 3600.0,
+        )
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
@@ -174,9 +173,7 @@ class _CalmTest:
         self._stamp_ns: int | None = None
         self._mean = 0.0
 
-    def update(
-        self, stamp_ns: int, sensor: Thermometer | None, change: ChangeDetector, lead_swing: float
-    ) -> bool:
+    def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
         """Follow the rate of the sensor; a lost or stale one has no say."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
@@ -184,6 +181,7 @@ class _CalmTest:
         if not sensor.is_ready:
             self._stamp_ns = None
             return False
+        change = self.change
         # The detector's filters do not overshoot a ripple; the third-order thermometer does.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         doubt = sqrt(sensor.var_rate)
