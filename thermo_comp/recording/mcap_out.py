@@ -12,9 +12,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +25,6 @@ from mcap.opcode import Opcode
 
 from .. import __version__
 from ..errors import RecordingError
-from ..typing import Bytes
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .mcap_file import MAGIC, METADATA_NAME
 from .messages import Messages, join_messages, pack, scatter
@@ -35,7 +32,6 @@ from .rosbag2_metadata import Definition, dump_yaml, information, offered_qos
 
 #: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
 _ZSTD_LEVEL = -1
-_MAX_PACKING = 2
 # Versions of mcap differ in which of its methods are typed.
 _new_builder: Callable[[], Any] = RecordBuilder
 #: Opcode, length, channel, sequence, log time, publish time.
@@ -72,8 +68,6 @@ class McapOutput:
         self._chunks: list[records.ChunkIndex] = []
         self._metadata_index: list[records.MetadataIndex] = []
         self._tail: list[Messages] = []
-        self._packing: deque[tuple[Messages, Future[tuple[Any, int]]]] = deque()
-        self._pool = ThreadPoolExecutor(1, 'recording')
         self._start_ns: int | None = None
         self._end_ns = 0
         self._at = 0
@@ -119,36 +113,15 @@ class McapOutput:
         begin = n_done = 0
         while len(ends) and ends[-1] - n_done >= self._chunk_bytes:
             end = int(np.searchsorted(ends, n_done + self._chunk_bytes)) + 1
-            self._close_chunk(messages.take(slice(begin, end)))
+            self._put_chunk(messages.take(slice(begin, end)))
             begin, n_done = end, int(ends[end - 1])
         self._tail = [messages.take(slice(begin, None)).packed()]
-
-    def _close_chunk(self, messages: Messages) -> None:
-        """Have messages laid out and compressed, and write what was so far."""
-        data, ends = pack(messages.data, messages.start, messages.size, MESSAGE_HEAD_BYTES)
-        at = ends - messages.size - MESSAGE_HEAD_BYTES
-        heads: Any = np.zeros(len(at), _RECORD_HEAD)
-        heads['f0'], heads['f1'] = MESSAGE, messages.size + (MESSAGE_HEAD_BYTES - PREFIX.size)
-        heads['f2'], heads['f4'], heads['f5'] = messages.channel, messages.log_ns, messages.log_ns
-        scatter(data, at, heads.view(np.dtype((np.void, MESSAGE_HEAD_BYTES))))
-        chunk = Messages(data, at, messages.size, messages.channel, messages.log_ns)
-        self._packing.append((chunk, self._pool.submit(self._pack, data)))
-        self._put_packed(_MAX_PACKING)
-
-    def _put_packed(self, n_left: int) -> None:
-        while len(self._packing) > n_left:
-            messages, future = self._packing.popleft()
-            self._put_chunk(messages, *future.result())
-
-    def _pack(self, data: Bytes) -> tuple[Any, int]:
-        return self._compress(data.data), zlib.crc32(data.data)
 
     def finish(self) -> dict[str, Any]:
         """Write the last chunk, the summary and the footer; gives the `information` of rosbag2."""
         for messages in self._tail:
             if len(messages):
-                self._close_chunk(messages)
-        self._put_packed(0)
+                self._put_chunk(messages)
         topics = (
             (topic, *self._types[topic], self._counts[channel.id])
             for topic, channel in self._channels.items()
@@ -164,7 +137,6 @@ class McapOutput:
 
     def close(self) -> None:
         """Close the file as it is."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
         self._stream.close()
 
     def _put(self, data: Any) -> None:
@@ -186,20 +158,28 @@ class McapOutput:
         self._put_record(records.Metadata(name, dict(content)))
         self._metadata_index.append(records.MetadataIndex(begin, self._at - begin, name))
 
-    def _put_chunk(self, messages: Messages, packed: Any, checksum: int) -> None:
-        log_ns, channel = messages.log_ns, messages.channel
+    def _put_chunk(self, messages: Messages) -> None:
+        """Lay messages out as the records of a chunk, and write it with its message indexes."""
+        log_ns, channel, size = messages.log_ns, messages.channel, messages.size
+        data, ends = pack(messages.data, messages.start, size, MESSAGE_HEAD_BYTES)
+        at = ends - size - MESSAGE_HEAD_BYTES
+        heads: Any = np.zeros(len(at), _RECORD_HEAD)
+        heads['f0'], heads['f1'] = MESSAGE, size + (MESSAGE_HEAD_BYTES - PREFIX.size)
+        heads['f2'], heads['f4'], heads['f5'] = channel, log_ns, log_ns
+        scatter(data, at, heads.view(np.dtype((np.void, MESSAGE_HEAD_BYTES))))
+        packed, checksum = self._compress(data.data), zlib.crc32(data.data)
         start, end = int(np.min(log_ns)), int(np.max(log_ns))
         self._start_ns = start if self._start_ns is None else min(self._start_ns, start)
         self._end_ns = max(self._end_ns, end)
         name = self._compression.encode()
-        begin, n_bytes = self._at, len(messages.data)
+        begin, n_bytes = self._at, len(data)
         head = (Opcode.CHUNK, 40 + len(name) + len(packed), start, end, n_bytes, checksum)
         self._put(struct.pack(f'<BQQQQII{len(name)}sQ', *head, len(name), name, len(packed)))
         self._put(packed)
         chunk_length = self._at - begin
         offsets: dict[int, int] = {}
         rows = np.empty(len(log_ns), _INDEX_ROW)
-        rows['log'], rows['offset'] = log_ns, messages.start
+        rows['log'], rows['offset'] = log_ns, at
         for number in np.unique(channel).tolist():
             own = rows[channel == number]
             self._counts[number] += len(own)

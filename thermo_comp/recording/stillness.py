@@ -57,17 +57,17 @@ class Cells:
     """
 
     start_ns: int
-    time: Floats
-    count: Ints
-    mean: Floats
-    variance: Floats
-    index: Ints
     cell_s: float
     n_dropped: int
     n_saturated: int
     is_integer: bool
     quantum: Floats
     middle: float
+    time: Floats
+    count: Ints
+    index: Ints
+    mean: Floats
+    variance: Floats
     rate: Floats
     rate_variance: Floats
 
@@ -160,21 +160,12 @@ class CellAccumulator:
         rate, rate_variance = (
             one[:, 3:] if one.shape[1] > 3 else np.zeros((len(one), 3)) for one in (mean, variance)
         )
+        cell_s = self._cell_ns * 1e-9
         return Cells(
-            start_ns=self._start_ns,
-            time=sums[:, 1] / count + index * (self._cell_ns * 1e-9),
-            count=count.astype(np.int64),
-            mean=mean[:, :3] + self._shift,
-            variance=variance[:, :3],
-            index=index,
-            cell_s=self._cell_ns * 1e-9,
-            n_dropped=self._n_dropped,
-            n_saturated=self._n_saturated,
-            is_integer=self._is_integer,
-            quantum=self._quantum,
-            middle=self._middle,
-            rate=rate,
-            rate_variance=rate_variance,
+            *(self._start_ns, cell_s, self._n_dropped, self._n_saturated),
+            *(self._is_integer, self._quantum, self._middle),
+            *(sums[:, 1] / count + index * cell_s, count.astype(np.int64), index),
+            *(mean[:, :3] + self._shift, variance[:, :3], rate, rate_variance),
         )
 
     def _look_for_sign(self, samples: Floats) -> None:

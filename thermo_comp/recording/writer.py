@@ -50,8 +50,8 @@ class BagWriter:
     Messages are buffered until `flush`, which merges all topics in log-time order; 64 MiB of them
     are flushed unasked. So one group of calls whose time spans overlap and a `flush` make a file
     in log-time order, whatever order the calls had. A process that is killed loses what is
-    buffered and up to four chunks; the rest stands in a hidden file beside the target and can be
-    read as a torn bag.
+    buffered and the chunk being filled; the rest stands in a hidden file beside the target and can
+    be read as a torn bag.
 
     The writing methods raise ValueError for shapes that do not fit and times that no ROS stamp can
     hold, OutputError where the disk is full or the like. Log times are the stamps, if not given.
