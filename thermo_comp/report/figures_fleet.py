@@ -10,32 +10,21 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..typing import Floats
+from . import style
 from .html import label_text
-from .style import (
-    BLACK,
-    DYNAMIC_LINE,
-    GREY,
-    RED,
-    RUNG_LINES,
-    STATIC_LINE,
-    Line,
-    legend_above,
-    log_axis,
-    new_figure,
-)
 
 # More names than these would lie over each other.
 _MOST_NAMES = 12
-_SECTION_LINES: dict[str, Line] = {
-    'raw': RUNG_LINES['raw'],
-    'static': STATIC_LINE,
-    'dynamic': DYNAMIC_LINE,
+_SECTION_LINES: dict[str, style.Line] = {
+    'raw': style.RUNG_LINES['raw'],
+    'static': style.STATIC_LINE,
+    'dynamic': style.DYNAMIC_LINE,
 }
 
 
 def draw_shares(curves: Mapping[str, Floats]) -> Figure:
     """Draw the share of units below each residual [micro-g], by section."""
-    figure = new_figure(2.6)
+    figure = style.new_figure(2.6)
     axes = figure.subplots()
     drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}
     drawn = {name: values for name, values in drawn.items() if len(values)}
@@ -44,11 +33,11 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
         axes.step(values, share, where='post', label=name, **_SECTION_LINES[name])
     low = min((float(values[0]) for values in drawn.values()), default=1.0)
     high = max((float(values[-1]) for values in drawn.values()), default=1.0)
-    log_axis(axes, low / 1.3, high * 1.3)
+    style.log_axis(axes, low / 1.3, high * 1.3)
     axes.set_ylim(0.0, 103.0)
     axes.set_xlabel('|f| − g of a unit, RMS, µg')
     axes.set_ylabel('units, %')
-    legend_above(axes)
+    style.legend_above(axes)
     return figure
 
 
@@ -59,15 +48,16 @@ def draw_distances(
     limit: float,
 ) -> Figure:
     """Draw each unit's distance from the middle, by quantity; beyond `limit` with its name."""
-    figure = new_figure(0.6 + 0.19 * len(labels))
+    figure = style.new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
     shown = min(max(1.15 * limit, 4.0), 12.0)
     n_named = 0
     for row, (z, units) in enumerate(zip(distances, names, strict=True)):
         at = np.clip(z, -1.04 * shown, 1.04 * shown)
         is_far = np.abs(z) > limit
-        axes.plot(at[~is_far], np.full(int((~is_far).sum()), row), '|', color=GREY, markersize=6)
-        axes.plot(at[is_far], np.full(int(is_far.sum()), row), 'D', color=RED, markersize=3.5)
+        marks = ((~is_far, '|', style.GREY, 6.0), (is_far, 'D', style.RED, 3.5))
+        for rows, mark, color, size in marks:
+            axes.plot(at[rows], np.full(int(rows.sum()), row), mark, color=color, ms=size)
         for i in np.flatnonzero(is_far)[: max(_MOST_NAMES - n_named, 0)]:
             n_named += 1
             axes.annotate(
@@ -80,7 +70,7 @@ def draw_distances(
                 fontsize=7,
             )
     for edge in (-limit, limit):
-        axes.axvline(edge, color=BLACK, linewidth=0.8, linestyle=(0, (5, 2)))
+        axes.axvline(edge, color=style.BLACK, linewidth=0.8, linestyle=(0, (5, 2)))
     axes.set_xlim(-1.1 * shown, 1.1 * shown)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_yticks(range(len(labels)), labels)

@@ -12,20 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..unit.gravity import MICRO_G, spoken
+from . import style
 from .evidence import LEFT_OUT, RAW, Evidence, Position, given
 from .html import number
-from .style import (
-    BLACK,
-    DYNAMIC_LINE,
-    RED,
-    STATIC_LINE,
-    Line,
-    few_ticks,
-    legend_above,
-    log_axis,
-    new_figure,
-    time_unit,
-)
 
 # Diameter of the ring of the position that the others tell the least of [pt].
 _RING = 22.0
@@ -40,12 +29,12 @@ def draw_histograms(evidence: Evidence) -> Figure:
     parts = [
         (label, residual[rows] / MICRO_G, line)
         for label, rows, line in (
-            ('static', ~dynamic, STATIC_LINE),
-            ('dynamic', dynamic, DYNAMIC_LINE),
+            ('static', ~dynamic, style.STATIC_LINE),
+            ('dynamic', dynamic, style.DYNAMIC_LINE),
         )
         if rows.any()
     ]
-    figure = new_figure(2.0)
+    figure = style.new_figure(2.0)
     panels = figure.subplots(1, len(parts), squeeze=False)[0]
     for axes, (label, values, line) in zip(panels, parts, strict=True):
         limit = max(float(np.quantile(np.abs(values), 0.998)) * 1.1, 1e-3)
@@ -64,7 +53,7 @@ def draw_histograms(evidence: Evidence) -> Figure:
         axes.set_ylim(0.0, None)
         axes.set_ylabel('windows, %')
         axes.xaxis.set_major_locator(MaxNLocator(6))
-        few_ticks(axes, 4)
+        style.few_ticks(axes, 4)
         axes.set_title(f'{name}, {label}: sd {number(sd)} µg')
         axes.set_xlabel('|f| − g, µg')
     return figure
@@ -78,8 +67,8 @@ def draw_every_position(evidence: Evidence) -> Figure:
     shown = sorted(worst, key=lambda one: one.number)
     numbers = np.unique(windows.position)
     limit = float(np.quantile(np.abs(residual), 0.998)) * 1.15
-    unit, name = time_unit(max(one.duration_s for one in shown))
-    figure = new_figure(0.8 + 0.24 * len(shown))
+    unit, name = style.time_unit(max(one.duration_s for one in shown))
+    figure = style.new_figure(0.8 + 0.24 * len(shown))
     axes = figure.subplots()
     for row, one in enumerate(shown):
         rows = windows.position == numbers[one.number - 1]
@@ -88,7 +77,7 @@ def draw_every_position(evidence: Evidence) -> Figure:
         dynamic = windows.is_dynamic[rows]
         axes.axhline(row, color='black', linewidth=0.4)
         # Dashes would hide what is noise: the regimes differ by width.
-        for is_drawn, color, width in ((~dynamic, BLACK, 1.4), (dynamic, RED, 0.7)):
+        for is_drawn, color, width in ((~dynamic, style.BLACK, 1.4), (dynamic, style.RED, 0.7)):
             axes.plot(time, np.where(is_drawn, value, np.nan), color=color, linewidth=width)
     axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.set_yticks(range(len(shown)), [str(one.number) for one in shown])
@@ -107,16 +96,16 @@ def draw_every_position(evidence: Evidence) -> Figure:
 
 def draw_positions(evidence: Evidence) -> Figure:
     """Draw where the positions point on the sphere, and what is left on each of them."""
-    figure = new_figure(2.9)
+    figure = style.new_figure(2.9)
     *sides, dots = figure.subplots(1, 3, width_ratios=[1.0, 1.0, 1.25])
     least = evidence.least_known
     for side, axes, name in ((1, sides[0], 'z up'), (-1, sides[1], 'z down')):
         _draw_hemisphere(axes, evidence.positions, side)
         if least is not None and (least.up[2] >= 0.0) == (side > 0):
             place = equal_area(least.up, side)
-            axes.plot(*place, 'x', markersize=7.0, color=RED, mew=1.6)
+            axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
             said = '±' + spoken(least.sd_m_s2).replace('ug', 'µg')
-            _note(axes, said, place, (0.0, -9.0), ha='center', color=RED)
+            _note(axes, said, place, (0.0, -9.0), ha='center', color=style.RED)
         axes.set_title(name, loc='center')
     if evidence.residuals:
         _draw_dots(dots, evidence)
@@ -158,7 +147,7 @@ def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int) -> 
             axes.plot(*place, 'o', markersize=4.5, color='black')
             if LEFT_OUT in position.residual_rms and largest > 0.0:
                 size = _RING * np.sqrt(position.residual_rms[LEFT_OUT] / largest)
-                axes.plot(*place, 'o', markersize=size, mfc='none', mec=RED, mew=1.1)
+                axes.plot(*place, 'o', markersize=size, mfc='none', mec=style.RED, mew=1.1)
             _note(axes, str(position.number), place, (3.5, 2.5))
     axes.set_xlim(-1.32, 1.32)
     axes.set_ylim(-1.32, 1.32)
@@ -170,10 +159,10 @@ def _draw_dots(axes: Axes, evidence: Evidence) -> None:
     """Draw a dot for each position and rung."""
     positions = evidence.positions
     judged = list(evidence.residuals)[-1]
-    looks: dict[str, Line] = {
+    looks: dict[str, style.Line] = {
         RAW: {'marker': 'o', 'mfc': 'white', 'mec': 'black', 'ms': 4.5},
         judged: {'marker': 'o', 'color': 'black', 'ms': 4.5},
-        LEFT_OUT: {'marker': 'D', 'mfc': 'none', 'mec': RED, 'ms': 5.5},
+        LEFT_OUT: {'marker': 'D', 'mfc': 'none', 'mec': style.RED, 'ms': 5.5},
     }
     drawn = []
     for rung, look in looks.items():
@@ -185,7 +174,7 @@ def _draw_dots(axes: Axes, evidence: Evidence) -> None:
     if len(evidence.residuals) > 1:
         axes.hlines([p.number for p in positions], *drawn[:2], color='#BBBBBB', lw=0.7, zorder=1)
     both = np.maximum(np.concatenate(drawn), 1e-3)
-    log_axis(axes, float(np.min(both)) / 1.4, float(np.max(both)) * 1.4)
+    style.log_axis(axes, float(np.min(both)) / 1.4, float(np.max(both)) * 1.4)
     axes.set_ylim(len(positions) + 0.7, 0.3)
     if len(positions) <= _MOST:
         axes.set_yticks([p.number for p in positions])
@@ -193,4 +182,4 @@ def _draw_dots(axes: Axes, evidence: Evidence) -> None:
         axes.yaxis.set_major_locator(MaxNLocator(12, integer=True))
     axes.set_xlabel('RMS of |f| − g, µg')
     axes.set_ylabel('position')
-    legend_above(axes, share=0.4)
+    style.legend_above(axes, share=0.4)

@@ -16,19 +16,9 @@ from ..thermal.regime import Regime
 from ..typing import Bools, Floats
 from ..unit.calibration import AXES
 from ..unit.gravity import MICRO_G
+from . import style
 from .evidence import RAW, Evidence, ShownBag, given
 from .html import number
-from .style import (
-    AXIS_LINES,
-    BOARD_LINE,
-    CASE_LINE,
-    RUNG_LINES,
-    broken,
-    few_ticks,
-    legend_above,
-    new_figure,
-    time_unit,
-)
 
 # Where the drift's zero is taken: long enough for the windows' noise, short against any ramp.
 _ZERO_S = 120.0
@@ -39,14 +29,14 @@ def draw_temperatures(evidence: Evidence) -> Figure:
     """Draw the readings of both sensors (the paper's Fig. 3)."""
     figure, (axes,), shown, unit = _panels(evidence, [2.5])
     for label, readings, line in (
-        ('T case', shown.case, CASE_LINE),
-        ('T board', shown.board, BOARD_LINE),
+        ('T case', shown.case, style.CASE_LINE),
+        ('T board', shown.board, style.BOARD_LINE),
     ):
         if len(readings.value):
             seconds = (readings.stamp_ns - shown.start_ns) * 1e-9
             axes.plot(seconds / unit, readings.value, label=label, **line)
     axes.set_ylabel('temperature, °C')
-    legend_above(axes)
+    style.legend_above(axes)
     return figure
 
 
@@ -57,24 +47,24 @@ def draw_dynamics(evidence: Evidence) -> Figure:
     figure, panels, shown, unit = _panels(evidence, heights, is_flagged=True)
     if len(drift):
         for i, axis in enumerate(AXES):
-            _plot(panels[0], evidence, drift[:, i], unit, label=axis, **AXIS_LINES[i])
+            _plot(panels[0], evidence, drift[:, i], unit, label=axis, **style.AXIS_LINES[i])
         panels[0].set_ylabel(name)
         title = 'a  drift of the readings since the start'
-        legend_above(panels[0], title=title, alignment='left')
+        style.legend_above(panels[0], title=title, alignment='left')
     rates, bend, flag = panels[-3:]
     for label, rate, line in (
-        ('dT case/dt', shown.case_rate, CASE_LINE),
-        ('dT board/dt', shown.board_rate, BOARD_LINE),
+        ('dT case/dt', shown.case_rate, style.CASE_LINE),
+        ('dT board/dt', shown.board_rate, style.BOARD_LINE),
     ):
         if np.isfinite(rate).any():
             rates.plot(shown.time / unit, rate * 60.0, label=label, **line)
     rates.set_ylabel('K/min')
-    legend_above(rates, title='b  first derivatives', alignment='left')
-    line = CASE_LINE if shown.leader == 'case' else BOARD_LINE
+    style.legend_above(rates, title='b  first derivatives', alignment='left')
+    line = style.CASE_LINE if shown.leader == 'case' else style.BOARD_LINE
     bend.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
     bend.set_ylabel('K/min²')
     bend.set_title(f'second derivative of T {shown.leader}')
-    few_ticks(bend, 4)
+    style.few_ticks(bend, 4)
     _draw_flag(flag, shown, unit)
     figure.align_ylabels(panels[:-1])
     return figure
@@ -88,10 +78,12 @@ def draw_residuals(evidence: Evidence) -> Figure:
     figure, panels, _, unit = _panels(evidence, [1.05] * len(residuals), more=0.5)
     for axes, (rung, residual) in zip(panels, residuals.items(), strict=True):
         for i, axis in enumerate(AXES):
-            _plot(axes, evidence, residual[:, i] / MICRO_G, unit, label=axis, **AXIS_LINES[i])
+            _plot(
+                axes, evidence, residual[:, i] / MICRO_G, unit, label=axis, **style.AXIS_LINES[i]
+            )
         axes.set_ylabel('µg')
         axes.axhline(0.0, color='black', linewidth=0.5)
-        few_ticks(axes)
+        style.few_ticks(axes)
         if rung != RAW:
             _symmetric(axes, residual[rows])
         parts = [
@@ -101,7 +93,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
         ]
         title = f'{rung}: RMS {", ".join(parts)} µg'
         if axes is panels[0]:
-            legend_above(axes, title=title, alignment='left')
+            style.legend_above(axes, title=title, alignment='left')
         else:
             axes.set_title(title)
     figure.align_ylabels(panels)
@@ -117,7 +109,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
     for axes, drawn in zip(panels, sets, strict=True):
         for rung in drawn:
             value = residuals[rung] / MICRO_G
-            _plot(axes, evidence, value, unit, label=rung, **RUNG_LINES[rung])
+            _plot(axes, evidence, value, unit, label=rung, **style.RUNG_LINES[rung])
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_ylabel('|f| − g, µg')
         right = axes.secondary_yaxis(
@@ -129,7 +121,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
         )
         right.set_ylabel('|f|, m/s²')
         right.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
-        legend_above(axes)
+        style.legend_above(axes)
     for rung in corrected:
         _symmetric(panels[-1], residuals[rung][_rows(evidence)])
     return figure
@@ -145,8 +137,8 @@ def _panels(
     """
     shown = given(evidence.shown)
     duration_s = evidence.bags[shown.index].duration_s
-    unit, name = time_unit(duration_s)
-    figure = new_figure(more + sum(heights))
+    unit, name = style.time_unit(duration_s)
+    figure = style.new_figure(more + sum(heights))
     panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     spans: list[tuple[float, float]] = []
     for one in shown.stretches:
@@ -171,7 +163,7 @@ def _rows(evidence: Evidence) -> Bools:
 def _plot(axes: Axes, evidence: Evidence, value: Floats, unit: float, **line: Any) -> None:
     """Draw a value of the windows over time, with a gap between positions."""
     windows, rows = given(evidence.windows), _rows(evidence)
-    time, value = broken(windows.time[rows], value[rows], windows.position[rows])
+    time, value = style.broken(windows.time[rows], value[rows], windows.position[rows])
     axes.plot(time / unit, value, **line)
 
 

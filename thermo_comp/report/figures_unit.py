@@ -19,34 +19,22 @@ from ..unit.gravity import MICRO_G
 from ..unit.gyroscope import MILLIDEGREE
 from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
 from ..unit.rate_triad import rate_triad
+from . import style
 from .evidence import CHOSEN, Evidence, given
 from .html import label_text, minus, number
-from .style import (
-    AXIS_LINES,
-    BLACK,
-    DYNAMIC_LINE,
-    GREY,
-    STATIC_LINE,
-    Line,
-    few_ticks,
-    legend_above,
-    log_axis,
-    new_figure,
-    shared_legend,
-)
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
 _N_CURVE = 61
 #: From a few readings to where the longest lag of the bank has forgotten.
 _STEP_MINUTES = (0.2, 500.0)
-_POINT: Line = {'color': BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
+_POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
 
 
 def draw_functions(evidence: Evidence) -> Figure:
     """Draw bias and scale over temperature, less a line, with bands and measurements."""
     calibration = given(evidence.calibration)
-    figure = new_figure(4.4)
+    figure = style.new_figure(4.4)
     panels = figure.subplots(2, 3, sharex=True)
     drawn = curves(calibration)
     soak = drawn[0]
@@ -63,7 +51,7 @@ def draw_functions(evidence: Evidence) -> Figure:
         panels[part, 0].set_ylabel(f'{name} less the line, {unit}')
     for axes in panels[1]:
         axes.set_xlabel('T board, °C')
-    shared_legend(figure, panels[0, 0], 4)
+    style.shared_legend(figure, panels[0, 0], 4)
     return figure
 
 
@@ -75,13 +63,13 @@ def draw_rates(evidence: Evidence) -> Figure:
     for i, axes in enumerate(panels):
         # What is said in m/s^2 of a triad is rad/s of this one.
         _draw_less_line(axes, triad, drawn, ('bias', i), 'mdeg/s', MICRO_G / MILLIDEGREE)
-    shared_legend(figure, panels[0], 3)
+    style.shared_legend(figure, panels[0], 3)
     return figure
 
 
 def _axis_panels(name: str, *, sharey: bool = False) -> tuple[Figure, list[Axes]]:
     """Make a panel for each axis, over the board temperature."""
-    figure = new_figure(2.5)
+    figure = style.new_figure(2.5)
     panels = list(figure.subplots(1, 3, sharex=True, sharey=sharey))
     panels[0].set_ylabel(name)
     for axes in panels:
@@ -109,7 +97,7 @@ def _draw_less_line(
         value = factor * getattr(curve, name)[:, i] - slope * (at - reference)
         if calibration.posterior is not None:
             half = BAND_SDS * factor * getattr(curve, f'sd_{name}')[:, i]
-            look: Line = {'facecolor': color, 'edgecolor': color, 'hatch': curve.hatch}
+            look: style.Line = {'facecolor': color, 'edgecolor': color, 'hatch': curve.hatch}
             axes.fill_between(at, value - half, value + half, alpha=0.25, linewidth=0, **look)
             widest = max(widest, float(half.max()))
         # The ends of the valid range are marked; a range of a few K stays visible so.
@@ -117,8 +105,8 @@ def _draw_less_line(
         axes.plot(at, value, label=curve.name, **look, **curve.line)
     title = f'{AXES[i]}: {minus(f"{slope:+.3g}")} {unit}/K'
     axes.set_title(f'{title}, ±{number(widest, 2)} {unit}' if widest else title)
-    axes.axvline(reference, color=GREY, linewidth=0.8)
-    few_ticks(axes)
+    axes.axvline(reference, color=style.GREY, linewidth=0.8)
+    style.few_ticks(axes)
     return slope
 
 
@@ -157,7 +145,7 @@ class Curve(NamedTuple):
     """
 
     name: str
-    line: Line
+    line: style.Line
     hatch: str
     marker: str
     temperature: Floats
@@ -170,12 +158,12 @@ class Curve(NamedTuple):
 def curves(calibration: Calibration) -> list[Curve]:
     """Evaluate a soak and, where they differ, ramps at half of the fastest rate."""
     static, dynamic = calibration.regime_sets()
-    looks = [('soak', static, 0.0, STATIC_LINE, '////', 'o')]
+    looks = [('soak', static, 0.0, style.STATIC_LINE, '////', 'o')]
     cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
     if calibration.response or static != dynamic:
         for word, rate, line, hatch, marker in (
-            ('heating', heating, DYNAMIC_LINE, '\\\\\\\\', '^'),
-            ('cooling', cooling, AXIS_LINES[2], '....', 'v'),
+            ('heating', heating, style.DYNAMIC_LINE, '\\\\\\\\', '^'),
+            ('cooling', cooling, style.AXIS_LINES[2], '....', 'v'),
         ):
             if rate:
                 name = f'{word} at {abs(rate):g} K/min'
@@ -200,17 +188,17 @@ def curves(calibration: Calibration) -> list[Curve]:
 def draw_step(evidence: Evidence) -> Figure:
     """Draw what a step of the temperature does to each axis over time."""
     minutes, bias, scale = step_answer(given(evidence.calibration))
-    figure = new_figure(2.5)
+    figure = style.new_figure(2.5)
     for axes, title, value, unit in zip(
         figure.subplots(1, 2), ('bias', 'scale'), (bias, scale), ('µg', 'ppm'), strict=True
     ):
         for i, axis in enumerate(AXES):
-            axes.plot(minutes, value[:, i], label=axis, **AXIS_LINES[i])
+            axes.plot(minutes, value[:, i], label=axis, **style.AXIS_LINES[i])
         axes.axhline(0.0, color='black', linewidth=0.5)
-        log_axis(axes, float(minutes[0]), float(minutes[-1]))
+        style.log_axis(axes, float(minutes[0]), float(minutes[-1]))
         axes.set_ylabel(f'still to come, {unit}/K')
         axes.set_xlabel('time since the step, min')
-        legend_above(axes, share=0.5, title=title, alignment='left')
+        style.legend_above(axes, share=0.5, title=title, alignment='left')
     return figure
 
 
@@ -234,14 +222,14 @@ def draw_hysteresis(evidence: Evidence) -> Figure:
     for i, axes in enumerate(panels):
         middle = (heating[:, i] + cooling[:, i]) / 2.0
         for name, bias, line, marker in (
-            ('heating', heating, DYNAMIC_LINE, '^'),
-            ('cooling', cooling, AXIS_LINES[2], 'v'),
+            ('heating', heating, style.DYNAMIC_LINE, '^'),
+            ('cooling', cooling, style.AXIS_LINES[2], 'v'),
         ):
-            look: Line = {'marker': marker, 'markevery': 12, 'markersize': 3.5}
+            look: style.Line = {'marker': marker, 'markevery': 12, 'markersize': 3.5}
             axes.plot(temperature, bias[:, i] - middle, label=name, **look, **line)
         axes.set_title(f'bias {AXES[i]}')
         axes.axhline(0.0, color='black', linewidth=0.5)
-    shared_legend(figure, panels[0], 2)
+    style.shared_legend(figure, panels[0], 2)
     return figure
 
 
@@ -266,7 +254,7 @@ def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 def draw_history(evidence: Evidence) -> Figure:
     """Draw bias and scale of each calibration of the unit against the first one, by date."""
     history = evidence.history
-    figure = new_figure(2.6)
+    figure = style.new_figure(2.6)
     places = np.arange(len(history))
     for axes, name, unit in zip(
         figure.subplots(1, 2), ('bias', 'scale'), ('µg', 'ppm'), strict=True
@@ -276,10 +264,15 @@ def draw_history(evidence: Evidence) -> Figure:
         )
         for i, (axis, marker) in enumerate(zip(AXES, 'os^', strict=True)):
             change, half = value[:, i] - value[0, i], BAND_SDS * np.nan_to_num(sd[:, i])
-            look: Line = {'marker': marker, 'markersize': 3.5, 'capsize': 2.0, **AXIS_LINES[i]}
+            look: style.Line = {
+                'marker': marker,
+                'markersize': 3.5,
+                'capsize': 2.0,
+                **style.AXIS_LINES[i],
+            }
             axes.errorbar(places + 0.08 * (i - 1), change, yerr=half, label=axis, **look)
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_xticks(places, [label_text(one.created[:10]) for one in history])
         axes.set_ylabel(f'change, {unit}')
-        legend_above(axes, share=0.5, title=name, alignment='left')
+        style.legend_above(axes, share=0.5, title=name, alignment='left')
     return figure
