@@ -31,6 +31,7 @@ REPOSITORY = Path(__file__).parents[1]
 number = st.floats(-1e6, 1e6)
 # The fourth power of 15 K times this stays far from turning a scale function to 0.
 small = st.floats(-1e-6, 1e-6)
+RICH = rich_calibration()
 
 
 @st.composite
@@ -63,7 +64,7 @@ def calibrations(draw):
     def weights(numbers):
         return tuple(draw(numbers) for _ in range(3))
 
-    terms = draw(st.lists(st.sampled_from(rich_calibration().response), max_size=4))
+    terms = draw(st.lists(st.sampled_from(RICH.response), max_size=4))
     return replace(
         calibration(sensors=('case', 'frame')),
         response=tuple(replace(t, bias=weights(number), scale=weights(small)) for t in terms),
@@ -109,7 +110,7 @@ def test_numbers_as_people_write_them():
     assert (unit.full_scale, unit.cycle_time_s) == (32767.0, 0.01)
 
 
-TEXT = dump_calibration(rich_calibration())
+TEXT = dump_calibration(RICH)
 
 
 @pytest.mark.parametrize(
@@ -303,8 +304,8 @@ def test_write_replaces_as_a_whole_or_not_at_all(tmp_path):
     path = tmp_path / 'unit.yaml'
     save_calibration(calibration(), path)
     assert load_calibration(path) == calibration()
-    save_calibration(rich_calibration(), path)
-    assert load_calibration(path) == rich_calibration()
+    save_calibration(RICH, path)
+    assert load_calibration(path) == RICH
     assert [p.name for p in tmp_path.iterdir()] == ['unit.yaml']
     with pytest.raises(OutputError, match=r'cannot be written: .* is no directory'):
         save_calibration(calibration(), path / 'unit.yaml')
@@ -327,8 +328,7 @@ def test_value_that_the_reader_would_refuse_is_not_written():
     ],
 )
 def test_posterior_that_is_none_is_refused(key, value, message):
-    whole = rich_calibration()
-    old = getattr(whole.posterior, key)
+    old = getattr(RICH.posterior, key)
     assert old in TEXT
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(TEXT.replace(old, f"'{value}'").encode())
@@ -336,11 +336,11 @@ def test_posterior_that_is_none_is_refused(key, value, message):
 
 
 def test_posterior_of_other_size_is_refused():
-    n = parameter_layout(rich_calibration()).n_parameters
+    n = parameter_layout(RICH).n_parameters
     with pytest.raises(
         ValueError, match=rf'`posterior.rest` .*per parameter \({n + 6}\), got {n}'
     ):
-        replace(rich_calibration(), response=(term('now'), *rich_calibration().response))
+        replace(RICH, response=(term('now'), *RICH.response))
 
 
 def test_shipped_schema_is_the_schema():

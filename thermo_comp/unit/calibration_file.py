@@ -43,11 +43,7 @@ def load_calibration(path: str | Path) -> Calibration:
 
 
 def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibration:
-    """
-    Build a Calibration from the bytes of a calibration file.
-
-    Raises CalibrationError if as `load_calibration`.
-    """
+    """Build a Calibration from the bytes of a calibration file; raises as `load_calibration`."""
     try:
         data = load_plain_yaml(content.decode('utf-8'))
     except UnicodeDecodeError as error:

@@ -20,11 +20,8 @@ from .gravity import MICRO_G
 @dataclass(frozen=True)
 class ResidualStatistics:
     """
-    What is said of a set of residuals.
-
-    n: how many residuals were finite and counted
-    mean, rms, peak: mean, root of the mean square and largest magnitude, in the residual's unit;
-        NaN when there are none
+    What is said of a set of residuals: how many were finite and, of these, mean, root of the mean
+    square and largest magnitude in their unit, NaN when there are none.
     """
 
     n: int
