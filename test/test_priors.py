@@ -14,7 +14,6 @@ from builders import ArrayBlock
 from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
-from thermo_comp.fitting.options import Ageing
 from thermo_comp.fitting.priors import population
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
@@ -124,12 +123,13 @@ def fitted_curve(number: int):
 def test_new_rests_make_an_old_calibration_better():
     old = fitted(4).calibration
     later = [source(record) for record in test_of(4, 3, 6)]
-    aged = Ageing(bias=1e-4, scale=2e-5)
-    options = FitOptions(STANDARD_GRAVITY, serial='unit-4', prior=old, ageing=aged)
+    options = FitOptions(
+        STANDARD_GRAVITY, serial='unit-4', prior=old, ageing_bias=1e-4, ageing_scale=2e-5
+    )
     new = fit(later, options).calibration
     # Three positions measure three combinations of the six levels that have aged by 10 ug (bias)
     # and 20 ug (scale): on average half of the variance that the ageing brought must be gone.
-    grown = np.mean(sd_of_levels(old) ** 2 + aged.bias**2)
+    grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [
         (a.bias - b.bias) / a.scale_factor

@@ -90,7 +90,6 @@ def fit(
     from ..files import CALIBRATION, PAGE, check_output
     from ..fitting import FitOptions
     from ..fitting import fit as run
-    from ..fitting.options import Ageing
     from ..fitting.sources import fit_sources
     from ..unit.calibration_file import load_calibration, save_calibration
 
@@ -116,9 +115,8 @@ def fit(
             groups=None if groups is None else _names(groups),
             forced=_names(force_groups),
             prior=None if prior is None else load_calibration(prior),
-            ageing=Ageing(
-                options.acceleration(ageing_bias, '--ageing-bias') or 0.0, ageing_scale * 1e-6
-            ),
+            ageing_bias=options.acceleration(ageing_bias, '--ageing-bias') or 0.0,
+            ageing_scale=ageing_scale * 1e-6,
             serial=serial,
             input='counts' if kind == 'counts' else 'm/s^2',
             offset=offset,

@@ -54,7 +54,7 @@ def regress(
     prior, knowns = _wide_prior(windows, start, up, options), []
     if known is not None:
         state = state_of(known, regression, up)
-        knowns = known_of(known, regression, state, sets, options.ageing)
+        knowns = known_of(known, regression, state, sets, options)
         prior = replace(
             prior,
             on_bias=np.ones(len(windows.data.groups)),

@@ -45,19 +45,6 @@ _WORDS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class Ageing:
-    """Sd of what each bias [m/s^2] and relative scale has changed by since a calibration."""
-
-    bias: float = 0.0
-    scale: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ('bias', 'scale'):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f'`{name}` must be 0 or positive, got {getattr(self, name)}')
-
-
-@dataclass(frozen=True)
 class FitOptions:
     """
     Options of a fit; ValueError if one is outside its range.
@@ -68,7 +55,7 @@ class FitOptions:
     static_curve, dynamic_curve: one of `CURVES`; None takes the model's own
     groups, forced: groups of columns that may take part (None: all); that stay whatever they earn
     prior: what is known beforehand, of the type or of this unit; its columns are the model
-    ageing: what the prior's covariance has grown by since
+    ageing_bias, ageing_scale: sd of what each has changed by since the prior [m/s^2], [1]
     serial: unit serial; None takes the sources'
     input: unit of the samples
     full_scale: magnitude of a saturated sample; None takes 32767 for counts, and for m/s^2 the
@@ -88,7 +75,8 @@ class FitOptions:
     groups: tuple[str, ...] | None = None
     forced: tuple[str, ...] = ()
     prior: Calibration | None = None
-    ageing: Ageing = Ageing()
+    ageing_bias: float = 0.0
+    ageing_scale: float = 0.0
     serial: str | None = None
     input: Literal['counts', 'm/s^2'] = 'counts'
     full_scale: float | None = None
@@ -104,6 +92,9 @@ class FitOptions:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {value}')
+        for name in ('ageing_bias', 'ageing_scale'):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f'`{name}` must be 0 or positive, got {getattr(self, name)}')
         if self.offset is not None and not math.isfinite(self.offset):
             raise ValueError(f'`offset` must be finite, got {self.offset}')
         for name, words in _WORDS.items():

@@ -32,7 +32,7 @@ from ..unit.calibration import (
 from ..unit.columns import Column
 from ..unit.posterior import posterior_of
 from .assembly import file_parameters
-from .options import Ageing
+from .options import FitOptions
 from .posterior import Regression
 from .start import ConstantCalibration
 from .unknowns import Known, State
@@ -125,7 +125,7 @@ def state_of(calibration: Calibration, regression: Regression, up: Floats) -> St
 
 
 def known_of(
-    calibration: Calibration, regression: Regression, state: State, sets: Sets, ageing: Ageing
+    calibration: Calibration, regression: Regression, state: State, sets: Sets, options: FitOptions
 ) -> list[Known]:
     """
     Turn a calibration into the prior of a regression on its columns: several, for the evidence.
@@ -142,8 +142,8 @@ def known_of(
     places = parameter_layout(calibration)
     for axis in range(3):
         for block, sd in (
-            (places.bias[axis], ageing.bias * K[axis]),
-            (places.scale[axis], ageing.scale),
+            (places.bias[axis], options.ageing_bias * K[axis]),
+            (places.scale[axis], options.ageing_scale),
         ):
             levels = [block.static, block.dynamic]
             covariance[np.ix_(levels, levels)] += sd * sd
