@@ -196,7 +196,8 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     ]
     K = np.array([[a.scale_factor for a in (c.axes.x, c.axes.y, c.axes.z)] for c in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
-    vectors = np.array([_vector(one, columns, mean_K) for one in calibrations])
+    told = [_told(one, columns, mean_K) for one in calibrations]
+    vectors = np.array([vector for vector, _ in told])
     mean = vectors.mean(axis=0)
     away = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
     scatter = (1.0 - _ALONE) * away.T @ away
@@ -204,8 +205,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     # Of the mean itself, too.
     scatter *= 1.0 + 1.0 / len(vectors)
     # What none of the units told is as alike in all as their prior was: it stays as unknown.
-    for one in calibrations:
-        scatter += _own_covariance(one, columns, mean_K) / len(calibrations)
+    scatter += np.mean([covariance for _, covariance in told], axis=0)
     return _calibration(calibrations, columns, mean_K, mean, scatter)
 
 
@@ -214,36 +214,52 @@ def _unranged(columns: Sequence[Column]) -> list[Column]:
     return [replace(column, range=(0.0, 1.0)) for column in columns]
 
 
-def _own_covariance(calibration: Calibration, columns: Sequence[Column], mean_K: Floats) -> Floats:
+def _told(
+    calibration: Calibration, columns: Sequence[Column], mean_K: Floats
+) -> tuple[Floats, Floats]:
     """
-    Return a unit's covariance in the order of `_vector`; 0 for columns that it does not have.
+    Return a unit's parameters and covariance in the order of a file with these columns.
 
-    Raises FitError if the calibration makes no claim.
+    At the mean scale factors; 0 for columns that it does not have. Raises FitError if the
+    calibration makes no claim.
     """
     if calibration.posterior is None:
         raise FitError(
             f'{calibration.unit.serial} has no covariance: an import says nothing of its type'
         )
-    own = _unranged(prior_columns(calibration))
-    terms = [own.index(c) if c in own else -1 for c in _unranged(columns)]
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    places: list[int] = []
+    everything = _unranged(columns)
+    terms = [everything.index(column) for column in _unranged(prior_columns(calibration))]
+    values: list[float] = []
     factor: list[float] = []
+    places: list[int] = []
     at = 0
+    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, sets in enumerate(pairs):
-        for name in ('bias_function', 'scale_function'):
-            n = 2 + sum(getattr(one, name).n_free for one in sets)
-            places += [*range(at, at + n), *(at + n + k if k >= 0 else -1 for k in terms)]
-            relative = mean_K[axis] / axes[axis].scale_factor if name == 'bias_function' else 1.0
-            factor += [relative] * (n + len(terms))
-            at += n + len(own)
-    places += range(at, at + 3)
+        K = axes[axis].scale_factor
+        scale = float(np.log(K / mean_K[axis]))
+        for part, relative, levels in (
+            ('bias', mean_K[axis] / K, [axes[axis].bias + one.delta for one in sets]),
+            ('scale', 1.0, [scale, scale]),
+        ):
+            own: list[float] = []
+            for level, one in zip(levels, sets, strict=True):
+                own += [level, *getattr(one, f'{part}_function').free_coefficients]
+            places += [*range(at, at + len(own)), *(at + len(own) + k for k in terms)]
+            at += len(own) + len(columns)
+            own += [getattr(term, part)[axis] for term in calibration.response]
+            values += own
+            factor += [relative] * len(own)
+    M = calibration.misalignment
+    values += [M[1][0], M[2][0], M[2][1]]
     factor += [1.0] * 3
-    there = np.array(places) >= 0
-    scale = np.where(there, factor, 0.0)
-    covariance = calibration.posterior.covariance()[np.ix_(places, places)]
-    return np.asarray(covariance * np.outer(scale, scale))
+    places += range(at, at + 3)
+    vector, covariance = np.zeros(at + 3), np.zeros((at + 3, at + 3))
+    vector[places] = np.multiply(values, factor)
+    covariance[np.ix_(places, places)] = calibration.posterior.covariance() * np.outer(
+        factor, factor
+    )
+    return vector, covariance
 
 
 def _shape(calibration: Calibration) -> list[tuple[str, int]]:
@@ -253,36 +269,6 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
         for axis in regime.axes()
         for function in (axis.bias_function, axis.scale_function)
     ]
-
-
-def _vector(calibration: Calibration, columns: Sequence[Column], mean_K: Floats) -> Floats:
-    """Return a unit's parameters in the order of the file, at the mean scale factors."""
-    own = _unranged(prior_columns(calibration))
-    weights = dict(zip(own, calibration.response, strict=True))
-    terms = [weights.get(column) for column in _unranged(columns)]
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    result: list[float] = []
-    pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
-    for axis, (static, dynamic) in enumerate(pairs):
-        K = axes[axis].scale_factor
-        of_bias = [
-            axes[axis].bias + static.delta,
-            *static.bias_function.free_coefficients,
-            axes[axis].bias + dynamic.delta,
-            *dynamic.bias_function.free_coefficients,
-            *(term.bias[axis] if term else 0.0 for term in terms),
-        ]
-        level = float(np.log(K / mean_K[axis]))
-        result += [value * mean_K[axis] / K for value in of_bias]
-        result += [
-            level,
-            *static.scale_function.free_coefficients,
-            level,
-            *dynamic.scale_function.free_coefficients,
-            *(term.scale[axis] if term else 0.0 for term in terms),
-        ]
-    M = calibration.misalignment
-    return np.array([*result, M[1][0], M[2][0], M[2][1]])
 
 
 def _calibration(
