@@ -145,18 +145,18 @@ def _apply(
     correction, of_rate = compensator.thermal.correction, compensator.thermal.rate_correction
     if len(index) < len(stamps):
         stamps, samples = stamps[index], samples[index]
-    force, rate = np.empty((12, 0)), np.empty((6, 0))
+        angular_rate = None if angular_rate is None else angular_rate[index]
+    force = rate = np.empty((12, 0))
     has_rate = angular_rate is not None and of_rate is not None
     if segments:
         lines = _lines(correction, segments, 0)
         force = lines.correct(stamps, samples, correction.misalignment)
         is_kept = _judge(compensator, segments, stamps, samples, force)
         if angular_rate is not None and of_rate is not None:
-            rate = _lines(of_rate, segments, 9).correct(stamps, angular_rate[index], None)
+            rate = _lines(of_rate, segments, 9).correct(stamps, angular_rate, None)[:, is_kept]
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
-            rate = rate[:, is_kept] if has_rate else rate
-    rates = (rate[:3].T, rate[3:].T) if has_rate else ()
+    rates = (rate[:3].T, rate[3:6].T) if has_rate else ()
     return CompensatedBlock(index, stamps, force[:3].T, force[3:].T, *rates)
 
 

@@ -108,22 +108,23 @@ class Compensator:
         return corrected_rate(self.rate_line, (stamp_ns - self._segment[0]) * 1e-9, x, y, z)
 
     def _count_bad(self, x: float, y: float, z: float) -> None:
-        full_scale = self._full_scale
-        if self.is_refusing:
-            if self.thermal.is_too_fast:
-                self.counters.n_too_fast += 1
-            else:
-                self.counters.n_refuted += 1
+        if self.is_refusing and self.thermal.is_too_fast:
+            self.counters.n_too_fast += 1
+        elif self.is_refusing:
+            self.counters.n_refuted += 1
         elif not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
             self.counters.n_not_finite += 1
-        elif max(abs(x), abs(y), abs(z)) < full_scale:
+        elif max(abs(x), abs(y), abs(z)) < self._full_scale:
             self.counters.n_stuck += 1
         else:
             self.counters.n_saturated += 1
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
         """Correct the first sample after an event, which serves the checks, too."""
-        if not self._admit(stamp_ns):
+        if stamp_ns <= self.last_ns - TIME_JUMP_NS:
+            self.jump_back(stamp_ns)
+        elif stamp_ns <= self.last_ns:
+            self.counters.n_out_of_order += 1
             return None
         thermal = self.thermal
         thermal.flush(stamp_ns)
@@ -156,15 +157,6 @@ class Compensator:
         if row is not None and self.gravity.wants(stamp_ns):
             self.gravity.add(stamp_ns, row[:3], row[3:], correction.noise_trace)
         return None if self.is_refusing else row
-
-    def _admit(self, stamp_ns: int) -> bool:
-        if stamp_ns > self.last_ns:
-            return True
-        if stamp_ns > self.last_ns - TIME_JUMP_NS:
-            self.counters.n_out_of_order += 1
-            return False
-        self.jump_back(stamp_ns)
-        return True
 
     def jump_back(self, stamp_ns: int) -> None:
         """Begin anew at a sample before which time has jumped back: a bag that loops."""
