@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline as ReferenceSpline
 
-from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial, hold
+from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial, check_reference, hold
 
 KNOTS = (-15.0, -6.0, 0.0, 4.0, 15.0)
 FUNCTIONS = [
@@ -86,7 +86,6 @@ def test_value_is_linear_in_the_free_coefficients(function, t, data):
     ('build', 'message'),
     [
         (lambda: Polynomial(()), 'at least the value'),
-        (lambda: Polynomial((0.0, float('nan'))), '`coefficients` must be finite'),
         (lambda: CubicSpline((0.0, 1.0), (0.0, 1.0)), 'at least 3 knots'),
         (lambda: CubicSpline((-1.0, 0.0, 1.0), (0.0, 1.0)), 'one number per knot'),
         (lambda: CubicSpline((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)), 'must rise'),
@@ -94,7 +93,6 @@ def test_value_is_linear_in_the_free_coefficients(function, t, data):
         (lambda: Exponential(0.0, (), ()), 'at least one number'),
         (lambda: Exponential(0.0, (1.0,), (1.0, 2.0)), 'one number per amplitude'),
         (lambda: Exponential(0.0, (1.0,), (0.0,)), 'at least 1 K'),
-        (lambda: Exponential(float('inf'), (1.0,), (9.0,)), '`constant` must be finite'),
     ],
 )
 def test_refusals(build, message):
@@ -105,3 +103,10 @@ def test_refusals(build, message):
 def test_hold():
     assert [hold(x, -1.0, 2.0) for x in (-3.0, 0.5, 4.0)] == [-1.0, 0.5, 2.0]
     assert hold(np.array([-3.0, 0.5, 4.0]), -1.0, 2.0).tolist() == [-1.0, 0.5, 2.0]
+
+
+@pytest.mark.parametrize('bad', [float('nan'), float('inf')])
+def test_what_is_not_finite_is_no_curve_of_a_set(bad):
+    for function in (Polynomial((0.0, bad)), Exponential(bad, (1.0,), (9.0,))):
+        with pytest.raises(ValueError, match='`bias_function` must be 0 at the reference'):
+            check_reference('bias_function', function, 0.0)

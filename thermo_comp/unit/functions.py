@@ -78,7 +78,7 @@ class Polynomial(_Family):
     coefficients: by rising power; the first is the value at the reference: 0 for a bias function,
         1 for a scale function. Unit of the function per K^power
 
-    Raises ValueError if there are no coefficients or one is not finite.
+    Raises ValueError if there are no coefficients.
     """
 
     coefficients: tuple[float, ...]
@@ -87,7 +87,6 @@ class Polynomial(_Family):
     def __post_init__(self) -> None:
         if not self.coefficients:
             raise ValueError('`coefficients` must hold at least the value at the reference')
-        _check_finite('coefficients', self.coefficients)
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
@@ -121,8 +120,8 @@ class CubicSpline(_Family):
     knots_k: rising deviations from the reference temperature [K]; 0 is one of them
     values: the function at the knots; at knot 0 it is 0 (bias) or 1 (scale)
 
-    Raises ValueError if there are fewer than three knots, they do not rise, 0 is missing, the
-    lengths differ, or a number is not finite.
+    Raises ValueError if there are fewer than three knots, they do not rise, 0 is missing, or the
+    lengths differ.
     """
 
     knots_k: tuple[float, ...]
@@ -137,8 +136,6 @@ class CubicSpline(_Family):
                 f'`values` must have one number per knot ({len(self.knots_k)}), '
                 f'got {len(self.values)}'
             )
-        _check_finite('knots_k', self.knots_k)
-        _check_finite('values', self.values)
         if any(b - a < _KNOT_STEP for a, b in zip(self.knots_k, self.knots_k[1:], strict=False)):
             raise ValueError(f'`knots_k` must rise strictly, by {_KNOT_STEP} K or more')
         if max(map(abs, self.knots_k)) > _FARTHEST_KNOT:
@@ -193,8 +190,7 @@ class Exponential(_Family):
     amplitudes: in the unit of the function
     e_fold_k: the temperature change that multiplies a term by e [K]; any sign, not 0
 
-    Raises ValueError if there is no term, the lengths differ, an e-fold is 0, or a number is not
-    finite.
+    Raises ValueError if there is no term, the lengths differ, or an e-fold is below 1 K.
     """
 
     constant: float
@@ -210,9 +206,6 @@ class Exponential(_Family):
                 f'`e_fold_k` must have one number per amplitude ({len(self.amplitudes)}), '
                 f'got {len(self.e_fold_k)}'
             )
-        _check_finite('constant', (self.constant,))
-        _check_finite('amplitudes', self.amplitudes)
-        _check_finite('e_fold_k', self.e_fold_k)
         if any(abs(e_fold) < 1.0 for e_fold in self.e_fold_k):
             # Below 1 K the exponential overflows within any useful temperature range.
             raise ValueError('`e_fold_k` must be at least 1 K in magnitude')
@@ -280,12 +273,6 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:
         raise ValueError(f'`{name}` must be {expected:g} at the reference, got {value:g}')
-
-
-def _check_finite(name: str, values: tuple[float, ...]) -> None:
-    for value in values:
-        if not math.isfinite(value):
-            raise ValueError(f'`{name}` must be finite, got {value}')
 
 
 def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
