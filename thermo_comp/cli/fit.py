@@ -126,9 +126,9 @@ def fit(
     out.told((bag.source.name, bag.info.chosen, bag.info.truncated) for bag in result.bags)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
-        from ..report import write_report
+        from ..report import evidence_of_fit, write_report
 
-        write_report(result, report, info=info, overwrite=force)
+        write_report(evidence_of_fit(result), report, info=info, overwrite=force)
     _say(out, result, output, verbose)
     if report is not None:
         out.line(f'{report}: certificate')

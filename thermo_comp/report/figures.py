@@ -16,7 +16,7 @@ from .figures_position import draw_every_position, draw_histograms, draw_positio
 from .figures_time import draw_dynamics, draw_gravity, draw_residuals, draw_temperatures
 from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_rates, draw_step
 from .html import label_text
-from .style import drawing, png, svg
+from .style import drawing, svg
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,6 @@ def drawn_figures(figures: Sequence[ReportFigure]) -> list[tuple[ReportFigure, s
             (one, svg(one.draw(), f'f{number}', one.question))
             for number, one in enumerate(figures, 1)
         ]
-
-
-def png_files(evidence: Evidence) -> dict[str, bytes]:
-    """Draw all figures as PNG: their content by file name, like ``1_temperatures.png``."""
-    with drawing():
-        return {
-            f'{number}_{one.name}.png': png(one.draw())
-            for number, one in enumerate(figures_of(evidence), 1)
-        }
 
 
 def figures_of(evidence: Evidence) -> list[ReportFigure]:

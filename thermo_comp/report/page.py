@@ -12,46 +12,41 @@ import numpy as np
 
 from .. import __version__
 from ..files import PAGE, PICTURE, write_atomically
-from ..fitting import FitResult
 from ..judging.history import drifts_of
 from ..text import counted
 from ..thermal.regime import Regime
-from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
+from ..unit.gravity import STANDARD_GRAVITY
 from .certificate import CertificateInfo, budget, combined, conformity_rule, results
 from .evidence import LEFT_OUT, Evidence
-from .figures import ReportFigure, drawn_figures, figures_of, png_files
-from .gather import evidence_of_fit
+from .figures import ReportFigure, drawn_figures, figures_of
 from .html import render, spelt, utc
+from .style import drawing, png
 
 # Mean radius of the Earth [m]: GRS 80.
 _EARTH_RADIUS = 6.371e6
-#: Peak of the Schuler oscillation, 2 R b / g, for a bias b of one micro-g [m]: 12.7.
-SCHULER_PEAK_PER_MICRO_G = 2.0 * MICRO_G * _EARTH_RADIUS / STANDARD_GRAVITY
 
 
 def write_report(
-    subject: FitResult | Evidence,
+    evidence: Evidence,
     path: str | Path,
     *,
     info: CertificateInfo | None = None,
     figures: str | Path | None = None,
     overwrite: bool = True,
-) -> Evidence:
+) -> None:
     """
-    Write a certificate as one self-contained HTML page; give what it is made of.
+    Write a certificate as one self-contained HTML page.
 
-    What the laboratory does not state in `info` stays blank. The folder `figures` gets PNG files.
-    Raises OutputError if a file may not or cannot be written.
+    What the laboratory does not state in `info` stays blank. The folder `figures` gets them as PNG
+    files, like ``1_temperatures.png``. Raises OutputError if a file may not or cannot be written.
     """
-    evidence = subject
-    if isinstance(evidence, FitResult):
-        evidence = evidence_of_fit(evidence)
     page = render_report(evidence, info)
     if figures is not None:
-        for name, content in png_files(evidence).items():
-            write_atomically(Path(figures) / name, content, PICTURE, overwrite=overwrite)
+        with drawing():
+            for number, one in enumerate(figures_of(evidence), 1):
+                name = Path(figures) / f'{number}_{one.name}.png'
+                write_atomically(name, png(one.draw()), PICTURE, overwrite=overwrite)
     write_atomically(path, page.encode(), PAGE, overwrite=overwrite)
-    return evidence
 
 
 def render_report(
@@ -110,8 +105,8 @@ def position_error(bias: float, time: float) -> float:
 
 
 def schuler_peak(bias: float) -> float:
-    """Give the largest position error [m] of a constant error, reached after 42 minutes."""
-    return bias / MICRO_G * SCHULER_PEAK_PER_MICRO_G
+    """Give the largest position error [m] of a constant error, 2 R b / g, after 42 minutes."""
+    return 2.0 * _EARTH_RADIUS * bias / STANDARD_GRAVITY
 
 
 def _verdict(evidence: Evidence) -> tuple[str, str]:
