@@ -37,7 +37,7 @@ SECOND_NS = 1_000_000_000
 
 
 def thermal_test(
-    path: Path, minutes: float = 40.0, rate_hz: float = 10.0, serial: str = '', imu: bool = False
+    path: Path, minutes: float = 30.0, rate_hz: float = 10.0, serial: str = '', imu: bool = False
 ) -> Path:
     """Write a recording with a ramp between two soaks, board lagging, in several write groups."""
     rng = np.random.default_rng(7)
