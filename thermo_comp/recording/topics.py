@@ -13,6 +13,7 @@ from math import isfinite
 from typing import Any, Literal, NamedTuple, cast
 
 from ..errors import RecordingError
+from ..text import one_line
 from .columns import Input, Role
 
 VECTOR3_STAMPED = 'geometry_msgs/msg/Vector3Stamped'
@@ -120,8 +121,7 @@ def is_thermometer(name: str) -> bool:
 
 def shown(name: str) -> str:
     """Make a name that comes from a bag fit for one line: no control characters, not too long."""
-    short = name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...'
-    return ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in short)
+    return one_line(name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...')
 
 
 def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
