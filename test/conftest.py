@@ -18,7 +18,7 @@ import sys
 import tempfile
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -221,6 +221,32 @@ def cli(program: Cli) -> Cli:
         return _checked(finished, code)
 
     return run
+
+
+@pytest.fixture(scope='session')
+def equal_fits_once() -> Iterator[None]:
+    """
+    Fit equal bags with equal options once: pages and examples have the same fit again and again.
+    """
+    from thermo_comp import fitting
+
+    known: dict[str, fitting.FitResult] = {}
+    fit = fitting.fit
+
+    def remembered(
+        sources: Sequence[fitting.FitSource], options: fitting.FitOptions, *progress: Any
+    ) -> fitting.FitResult:
+        hashes = [source.sha256 for source in sources]
+        key = repr((hashes, [source.name for source in sources], options))
+        if None in hashes or options.prior is not None:
+            return fit(sources, options, *progress)
+        if key not in known:
+            known[key] = fit(sources, options, *progress)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, 'fit', remembered)
+        yield
 
 
 class Once(Protocol):

@@ -15,6 +15,8 @@ from readme_helpers import ROOT, is_alike, shown
 
 from thermo_comp.recording import inspect_recording
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 
 @pytest.fixture(autouse=True)
 def needs_ros() -> None:

@@ -15,6 +15,8 @@ from typer.main import get_command
 
 from thermo_comp.cli.app import app
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 
 def leaves(group: Any, prefix: str = '') -> dict[str, Any]:
     """Return every command by the words that call it, those of groups included."""

@@ -23,6 +23,8 @@ from desk_helpers import Desk
 from matplotlib import pyplot as plt
 from readme_helpers import is_alike
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)

@@ -15,6 +15,8 @@ from readme_helpers import FENCES, README, ROOT, is_alike, shown
 
 from thermo_comp.cli.app import app
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 
 def test_the_shown_commands_give_the_shown_output(tmp_path: Path, cli: Cli, once: Once) -> None:
     # The demo has a test of its own, test_cli_demo.
