@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builders import calibration, rich_calibration
+from recording_helpers import OTHER, Message, regular_messages, write_rosbag1
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -347,6 +348,14 @@ def test_a_table_holds_no_other_topics(tmp_path: Path) -> None:
     bag = thermal_test(tmp_path / 'bag', minutes=1.0)
     with pytest.raises(OutputError, match='the corrected samples alone'):
         replay(bag, rich_calibration(), tmp_path / 'out.csv', all_topics=True)
+
+
+def test_topics_that_cannot_be_copied_leave_nothing_behind(tmp_path: Path) -> None:
+    bag = tmp_path / 'bag.bag'
+    write_rosbag1(bag, [*regular_messages(40), Message(OTHER, START_NS)])
+    with pytest.raises(RecordingError, match=f"{OTHER}: .* encoded as 'ros1', expected cdr"):
+        replay(bag, rich_calibration(), tmp_path / 'out.mcap', all_topics=True)
+    assert list(tmp_path.iterdir()) == [bag]
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])

@@ -181,47 +181,47 @@ def _messages_of(
     bag: BagWriter, reader: RecordingReader, serial: str, frame_id: str, all_topics: bool
 ) -> Iterator[WriteBlock]:
     """Write blocks as the node's messages, and beside them what was recorded until then."""
-    taken = {OUTPUT_TOPIC, REGIME_TOPIC, STAMPED_TOPIC}
-    taken |= {topic.strip('/') for topic in reader.topics.values()}
-    others = {topic for topic in reader.info.topics if topic.strip('/') not in taken}
-    following = reader.raw(others if all_topics else ())
-    one = next(following, None)
-
-    def copy(raw: RawMessages, times: Ints) -> None:
-        writer.write_raw(raw.topic, raw.type, times, raw, reader.definitions.get(raw.type))
-
-    def copy_others(until_ns: float) -> None:
-        nonlocal one
-        while one is not None and one.log_ns[0] <= until_ns:
-            copy(one, one.log_ns)
-            one = next(following, None)
-
-    def write(item: CorrectedBlock) -> None:
-        corrected, block = item.corrected, item.block
-        if len(corrected.stamp_ns):
-            writer.write_imu(
-                OUTPUT_TOPIC,
-                corrected.stamp_ns,
-                corrected.specific_force,
-                corrected.covariance,
-                frame_id or block.frame_id,
-                imu=_imu_of(item),
-            )
-        if item.flags:
-            stamps, values = zip(*item.flags, strict=True)
-            times = np.array(stamps, dtype=np.int64)
-            writer.write_bool(REGIME_TOPIC, times, np.array(values))
-            stamped = [stamped_flag(*flag, serial) for flag in item.flags]
-            writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
-        # Their log time becomes their stamp, as that of the outputs is.
-        for role, raw in block.raw.items():
-            is_accel = role == 'accel'
-            copy(raw, block.accel_stamp_ns if is_accel else block.temperatures[role].stamp_ns)
-        if len(block):
-            copy_others(block.log_ns['accel'][-1])
-        writer.flush()
-
     with bag as writer:
+        taken = {OUTPUT_TOPIC, REGIME_TOPIC, STAMPED_TOPIC}
+        taken |= {topic.strip('/') for topic in reader.topics.values()}
+        others = {topic for topic in reader.info.topics if topic.strip('/') not in taken}
+        following = reader.raw(others if all_topics else ())
+        one = next(following, None)
+
+        def copy(raw: RawMessages, times: Ints) -> None:
+            writer.write_raw(raw.topic, raw.type, times, raw, reader.definitions.get(raw.type))
+
+        def copy_others(until_ns: float) -> None:
+            nonlocal one
+            while one is not None and one.log_ns[0] <= until_ns:
+                copy(one, one.log_ns)
+                one = next(following, None)
+
+        def write(item: CorrectedBlock) -> None:
+            corrected, block = item.corrected, item.block
+            if len(corrected.stamp_ns):
+                writer.write_imu(
+                    OUTPUT_TOPIC,
+                    corrected.stamp_ns,
+                    corrected.specific_force,
+                    corrected.covariance,
+                    frame_id or block.frame_id,
+                    imu=_imu_of(item),
+                )
+            if item.flags:
+                stamps, values = zip(*item.flags, strict=True)
+                times = np.array(stamps, dtype=np.int64)
+                writer.write_bool(REGIME_TOPIC, times, np.array(values))
+                stamped = [stamped_flag(*flag, serial) for flag in item.flags]
+                writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
+            # Their log time becomes their stamp, as that of the outputs is.
+            for role, raw in block.raw.items():
+                is_accel = role == 'accel'
+                copy(raw, block.accel_stamp_ns if is_accel else block.temperatures[role].stamp_ns)
+            if len(block):
+                copy_others(block.log_ns['accel'][-1])
+            writer.flush()
+
         yield write
         copy_others(inf)
 
