@@ -30,6 +30,7 @@ from .evidence import PositionReport, ResidualRow, position_reports, residual_ro
 from .gyroscope import RateRow, add_gyroscope
 from .learning import Learnt
 from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
+from .posterior import Regression
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
 from .sensors import learn_detector
@@ -44,6 +45,8 @@ Progress = Callable[[float], None]
 _WINDOW_S = 60.0
 # Usual full scales of units that report m/s^2.
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+# The board has its say in when the regime closes, unless the log evidence gains this without.
+_CLOSING_EARNED = 10.0
 # Stands in where the bags do not tell how far the board lags behind the case.
 _USUAL_BOARD_LAG_S = 900.0
 # A bias beyond this part of 1 g is a word of no force.
@@ -206,14 +209,17 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     tell(0.7)
     nominal = start.scale
     regression, learnt = regress(windows, start, up, sets, options, tell)
-    may_choose = has_case and known is None and options.detector is None
-    if may_choose and any(one.group == SET for one in learnt.worth):
+    if has_case and known is None and options.detector is None and learnt.has(SET):
         # Only the sets feel when the regime closes: with the case, or with the board too.
         earlier = replace(detector, closes='case')
         others = table(earlier)
-        again, found = regress(others, start, up, sets, options, tell)
-        if found.posterior.log_evidence > learnt.posterior.log_evidence:
-            detector, windows, regression, learnt = earlier, others, again, found
+        again = Regression(others.data, options.gravity, nominal)
+        again.reweight(regression.weight)
+        evidence = learnt.posterior.log_evidence
+        if again.solve(learnt.posterior.state, learnt.prior).log_evidence > evidence:
+            again, found = regress(others, start, up, sets, options, tell)
+            if found.posterior.log_evidence > evidence + _CLOSING_EARNED:
+                detector, windows, regression, learnt = earlier, others, again, found
     residuals, left_out = residual_rows(windows, regression, learnt)
     findings += verdict.judge_result(
         learnt.posterior.state.kappa * nominal,

@@ -63,16 +63,16 @@ _NEIGHBOURS = 3
 
 @dataclass(frozen=True)
 class Learnt:
-    """
-    A posterior under the prior that the data chose.
-
-    claim: the same mode with the covariance to claim, which leaves open what nobody has seen
-    """
+    """Mode under the prior that the data chose; `claim` leaves open what nobody has seen."""
 
     posterior: Posterior
     prior: Prior
     worth: tuple[GroupEvidence, ...]
     claim: Posterior
+
+    def has(self, group: str) -> bool:
+        """Whether a group of columns has a place."""
+        return any(one.group == group for one in self.worth)
 
 
 def learn(
