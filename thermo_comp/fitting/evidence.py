@@ -78,7 +78,7 @@ def residual_rows(
     rungs = (_with_only(regression, learnt, groups) for groups in ((CURVE,), (CURVE, SET)))
     steps += [regression.force(step) for step in (*rungs, state)]
     residuals = [norm_residual(force, regression.gravity) for force in steps]
-    left_out = left_out_residual(regression, learnt)
+    left_out = norm_residual(left_out_force(regression, learnt), regression.gravity)
     is_dynamic = windows.weight > 0.5
     known = np.isfinite(left_out)
     tables = [statistics_by_regime(r, is_dynamic) for r in residuals]
@@ -105,19 +105,14 @@ def _with_only(regression: Regression, learnt: Learnt, groups: tuple[str, ...]) 
     return regression.solve(learnt.posterior.state, prior).state
 
 
-def left_out_residual(regression: Regression, learnt: Learnt) -> Floats:
-    """
-    ``|f| - g`` of each position's windows by the others, shape (n,) [m/s^2]; NaN for a position
-    that tells what no other does.
-    """
+def left_out_force(regression: Regression, learnt: Learnt) -> Floats:
+    """Correct each position by the others, shape (n, 3); NaN where it tells what no other does."""
     position = regression.windows.position
-    result = np.full(len(position), np.nan)
+    result = np.full((len(position), 3), np.nan)
     for p in range(regression.windows.n_positions):
         state = regression.without(learnt.posterior, learnt.prior, p)
-        if state is None:
-            continue
-        rows = position == p
-        result[rows] = norm_residual(regression.force(state), regression.gravity)[rows]
+        if state is not None:
+            result[position == p] = regression.force(state)[position == p]
     return result
 
 
@@ -131,7 +126,7 @@ def position_reports(
     """
     List the positions with what the fit left on each.
 
-    `left_out`: as `left_out_residual` gives it, shape (n,).
+    `left_out`: ``|f| - g`` by the others, shape (n,).
     """
     data, state = windows.data, learnt.posterior.state
     residual = norm_residual(regression.force(state), regression.gravity)

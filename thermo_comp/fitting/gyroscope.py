@@ -24,6 +24,7 @@ from ..unit.gravity import EARTH_RATE
 from ..unit.metrics import ResidualStatistics, statistics_by_regime
 from ..unit.rate_triad import gyroscope_of
 from .assembly import UnitFacts, build_calibration
+from .evidence import left_out_force
 from .learning import Learnt, learn
 from .options import FitOptions
 from .posterior import Regression
@@ -104,14 +105,8 @@ def add_gyroscope(
 
 
 def _rows(windows: ThermalWindows, regression: Regression, learnt: Learnt) -> tuple[RateRow, ...]:
-    position = windows.data.position
-    fitted = regression.force(learnt.posterior.state)
-    left_out = np.full_like(fitted, np.nan)
-    for p in range(windows.data.n_positions):
-        state = regression.without(learnt.posterior, learnt.prior, p)
-        if state is not None:
-            rows = position == p
-            left_out[rows] = regression.force(state)[rows]
+    position, fitted = windows.data.position, regression.force(learnt.posterior.state)
+    left_out = left_out_force(regression, learnt)
     is_dynamic = np.repeat(windows.weight > 0.5, 3)
     raw, by_fit, by_others = (
         statistics_by_regime(within_positions(rate, position).ravel(), is_dynamic)

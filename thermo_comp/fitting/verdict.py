@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -21,8 +20,8 @@ from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
-from .branches import Event, find_branches
 from .coverage import LeastKnown, distinct_directions, geometry, spoken_direction
+from .jumps import Jump, find_jumps
 from .options import FitOptions
 from .reduction import ReducedBag
 from .windows import ThermalWindows
@@ -37,8 +36,6 @@ _WORST_GEOMETRY = 6.0
 _SATURATED_NEEDED, _SATURATED_ADVISED = 0.05, 0.001
 # A direction is unseen whose |f| is known so many times less than in the positions.
 _UNSEEN = 3.0
-# Neighbours this close in time and direction may be one rest with a step in it.
-_NEAR_S, _NEAR_DEG = 30.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -116,20 +113,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         yield _advice('rate', text)
 
 
-def find_jumps(bag: ReducedBag) -> tuple[Event, ...]:
-    """Find where a sensor jumped at rest; streams the bag again only where that may be."""
-    means = [np.average(one.mean, axis=0, weights=one.count) for one in bag.intervals]
-    ups = [mean / np.linalg.norm(mean) for mean in means]
-    near = np.cos(np.radians(_NEAR_DEG))
-    may_be = any(
-        after.start_ns - before.end_ns <= _NEAR_S * 1e9 and up @ other > near
-        for (before, up), (after, other) in pairwise(zip(bag.intervals, ups, strict=True))
-    )
-    events = find_branches(bag.source, bag)[0] if may_be else ()
-    return tuple(event for event in events if event.kind == 'jump')
-
-
-def describe(jump: Event, per_mg: float, since_s: float = 0.0) -> str:
+def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
     """Say one jump in words; `since_s` is where the part of its bag begins."""
     vector = ', '.join(f'{v / per_mg:+.3g}' for v in jump.step)
     warmed = ''

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the branches of a rest: where a sensor that lies still jumps, and the runs between the jumps.
+Owns the jumps: where a sensor that lies still changes by itself.
 
 A sensor can change by itself within one sample: a die that relaxes, a part that loses its grip.
 The temperature does not jump, so no function of temperature can follow, and a fit over the jump
@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
@@ -23,8 +22,9 @@ from ..typing import Floats, Ints
 from .reduction import ReducedBag
 from .sources import FitSource, angular_velocity
 
-# Still intervals further apart than this are not looked at for a step: too much can have happened.
-_LONGEST_GAP_S = 30.0
+# Still intervals further apart than this are not looked at for a step: too much can have happened;
+# nor those whose readings point so far from each other.
+_LONGEST_GAP_S, _NEAR = 30.0, np.cos(np.radians(10.0))
 # Readings on either side of the gap that say what the level was.
 _MARGIN_S = 10.0
 _FEWEST_SAMPLES = 8
@@ -39,81 +39,39 @@ _TURN_SHARE = 0.33
 
 
 @dataclass(frozen=True)
-class Event:
+class Jump:
     """
-    A step in the reading of a sensor at rest.
+    A step in the reading of a sensor at rest, which no turn of the unit explains.
 
-    kind: the sensor changed by itself; it may have been turned, quietly; it was moved
     time: since the bag's first sample [s]
-    stamp_ns: stamp of the first sample after it
     duration_s: interval between the samples before and after it [s]
     step: change of the reading, per axis [input units]
-    along, along_sd: change of the norm, that is, along the specific force, and its sd [input
-        units]
+    along: change of the norm, that is, along the specific force [input units]
     temperature_change, temperature_change_sd: step of the board's readings at that time, beside a
         drift, and its sd [K]; NaN where too few readings are near
-    turn_needed, turn_seen: angle by which the unit would have to turn for such a step, and what
-        the gyroscope saw [rad]; NaN without one
     """
 
-    kind: Literal['jump', 'turn', 'motion']
     time: float
-    stamp_ns: int
     duration_s: float
     step: tuple[float, float, float]
     along: float
-    along_sd: float
     temperature_change: float
     temperature_change_sd: float
-    turn_needed: float
-    turn_seen: float
 
 
-@dataclass(frozen=True)
-class Branch:
-    """
-    A run at rest in one attitude without a step.
-
-    start_s, end_s: from a step (or the first still interval's start) to the next step (or the last
-        one's end), since the bag's first sample [s]
-    still: its still intervals [s]
-    """
-
-    start_s: float
-    end_s: float
-    still: tuple[tuple[float, float], ...]
-
-
-def find_branches(
-    source: FitSource, bag: ReducedBag
-) -> tuple[tuple[Event, ...], tuple[Branch, ...]]:
-    """Find the steps between a bag's still intervals, and the branches between the steps."""
-    spans = [
-        ((i.start_ns - bag.start_ns) * 1e-9, (i.end_ns - bag.start_ns) * 1e-9)
-        for i in bag.intervals
+def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
+    """Find the jumps between a bag's rests; streams it again only where there may be one."""
+    means = [np.average(one.mean, axis=0, weights=one.count) for one in bag.intervals]
+    ups = [mean / np.linalg.norm(mean) for mean in means]
+    gaps = [
+        ((before.end_ns - bag.start_ns) * 1e-9, (after.start_ns - bag.start_ns) * 1e-9)
+        for (before, up), (after, other) in pairwise(zip(bag.intervals, ups, strict=True))
+        if after.start_ns - before.end_ns <= _LONGEST_GAP_S * 1e9 and up @ other > _NEAR
     ]
-    gaps = [(a[1], b[0]) for a, b in pairwise(spans)]
-    short = [gap for gap in gaps if gap[1] - gap[0] <= _LONGEST_GAP_S]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
-    found = {
-        gap: _examine(near, gap, quiet_sd, bag)
-        for gap, near in zip(short, _near(source, bag.start_ns, short), strict=True)
-    }
-    events: list[Event] = []
-    branches: list[Branch] = []
-    run, start = spans[:1], spans[0][0] if spans else 0.0
-    for gap, span in zip(gaps, spans[1:], strict=True):
-        event = found.get(gap)
-        if event is not None or gap not in found:
-            end, following = gap if event is None else (event.time, event.time)
-            branches.append(Branch(start, end, tuple(run)))
-            run, start = [], following
-        if event is not None:
-            events.append(event)
-        run.append(span)
-    if run:
-        branches.append(Branch(start, run[-1][1], tuple(run)))
-    return tuple(events), tuple(branches)
+    near = _near(bag.source, bag.start_ns, gaps)
+    found = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(near, gaps, strict=True))
+    return tuple(jump for jump in found if jump is not None)
 
 
 @dataclass(frozen=True)
@@ -121,7 +79,6 @@ class _Near:
     """Samples beside one gap."""
 
     time: Floats
-    stamp_ns: Ints
     accel: Floats
     gyro: Floats | None
 
@@ -129,7 +86,7 @@ class _Near:
 def _near(
     source: FitSource, start_ns: int, gaps: Sequence[tuple[float, float]]
 ) -> Iterable[_Near]:
-    parts: list[list[tuple[Ints, Floats, Floats | None]]] = [[] for _ in gaps]
+    parts: list[list[tuple[Floats, Floats, Floats | None]]] = [[] for _ in gaps]
     if gaps:
         for block in source.blocks():
             time = _seconds(block.accel_stamp_ns, start_ns)
@@ -138,19 +95,14 @@ def _near(
                 use = (time >= begin - _MARGIN_S) & (time <= end + _MARGIN_S)
                 use &= np.isfinite(block.accel).all(axis=1)
                 if use.any():
-                    part.append(
-                        (
-                            block.accel_stamp_ns[use],
-                            block.accel[use],
-                            None if rate is None else rate[use],
-                        )
-                    )
+                    part.append((time[use], block.accel[use], None if rate is None else rate[use]))
     for part in parts:
-        stamps = np.concatenate([p[0] for p in part]) if part else np.zeros(0, dtype=np.int64)
-        accel = np.concatenate([p[1] for p in part]) if part else np.zeros((0, 3))
+        time = np.concatenate([np.zeros(0), *(p[0] for p in part)])
+        accel = np.concatenate([np.zeros((0, 3)), *(p[1] for p in part)])
         rates = [p[2] for p in part if p[2] is not None]
-        gyro = np.concatenate(rates) if part and len(rates) == len(part) else None
-        yield _Near(_seconds(stamps, start_ns), stamps, accel, gyro)
+        yield _Near(
+            time, accel, np.concatenate(rates) if part and len(rates) == len(part) else None
+        )
 
 
 def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
@@ -160,7 +112,7 @@ def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
 
 def _examine(
     near: _Near, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
-) -> Event | None:
+) -> Jump | None:
     beside = (near.time <= gap[0]) | (near.time >= gap[1])
     if min(np.sum(near.time <= gap[0]), np.sum(near.time >= gap[1])) < _FEWEST_SAMPLES:
         return None
@@ -172,7 +124,6 @@ def _examine(
     step, step_sd = _step(near.time, near.accel, near.time[at], quiet_sd)
     before, after = near.accel[:at], near.accel[at:]
     spread = np.sqrt(0.5 * (_local_variance(before) + _local_variance(after)))
-    is_quiet = bool(np.all(spread <= _QUIET_RATIO * quiet_sd))
     middle = 0.5 * (before.mean(axis=0) + after.mean(axis=0))
     norm = float(np.linalg.norm(middle))
     along = float(np.linalg.norm(middle + 0.5 * step) - np.linalg.norm(middle - 0.5 * step))
@@ -183,20 +134,17 @@ def _examine(
     is_no_turn = seen < _TURN_SHARE * needed or (
         abs(along) > _NORM_SHARE * size and abs(along) > _STEP_SDS * along_sd
     )
+    if not is_no_turn or np.any(spread > _QUIET_RATIO * quiet_sd):
+        return None
     warmed, warmed_sd = _temperature_step(bag, near.time[0], near.time[at], near.time[-1])
     x, y, z = step.tolist()
-    return Event(
-        kind='motion' if not is_quiet else ('jump' if is_no_turn else 'turn'),
+    return Jump(
         time=float(near.time[at]),
-        stamp_ns=int(near.stamp_ns[at]),
         duration_s=float(near.time[at] - near.time[at - 1]),
         step=(x, y, z),
         along=along,
-        along_sd=along_sd,
         temperature_change=warmed,
         temperature_change_sd=warmed_sd,
-        turn_needed=needed,
-        turn_seen=seen,
     )
 
 
