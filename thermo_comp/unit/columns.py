@@ -222,7 +222,10 @@ class ColumnTable:
         rows = {
             form: [k for k, (_, own, _) in enumerate(sources) if own == form] for form in _FORMS
         }
-        self._forms = [(rows[form], *both) for form, both in _FORMS.items() if rows[form]]
+        # A line is what it is made of.
+        self._forms = [
+            (rows[form], *both) for form, both in _FORMS.items() if rows[form] and form != 'line'
+        ]
         #: Which number of a state each column is made of.
         self.places = self._places[self._source]
 
@@ -258,10 +261,10 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> Floats:
         """Differentiate u by the number that it is made of, ranges aside."""
-        x = states[self._places] / self._widths
+        slopes = np.ones((len(self._places), states.shape[1]))
         for rows, _, slope in self._forms:
-            x[rows] = slope(x[rows])
-        return np.asarray((x / self._widths)[self._source])
+            slopes[rows] = slope(states[self._places[rows]] / self._widths[rows])
+        return np.asarray((slopes / self._widths)[self._source])
 
 
 def _source(column: Column, layout: Layout) -> tuple[int, str, float]:

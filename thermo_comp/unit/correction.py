@@ -256,13 +256,13 @@ class Correction:
         factors = self.table.factors(board, states[WEIGHT])
         phi = self.table.held(raw) * factors[0]
         found = self._blended(sets, states[WEIGHT], phi).reshape(2, 3, 2, n)
-        lines = np.stack((found[:, :, 0], found[:, :, 1] - found[:, :, 0]), axis=2)
+        found[:, :, 1] -= found[:, :, 0]
         factors_at_end = factors[0][:, n:], factors[1][:, n:]
         gap = (sets[1] - sets[0])[:, n:]
         unchanging = np.reshape(slow, (3, 3, n))
         v = self._variance(states[:, n:], raw[:, n:], factors_at_end, gap, unchanging)
         v[:, 0] += np.array(self.noise)[:, np.newaxis] * (1.0 + np.asarray(noise_excess))
-        line = np.concatenate((lines.swapaxes(0, 1).reshape(12, n), v.reshape(9, n)))
+        line = np.concatenate((found.swapaxes(0, 1).reshape(12, n), v.reshape(9, n)))
         return line.reshape(21, *ends.shape[2:])
 
     def _variance(
@@ -297,13 +297,15 @@ class Correction:
         # Far outside, the residual of the fit says nothing any more: it grows with the excess.
         own = np.where(self._is_present, self.table.excess(raw), 0.0).max(axis=1, initial=0.0)
         v = (v + slow) * (1.0 + (outside + own) ** 2)[:, np.newaxis]
+        doubt, over = unknown + weight * rest + outside * outside, raw - held
+        if not doubt.any() and not over.any():
+            return np.asarray(v)
         if self.table.differs:
             of_static, of_dynamic = (
                 self.table.factors(board, np.full_like(weight, of))[0] for of in (0.0, 1.0)
             )
             gap = self._weigh(held * (of_dynamic - of_static), gap)
-        doubt = unknown + weight * rest + outside * outside
-        cut_off = self._weigh((raw - held) * factors[0], np.zeros_like(gap))
+        cut_off = self._weigh(over * factors[0], np.zeros_like(gap))
         more = self._spread(np.array([doubt, np.ones_like(doubt)]), np.array([gap, cut_off]))
         return np.asarray(v + more)
 
@@ -313,12 +315,16 @@ class Correction:
         each moves bias and relative scale by `moved` per unit, shape (p, 6, n).
         """
         variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
-        parts = (variance * bias * bias, 2.0 * variance * bias * scale, variance * scale * scale)
-        return in_order(np.stack(parts, axis=2), 0)
+        parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))
+        parts[:, :, 0] = variance * bias * bias
+        parts[:, :, 1] = 2.0 * variance * bias * scale
+        parts[:, :, 2] = variance * scale * scale
+        return in_order(parts, 0)
 
 
 def in_order(values: Floats, axis: int) -> Floats:
     """Sum along an axis, one after the other, however many there are along the others."""
     if not values.shape[axis]:
         return np.asarray(values.sum(axis=axis))
-    return np.asarray(np.add.accumulate(values, axis=axis).take(-1, axis))
+    total: Floats = np.add.accumulate(values, axis=axis).take(-1, axis)
+    return total
