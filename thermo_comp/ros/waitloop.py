@@ -220,7 +220,7 @@ class WaitLoop:
                     continue
                 if is_flowing:
                     alone.wait(min(self._call_ns - now, OTHERS_PERIOD_NS))
-                    is_flowing = alone.is_ready()
+                    is_flowing = alone.is_ready(hot.subscription) if hot else False
                 else:
                     everything.wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
                     is_flowing, look_ns = hot is not None, 0
@@ -228,7 +228,10 @@ class WaitLoop:
                 on_data()
                 if woken_ns >= look_ns:
                     # After a request the next one may wait already.
-                    is_busy = self._look_after(others, services)
+                    everything.wait(0)
+                    ready = [one for one in others if everything.is_ready(one)]
+                    asked = [one for one in services if everything.is_ready(one)]
+                    is_busy = self._look_after(ready, asked)
                     look_ns = 0 if is_busy else woken_ns + OTHERS_PERIOD_NS
                 # No interval at all: the middleware does not tell the time.
                 if hot and 0 < hot.interval_ns < crowd_ns:
@@ -298,9 +301,11 @@ class _WaitSet:
             *[(self._set.add_service, one.handle) for one in services],
             *[(self._set.add_guard_condition, one.handle) for one in guards],
         ]
-
-        #: Tells whether the first subscription has a message.
-        self.is_ready = partial(self._set.is_ready, 'subscription', 0)
+        self._places = {
+            one: (kind, place)
+            for kind, many in (('subscription', subscriptions), ('service', services))
+            for place, one in enumerate(many)
+        }
 
     def wait(self, timeout_ns: int) -> None:
         """Wait at most so long [ns]."""
@@ -308,6 +313,10 @@ class _WaitSet:
         for add, handle in self._content:
             add(handle)
         self._set.wait(timeout_ns)
+
+    def is_ready(self, entity: Subscription | Service) -> bool:
+        """Tell whether something waits at an entity, as the last wait has found."""
+        return bool(self._set.is_ready(*self._places[entity]))
 
 
 def _take_message(subscription: Subscription) -> bool:
