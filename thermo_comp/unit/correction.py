@@ -33,6 +33,8 @@ LONGEST_TRANSITION = 10.0
 _GAP_TEMPERATURES = 33
 #: Rounding to whole counts, twice 1/12 where the converter carries the remainder on [counts^2].
 ROUNDING_VARIANCE = 1.0 / 6.0
+#: Of so many states a call for each column costs less than a table of all sums.
+_FEW = 64
 #: So many states at once bound the memory that a line takes.
 _CHUNK = 2048
 
@@ -185,6 +187,12 @@ class Correction:
 
     def _weigh(self, columns: Floats, start: Floats) -> Floats:
         """Add ``W @ columns`` to a start, shape (6, n), column by column."""
+        if columns.shape[1] > _FEW:
+            # The same sums, without a table of what comes in between.
+            total: Floats = start.copy()
+            for weights, column in zip(self._W.swapaxes(0, 1), columns, strict=True):
+                total += weights * column
+            return total
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
