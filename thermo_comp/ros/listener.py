@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -55,7 +56,7 @@ _CLASSES = {VECTOR3_STAMPED: Vector3Stamped, IMU: Imu, TEMPERATURE: Temperature}
 _STAMP = Struct('<iI')
 
 
-class _Listener:
+class _Listener(ABC):
     """A node whose subscriptions are emptied in a thread of its own, while the context lasts."""
 
     def __init__(self, name: str, ros_args: Sequence[str]) -> None:
@@ -88,9 +89,9 @@ class _Listener:
             self._node.destroy_node()
             self._context.try_shutdown()
 
+    @abstractmethod
     def _open(self) -> None:
         """Subscribe."""
-        raise NotImplementedError
 
     def _run(self) -> None:
         self._loop.run(self._take)

@@ -86,6 +86,8 @@ class Curves:
         """
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
+        if not (over.any() or too_fast.any()):
+            return over, too_fast, np.zeros_like(over)
         half, half_rate = (one[1] - one[0] for one in (self._t_range, self._rate_range))
         relative = np.abs(over) / (half / 2.0) + np.abs(too_fast) / (half_rate / 2.0)
         return over, too_fast, relative
@@ -152,6 +154,7 @@ class Correction:
             for density, k in zip(calibration.noise_density_m_s2_sqrt_hz, K, strict=True)
         )
         self.noise_trace = sum(self.noise, 0.0)
+        self._noise = np.array(self.noise)[:, np.newaxis]
         M, variances = calibration.misalignment, [sd**2 for sd in calibration.misalignment_sd]
         posterior = calibration.posterior
         if posterior is not None:
@@ -262,14 +265,15 @@ class Correction:
         sets = self.curves.values(board)
         raw = self.table.raw(states)
         factors = self.table.factors(board, states[WEIGHT])
-        phi = self.table.held(raw) * factors[0]
+        held = self.table.held(raw)
+        phi = held * factors[0]
         found = self._blended(sets, states[WEIGHT], phi).reshape(2, 3, 2, n)
         found[:, :, 1] -= found[:, :, 0]
         factors_at_end = factors[0][:, n:], factors[1][:, n:]
         gap = (sets[1] - sets[0])[:, n:]
         unchanging = np.reshape(slow, (3, 3, n))
-        v = self._variance(states[:, n:], raw[:, n:], factors_at_end, gap, unchanging)
-        v[:, 0] += np.array(self.noise)[:, np.newaxis] * (1.0 + np.asarray(noise_excess))
+        v = self._variance(states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, unchanging)
+        v[:, 0] += self._noise * (1.0 + np.asarray(noise_excess))
         line = np.concatenate((found.swapaxes(0, 1).reshape(12, n), v.reshape(9, n)))
         return line.reshape(21, *ends.shape[2:])
 
@@ -277,6 +281,7 @@ class Correction:
         self,
         states: Floats,
         raw: Floats,
+        held: Floats,
         factors: tuple[Floats, Floats],
         gap: Floats,
         slow: Floats,
@@ -290,8 +295,7 @@ class Correction:
         unknown either set may be the right one, and the variances of both count.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
-        rest = 1.0 - weight
-        held = self.table.held(raw)
+        rest, over = 1.0 - weight, raw - held
         excess, _, relative = self.curves.excess(states)
         outside = rest * relative[0] + weight * relative[1]
         shares = np.array([rest + unknown * weight, weight + unknown * rest])
@@ -302,12 +306,15 @@ class Correction:
         slopes = self.curves.slopes(board) + on_board
         v = self._spread(np.concatenate(variances), np.concatenate((slopes, felt)))
         v[:, 0] += (shares[:, np.newaxis] * self.curves.residuals).sum(axis=0)
-        # Far outside, the residual of the fit says nothing any more: it grows with the excess.
-        own = np.where(self._is_present, self.table.excess(raw), 0.0).max(axis=1, initial=0.0)
-        v = (v + slow) * (1.0 + (outside + own) ** 2)[:, np.newaxis]
-        doubt, over = unknown + weight * rest + outside * outside, raw - held
-        if not doubt.any() and not over.any():
-            return np.asarray(v)
+        v += slow
+        is_beyond = bool(over.any())
+        if is_beyond or outside.any():
+            # Far outside, the residual of the fit says nothing any more: it grows with the excess.
+            own = np.where(self._is_present, self.table.excess(raw), 0.0).max(axis=1, initial=0.0)
+            v *= (1.0 + (outside + own) ** 2)[:, np.newaxis]
+        doubt = unknown + weight * rest + outside * outside
+        if not (is_beyond or doubt.any()):
+            return v
         if self.table.differs:
             of_static, of_dynamic = (
                 self.table.factors(board, np.full_like(weight, of))[0] for of in (0.0, 1.0)

@@ -237,11 +237,13 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 class Functions:
-    """Rows of functions, each row at temperatures of its own; if polynomials, all in one go."""
+    """Rows of functions, each row at temperatures of its own; all polynomials in one go."""
 
     def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
         self.rows = rows
-        flat = [one for row in rows for one in row if isinstance(one, Polynomial)]
+        places = [(i, j, one) for i, row in enumerate(rows) for j, one in enumerate(row)]
+        self._others = [place for place in places if not isinstance(place[2], Polynomial)]
+        flat = [one if isinstance(one, Polynomial) else Polynomial((0.0,)) for *_, one in places]
         shape = -1, len(rows), len(rows[0]), 1
         self._tables = {
             name: np.array(list(zip_longest(*many, fillvalue=0.0))).reshape(shape)
@@ -249,15 +251,14 @@ class Functions:
                 ('value', [one.coefficients for one in flat]),
                 ('slope', [one.slopes for one in flat]),
             )
-            if len(flat) == sum(map(len, rows))
         }
 
     def evaluate(self, t: Floats, name: str = 'value') -> Floats:
         """Evaluate at `t`, shape (n_rows, n) [K], values or slopes, (n_rows, n_functions, n)."""
-        if self._tables:
-            return _horner(self._tables[name], t[:, np.newaxis])
-        pairs = zip(self.rows, t, strict=True)
-        return np.array([[getattr(one, name)(own) for one in row] for row, own in pairs])
+        result = _horner(self._tables[name], t[:, np.newaxis])
+        for row, place, one in self._others:
+            result[row, place] = getattr(one, name)(t[row])
+        return result
 
 
 def _horner(coefficients: Floats | tuple[float, ...], t: Floats) -> Floats:
