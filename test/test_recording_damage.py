@@ -185,7 +185,7 @@ def test_a_torn_directory_says_which_file(tmp_path: Path) -> None:
     assert 'no message is' in str(info.truncated)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=500, deadline=None)
 @given(
     data=st.data(),
     compression=st.sampled_from(['none', 'lz4', 'zstd', 'unchunked']),

@@ -89,7 +89,7 @@ def index_of(entries: list[tuple[int, int, int, int]]) -> bytes:
     return b''.join(pieces)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(data=records(), cut=st.integers(0, 200), tail=st.binary(max_size=30), drawn=st.data())
 def test_a_walk_equals_the_plain_loop_and_a_false_index_changes_nothing(
     data: bytes, cut: int, tail: bytes, drawn: st.DataObject

@@ -37,7 +37,7 @@ def imu_columns(rng: np.random.Generator, n: int) -> ImuColumns:
     return ImuColumns(*(rng.normal(size=(n, width)) for width in (4, 9, 3, 9, 9)))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     counts=st.lists(st.integers(0, 60), min_size=1, max_size=4),
     frame_id=st.text(max_size=20).filter(lambda text: '\0' not in text),

@@ -105,7 +105,9 @@ def draw_positions(evidence: Evidence) -> Figure:
             place = equal_area(least.up, side)
             axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
             said = '±' + spoken(least.sd_m_s2).replace('ug', 'µg')
-            _note(axes, said, place, (0.0, -9.0), ha='center', color=style.RED)
+            # Towards the middle: outside stand the names of the axes.
+            by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
+            _note(axes, said, place, by, ha='center', color=style.RED)
         axes.set_title(name, loc='center')
     if evidence.residuals:
         _draw_dots(dots, evidence)
