@@ -15,7 +15,8 @@ import pyarrow as pa
 import zstandard
 from pyarrow import parquet
 
-from thermo_comp.convert import ColumnMap, table_log, write_log
+from thermo_comp.convert.columns import ColumnMap, table_log
+from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import open_recording
 from thermo_comp.unit.schema import build
@@ -85,8 +86,12 @@ def _check_table(name: str, data: bytes) -> None:
 
     def convert() -> None:
         report = write_log(table_log(path, build(ColumnMap, MAP)), output, force=True)
-        lost = (report.short_rows, report.non_numeric, report.out_of_range)
-        assert report.accel_messages + sum(one.count for one in lost) == report.rows
+        lost = (
+            report.findings['short_rows'],
+            report.findings['non_numeric'],
+            report.findings['out_of_range'],
+        )
+        assert report.messages['accel'] + sum(one.count for one in lost) == report.rows
 
     _one_line(convert)
 

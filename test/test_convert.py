@@ -13,8 +13,8 @@ import yaml
 from builders import calibration
 from conftest import Cli
 
-from thermo_comp.convert import ColumnMap, load_column_map, table_log, write_log
-from thermo_comp.convert.log import Readings, thin
+from thermo_comp.convert.columns import ColumnMap, load_column_map, table_log
+from thermo_comp.convert.log import Readings, thin, write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import read_recording
 from thermo_comp.replay import replay
@@ -85,10 +85,10 @@ def test_round_trip_through_the_bag(tmp_path: Path) -> None:
     case, board = block.temperatures['case'], block.temperatures['board']
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
-    assert len(board.celsius) == report.board_messages == 10
+    assert len(board.celsius) == report.messages['board'] == 10
     # A reading stands before the sample of its own stamp: a node has it when the sample comes.
     assert case.after.tolist() == [0, 100, 200, 300]
-    assert (report.rows, report.accel_messages) == (400, 400)
+    assert (report.rows, report.messages['accel']) == (400, 400)
     assert report.rate_hz == pytest.approx(100.0)
     assert report.duration_s == pytest.approx(3.99)
     assert 'gravity is 1 g' in report.believed
@@ -161,12 +161,12 @@ def test_every_odd_row_is_accounted_for(tmp_path: Path) -> None:
     report = write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag')
     block = read_recording(tmp_path / 'bag').columns
     assert report.rows == 400
-    assert (report.short_rows.count, report.non_numeric.count) == (1, 2)
-    assert report.non_numeric.lines == (12, 22)
-    assert (report.clipped.count, report.clipped.lines) == (1, (32,))
-    assert (report.backwards.count, report.backwards.lines) == (1, (43,))
-    assert (report.repeated.count, report.repeated.lines) == (1, (52,))
-    assert len(block) == report.accel_messages == 397
+    assert (report.findings['short_rows'].count, report.findings['non_numeric'].count) == (1, 2)
+    assert report.findings['non_numeric'].lines == (12, 22)
+    assert (report.findings['clipped'].count, report.findings['clipped'].lines) == (1, (32,))
+    assert (report.findings['backwards'].count, report.findings['backwards'].lines) == (1, (43,))
+    assert (report.findings['repeated'].count, report.findings['repeated'].lines) == (1, (52,))
+    assert len(block) == report.messages['accel'] == 397
     # The clipped row and the disorder are the node's to judge: they are in the bag as they were.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
@@ -393,11 +393,11 @@ class TestFreezer:
     def test_every_row_is_there_and_the_faults_are_seen(self, path: Path, tmp_path: Path) -> None:
         columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
         report = write_log(table_log(path, columns), tmp_path / 'bag')
-        assert report.rows == report.accel_messages == 24514
-        assert report.clipped.count == 7
+        assert report.rows == report.messages['accel'] == 24514
+        assert report.findings['clipped'].count == 7
         # Handled before 49 s and after 1945 s of its clock, which starts at 1.5 s.
         first, last = report.stillness.moving_ns[0], report.stillness.moving_ns[-1]
-        assert first[0] == report.start_ns
+        assert first[0] == report.log.stamp_ns[0]
         assert first[1] * 1e-9 == pytest.approx(49.0, abs=3.0)
         assert last[0] * 1e-9 == pytest.approx(1944.0, abs=3.0)
         assert report.stillness.magnitude == pytest.approx(1.02, abs=0.03)
@@ -407,11 +407,11 @@ class TestFreezer:
         assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
         # Three thermometers in three places.
         assert block.temperatures['barometer'].celsius.min() == pytest.approx(-17.0, abs=0.1)
-        assert report.further_messages == {
-            'barometer': len(block.temperatures['barometer'].celsius)
-        }
+        n_barometer = len(block.temperatures['barometer'].celsius)
+        assert report.messages['barometer'] == n_barometer
+        assert report.messages.keys() == {'accel', 'board', 'case', 'barometer'}
         # The air sensor holds its value between readings of its own: fewer messages than rows.
-        assert report.case_messages < 0.75 * report.rows
+        assert report.messages['case'] < 0.75 * report.rows
 
     def test_it_plays_into_the_node(self, path: Path, tmp_path: Path) -> None:
         pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
@@ -443,7 +443,7 @@ class TestFreezer:
         assert recorded['regime/dynamic'] > 0
         # The clipped rows are among what the node holds back.
         assert offline.counters.n_dropped >= offline.counters.n_saturated
-        assert offline.counters.n_saturated >= report.clipped.count > 0
+        assert offline.counters.n_saturated >= report.findings['clipped'].count > 0
 
     def test_a_map_with_the_wrong_unit_is_refused(self, path: Path, tmp_path: Path) -> None:
         text = (ROOT / 'config' / 'columns' / 'freezer.yaml').read_text()
@@ -490,8 +490,8 @@ def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> 
     )
     for stamps in (rows, good + bad[1:]):
         report = write_log(table_log(written(stamps), chart), tmp_path / 'bag.mcap', force=True)
-        left_out = report.out_of_range.count + report.non_numeric.count
-        assert (report.accel_messages, left_out) == (40, len(stamps) - 40)
+        left_out = report.findings['out_of_range'].count + report.findings['non_numeric'].count
+        assert (report.messages['accel'], left_out) == (40, len(stamps) - 40)
         bag = read_recording(tmp_path / 'bag.mcap', input='imu', require=('accel',))
         found = bag.columns.accel_stamp_ns
         assert found.tolist() == [stamp * scale for stamp in good]

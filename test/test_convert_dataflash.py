@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert import read_dataflash, write_log
+from thermo_comp.convert.autopilot import read_autopilot
+from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import read_recording
 
@@ -85,7 +86,7 @@ def write_new(path: Path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)) -> np.nd
 def test_new_instances(tmp_path, rng, imu, baro):
     path = tmp_path / 'new.BIN'
     force = write_new(path, rng)
-    write_log(read_dataflash(path, imu=imu, baro=baro), tmp_path / 'bag.mcap')
+    write_log(read_autopilot(path, imu=imu, baro=baro), tmp_path / 'bag.mcap')
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
     np.testing.assert_array_equal(
@@ -119,7 +120,7 @@ def test_old_types_are_the_instances(tmp_path, rng):
     path = tmp_path / 'old.BIN'
     path.write_bytes(log.body)
     for i, name in enumerate(force):
-        read = read_dataflash(path, imu=i, baro=i)
+        read = read_autopilot(path, imu=i, baro=i)
         np.testing.assert_array_equal(read.accel, force[name])
         np.testing.assert_array_equal(read.temperatures['board'].celsius, [30.0 + i])
         np.testing.assert_array_equal(read.temperatures['case'].celsius, [21.5 + i])
@@ -133,17 +134,17 @@ def test_chip_without_a_thermometer(tmp_path, rng):
         log.write('IMU', 1000 + k * STEP_US, 0, 0.0, 0.0, 0.0, *force, 0, 0, 0.0, 1, 1, 1000, 1000)
     path = tmp_path / 'none.BIN'
     path.write_bytes(log.body)
-    assert not read_dataflash(path).temperatures
+    assert not read_autopilot(path).temperatures
 
 
 def test_corrected_log_is_refused(tmp_path, rng):
     path = tmp_path / 'corrected.BIN'
     write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 1.0),))
     with pytest.raises(RecordingError, match=r'INS_TCAL1_ENABLE was 1.*already'):
-        read_dataflash(path)
-    assert len(read_dataflash(path, allow_compensated=True).stamp_ns) == N
+        read_autopilot(path)
+    assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
     # The second IMU's drift was left as it is.
-    assert len(read_dataflash(path, imu=1).stamp_ns) == N
+    assert len(read_autopilot(path, imu=1).stamp_ns) == N
 
 
 def test_simulator_is_refused(tmp_path):
@@ -159,13 +160,13 @@ def test_simulator_is_refused(tmp_path):
     path = tmp_path / 'sitl.BIN'
     path.write_bytes(log.body)
     with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
-        read_dataflash(path)
+        read_autopilot(path)
 
 
 def test_a_simulator_that_makes_noise_is_said(tmp_path, rng):
     path = tmp_path / 'noisy.BIN'
     write_new(path, rng, parameters=(('SIM_ACC1_RND', 0.1),))
-    assert 'SIM_' in read_dataflash(path).metadata['ardupilot_simulated']
+    assert 'SIM_' in read_autopilot(path).metadata['ardupilot_simulated']
 
 
 def test_torn_log_is_read_up_to_the_tear(tmp_path, rng):
@@ -175,7 +176,7 @@ def test_torn_log_is_read_up_to_the_tear(tmp_path, rng):
     # 40 bytes into the last message of the last IMU row.
     cut = whole.rindex(b'\xa3\x95\x81') + 40
     path.write_bytes(whole[:cut])
-    log = read_dataflash(path, imu=1)
+    log = read_autopilot(path, imu=1)
     assert log.n_short == 1
     np.testing.assert_array_equal(log.accel, force[1][: N - 1])
 
@@ -184,9 +185,9 @@ def test_absent_instances_are_named(tmp_path, rng):
     path = tmp_path / 'new.BIN'
     write_new(path, rng)
     with pytest.raises(RecordingError, match='no IMU 2; there are: 0, 1'):
-        read_dataflash(path, imu=2)
+        read_autopilot(path, imu=2)
     with pytest.raises(RecordingError, match='no barometer 5; there are: 0, 1'):
-        read_dataflash(path, baro=5)
+        read_autopilot(path, baro=5)
 
 
 @pytest.mark.parametrize('content', [b'', b'time,x,y,z\n', b'\xa3\x95' + bytes(600)])
@@ -194,7 +195,7 @@ def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / 'other.BIN'
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r'not a DataFlash log|holds no IMU'):
-        read_dataflash(path)
+        read_autopilot(path)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +216,7 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
     path = tmp_path / 'damaged.BIN'
     path.write_bytes(body)
     with pytest.raises(RecordingError, match=message):
-        read_dataflash(path)
+        read_autopilot(path)
 
 
 def test_absurd_stamps_are_no_stamps(tmp_path, rng):
@@ -226,9 +227,9 @@ def test_absurd_stamps_are_no_stamps(tmp_path, rng):
     at = body.index(b'\xa3\x95\x81') + 3
     body[at : at + 8] = b'\xff' * 8
     path.write_bytes(body)
-    report = write_log(read_dataflash(path), tmp_path / 'bag.mcap')
-    assert report.accel_messages == N - 1
-    assert report.non_numeric.count == 1
+    report = write_log(read_autopilot(path), tmp_path / 'bag.mcap')
+    assert report.messages['accel'] == N - 1
+    assert report.findings['non_numeric'].count == 1
 
 
 def test_command(tmp_path, rng, cli):

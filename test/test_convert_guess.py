@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert import guess_columns, spoken_columns, table_log
+from thermo_comp.convert.columns import guess_columns, spoken_columns, table_log
 from thermo_comp.errors import RecordingError
 
 UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], 400, axis=0)

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert import read_ulog, write_log
+from thermo_comp.convert.autopilot import read_autopilot
+from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import read_recording
 
@@ -94,10 +95,10 @@ def flight(tmp_path, rng):
 @pytest.mark.parametrize('imu', [0, 1])
 def test_log_arrives_in_the_bag(flight, tmp_path, imu):
     path, truth = flight
-    report = write_log(read_ulog(path, imu=imu), tmp_path / 'bag.mcap')
+    report = write_log(read_autopilot(path, imu=imu), tmp_path / 'bag.mcap')
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
-    assert report.accel_messages == N
+    assert report.messages['accel'] == N
     # The sample's own time counts, not the time of its publication; each IMU has its own.
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
@@ -111,17 +112,17 @@ def test_log_arrives_in_the_bag(flight, tmp_path, imu):
 
 def test_gyro_of_the_same_instance_travels_along(flight, tmp_path):
     path, _ = flight
-    write_log(read_ulog(path, imu=0), tmp_path / 'bag.mcap')
+    write_log(read_autopilot(path, imu=0), tmp_path / 'bag.mcap')
     rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
     # Both sensors have the same stamps here; the values passed through a float32.
     np.testing.assert_allclose(rate[:, 0], 0.001 * np.arange(N), atol=1e-6)
-    assert read_ulog(path, imu=1).gyro is None
+    assert read_autopilot(path, imu=1).gyro is None
 
 
 def test_gyro_logged_sparsely_is_left_out(tmp_path, rng):
     path = tmp_path / 'flight.ulg'
     write_two_imus(path, rng, gyro_every=5)
-    assert read_ulog(path).gyro is None
+    assert read_autopilot(path).gyro is None
 
 
 def test_old_layout_without_sample_time(tmp_path, rng):
@@ -132,7 +133,7 @@ def test_old_layout_without_sample_time(tmp_path, rng):
         log.data(number, struct.pack('<Qffff', 1_000_000 + k * STEP_US, *force[k], 31.5))
     path = tmp_path / 'old.ulg'
     path.write_bytes(log.body)
-    read = read_ulog(path)
+    read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force)
     assert 'case' not in read.temperatures
     # A chip that stands still is heard of every 10 s; the log is 6 s long.
@@ -149,14 +150,14 @@ def test_thermometer_that_is_not_there(tmp_path, rng):
         )
     path = tmp_path / 'cold.ulg'
     path.write_bytes(log.body)
-    assert not read_ulog(path).temperatures
+    assert not read_autopilot(path).temperatures
 
 
 def test_torn_log_is_read_up_to_the_tear(flight):
     path, truth = flight
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    read = read_ulog(path)
+    read = read_autopilot(path)
     n = len(read.stamp_ns)
     assert 250 < n < 350
     np.testing.assert_array_equal(read.accel, truth['force'][0][:n])
@@ -170,7 +171,7 @@ def test_simulator_is_refused(tmp_path):
     path = tmp_path / 'sitl.ulg'
     path.write_bytes(log.body)
     with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
-        read_ulog(path)
+        read_autopilot(path)
 
 
 COMBINED = 'sensor_combined:uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;'
@@ -208,7 +209,7 @@ def write_combined(path: Path, rng, **parameters: int) -> np.ndarray:
 def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
     path = tmp_path / 'default.ulg'
     force = write_combined(path, rng)
-    read = read_ulog(path)
+    read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
@@ -224,8 +225,8 @@ def test_a_combined_sensor_that_px4_compensated_is_refused(tmp_path, rng):
     path = tmp_path / 'corrected.ulg'
     write_combined(path, rng, TC_A_ENABLE=1)
     with pytest.raises(RecordingError, match=r'TC_A_ENABLE was 1.*SDLOG_PROFILE'):
-        read_ulog(path)
-    assert len(read_ulog(path, allow_compensated=True).stamp_ns) == N
+        read_autopilot(path)
+    assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
 
 
 def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):
@@ -243,9 +244,9 @@ def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):
 def test_absent_instances_are_named(flight):
     path, _ = flight
     with pytest.raises(RecordingError, match='no IMU 2; there are: 0, 1'):
-        read_ulog(path, imu=2)
+        read_autopilot(path, imu=2)
     with pytest.raises(RecordingError, match='no barometer 1; there are: 0'):
-        read_ulog(path, baro=1)
+        read_autopilot(path, baro=1)
 
 
 def test_log_without_an_accelerometer(tmp_path):
@@ -254,7 +255,7 @@ def test_log_without_an_accelerometer(tmp_path):
     path = tmp_path / 'baro.ulg'
     path.write_bytes(log.body)
     with pytest.raises(RecordingError, match='the log holds no IMU'):
-        read_ulog(path)
+        read_autopilot(path)
 
 
 @pytest.mark.parametrize('content', [b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10])
@@ -262,7 +263,7 @@ def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / 'other.ulg'
     path.write_bytes(content)
     with pytest.raises(RecordingError, match='not a ULog file'):
-        read_ulog(path)
+        read_autopilot(path)
 
 
 def test_format_without_a_time_stamp_is_left_out(tmp_path):
@@ -271,7 +272,7 @@ def test_format_without_a_time_stamp_is_left_out(tmp_path):
     path = tmp_path / 'damaged.ulg'
     path.write_bytes(log.body)
     with pytest.raises(RecordingError, match=r'not a ULog file|holds no IMU'):
-        read_ulog(path)
+        read_autopilot(path)
 
 
 def test_command(tmp_path, rng, cli):

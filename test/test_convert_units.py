@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermo_comp.convert.units import believed_unit, contradiction, find_stillness
+from thermo_comp.convert.log import believed_unit, contradiction, find_stillness
 
 
 @pytest.mark.parametrize(

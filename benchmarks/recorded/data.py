@@ -7,8 +7,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from thermo_comp.convert import load_column_map, table_log, write_log
-from thermo_comp.convert.columns import Accel, ColumnMap, Stamp
+from thermo_comp.convert.columns import Accel, ColumnMap, Stamp, load_column_map, table_log
+from thermo_comp.convert.log import write_log
 
 from . import ROOT
 

@@ -17,10 +17,10 @@ from ..errors import CalibrationError
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from . import options
 from .options import argument, option
-from .output import Output
+from .output import Output, picked
 
 if TYPE_CHECKING:
-    from ..convert import ConversionReport, ForeignLog
+    from ..convert.log import ConversionReport, ForeignLog
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
@@ -83,7 +83,7 @@ def convert(
       thermo_comp convert log.csv --columns map.yaml -o unit42
       thermo_comp convert flight.ulg --imu 1 -o unit43
     """
-    from ..convert import write_log
+    from ..convert.log import write_log
     from ..files import bag_kind, check_output
 
     read_too = [] if columns is None else [columns]
@@ -100,7 +100,7 @@ def convert(
     with out.progress('converting') as done:
         report = write_log(_read(out, log, given), output, force, done)
     _say(out, report)
-    out.told([(log, report.chosen, report.missing)])
+    out.told([(log, report.log.chosen, report.log.missing)])
     out.end()
 
 
@@ -116,7 +116,7 @@ def as_bags(
     out: Output, paths: Sequence[Path], columns: Path | None, rate_hz: float | None
 ) -> Iterator[list[Path]]:
     """Let tables and logs take part as bags, for as long as it lasts."""
-    from ..convert import write_log
+    from ..convert.log import write_log
 
     others = [path for path in paths if path.is_file() and _kind_of(path) != 'bag']
     if (columns or rate_hz) and not others:
@@ -133,7 +133,7 @@ def as_bags(
 
 def _read(out: Output, path: Path, given: Mapping[str, Any]) -> ForeignLog:
     """Read a table, log or bag, which its name tells; refuse options that it has no use for."""
-    from .. import convert
+    from ..convert import autopilot, bag, columns
 
     kind = _kind_of(path)
     said = {flag: value for flag, value in given.items() if value is not None}
@@ -144,60 +144,67 @@ def _read(out: Output, path: Path, given: Mapping[str, Any]) -> ForeignLog:
         names = said.get('--topic', {})
         if not names.keys() <= {'imu', 'board', 'case'}:
             raise options.usage('--topic: of a bag, imu, board and case are converted')
-        return convert.bag_log(path, **names, unit=said.get('--unit', 'm/s^2'))
+        return bag.bag_log(path, **names, unit=said.get('--unit', 'm/s^2'))
     if kind == 'log':
-        read = convert.read_ulog if path.suffix.lower() == '.ulg' else convert.read_dataflash
         imu, baro, is_allowed = (said.get(flag) for flag in _OPTIONS['log'])
-        return read(path, imu, baro, bool(is_allowed))
-    columns, rate_hz = said.get('--columns'), said.get('--rate-hz')
-    if columns is not None and rate_hz is not None:
+        return autopilot.read_autopilot(path, imu, baro, bool(is_allowed))
+    chart, rate_hz = said.get('--columns'), said.get('--rate-hz')
+    if chart is not None and rate_hz is not None:
         raise options.usage('--rate-hz: a column map says that')
-    if columns is not None:
-        return convert.table_log(path, convert.load_column_map(columns))
+    if chart is not None:
+        return columns.table_log(path, columns.load_column_map(chart))
     if path.suffix.lower() in ('.parquet', '.pq'):
         raise options.usage('a Parquet table needs --columns MAP')
-    guessed = convert.guess_columns(path, rate_hz)
-    out.line(f'{path}: taken as {convert.spoken_columns(guessed)}; --columns says otherwise')
-    return convert.table_log(path, guessed)
+    guessed = columns.guess_columns(path, rate_hz)
+    taken = columns.spoken_columns(guessed)
+    out.line(f'{path}: taken as {taken}; --columns says otherwise')
+    return columns.table_log(path, guessed)
 
 
 def _say(out: Output, report: ConversionReport) -> None:
     """Print the account of a conversion."""
     from ..convert.log import SLOW_HZ
 
+    log, messages = report.log, dict(report.messages)
+    accel, board, case = (messages.pop(name) for name in ('accel', 'board', 'case'))
     out.line(
-        f'{report.source}: {report.rows} rows, {report.duration_s:.1f} s '
-        f'at {report.rate_hz:.4g} Hz'
+        f'{log.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
     )
     out.line(f'{report.output}:')
     counts = {
-        'accel/counts' if report.input == 'counts' else 'imu/uncompensated': report.accel_messages,
-        'temperature/board': report.board_messages,
-        'temperature/case': report.case_messages,
-        **{f'temperature/{name}': count for name, count in report.further_messages.items()},
+        'accel/counts' if log.input == 'counts' else 'imu/uncompensated': accel,
+        'temperature/board': board,
+        'temperature/case': case,
+        **{f'temperature/{name}': count for name, count in messages.items()},
     }
     for topic, count in counts.items():
         out.line(f'  {count:8} {topic}')
-    out.line(f'unit: {report.unit}; {report.believed}')
+    out.line(f'unit: {log.unit}; {report.believed}')
     if report.rate_hz < SLOW_HZ:
         out.line(
             f'{report.rate_hz:.3g} Hz: good for soaks of minutes; rests by hand are too short for '
             'it, and it sees neither vibration nor a knock between two samples'
         )
-    if report.hint:
-        out.line(report.hint)
-    for name, what in _FINDINGS.items():
-        finding = getattr(report, name)
+    if log.hint:
+        out.line(log.hint)
+    for name, finding in report.findings.items():
         if finding.count:
             more = ', ...' if finding.count > len(finding.lines) else ''
             where = f' (line {", ".join(map(str, finding.lines))}{more})' if finding.lines else ''
-            out.line(f'{what}: {finding.count}{where}')
+            out.line(f'{_FINDINGS[name]}: {finding.count}{where}')
+    start_ns = int(log.stamp_ns[0])
     if report.stillness.moving_ns:
         out.line('moved or shaken, not at rest:')
         for stretch in report.stillness.moving_ns:
-            begin, end = ((stamp_ns - report.start_ns) * 1e-9 for stamp_ns in stretch)
+            begin, end = ((stamp_ns - start_ns) * 1e-9 for stamp_ns in stretch)
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
-    out.json(vars(report))
+    out.json(
+        picked(report, 'output rows rate_hz duration_s believed stillness')
+        | picked(log, 'input unit missing chosen hint')
+        | {'source': log.path, 'start_ns': start_ns, 'accel_messages': accel}
+        | {'board_messages': board, 'case_messages': case, 'further_messages': messages}
+        | report.findings
+    )
 
 
 def export(

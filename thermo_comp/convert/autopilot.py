@@ -25,22 +25,21 @@ https://ardupilot.org/copter/docs/logmessages.html
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import RecordingError
 from ..files import open_regular
-from ..typing import Bools, Floats, Ints
-from .log import NO_STAMP, SLOW_HZ, ForeignLog, Readings, thin
-from .units import find_stillness
+from ..typing import Floats, Ints
+from .log import NO_STAMP, SLOW_HZ, ForeignLog, Readings, find_stillness, thin
 
 T = TypeVar('T')
 _Columns = dict[str, npt.NDArray[Any]]
@@ -61,13 +60,49 @@ _HEADER_BYTES = 3
 _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
 
-def read_ulog(
+class _Held(NamedTuple):
+    """What a log holds by instance; `compensated` says why an IMU's thermal drift is gone."""
+
+    imus: Mapping[int, ForeignLog]
+    baros: Mapping[int, Readings]
+    compensated: Mapping[int, str]
+
+
+def read_autopilot(
     path: str | Path,
     imu: int | None = None,
     baro: int | None = None,
     allow_compensated: bool = False,
 ) -> ForeignLog:
-    """Read an IMU of a PX4 log."""
+    """
+    Read one IMU and one barometer of a PX4 (``.ulg``) or ArduPilot log, those of the lowest
+    instance by default; ArduPilot's are counted from 0: the old type ``IMU2`` is 1.
+    """
+    path = Path(path)
+    held = _ulog(path) if path.suffix.lower() == '.ulg' else _dataflash(path)
+    why = held.compensated.get(min(held.imus, default=0) if imu is None else imu)
+    if why and not allow_compensated:
+        raise RecordingError(why, path=path)
+    rows = _instance(held.imus, imu, 'IMU', path)
+    stamped = rows.stamp_ns != NO_STAMP
+    rest = find_stillness(rows.stamp_ns[stamped], rows.accel[stamped])
+    if rest.noise <= _NO_NOISE * rest.magnitude:
+        raise RecordingError(
+            'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
+            'from which no calibration of a real sensor can come',
+            path=path,
+        )
+    heard = {number: _reported(readings) for number, readings in held.baros.items()}
+    if baro is None:
+        heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
+    found = [_reported(one) for one in rows.temperatures.values()]
+    if heard or baro is not None:
+        found.append(_instance(heard, baro, 'barometer', path))
+    named = zip(('board', 'case'), (thin(one) for one in found if len(one.celsius)), strict=False)
+    return replace(rows, temperatures=dict(named))
+
+
+def _ulog(path: Path) -> _Held:
     with open_regular(path) as file:
         log = _read('pyulog', 'ULog', 'px4', 'a ULog file', path, file, list(_TOPICS))
     by_topic: dict[str, dict[int, _Columns]] = {topic: {} for topic in _TOPICS}
@@ -117,7 +152,7 @@ def read_ulog(
                 'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
                 f'thermal drift out of these readings; {_PROFILE}'
             )
-    return _chosen(Path(path), imus, baros, compensated, imu, baro, allow_compensated)
+    return _Held(imus, baros, compensated)
 
 
 def _combined(columns: _Columns) -> tuple[Ints, Floats, Floats | None]:
@@ -162,14 +197,7 @@ def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
     return np.column_stack([np.interp(at, where, gyro[:, i]) for i in range(3)])
 
 
-def read_dataflash(
-    path: str | Path,
-    imu: int | None = None,
-    baro: int | None = None,
-    allow_compensated: bool = False,
-) -> ForeignLog:
-    """Read an IMU of an ArduPilot log, counted from 0: the old type ``IMU2`` is 1."""
-    path = Path(path)
+def _dataflash(path: Path) -> _Held:
     with open_regular(path) as file:
         magic = file.read(2)
     if magic != b'\xa3\x95':
@@ -179,26 +207,33 @@ def read_dataflash(
     )
     imus: dict[int, ForeignLog] = {}
     baros: dict[int, Readings] = {}
+    metadata = {}
+    if any(str(key).startswith('SIM_') for key in reader.params):
+        metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
     try:
-        metadata = {}
-        if any(str(key).startswith('SIM_') for key in reader.params):
-            metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d', name):
                 continue
-            columns, n_short = _messages(reader, name, path)
-            is_imu = name.startswith('IMU')
-            for number, stamp_ns, rows in _instances(name, columns):
-                celsius = columns.get('T', columns.get('Temp', np.full(len(rows), np.nan)))
-                readings = Readings(stamp_ns[rows], celsius[rows].astype(np.float64))
-                if not is_imu:
+            found, n_short = _messages(reader, name, path)
+            if 'TimeMS' in found:
+                found['TimeUS'] = found['TimeMS'].astype(np.int64) * 1000
+            n = len(found.get('TimeUS', ()))
+            # The second IMU's old type is IMU2: counted from 1, the first without its number.
+            old = int(name[-1]) - 1 if name[-1].isdigit() else 0
+            instance = found.get('I', np.full(n, old))
+            for number in np.unique(instance[:n]).tolist():
+                columns = {title: one[instance == number] for title, one in found.items()}
+                stamp_ns = _stamps_ns(columns['TimeUS'])
+                celsius = columns.get('T', columns.get('Temp', np.full(len(stamp_ns), np.nan)))
+                readings = Readings(stamp_ns, celsius.astype(np.float64))
+                if not name.startswith('IMU'):
                     baros[number] = readings
-                elif all(title in columns for title in _VECTORS):
-                    both = np.column_stack([columns[title][rows] for title in _VECTORS])
+                elif columns.keys() >= {*_VECTORS}:
+                    both = np.column_stack([columns[title] for title in _VECTORS])
                     accel, gyro = both.astype(np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
                     imus[number] = ForeignLog(
                         str(path),
-                        stamp_ns[rows],
+                        stamp_ns,
                         accel,
                         gyro,
                         {'imu': readings},
@@ -213,51 +248,30 @@ def read_dataflash(
         for number in imus
         if reader.params.get(name := f'INS_TCAL{number + 1}_ENABLE') == 1.0
     }
-    return _chosen(path, imus, baros, compensated, imu, baro, allow_compensated)
+    return _Held(imus, baros, compensated)
 
 
 def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     """Gather one message type: its columns, and how many of its messages were cut off."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
-    offsets = np.asarray(reader.offsets[number], dtype=np.int64)
-    whole = offsets[offsets + layout.len <= reader.data_len]
-    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)
     # numpy calls numbers as struct does.
-    fields = [
-        (title, f'S{size or 1}' if code == 's' else f'<{code}')
-        for title, (size, code) in zip(layout.columns, codes, strict=False)
-    ]
-    if len(dict(fields)) < len(fields):
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)
+    kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
+    if len({*layout.columns}) < len(layout.columns):
         raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)
-    kind = np.dtype(fields)
+    kind = np.dtype(list(zip(layout.columns, kinds, strict=False)))
     if _HEADER_BYTES + kind.itemsize > layout.len:
         raise RecordingError(f'damaged: the format of {name} is longer than it says', path=path)
-    raw = np.memmap(path, dtype=np.uint8, mode='r')
-    span = np.arange(_HEADER_BYTES, _HEADER_BYTES + kind.itemsize)
-    rows = np.ascontiguousarray(raw[whole[:, None] + span]).view(kind).ravel()
+    offsets = reader.offsets[number]
+    begins = [at + _HEADER_BYTES for at in offsets if at + layout.len <= reader.data_len]
+    content = b''.join(reader.data_map[at : at + kind.itemsize] for at in begins)
+    rows = np.frombuffer(content, kind)
     columns = {
         title: rows[title] if factor is None else rows[title] * factor
         for title, factor in zip(layout.columns, layout.msg_mults, strict=False)
     }
-    return columns, len(offsets) - len(whole)
-
-
-def _instances(name: str, columns: _Columns) -> Iterator[tuple[int, Ints, Bools]]:
-    """Give number, stamps and rows of each sensor; of messages without a time, of none."""
-    if 'TimeUS' in columns:
-        stamp_ns = _stamps_ns(columns['TimeUS'])
-    elif 'TimeMS' in columns:
-        stamp_ns = _stamps_ns(columns['TimeMS'].astype(np.uint64) * np.uint64(1000))
-    else:
-        return
-    if 'I' in columns:
-        for number in np.unique(columns['I']):
-            yield int(number), stamp_ns, columns['I'] == number
-    elif len(stamp_ns):
-        # The second IMU's old type is IMU2: counted from 1, the first without its number.
-        number = int(name[-1]) - 1 if name[-1].isdigit() else 0
-        yield number, stamp_ns, np.ones(len(stamp_ns), dtype=np.bool_)
+    return columns, len(offsets) - len(begins)
 
 
 def _read(module: str, name: str, extra: str, what: str, path: str | Path, *arguments: Any) -> Any:
@@ -275,41 +289,6 @@ def _read(module: str, name: str, extra: str, what: str, path: str | Path, *argu
             return read(*arguments)
         except Exception as failure:
             raise RecordingError(f'not {what} ({failure})', path=path) from failure
-
-
-def _chosen(
-    path: Path,
-    imus: Mapping[int, ForeignLog],
-    baros: Mapping[int, Readings],
-    compensated: Mapping[int, str],
-    imu: int | None,
-    baro: int | None,
-    allow_compensated: bool,
-) -> ForeignLog:
-    """
-    Take one IMU and one barometer out of what a log holds, by default those of lowest instance;
-    `compensated` says why the thermal drift of an IMU is gone from its readings already.
-    """
-    why = compensated.get(min(imus, default=0) if imu is None else imu)
-    if why and not allow_compensated:
-        raise RecordingError(why, path=path)
-    rows = _instance(imus, imu, 'IMU', path)
-    stamped = rows.stamp_ns != NO_STAMP
-    rest = find_stillness(rows.stamp_ns[stamped], rows.accel[stamped])
-    if rest.noise <= _NO_NOISE * rest.magnitude:
-        raise RecordingError(
-            'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
-            'from which no calibration of a real sensor can come',
-            path=path,
-        )
-    heard = {number: _reported(readings) for number, readings in baros.items()}
-    if baro is None:
-        heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
-    found = [_reported(one) for one in rows.temperatures.values()]
-    if heard or baro is not None:
-        found.append(_instance(heard, baro, 'barometer', path))
-    named = zip(('board', 'case'), (thin(one) for one in found if len(one.celsius)), strict=False)
-    return replace(rows, temperatures=dict(named))
 
 
 def _stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:

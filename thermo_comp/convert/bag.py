@@ -18,9 +18,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..recording import Topics, inspect_recording, read_recording
 from ..recording.topics import IMU, TEMPERATURE, Present, said_choice
-from ..unit.gravity import STANDARD_GRAVITY
 from .log import ForeignLog, Readings
-from .units import PER_G
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
 
@@ -69,7 +67,6 @@ def bag_log(
             if name in found
         },
         unit=unit,
-        factor=STANDARD_GRAVITY / PER_G[unit],
         frame_id=columns.frame_id,
         serial=recording.info.metadata.get('serial', ''),
         missing=recording.info.truncated,

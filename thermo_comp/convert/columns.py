@@ -22,11 +22,9 @@ from ..files import read_bounded
 from ..plain_yaml import load_plain_yaml
 from ..recording.topics import is_thermometer
 from ..typing import Floats
-from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
-from .log import NO_STAMP, ForeignLog, Readings, thin
+from .log import NO_STAMP, ForeignLog, Readings, Unit, believed_unit, find_stillness, thin
 from .table import STAMP_EXPONENTS, Column, TimeUnit, read_parquet, read_text
-from .units import PER_G, Unit, believed_unit, find_stillness
 
 Triple = tuple[Column, Column, Column]
 
@@ -206,9 +204,6 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
     if gyro is not None:
         rate = np.column_stack([table.values[name] for name in gyro.columns])
         rate = np.radians(rate) if gyro.unit == 'deg/s' else rate
-    factor = 1.0
-    if accel.output == 'imu':
-        factor = STANDARD_GRAVITY / PER_G.get(accel.unit, accel.counts_per_g or 1.0)
     return ForeignLog(
         str(path),
         stamp_ns,
@@ -218,7 +213,6 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
         table.line,
         accel.output,
         accel.unit,
-        factor,
         counts_per_g=accel.counts_per_g,
         clip=accel.clip and (accel.clip[0] - accel.offset, accel.clip[1] - accel.offset),
         frame_id=columns.frame_id,

@@ -3,7 +3,9 @@
 """
 Owns the way from any foreign log to a bag: checks, thinning, and the account of every row.
 
-A reader of a format makes a `ForeignLog`; `write_log` does the rest, the same for all formats.
+A reader of a format makes a `ForeignLog`; `write_log` does the rest, the same for all formats. At
+rest the specific force is gravity, whatever the attitude: a log whose map says otherwise is
+refused, because a factor of 9.8 that nobody sees ends in a calibration.
 """
 
 from __future__ import annotations
@@ -21,15 +23,32 @@ from ..files import shown_name
 from ..fitting.sources import digest
 from ..online.blocks import said_anew
 from ..recording import STAMP_END_NS, BagWriter, ImuColumns, Topics
+from ..recording.stillness import CellAccumulator
 from ..text import valid_serial
 from ..typing import Bools, Floats, Ints
-from .units import Stillness, Unit, believed_unit, contradiction, find_stillness
+from ..unit.gravity import STANDARD_GRAVITY
+
+Unit = Literal['m/s^2', 'g', 'mg', 'counts']
+
+# |a| of a still sensor in each unit. A cheap one is off by a few per cent (bias and scale), a
+# thermal chamber adds some more; 20 % is beyond all of them and far below the ratios to be told.
+PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
+_TOLERANCE = 0.2
+# The usual sensitivities, from +-16 g to +-2 g of a 16-bit sensor.
+_SENSITIVITIES = (2048, 4096, 8192, 16384)
+
+_CELL_S, _MIN_SAMPLES = 0.5, 12
+# Noise this many times the quiet level is handling, not noise: the sd of 12 samples stays within
+# a factor of 2 of its mean.
+_MOVING_RATIO = 4.0
+# Two movements with less rest between them than this are one.
+_MERGE_NS = 10 * 10**9
 
 #: The stamp of a row that has none.
 NO_STAMP = np.iinfo(np.int64).min
 # No sensor on a circuit board is read outside this range; kelvins and raw counts are.
 _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
-# Messages are written in runs of this many rows: bounded memory in the writer.
+# Rows are reduced and written in runs of so many: bounded memory.
 _RUN_ROWS = 100_000
 _EXAMPLES = 5
 #: Slower logs tell of soaks alone.
@@ -59,7 +78,6 @@ class ForeignLog:
     temperatures: readings by the name of the thermometer
     line: where each row stands in the file, shape (n,); None counts the rows
     input, unit: what the accelerometer's messages become, and the unit that the log states
-    factor: from that unit to the message's
     counts_per_g, clip: the stated sensitivity; readings at and beyond which the sensor saturates
     n_short: rows that were left out because they are too short
     missing: what of the log could not be read
@@ -75,7 +93,6 @@ class ForeignLog:
     line: Ints | None = None
     input: Literal['counts', 'imu'] = 'imu'
     unit: Unit = 'm/s^2'
-    factor: float = 1.0
     counts_per_g: float | None = None
     clip: tuple[float, float] | None = None
     frame_id: str = 'imu_link'
@@ -85,6 +102,27 @@ class ForeignLog:
     missing: str | None = None
     chosen: str | None = None
     hint: str = ''
+
+    @property
+    def factor(self) -> float:
+        """From the stated unit to the message's."""
+        per_g = PER_G.get(self.unit, self.counts_per_g or 1.0)
+        return STANDARD_GRAVITY / per_g if self.input == 'imu' else 1.0
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """
+    Where a recording rests, and what it reads there.
+
+    Median |a| over the quiet cells, NaN where there are none, and their median sd per axis, in
+    the input's unit; how long it rests in all; begin and end of each part in which it is moved.
+    """
+
+    magnitude: float
+    noise: float
+    still_s: float
+    moving_ns: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
@@ -100,33 +138,20 @@ class ConversionReport:
     """
     What came in, what went out, and what was seen on the way.
 
-    Rows are left out that are short, hold no numbers, or a stamp that ROS has not; the other
-    findings are kept. `unit` is the one stated, `believed` what the readings at rest speak for.
+    `log` is what was written: without the rows that are short, hold no numbers, or a stamp that
+    ROS has not; those of the other `findings` are kept. `messages` counts by the name of the
+    input, `believed` is what the readings at rest speak for.
     """
 
-    source: str
+    log: ForeignLog
     output: str
     rows: int
-    accel_messages: int
-    board_messages: int
-    case_messages: int
-    further_messages: Mapping[str, int]
-    input: str
+    messages: Mapping[str, int]
     rate_hz: float
     duration_s: float
-    short_rows: Finding
-    non_numeric: Finding
-    out_of_range: Finding
-    backwards: Finding
-    repeated: Finding
-    clipped: Finding
-    unit: str
+    findings: dict[str, Finding]
     believed: str
     stillness: Stillness
-    start_ns: int
-    missing: str | None
-    chosen: str | None
-    hint: str
 
 
 def thin(readings: Readings) -> Readings:
@@ -179,33 +204,27 @@ def write_log(
     beyond: Bools = np.zeros(log.accel.shape, dtype=np.bool_)
     if log.clip is not None:
         beyond = (log.accel <= log.clip[0]) | (log.accel >= log.clip[1])
-    messages = {name: len(one.stamp_ns) for name, one in log.temperatures.items()}
+    counts = {name: len(one.stamp_ns) for name, one in log.temperatures.items()}
+    is_repeated = np.diff(stamp_ns, prepend=stamp_ns[0] - 1) == 0
     return ConversionReport(
-        source=log.path,
-        output=str(output),
+        log,
+        str(output),
         rows=len(usable) + log.n_short,
-        accel_messages=len(stamp_ns),
-        board_messages=messages.pop('board', 0),
-        case_messages=messages.pop('case', 0),
-        further_messages=messages,
-        input=log.input,
+        messages={'accel': len(stamp_ns), 'board': 0, 'case': 0, **counts},
         rate_hz=1e9 / float(np.median(steps[steps > 0])) if steps.any() else float('nan'),
         duration_s=float(newest[-1] - stamp_ns[0]) * 1e-9,
-        short_rows=Finding(log.n_short),
-        non_numeric=not_numeric,
-        out_of_range=out_of_range,
-        backwards=_finding(np.diff(stamp_ns, prepend=stamp_ns[0]) < 0, line),
-        repeated=_finding(np.diff(stamp_ns, prepend=stamp_ns[0] - 1) == 0, line),
-        clipped=_finding(np.any(beyond, axis=1), line),
-        unit=log.unit,
+        findings={
+            'short_rows': Finding(log.n_short),
+            'non_numeric': not_numeric,
+            'out_of_range': out_of_range,
+            'clipped': _finding(np.any(beyond, axis=1), line),
+            'backwards': _finding(np.diff(stamp_ns, prepend=stamp_ns[0]) < 0, line),
+            'repeated': _finding(is_repeated, line),
+        },
         believed=believed_unit(stillness.magnitude)[1]
         if np.isfinite(stillness.magnitude)
         else 'it never rests, so its unit was not checked',
         stillness=stillness,
-        start_ns=int(stamp_ns[0]),
-        missing=log.missing,
-        chosen=log.chosen,
-        hint=log.hint,
     )
 
 
@@ -276,3 +295,62 @@ def _write(
             writer.flush()
             if progress is not None:
                 progress(rows.stop / n)
+
+
+def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
+    """
+    Find where a recording rests, from its noise alone, whatever its unit, and however shortly;
+    readings (n, 3).
+    """
+    reduced = CellAccumulator(_CELL_S, None)
+    for first in range(0, len(accel), _RUN_ROWS):
+        run = slice(first, first + _RUN_ROWS)
+        reduced.add(stamp_ns[run], accel[run])
+    cells = reduced.finish()
+    full = cells.count >= _MIN_SAMPLES
+    if full.any():
+        full &= cells.count >= 0.5 * np.median(cells.count)
+    if not full.any():
+        return Stillness(float('nan'), float('nan'), 0.0, ())
+    sd = np.sqrt(cells.variance[full].mean(axis=1))
+    # The quiet level is the lower quartile: a log may be handled for most of its time. A sensor
+    # whose noise is below its own step shows none: then a step is the level.
+    is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
+    cell_ns = round(cells.cell_s * 1e9)
+    moving: list[tuple[int, int]] = []
+    for begin in (cells.start_ns + cells.index[full][~is_quiet] * cell_ns).tolist():
+        is_next = moving and begin - moving[-1][1] <= _MERGE_NS
+        moving.append((moving.pop()[0] if is_next else begin, begin + cell_ns))
+    return Stillness(
+        magnitude=float(np.median(np.linalg.norm(cells.mean[full][is_quiet], axis=1))),
+        noise=float(np.median(sd[is_quiet])),
+        still_s=float(is_quiet.sum() * cells.cell_s),
+        moving_ns=tuple(moving),
+    )
+
+
+def believed_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
+    """Say which unit a still |a| speaks for (``counts`` and ``unknown`` among them), and why."""
+    said = f'|a| at rest is {magnitude:.4g}'
+    for unit, gravity in PER_G.items():
+        if abs(magnitude / gravity - 1.0) <= _TOLERANCE:
+            return unit, f'{said}, gravity is {gravity:.4g} {unit}'
+    for sensitivity in _SENSITIVITIES:
+        if abs(magnitude / sensitivity - 1.0) <= _TOLERANCE:
+            return 'counts', f'{said}, as of a sensor with {sensitivity} counts per g'
+    if magnitude > 50.0:
+        return 'counts', f'{said}, which is no gravity in g or m/s^2'
+    return 'unknown', f'{said}, which is gravity in no unit known here'
+
+
+def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
+    """Say why a stated unit cannot be true, or None where nothing speaks against it."""
+    if not np.isfinite(magnitude):
+        return None
+    believed, reason = believed_unit(magnitude)
+    if stated != 'counts':
+        return None if believed == stated else f'{reason}: that looks like {believed}'
+    if counts_per_g is not None and abs(magnitude / counts_per_g - 1.0) > _TOLERANCE:
+        text = f'|a| at rest is {magnitude:.4g} counts, {counts_per_g:g} per g are stated'
+        return f'{text}: is there an `offset`?' if magnitude > 2.0 * counts_per_g else text
+    return f'{reason}: that looks like {believed}' if magnitude < 50.0 else None

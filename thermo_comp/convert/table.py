@@ -293,14 +293,6 @@ def read_parquet(
         if pa.types.is_timestamp(column.type):
             stamp_exponent = STAMP_EXPONENTS[column.type.unit]
             column = column.cast(pa.int64())
-        factor = 10**stamp_exponent
-        if pa.types.is_integer(column.type):
-            steps = column.fill_null(0).to_numpy()
-        else:
-            steps, factor = np.rint(floats(stamp) * factor), 1
-        known = np.asarray(column.is_valid().to_numpy(), dtype=np.bool_)
-        known &= np.abs(steps.astype(np.float64)) * factor < 2.0**63
-        stamp_ns = np.full(len(steps), NO_STAMP)
-        stamp_ns[known] = steps[known].astype(np.int64) * factor
+        stamp_ns = exact_ns([str(cell) for cell in column.to_pylist()], stamp_exponent)
     line = np.arange(1, table.num_rows + 1, dtype=np.int64)
     return Table(line, {name: floats(name) for name in columns}, stamp_ns)
