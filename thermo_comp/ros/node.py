@@ -29,7 +29,7 @@ from ..text import hold_standard_streams, one_line
 from . import parameters
 from .diagnostics import Reporter
 from .process import SignalWatch, use_profile
-from .reader import LoadedCalibration, Reader, check, load, read
+from .reader import LoadedCalibration, Reader, read
 from .relay import INPUTS, Relay
 from .requests import ParameterRequests
 from .waitloop import WaitLoop, undeclared_overrides
@@ -73,23 +73,17 @@ class CompensationNode:
 
     def _build(self) -> None:
         """Make all that runs on the ROS node."""
-        self._config = parameters.declare(self.node)
-        self._loaded = load(self._config)
-        self._compensator = Compensator(
-            self._loaded.calibration, self._config.compensator_config()
-        )
+        self._log, self._config = self.node.get_logger(), parameters.declare(self.node)
+        config = self._config
+        self._loaded = read(config.calibration_file, config.calibration_directory)
+        self._compensator = Compensator(self._loaded.calibration, config.compensator_config())
+        self._check(self._loaded, config)
         self._loop = WaitLoop(self.node, REST_S)
-        self._relay = Relay(self.node, self._loop, self._compensator, self._config)
+        self._relay = Relay(self.node, self._loop, self._compensator, config)
         self._reporter = Reporter(self.node, self._loop, self._relay, self._compensator)
-        self._read: LoadedCalibration | None = None
-        self._prepared = (self._config, self._loaded, self._relay.samples)
-        self.node.add_pre_set_parameters_callback(parameters.coerce)
-        self.node.add_on_set_parameters_callback(self._on_set)
-        self.node.add_post_set_parameters_callback(self._post_set)
         self._reader = Reader()
         self._requests = ParameterRequests(self.node, self._loop, self._prepare, self._set)
-        self._report_every(self._config.diagnostics_period)
-        self._log = self.node.get_logger()
+        self._report_every(config.diagnostics_period)
         topics = [self.node.resolve_topic_name(topic) for _, topic in INPUTS.values()]
         # The input that is not open may be opened later, with these.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
@@ -125,47 +119,22 @@ class CompensationNode:
     def _set(
         self, changes: list[Parameter], loaded: LoadedCalibration | None
     ) -> SetParametersResult:
-        """Set what was prepared, between two samples."""
-        self._read = loaded
+        """Check a change as a whole, set and apply it, between two samples."""
+        changes, loaded = parameters.coerce(changes), loaded or self._loaded
+        before, samples, result = self._config, self._relay.samples, SetParametersResult()
+        config = parameters.updated(before, changes)
+        self._check(loaded, config)
+        if config.input != before.input:
+            samples = self._relay.open_samples(config)
         try:
-            return self.node.set_parameters_atomically(changes)
+            # rclpy has the last word: unknown and fixed parameters.
+            result = self.node.set_parameters_atomically(changes)
         finally:
-            self._read = None
-
-    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
-        """Check a change as a whole and keep what was made on the way."""
-        samples = self._relay.samples
-        # A topic that is opened below declares parameters of its own and comes here again.
-        loaded, self._read = self._read or self._loaded, None
-        try:
-            config = parameters.updated(self._config, changes)
-            if config.calibration_file != loaded.path:
-                # Set by code of this process, not through a service.
-                loaded = read(config.calibration_file, config.calibration_directory)
-            check(loaded, config)
-            self._check_thermometers(loaded)
-            if config.input != self._config.input:
-                samples = self._relay.open_samples(config)
-        except ThermoCompError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        self._prepared = (config, loaded, samples)
-        return SetParametersResult(successful=True)
-
-    def _check_thermometers(self, loaded: LoadedCalibration) -> None:
-        """Refuse a calibration whose thermometers are not those that this node listens to."""
-        named, heard = loaded.calibration.sensors, self._compensator.thermal.inputs[1:]
-        if named != heard:
-            raise CalibrationError(
-                f'must be {", ".join(heard)}, which this node listens to, got {", ".join(named)}: '
-                'start the node anew with this file',
-                loaded.path,
-                'sensors',
-            )
-
-    def _post_set(self, _changes: list[Parameter]) -> None:
-        """Apply what `_on_set` checked."""
-        before, (self._config, loaded, samples) = self._config, self._prepared
-        config = self._config
+            if not result.successful and samples is not self._relay.samples:
+                self._loop.unsubscribe(samples)
+        if not result.successful:
+            return result
+        self._config = config
         if loaded is not self._loaded:
             self._loaded = loaded
             self._compensator.swap(loaded.calibration)
@@ -176,6 +145,24 @@ class CompensationNode:
             self._relay.configure(config, samples)
         if config.diagnostics_period != before.diagnostics_period:
             self._report_every(config.diagnostics_period)
+        return result
+
+    def _check(self, loaded: LoadedCalibration, config: parameters.NodeConfig) -> None:
+        """Refuse a calibration that is for another unit, input or set of thermometers."""
+        unit, heard = loaded.calibration.unit, self._compensator.thermal.inputs[1:]
+        message = key = ''
+        if config.serial and unit.serial != config.serial:
+            message = f'must be {config.serial!r} (parameter `serial`), got {unit.serial!r}'
+            key = 'unit.serial'
+        elif config.input == 'imu' and unit.input != 'm/s^2':
+            message = f"must be 'm/s^2' (parameter `input` is imu), got {unit.input!r}"
+            key = 'unit.input'
+        elif loaded.calibration.sensors != heard:
+            named, key = ', '.join(loaded.calibration.sensors), 'sensors'
+            message = f'must be {", ".join(heard)}, which this node listens to, got {named}: '
+            message += 'start the node anew with this file'
+        if message:
+            raise CalibrationError(message, loaded.path, key)
 
     def _say_calibration(self) -> None:
         loaded = self._loaded

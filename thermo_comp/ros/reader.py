@@ -18,15 +18,11 @@ from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..errors import CalibrationError
 from ..files import read_bounded
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
-
-if TYPE_CHECKING:
-    from .parameters import NodeConfig
 
 #: Added to the niceness of the process: the samples go first.
 NICENESS = 5
@@ -48,8 +44,20 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
     The CalibrationError names the path as given and the rule, and quotes nothing of a file that is
     no calibration.
     """
+    if not name:
+        raise CalibrationError(
+            'parameter `calibration_file` is not set; start with '
+            '--ros-args -p calibration_file:=PATH'
+        )
     try:
-        content = read_bounded(_allowed(name, directory), SIZE_LIMIT)
+        path = Path(name).expanduser()
+        if directory:
+            # Links included.
+            path, root = path.resolve(), Path(directory).expanduser().resolve()
+            if not path.is_relative_to(root):
+                rule = 'must be in the folder that the parameter `calibration_directory` names'
+                raise CalibrationError(rule, name)
+        content = read_bounded(path, SIZE_LIMIT)
         calibration = parse_calibration(content, name)
     except CalibrationError as error:
         if error.rule is None:
@@ -66,48 +74,6 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
     return LoadedCalibration(calibration, name, hashlib.sha256(content).hexdigest())
 
 
-def load(config: NodeConfig) -> LoadedCalibration:
-    """Read the calibration that is configured; CalibrationError where it cannot be used."""
-    if not config.calibration_file:
-        raise CalibrationError(
-            'parameter `calibration_file` is not set; start with '
-            '--ros-args -p calibration_file:=PATH'
-        )
-    loaded = read(config.calibration_file, config.calibration_directory)
-    check(loaded, config)
-    return loaded
-
-
-def check(loaded: LoadedCalibration, config: NodeConfig) -> None:
-    """Make sure that a calibration is for the serial number and the input of a configuration."""
-    unit = loaded.calibration.unit
-    if config.serial and unit.serial != config.serial:
-        raise CalibrationError(
-            f'must be {config.serial!r} (parameter `serial`), got {unit.serial!r}',
-            loaded.path,
-            'unit.serial',
-        )
-    if config.input == 'imu' and unit.input != 'm/s^2':
-        raise CalibrationError(
-            f"must be 'm/s^2' (parameter `input` is imu), got {unit.input!r}",
-            loaded.path,
-            'unit.input',
-        )
-
-
-def _allowed(name: str, directory: str) -> Path:
-    """Resolve a path, links included; CalibrationError where it leads out of the directory."""
-    path = Path(name).expanduser()
-    if not directory:
-        return path
-    path, root = path.resolve(), Path(directory).expanduser().resolve()
-    if not path.is_relative_to(root):
-        raise CalibrationError(
-            'must be in the folder that the parameter `calibration_directory` names', name
-        )
-    return path
-
-
 class Reader:
     """A process that reads calibrations, begun when the first is asked for."""
 
@@ -118,28 +84,24 @@ class Reader:
         """Do what the function `read` does, there."""
         try:
             if self._process is None:
-                self._start()
+                self._pipe, theirs = Pipe()
+                # The very package that runs here; a Ctrl-C is for the node, with whom this ends.
+                code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
+                with theirs:
+                    self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and words
+                        [sys.executable, '-c', f'{code}; serve({theirs.fileno()})'],
+                        pass_fds=[theirs.fileno()],
+                        start_new_session=True,
+                    )
             self._pipe.send((name, directory))
             answer: LoadedCalibration | CalibrationError = self._pipe.recv()
         except (OSError, EOFError) as error:
             self.close()
-            raise CalibrationError(
-                'cannot be read: the process that reads it ended', name
-            ) from error
+            ended = 'cannot be read: the process that reads it ended'
+            raise CalibrationError(ended, name) from error
         if isinstance(answer, CalibrationError):
             raise answer
         return answer
-
-    def _start(self) -> None:
-        self._pipe, theirs = Pipe()
-        # The very package that runs here; a Ctrl-C is for the node, with whom this ends.
-        code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
-        with theirs:
-            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and words
-                [sys.executable, '-c', f'{code}; serve({theirs.fileno()})'],
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,
-            )
 
     def close(self) -> None:
         """End the process."""
@@ -157,7 +119,6 @@ def serve(handle: int) -> None:
     with suppress(EOFError, OSError):
         while True:
             try:
-                answer: LoadedCalibration | CalibrationError = read(*pipe.recv())
-            except CalibrationError as error:
-                answer = error
-            pipe.send(answer)
+                pipe.send(read(*pipe.recv()))
+            except CalibrationError as error:  # noqa: PERF203 - it is the answer
+                pipe.send(error)

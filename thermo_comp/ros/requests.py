@@ -12,7 +12,7 @@ came, whatever is wrong with them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -58,10 +58,7 @@ class ParameterRequests:
     """
 
     def __init__(self, node: Node, loop: WaitLoop, prepare: Prepare, apply: Apply) -> None:
-        self._node = node
-        self._loop = loop
-        self._prepare = prepare
-        self._apply = apply
+        self._node, self._loop, self._prepare, self._apply = node, loop, prepare, apply
         self._n_waiting = 0
         self._beside = ThreadPoolExecutor(1, 'parameters')
         for service in node.services:
@@ -76,53 +73,46 @@ class ParameterRequests:
 
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         """Let a request wait for its turn."""
-        is_each, n = kind is SetParameters, len(request.parameters)
+        is_each, n, reason = kind is SetParameters, len(request.parameters), ''
         groups = [[one] for one in request.parameters] if is_each else [request.parameters]
+        results: list[SetParametersResult] = []
 
-        def respond(results: list[SetParametersResult]) -> None:
+        def respond() -> None:
             answer(kind.Response(results=results) if is_each else kind.Response(result=results[0]))
+
+        def end(prepared: Future[Any]) -> None:
+            """Apply a group in the loop's thread; after the last one answer."""
+            try:
+                self._set(prepared, results)
+            finally:
+                if len(results) == len(groups):
+                    self._n_waiting -= 1
+                    respond()
 
         if n > PARAMETERS_LIMIT:
             reason = f'{n} parameters at once, at most {PARAMETERS_LIMIT}'
         elif self._n_waiting >= WAITING_LIMIT:
             reason = 'too many requests wait already, try again'
-        else:
+        elif groups:
             self._n_waiting += 1
-            self._beside.submit(self._work, groups, respond)
+            for group in groups:
+                future = self._beside.submit(self._read, group)
+                future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
         # Not one for each: to write so many would take as long as to read them.
-        respond([_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT))
+        results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
+        respond()
 
-    def _work(
-        self,
-        groups: list[list[ParameterMessage]],
-        respond: Callable[[list[SetParametersResult]], None],
-    ) -> None:
-        """Prepare one group after the other, in the thread."""
-        results: list[SetParametersResult] = []
-        for group in groups:
-            try:
-                changes = [read_parameter(message) for message in group]
-                prepared = self._prepare(changes)
-            except Exception as error:  # noqa: BLE001 - whatever it is, it is answered
-                changes, prepared = [], error
-            self._loop.call_soon(partial(self._set, changes, prepared, results))
+    def _read(self, group: list[ParameterMessage]) -> tuple[list[Parameter], Any]:
+        changes = [read_parameter(message) for message in group]
+        return changes, self._prepare(changes)
 
-        def end() -> None:
-            self._n_waiting -= 1
-            respond(results)
-
-        self._loop.call_soon(end)
-
-    def _set(
-        self, changes: list[Parameter], prepared: Any, results: list[SetParametersResult]
-    ) -> None:
-        """Apply one group in the loop's thread; what nobody foresaw is logged there, too."""
+    def _set(self, prepared: Future[Any], results: list[SetParametersResult]) -> None:
+        """Apply one group; what nobody foresaw is refused and logged by the loop."""
         try:
-            if isinstance(prepared, Exception):
-                raise prepared
+            changes, found = prepared.result()
             news = [one for one in changes if not self._is_in_force(one)]
-            result = self._apply(news, prepared) if news else SetParametersResult(successful=True)
+            result = self._apply(news, found) if news else SetParametersResult(successful=True)
             results.append(result if result.successful else _refusal(result.reason))
         except (ThermoCompError, ParameterNotDeclaredException) as error:
             results.append(_refusal(str(error)))
