@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from conftest import ROOT, Cli
 
 from thermo_comp import simulation
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import BagWriter, RawMessages, Topics, open_recording
+from thermo_comp.recording import BagWriter, Topics, open_recording
 from thermo_comp.recording.growing import growing_blocks, numbered_bags
 from thermo_comp.unit.calibration_file import load_calibration
 
@@ -68,18 +67,13 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_session(tmp_path_factory.mktemp('session') / 'session.mcap')
 
 
-def messages_of(one: RawMessages) -> list[bytes]:
-    data = one.data.tobytes()
-    return [data[a:b] for a, b in pairwise([0, *one.ends.tolist()])]
-
-
 def contents(paths: list[Path]) -> dict[str, list[bytes]]:
     """Give the serialized messages of bags, one after the other, by topic."""
     found: dict[str, list[bytes]] = {}
     for path in paths:
         with open_recording(path, require=()) as reader:
-            for one in reader.raw(reader.info.topics):
-                found.setdefault(one.topic, []).extend(messages_of(one))
+            for topic, messages in reader.raw(reader.info.topics):
+                found.setdefault(topic.name, []).extend(messages)
     return found
 
 
@@ -138,10 +132,12 @@ class TestGrowing:
             if news is not None:
                 assert news.info is not None
                 assert news.info.metadata['serial'] == 'lab-7'
-                for one in news.block.raw.values():
-                    found.setdefault(one.topic, []).extend(messages_of(one))
+                for role, messages in news.block.raw.items():
+                    found.setdefault(role, []).extend(messages)
         assert n_looks == 10
-        assert found == contents([session])
+        sent = contents([session])
+        assert found.pop('accel') == sent.pop('/accel/counts')
+        assert {f'/temperature/{name}': own for name, own in found.items()} == sent
 
     def test_what_is_no_bag_is_said(self, tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match='no such file'):

@@ -228,8 +228,10 @@ def test_inputs_can_be_copied_beside_the_outputs(tmp_path: Path) -> None:
         BagWriter(tmp_path / 'out') as bag,
     ):
         for block in reader.blocks(raw=True):
-            for raw in block.raw.values():
-                bag.write_raw(raw.topic, raw.type, raw.log_ns, raw, reader.definitions[raw.type])
+            for role, raw in block.raw.items():
+                name = reader.topics[role]
+                kind, _ = reader.info.topics[name]
+                bag.write_raw(name, kind, raw.log_ns, raw, reader.definitions[kind])
     found, given = (read_with_rosbags(tmp_path / name) for name in ('out', 'in'))
     assert [entry[:2] for entry in found] == [entry[:2] for entry in given]
     assert [entry[2].vector for entry in found] == [entry[2].vector for entry in given]

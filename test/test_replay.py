@@ -367,8 +367,9 @@ def test_every_topic_is_copied(tmp_path: Path, storage: str) -> None:
     messages = [f'message {k}'.encode() * (1 + k % 3) for k in range(len(stamps))]
     with open_recording(inputs) as reader, BagWriter(mcap) as writer:
         for block in reader.blocks(raw=True):
-            for raw in block.raw.values():
-                writer.write_raw(raw.topic, raw.type, raw.log_ns, raw)
+            for role, raw in block.raw.items():
+                name = reader.topics[role]
+                writer.write_raw(name, reader.info.topics[name][0], raw.log_ns, raw)
         definition = ('ros2msg', 'string data')
         writer.write_raw('odd', 'odd_msgs/msg/Odd', stamps, messages, definition)
         writer.write_bool('gps/ok', stamps, np.arange(len(stamps)) % 2)

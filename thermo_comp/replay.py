@@ -35,7 +35,7 @@ from .recording import (
     Block,
     ImuColumns,
     Input,
-    RawMessages,
+    Messages,
     RecordingInfo,
     RecordingReader,
     Role,
@@ -188,13 +188,14 @@ def _messages_of(
         following = reader.raw(others if all_topics else ())
         one = next(following, None)
 
-        def copy(raw: RawMessages, times: Ints) -> None:
-            writer.write_raw(raw.topic, raw.type, times, raw, reader.definitions.get(raw.type))
+        def copy(topic: str, kind: str, messages: Messages, times: Ints) -> None:
+            writer.write_raw(topic, kind, times, messages, reader.definitions.get(kind))
 
         def copy_others(until_ns: float) -> None:
             nonlocal one
-            while one is not None and one.log_ns[0] <= until_ns:
-                copy(one, one.log_ns)
+            while one is not None and one[1].log_ns[0] <= until_ns:
+                topic, messages = one
+                copy(topic.name, topic.type, messages, messages.log_ns)
                 one = next(following, None)
 
         def write(item: CorrectedBlock) -> None:
@@ -215,9 +216,10 @@ def _messages_of(
                 stamped = [stamped_flag(*flag, serial) for flag in item.flags]
                 writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
             # Their log time becomes their stamp, as that of the outputs is.
-            for role, raw in block.raw.items():
-                is_accel = role == 'accel'
-                copy(raw, block.accel_stamp_ns if is_accel else block.temperatures[role].stamp_ns)
+            for role, messages in block.raw.items():
+                name, is_accel = reader.topics[role], role == 'accel'
+                own = block.accel_stamp_ns if is_accel else block.temperatures[role].stamp_ns
+                copy(name, reader.info.topics[name][0], messages, own)
             if len(block):
                 copy_others(block.log_ns['accel'][-1])
             writer.flush()

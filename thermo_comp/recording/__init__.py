@@ -8,7 +8,8 @@ The only package that knows `rosbags` and `mcap`.
 
 from __future__ import annotations
 
-from .columns import ROLES, Block, ImuColumns, Input, RawMessages, Recording, RecordingInfo, Role
+from .columns import ROLES, Block, ImuColumns, Input, Recording, RecordingInfo, Role
+from .messages import Messages
 from .reader import RecordingReader, inspect_recording, open_recording, read_recording
 from .topics import Part, Topics
 from .writer import STAMP_END_NS, BagWriter
@@ -20,8 +21,8 @@ __all__ = [
     'Block',
     'ImuColumns',
     'Input',
+    'Messages',
     'Part',
-    'RawMessages',
     'Recording',
     'RecordingInfo',
     'RecordingReader',

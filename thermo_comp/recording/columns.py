@@ -16,8 +16,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..typing import Bools, Bytes, Floats, Ints
-from .messages import Topic, pack
+from ..typing import Bools, Floats, Ints
+from .messages import Messages, Topic, join_messages
 
 Input = Literal['auto', 'counts', 'imu']
 #: ``accel``, or the name of a thermometer.
@@ -96,31 +96,12 @@ class ImuColumns(NamedTuple):
         return ImuColumns(*(one[rows] for one in self))
 
 
-class RawMessages(NamedTuple):
-    """Serialized messages of one topic, behind each other in `data`, each up to its `ends`."""
-
-    topic: str
-    type: str
-    log_ns: Ints
-    data: Bytes
-    ends: Ints
-
-    def take(self, rows: Bools) -> RawMessages:
-        """Choose some messages."""
-        size = np.diff(self.ends, prepend=0)
-        packed = pack(self.data, (self.ends - size)[rows], size[rows])
-        return RawMessages(self.topic, self.type, self.log_ns[rows], *packed)
-
-
 class Readings(NamedTuple):
     """What one thermometer said, shape (m,), `after` so many of the samples of its block."""
 
     stamp_ns: Ints
     celsius: Floats
     after: Ints
-
-
-NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +121,7 @@ class Block:
     imu: ImuColumns | None
     temperatures: Mapping[str, Readings]
     log_ns: Mapping[Role, Ints]
-    raw: Mapping[Role, RawMessages] = field(default_factory=dict)
+    raw: Mapping[Role, Messages] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the accelerometer messages."""
@@ -169,15 +150,8 @@ class Block:
                 for name, one in self.temperatures.items()
             },
             {role: log_ns[rows[role]] for role, log_ns in self.log_ns.items()},
-            {role: one.take(rows[role]) for role, one in self.raw.items()},
+            {role: one.take(rows[role]).packed() for role, one in self.raw.items()},
         )
-
-
-def empty_block(names: Iterable[str]) -> Block:
-    """Make a block without messages, for these thermometers."""
-    temperatures = dict.fromkeys(names, NO_READINGS)
-    log_ns = dict.fromkeys(('accel', *temperatures), NO_READINGS.stamp_ns)
-    return Block(NO_READINGS.stamp_ns, np.empty((0, 3)), '', None, temperatures, log_ns)
 
 
 class Recording(NamedTuple):
@@ -217,15 +191,10 @@ def joined(blocks: Sequence[Block]) -> Block:
         moved = [after + begin for after, begin in zip(afters, begins, strict=False)]
         temperatures[name] = Readings(*map(np.concatenate, (stamps, celsius, moved)))
     imus = [block.imu for block in blocks if block.imu is not None]
-    raws = {}
-    for role in dict.fromkeys(role for block in blocks for role in block.raw):
-        pieces = [block.raw[role] for block in blocks if role in block.raw]
-        ats = np.cumsum([0, *(len(one.data) for one in pieces)])
-        raws[role] = pieces[0]._replace(
-            log_ns=np.concatenate([one.log_ns for one in pieces]),
-            data=np.concatenate([one.data for one in pieces]),
-            ends=np.concatenate([one.ends + at for one, at in zip(pieces, ats, strict=False)]),
-        )
+    raws: dict[Role, list[Messages]] = {}
+    for block in blocks:
+        for role, own in block.raw.items():
+            raws.setdefault(role, []).append(own)
     return Block(
         np.concatenate([block.accel_stamp_ns for block in blocks]),
         np.concatenate([block.accel for block in blocks]),
@@ -233,5 +202,5 @@ def joined(blocks: Sequence[Block]) -> Block:
         ImuColumns(*map(np.concatenate, zip(*imus, strict=True))) if imus else None,
         temperatures,
         {role: np.concatenate([b.log_ns[role] for b in blocks]) for role in blocks[0].log_ns},
-        raws,
+        {role: join_messages(own) for role, own in raws.items()},
     )

@@ -22,9 +22,10 @@ import numpy as np
 from ..errors import OutputError, RecordingError
 from ..files import MCAP, check_output
 from ..typing import Ints
-from .columns import Block, Input, RawMessages, RecordingInfo, Role
+from .columns import Block, Input, RecordingInfo, Role
+from .messages import Messages
 from .reader import open_recording
-from .topics import IMU, Topics
+from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics
 from .writer import BagWriter
 
 _USUAL = Topics()
@@ -96,8 +97,8 @@ def numbered_bags(folder: Path) -> list[Path]:
     return sorted(found, key=lambda one: int(one.stem))
 
 
-#: Messages of one topic, with their own stamps.
-_Piece = tuple[Ints, RawMessages]
+#: Name and type of a topic, the stamps of its messages and these.
+_Piece = tuple[str, str, Ints, Messages]
 
 
 class PositionBags:
@@ -124,23 +125,23 @@ class PositionBags:
         block = news.block
         if news.info is not None and self._serial is None:
             self._serial = news.info.metadata.get('serial')
+        accel = (_USUAL.counts, VECTOR3_STAMPED) if block.imu is None else (_USUAL.imu, IMU)
         for role, one in block.raw.items():
             if role == 'accel':
-                stamp_ns = block.accel_stamp_ns
-                name = _USUAL.imu if one.type == IMU else _USUAL.counts
+                self._held.append((*accel, block.accel_stamp_ns, one))
             else:
-                stamp_ns, name = block.temperatures[role].stamp_ns, f'temperature/{role}'
-            self._held.append((stamp_ns, one._replace(topic=name)))
+                stamp_ns = block.temperatures[role].stamp_ns
+                self._held.append((f'temperature/{role}', TEMPERATURE, stamp_ns, one))
 
     def release(self, stamp_ns: int) -> None:
         """Write what is older than a stamp."""
         early: list[_Piece] = []
         late: list[_Piece] = []
-        for stamps, one in self._held:
+        for topic, kind, stamps, one in self._held:
             is_late = np.maximum.accumulate(stamps >= stamp_ns)
             for rows, part in ((~is_late, early), (is_late, late)):
                 if rows.any():
-                    part.append((stamps[rows], one.take(rows)))
+                    part.append((topic, kind, stamps[rows], one.take(rows).packed()))
         self._held = late
         self._write(early)
 
@@ -167,8 +168,8 @@ class PositionBags:
             )
             self.written.append(path)
         try:
-            for _, raw in pieces:
-                self._writer.write_raw(raw.topic, raw.type, raw.log_ns, raw)
+            for topic, kind, _, one in pieces:
+                self._writer.write_raw(topic, kind, one.log_ns, one)
             self._writer.flush()
         except OutputError:
             # It is said once, and not tried again.

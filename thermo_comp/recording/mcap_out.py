@@ -27,7 +27,7 @@ from .. import __version__
 from ..errors import RecordingError
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .mcap_file import MAGIC, METADATA_NAME
-from .messages import Messages, join_messages, pack, scatter
+from .messages import Messages, join_messages, scatter
 from .rosbag2_metadata import Definition, dump_yaml, information, offered_qos
 
 #: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
@@ -161,8 +161,8 @@ class McapOutput:
     def _put_chunk(self, messages: Messages) -> None:
         """Lay messages out as the records of a chunk, and write it with its message indexes."""
         log_ns, channel, size = messages.log_ns, messages.channel, messages.size
-        data, ends = pack(messages.data, messages.start, size, MESSAGE_HEAD_BYTES)
-        at = ends - size - MESSAGE_HEAD_BYTES
+        laid = messages.packed(MESSAGE_HEAD_BYTES)
+        data, at = laid.data, laid.start - MESSAGE_HEAD_BYTES
         heads: Any = np.zeros(len(at), _RECORD_HEAD)
         heads['f0'], heads['f1'] = MESSAGE, size + (MESSAGE_HEAD_BYTES - PREFIX.size)
         heads['f2'], heads['f4'], heads['f5'] = channel, log_ns, log_ns

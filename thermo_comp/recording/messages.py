@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..typing import Bytes, Ints
+from ..typing import Bools, Bytes, Ints
 
 
 def gather(buffer: Bytes, at: Ints, n_bytes: int) -> NDArray[Any]:
@@ -84,7 +84,13 @@ class Messages:
         """Count them."""
         return len(self.start)
 
-    def take(self, which: Ints | slice) -> Messages:
+    def __iter__(self) -> Iterator[bytes]:
+        """Give the bytes of each."""
+        data = self.data.tobytes()
+        for at, size in zip(self.start.tolist(), self.size.tolist(), strict=True):
+            yield data[at : at + size]
+
+    def take(self, which: Ints | Bools | slice) -> Messages:
         """Choose some of them; the bytes stay."""
         return Messages(
             self.data, self.start[which], self.size[which], self.channel[which], self.log_ns[which]
@@ -108,9 +114,13 @@ class Messages:
             return self
         return self.take(np.argsort(self.log_ns, kind='stable'))
 
-    def packed(self) -> Messages:
-        """Put their bytes behind each other, so that the others' can go."""
-        data, ends = pack(self.data, self.start, self.size)
+    def packed(self, room: int = 0) -> Messages:
+        """Put their bytes behind each other, with room before each, so that the others' can go."""
+        ends = np.cumsum(self.size + room)
+        data = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
+        for each in np.unique(self.size[self.size > 0]).tolist():
+            own = np.flatnonzero(self.size == each)
+            scatter(data, ends[own] - each, gather(self.data, self.start[own], each))
         return Messages(data, ends - self.size, self.size, self.channel, self.log_ns)
 
 
@@ -124,18 +134,6 @@ def join_messages(pieces: Sequence[Messages]) -> Messages:
         np.concatenate([one.start + at for one, at in zip(pieces, begins, strict=False)]),
         *(np.concatenate([getattr(one, n) for one in pieces]) for n in Messages.__slots__[2:]),
     )
-
-
-def pack(data: Bytes, start: Ints, size: Ints, room: int = 0) -> tuple[Bytes, Ints]:
-    """
-    Put pieces of bytes behind each other, with room before each; gives these and each one's end.
-    """
-    ends = np.cumsum(size + room)
-    packed = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
-    for each in np.unique(size[size > 0]).tolist():
-        own = np.flatnonzero(size == each)
-        scatter(packed, ends[own] - each, gather(data, start[own], each))
-    return packed, ends
 
 
 #: What is done with messages while their bytes are at hand.

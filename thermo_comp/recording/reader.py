@@ -24,22 +24,20 @@ from .columns import (
     ROLES,
     Block,
     Input,
-    RawMessages,
     Recording,
     RecordingInfo,
     Role,
     count_topics,
-    empty_block,
     gathered,
     joined,
 )
-from .decode import Decoder
 from .foreign import ForeignFile
 from .mcap_file import McapFile
-from .messages import BagFile, Messages, Topic, pack
+from .messages import BagFile, Messages, Topic
 from .rosbag2_metadata import Description, read_metadata
 from .topics import Topics, select_topics, shown
 from .unpack import expand, translated
+from .wire import decode_blocks
 
 _N_LOADERS = 2
 
@@ -148,20 +146,20 @@ class RecordingReader:
         """Decode the topic of each role, in reading order."""
         roles = {topic: role for role, topic in self.topics.items()}
         for file in self._opened():
-            feeds: dict[Role, Topic] = {}
-            channels: dict[int, Role] = {}
+            feeds: dict[int, tuple[Role, Topic]] = {}
             for number, topic in file.topics.items():
                 if topic.name in roles:
-                    role = channels[number] = roles[topic.name]
                     if topic.encoding not in {'cdr', 'ros1'}:
                         raise _no_cdr(topic, file)
-                    if feeds.setdefault(role, topic)[:3] != topic[:3]:
-                        reason = 'its messages have several encodings'
-                        raise RecordingError(reason, file.path, shown(topic.name))
-            if channels:
-                decoder = Decoder(feeds, channels, self._names, raw)
+                    feeds[number] = roles[topic.name], topic
+            for role, topic in feeds.values():
+                if topic[:3] != dict(feeds.values())[role][:3]:
+                    reason = 'its messages have several encodings'
+                    raise RecordingError(reason, file.path, shown(topic.name))
+            if feeds:
+                work = partial(decode_blocks, feeds=feeds, names=self._names, keep_raw=raw)
                 with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
-                    for blocks in file.read(channels, decoder.blocks):
+                    for blocks in file.read(feeds, work):
                         yield from blocks
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
@@ -181,7 +179,7 @@ class RecordingReader:
         """Where the part that is read begins, since the bag's first sample [s]; known then."""
         return self._cut.since_s
 
-    def raw(self, topics: Collection[str]) -> Iterator[RawMessages]:
+    def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
         """Read topics, by the bag's own names, as they are, about in order of log time."""
         for file in self._opened():
             own = {n: one for n, one in file.topics.items() if one.name in topics}
@@ -189,7 +187,7 @@ class RecordingReader:
                 if topic.encoding != 'cdr':
                     raise _no_cdr(topic, file)
             with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
-                for found in file.read(own, partial(_raw, own)) if own else ():
+                for found in file.read(own, partial(_raw, topics=own)) if own else ():
                     yield from found
 
     def close(self) -> None:
@@ -241,7 +239,8 @@ def read_recording(
     """Read a whole bag into memory; as `open_recording`, and RecordingError for damaged data."""
     with open_recording(path, topics, input, require=require) as reader:
         blocks = list(reader.blocks())
-        return Recording(reader.info, joined(blocks or [empty_block(ROLES[1:])]))
+        nothing = Messages.of([], [], [])
+        return Recording(reader.info, joined(blocks or decode_blocks(nothing, {}, ROLES[1:])))
 
 
 def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
@@ -281,14 +280,9 @@ def _in_split_order(files: Iterable[Path]) -> list[Path]:
     return sorted(files, key=number)
 
 
-def _raw(topics: Mapping[int, Topic], messages: Messages) -> list[RawMessages]:
-    found = []
-    for number, topic in topics.items():
-        one = messages.of_channels([number])
-        if len(one):
-            packed = pack(one.data, one.start, one.size)
-            found.append(RawMessages(topic.name, topic.type, one.log_ns, *packed))
-    return found
+def _raw(messages: Messages, topics: Mapping[int, Topic]) -> list[tuple[Topic, Messages]]:
+    found = ((topic, messages.of_channels([number])) for number, topic in topics.items())
+    return [(topic, one.packed()) for topic, one in found if len(one)]
 
 
 def _loss(topic: str, n_read: int, n_promised: int) -> str | None:

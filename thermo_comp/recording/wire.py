@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the serialized layout of stamped messages: many messages to columns, and back, at once.
+Owns the serialized layout of stamped messages: many messages to blocks, and back, at once.
 
 All three input types are a std_msgs/Header followed by nothing but float64 numbers. In CDR::
 
@@ -16,7 +16,8 @@ which stamps and numbers are views. Messages of ROS 1 are serialized anew by `ro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,12 +25,16 @@ from numpy.typing import NDArray
 
 from ..errors import RecordingError
 from ..typing import Bytes, Floats, Ints
-from .messages import Messages, field, gather
+from .columns import Block, ImuColumns, Readings, Role
+from .messages import Messages, Topic, field, gather
 from .rosbag2_metadata import typestore
-from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED
+from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, shown
 
 #: How many float64 numbers follow the header of each type.
 N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
+#: The columns of sensor_msgs/Imu among its numbers, as `ImuColumns` has them.
+_IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
+_IMU_ACCELERATION = slice(25, 28)
 
 HEAD_BYTES = 16
 _MAX_PADDING = 7
@@ -42,6 +47,59 @@ class Stamped(NamedTuple):
     stamp_ns: Ints
     numbers: Floats
     frame: NDArray[Any]
+
+
+def decode_blocks(
+    messages: Messages,
+    feeds: Mapping[int, tuple[Role, Topic]],
+    names: Iterable[str],
+    *,
+    keep_raw: bool = False,
+) -> list[Block]:
+    """
+    Decode messages, in their order; a block ends where the frame changes.
+
+    `feeds` are role and topic of each channel, `names` all thermometers. Raises RecordingError,
+    without a path, for a message whose bytes do not fit its type.
+    """
+    names = tuple(names)
+    roles = dict(feeds.values())
+    is_imu = 'accel' in roles and roles['accel'].type == IMU
+    temperatures, log_ns, raw = {}, {}, {}
+    for role in ('accel', *names):
+        kind = TEMPERATURE if role != 'accel' else IMU if is_imu else VECTOR3_STAMPED
+        rank = messages.places_of([number for number, (own, _) in feeds.items() if own == role])
+        own = messages.take(rank)
+        try:
+            if role in roles and roles[role].encoding == 'ros1':
+                own = as_cdr(own, kind)
+            stamp_ns, numbers, frame = decode_stamped(own, kind)
+        except RecordingError as error:
+            raise RecordingError(error.message, topic=shown(roles[role].name)) from error
+        if role == 'accel':
+            changes = rank[1:][frame[1:] != frame[:-1]].tolist()
+            if changes:
+                runs = (slice(*run) for run in pairwise([0, *changes, len(messages)]))
+                pieces = (messages.take(run) for run in runs)
+                return [decode_blocks(one, feeds, names, keep_raw=keep_raw)[0] for one in pieces]
+            accel, samples_ns, samples, frames = rank, stamp_ns, numbers, frame
+        else:
+            after = np.searchsorted(accel, rank).astype(np.int64)
+            temperatures[role] = Readings(stamp_ns, numbers[:, 0], after)
+        log_ns[role] = own.log_ns
+        if keep_raw and len(own):
+            raw[role] = own.packed()
+    return [
+        Block(
+            samples_ns,
+            np.ascontiguousarray(samples[:, _IMU_ACCELERATION]) if is_imu else samples,
+            frames[0].decode('utf-8', 'replace') if len(frames) else '',
+            ImuColumns(*(samples[:, c] for c in _IMU_COLUMNS)) if is_imu else None,
+            temperatures,
+            log_ns,
+            raw,
+        )
+    ]
 
 
 def decode_stamped(messages: Messages, kind: str) -> Stamped:
@@ -125,10 +183,9 @@ def encode_stamped(
 
 def as_cdr(messages: Messages, kind: str) -> Messages:
     """Serialize messages of ROS 1 as ROS 2 does; RecordingError for bytes that are none."""
-    data, convert = messages.data.tobytes(), typestore().ros1_to_cdr
-    places = zip(messages.start.tolist(), messages.size.tolist(), strict=True)
+    convert = typestore().ros1_to_cdr
     try:
-        pieces = [bytes(convert(data[at : at + size], kind)) for at, size in places]
+        pieces = [bytes(convert(one, kind)) for one in messages]
     except Exception as error:  # damaged bytes surface there as nearly any exception type
         raise _misfit(kind) from error
     return Messages.of(pieces, messages.channel, messages.log_ns)

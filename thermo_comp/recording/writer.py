@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike
 from ..errors import OutputError, RecordingError
 from ..files import Draft, bag_kind
 from ..typing import Bytes, Ints
-from .columns import ImuColumns, RawMessages
+from .columns import ImuColumns
 from .mcap_out import McapOutput
 from .messages import Messages
 from .rosbag2_metadata import Definition, dump_yaml, known_definition
@@ -153,14 +154,14 @@ class BagWriter:
             raise ValueError(f'`values` must have {len(times)} values, got {flags.shape}')
         rows = np.zeros((len(times), 5), np.uint8)
         rows[:, 1], rows[:, 4] = 1, flags
-        self._add(topic, BOOL, times, rows.ravel(), np.full(len(rows), 5))
+        self._add(topic, BOOL, _of_rows(rows, times))
 
     def write_raw(
         self,
         topic: str,
         type: str,  # noqa: A002 - the parameter's public name
         log_ns: ArrayLike,
-        messages: Sequence[bytes] | RawMessages,
+        messages: Sequence[bytes] | Messages,
         definition: tuple[str, str] | None = None,
     ) -> None:
         """
@@ -169,12 +170,10 @@ class BagWriter:
         `definition` is encoding and text of the type's, as `RecordingReader.definitions` gives it;
         by default that of ROS 2 Jazzy, RecordingError where that has none.
         """
-        if isinstance(messages, RawMessages):
-            data, size = messages.data, np.diff(messages.ends, prepend=0)
-        else:
-            data = np.frombuffer(b''.join(messages), np.uint8)
-            size = np.fromiter(map(len, messages), np.int64, len(messages))
-        self._add(topic, type, _as_times('log_ns', log_ns, len(size)), data, size, definition)
+        times = _as_times('log_ns', log_ns, len(messages))
+        if not isinstance(messages, Messages):
+            messages = Messages.of(messages, np.zeros(len(messages)), times)
+        self._add(topic, type, replace(messages, log_ns=times), definition)
 
     def flush(self) -> None:
         """Merge what is buffered in log-time order and hand it to the file."""
@@ -245,16 +244,10 @@ class BagWriter:
                 )
             pieces.append((at, numbers))
         rows = encode_stamped(stamps, frame_id, N_NUMBERS[kind], pieces)
-        self._add(topic, kind, times, rows.ravel(), np.full(len(rows), rows.shape[1]))
+        self._add(topic, kind, _of_rows(rows, times))
 
     def _add(
-        self,
-        topic: str,
-        kind: str,
-        log_ns: Ints,
-        data: Bytes,
-        size: Ints,
-        definition: tuple[str, str] | None = None,
+        self, topic: str, kind: str, messages: Messages, definition: tuple[str, str] | None = None
     ) -> None:
         name = '/' + topic.strip('/')
         try:
@@ -263,9 +256,9 @@ class BagWriter:
                 number = self._open_file().channel(name, kind, known)
         except RecordingError as error:
             raise RecordingError(error.message, self._path, name) from error
-        if len(log_ns):
-            channel = np.full(len(log_ns), number, np.uint16)
-            self._batches.append(Messages(data, np.cumsum(size) - size, size, channel, log_ns))
+        if len(messages):
+            channel = np.full(len(messages), number, np.uint16)
+            self._batches.append(replace(messages, channel=channel))
             if sum(len(one.data) for one in self._batches) > _AUTO_FLUSH_BYTES:
                 self.flush()
 
@@ -284,6 +277,12 @@ class BagWriter:
             raise OutputError(
                 f'cannot be written: {error.strerror or error}{kept}', self._path
             ) from error
+
+
+def _of_rows(rows: Bytes, log_ns: Ints) -> Messages:
+    size = np.full(len(rows), rows.shape[1])
+    channel = np.zeros(len(rows), np.uint16)
+    return Messages(rows.ravel(), np.cumsum(size) - size, size, channel, log_ns)
 
 
 def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:

@@ -33,10 +33,10 @@ from std_msgs.msg import Bool
 
 from ..online.stamped_flag import STAMPED_TOPIC
 from ..recording import ROLES, BagWriter, Input, Role, Topics
-from ..recording.decode import Decoder
 from ..recording.growing import News
 from ..recording.messages import Messages, Topic
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
+from ..recording.wire import decode_blocks
 from .waitloop import RawSubscription, WaitLoop
 
 #: The node's outputs.
@@ -231,17 +231,15 @@ class LiveTopics(_Listener):
 
     def _decode(self, waiting: list[tuple[Role, list[bytes], list[int]]]) -> Iterator[News]:
         """Decode what came, in the order of arrival."""
-        feeds = dict(self._feeds)
-        channels = dict(enumerate(feeds))
-        numbers = {role: number for number, role in channels.items()}
+        feeds = dict(enumerate(self._feeds.items()))
+        numbers = {role: number for number, (role, _) in feeds.items()}
         messages = Messages.of(
             [one for _, messages, _ in waiting for one in messages],
             [numbers[role] for role, messages, _ in waiting for _ in messages],
             [one for _, _, received_ns in waiting for one in received_ns],
         )
-        names = list(dict.fromkeys((*ROLES[1:], *(role for role in feeds if role != 'accel'))))
-        decoder = Decoder(feeds, channels, names, True)
-        yield from map(News, decoder.blocks(messages.in_order()))
+        names = dict.fromkeys((*ROLES[1:], *(role for role in numbers if role != 'accel')))
+        yield from map(News, decode_blocks(messages.in_order(), feeds, names, keep_raw=True))
 
     def _look(self) -> None:
         """Subscribe to what is published; say what is not."""

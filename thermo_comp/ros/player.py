@@ -34,7 +34,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
 
 from ..errors import ThermoCompError
-from ..recording import Block, Input, RawMessages, RecordingReader, Role, Topics, open_recording
+from ..recording import Block, Input, RecordingReader, Role, Topics, open_recording
 
 NODE_NAME = 'thermo_comp_player'
 
@@ -215,7 +215,7 @@ class _Player:
 
 def _in_order(block: Block) -> Iterator[tuple[int, Role, bytes]]:
     """Give a block's messages in the order of the bag: log time, role, bytes."""
-    messages = {role: _split(one) for role, one in block.raw.items()}
+    messages = {role: iter(one) for role, one in block.raw.items()}
     roles: list[Role] = [*block.temperatures, 'accel']
     places: list[Any] = [one.after - 0.5 for one in block.temperatures.values()]
     places.append(np.arange(len(block)))
@@ -225,10 +225,3 @@ def _in_order(block: Block) -> Iterator[tuple[int, Role, bytes]]:
     for index in np.lexsort((log_ns, np.concatenate(places))).tolist():
         role = roles[which[index]]
         yield int(log_ns[index]), role, next(messages[role])
-
-
-def _split(messages: RawMessages) -> Iterator[bytes]:
-    start, data = 0, messages.data.tobytes()
-    for end in messages.ends.tolist():
-        yield data[start:end]
-        start = end
