@@ -87,6 +87,11 @@ class TestUsage:
             (('simulate', '-o', 'a', '--unit', 'gold'), r'must be one of thermostatted'),
             (('simulate', '-o', 'a', '--plan', 'oven'), r'must be one of chamber-18'),
             (('simulate', '-o', 'a', '--profile', '20, up'), r"step 2 'up'"),
+            (('simulate', '-o', 'a', '--profile', '20, 90'), r'air of 20\.\.90 degC needs -.* W'),
+            (
+                ('simulate', '-o', 'a', '--temperature-rate-hz', '0'),
+                r'`temperature_rate_hz` must be positive',
+            ),
             (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
             (('convert', 'a.parquet', '-o', 'b'), r'--columns'),
             (('fit', 'a.mcap', '-o', 'b', '--gravity', '9.8', '--rate-hz', '9'), r'for tables'),

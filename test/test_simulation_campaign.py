@@ -6,10 +6,12 @@ A whole test in memory: the run of the bags, the units of every kind, the physic
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 from thermo_comp.simulation import (
     MICRO_G,
@@ -27,6 +29,10 @@ from thermo_comp.simulation import (
 from thermo_comp.simulation.drift import FlowEffect, PartHistory, SlipEffect
 from thermo_comp.simulation.unit import SwitchedLoad
 from thermo_comp.typing import Floats
+
+sys.path.insert(0, str(ROOT / 'benchmarks'))
+
+from accuracy import corrected_by_truth
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
 STATION = Position('one', PROGRAM, np.array([0.48, -0.6, 0.64]))
@@ -58,7 +64,7 @@ def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
     unit = unit_preset(kind, 2)
     errors, norms = [], []
     for record in arrays(unit, plan('held-out', 2), 7):
-        found = record.corrected_by_truth() / MICRO_G
+        found = corrected_by_truth(record) / MICRO_G
         errors.append(np.sum((found - record.truth.specific_force / MICRO_G) ** 2, axis=1))
         norms.append(np.linalg.norm(found, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
@@ -161,7 +167,7 @@ def test_a_switched_load_heats_its_part() -> None:
     unit = unit_preset('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
-    loaded: UnitModel = replace(unit, loads=(load,))
+    loaded: UnitModel = replace(unit, load=load)
     program = parse_cyclogram('20 16h')
     on, off = (
         simulate(one, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth

@@ -25,7 +25,6 @@ from thermo_comp.simulation import (
     unit_preset,
 )
 from thermo_comp.simulation.drift import PartEffect
-from thermo_comp.simulation.unit import ThermometerModel
 from thermo_comp.typing import Floats
 
 UP = np.array([0.48, -0.6, 0.64])
@@ -257,6 +256,8 @@ def test_ideal_regime_is_the_heat_flow_into_the_board(unit: UnitModel) -> None:
 def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:
     with pytest.raises(ValueError, match='`rate_hz` must be positive, got 0'):
         simulate(unit, SHORT, UP, rate_hz=0.0)
+    with pytest.raises(ValueError, match='`temperature_rate_hz` must be positive, got 0'):
+        simulate(unit, SHORT, UP, temperature_rate_hz=0.0)
     with pytest.raises(ValueError, match='shorter than one cycle'):
         simulate(unit, Cyclogram((0.0, 0.5), (20.0, 20.0)), UP, rate_hz=1.0)
     with pytest.raises(ValueError, match='`block_size` must be at least 1, got 0'):
@@ -268,17 +269,3 @@ def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:
             simulate(unit, SHORT, up)
     with pytest.raises(ValueError, match='`n` must be at least 1, got 0'):
         positions(0)
-
-
-@pytest.mark.parametrize(
-    ('change', 'message'),
-    [
-        ({'rate_hz': 0.0}, '`rate_hz` must be positive, got 0'),
-        ({'noise_sd': -1.0}, '`noise_sd` must not be negative, got -1'),
-        ({'quantum': float('nan')}, '`quantum` must not be negative, got nan'),
-        ({'phase': 1.0}, r'`phase` must lie in \[0, 1\), got 1'),
-    ],
-)
-def test_thermometer_refuses_what_cannot_be(change: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        ThermometerModel('board', **change)

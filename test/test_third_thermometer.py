@@ -52,7 +52,7 @@ def unit_with_a_lid() -> UnitModel:
         unit_preset('bare-quartz', 1),
         network=network,
         drift=drift,
-        loads=(SwitchedLoad('lid', 0.1 * LOAD_K),),
+        load=SwitchedLoad('lid', 0.1 * LOAD_K),
     )
 
 

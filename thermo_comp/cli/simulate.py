@@ -114,14 +114,15 @@ def simulate(
                 'simulated_by': f'thermo_comp {__version__}',
                 'truth': json.dumps(truth),
             }
-            runs = simulation.simulate_blocks(
-                specimen,
-                station.program,
-                station.up,
-                temperature_rate_hz=temperature_rate_hz,
-                warm=not cold_start,
-                **settings,
-            )
+            with options.usage_of():
+                runs = simulation.simulate_blocks(
+                    specimen,
+                    station.program,
+                    station.up,
+                    temperature_rate_hz=temperature_rate_hz,
+                    warm=not cold_start,
+                    **settings,
+                )
             n_cycles = station.program.duration_s * rate_hz
             count = {'counts': 0, 'board': 0, 'case': 0}
             with BagWriter(name, metadata=metadata, level=level, overwrite=force) as writer:

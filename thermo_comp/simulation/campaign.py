@@ -18,8 +18,7 @@ from ..typing import Floats
 from ..unit.gravity import STANDARD_GRAVITY
 from .cyclogram import Cyclogram, parse_cyclogram
 from .run import SimulatedRun, Truth, simulate
-from .streams import Stream, generator
-from .unit import UnitModel
+from .unit import Stream, UnitModel, generator
 
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
 # Edges of the cube: one per pair of axes and adding up to nothing, their opposites, the rest.
@@ -143,7 +142,7 @@ def arrays(
             gravity=gravity,
             start_ns=0,
             # A load is switched by the seed.
-            like=None if unit.loads else solved.get(one.program),
+            like=None if unit.load else solved.get(one.program),
         )
         solved[one.program] = run.truth
         runs.append(replace(run, name=one.name))

@@ -54,8 +54,6 @@ class Cyclogram:
     temperature_c: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'time_s', tuple(float(t) for t in self.time_s))
-        object.__setattr__(self, 'temperature_c', tuple(float(c) for c in self.temperature_c))
         if len(self.time_s) != len(self.temperature_c) or len(self.time_s) < 2:
             raise ValueError(
                 '`time_s` and `temperature_c` must have one length of at least 2, got '
@@ -63,8 +61,6 @@ class Cyclogram:
             )
         if not all(math.isfinite(v) for v in self.time_s + self.temperature_c):
             raise ValueError('`time_s` and `temperature_c` must be finite')
-        if self.time_s[0] != 0.0 or any(np.diff(self.time_s) <= 0.0):
-            raise ValueError('`time_s` must start at 0 and increase')
 
     @property
     def duration_s(self) -> float:

@@ -30,8 +30,16 @@ from .drift import (
     Triple,
 )
 from .network import AIR, Link, ThermalNetwork, Thermostat
-from .streams import Stream, generator
-from .unit import GyroModel, SwitchedLoad, ThermometerModel, UnitModel, rounded, triple
+from .unit import (
+    GyroModel,
+    Stream,
+    SwitchedLoad,
+    ThermometerModel,
+    UnitModel,
+    generator,
+    rounded,
+    triple,
+)
 
 
 class _Specimen:
@@ -220,9 +228,7 @@ def _triad(draw: _Specimen) -> UnitModel:
     drift = _tempcos(draw, ['board'] if kind in _ON_BOARD else heads)
     if kind in _EXTRA:
         drift += _EXTRA[kind](draw)
-    loads: tuple[SwitchedLoad, ...] = ()
-    if kind == 'switched-load':
-        loads = (SwitchedLoad('board', draw.between(0.3, 0.8)),)
+    load = SwitchedLoad('board', draw.between(0.3, 0.8)) if kind == 'switched-load' else None
     return draw.unit(
         network,
         tuple(drift) if kind != 'plain' else (),
@@ -231,7 +237,7 @@ def _triad(draw: _Specimen) -> UnitModel:
         # With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
         noise_density=(3.0, 3.0, 3.0),
         bias_walk=(3.0, 3.0, 3.0) if kind == 'slow-noise' else ZERO,
-        loads=loads,
+        load=load,
     )
 
 

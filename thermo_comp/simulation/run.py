@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..typing import Floats, Ints
+from ..typing import Bools, Floats, Ints
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.gyroscope import MILLIDEGREE
 from .cyclogram import Cyclogram
 from .drift import PartHistory, drift_of
 from .network import AIR, ThermalResponse
-from .streams import Stream, generator
-from .unit import UnitModel, first_charge
+from .unit import Stream, SwitchedLoad, UnitModel, first_charge, generator
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
@@ -99,22 +98,6 @@ class SimulatedRun:
     angular_rate: Floats | None = None
     name: str = ''
 
-    def corrected_by_truth(self, window_s: float = 60.0) -> Floats:
-        """Return what a perfect thermal model makes of windows' mean counts, (w, 3), m/s^2."""
-        unit = self.truth.unit
-        per = round(window_s / (2.0 * self.truth.cycle_s[0]))
-        n = len(self.counts) // per
-        counts, bias, scale = (
-            column[: n * size].reshape(n, size, 3).mean(axis=1)
-            for column, size in (
-                (self.counts, per),
-                (self.truth.thermal_bias, round(window_s)),
-                (self.truth.scale_grid, round(window_s)),
-            )
-        )
-        result: Floats = ((counts - bias) / scale / unit.scale_factor) @ unit.M.T
-        return result
-
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
     """Run a unit through a program as one block, as `simulate_blocks` does."""
@@ -155,7 +138,9 @@ def simulate_blocks(
     """
     if block_size < 1:
         raise ValueError(f'`block_size` must be at least 1, got {block_size}')
-    for name, value in (('rate_hz', rate_hz), ('gravity', gravity)):
+    readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
+    positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
+    for name, value in positive.items():
         if not (value > 0.0 and math.isfinite(value)):
             raise ValueError(f'`{name}` must be positive, got {value}')
     duration = cyclogram.duration_s
@@ -225,8 +210,11 @@ def simulate_blocks(
 def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int, warm: bool) -> Truth:
     """Solve what temperature does over a program, whatever the attitude."""
     knots, air, power = np.array(cyclogram.time_s), np.array(cyclogram.temperature_c), None
-    if unit.loads:
-        knots, air, power = _switched(unit, knots, air, seed)
+    if unit.load is not None:
+        knots, is_on = _switched(unit.load, knots, seed)
+        air = np.interp(knots, cyclogram.time_s, air)
+        heated = [part == unit.load.part for part in unit.network.nodes]
+        power = unit.load.power * np.outer(is_on, heated)
     response = ThermalResponse(unit.network, knots, air, power=power, is_warm=warm)
     grid = np.arange(math.ceil(cyclogram.duration_s / _GRID_S) + 1, dtype=float) * _GRID_S
     temperatures = response.temperatures(grid)
@@ -249,23 +237,12 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int, warm: bool) -> 
     )
 
 
-def _switched(
-    unit: UnitModel, knots: Floats, air: Floats, seed: int
-) -> tuple[Floats, Floats, Floats]:
-    """Return the knots with the switching of the loads among them, and the power between them."""
-    flips = []
-    for number, load in enumerate(unit.loads):
-        spells = generator(seed, Stream.LOAD, number).uniform(
-            *load.spell, size=2 + int(knots[-1] // load.spell[0])
-        )
-        flips.append(np.cumsum(spells))
-    fine = np.unique(np.concatenate([knots, *flips]))
-    fine = fine[fine <= knots[-1]]
-    power = np.zeros((len(fine) - 1, len(unit.network.nodes)))
-    for load, at in zip(unit.loads, flips, strict=True):
-        is_on = np.searchsorted(at, fine[:-1], side='right') % 2 == 1
-        power[:, unit.network.nodes.index(load.part)] += load.power * is_on
-    return fine, np.interp(fine, knots, air), power
+def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
+    """Return the knots with the switching of a load among them, and whether it is on between."""
+    n = 2 + int(knots[-1] // load.spell[0])
+    flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
+    fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))
+    return fine, np.searchsorted(flips, fine[:-1], side='right') % 2 == 1
 
 
 def _walk(unit: UnitModel, grid: Floats, seed: int) -> Floats:

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulated instrument: its parts, drift, converter, thermometers and gyroscope."""
+"""Owns the simulated instrument: converter, thermometers, gyroscope, and what is random in it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from ..unit.gravity import EARTH_RATE, MICRO_G
 from ..unit.gyroscope import MILLIDEGREE
 from .drift import ZERO, Effect, PartHistory, Triple, drift_of
 from .network import ThermalNetwork, ThermalResponse
-from .streams import Stream, generator
 
 _NS = 1_000_000_000
 _REFERENCE_C = 20.0  # of the board in still air: there K and bias hold
@@ -25,6 +25,32 @@ _RANGE = -(1 << 15), (1 << 15) - 1  # of the output, counts
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
 _ROWS = 1 << 20  # rows summed at once: 2^20 fractions below 2^40 stay far below 2^63
+
+
+class Stream(IntEnum):
+    """
+    What takes random numbers, each from a stream of its own: switching one on or off, or asking
+    for other block sizes, leaves the others as they were. The numbers are part of what a seed
+    means: never changed, nor used again.
+    """
+
+    ACCEL_NOISE = 0
+    CONVERTER_PHASE = 1
+    BOARD_NOISE = 2
+    CASE_NOISE = 3
+    UNIT = 8
+    POSITIONS = 9
+    CYCLOGRAM = 10
+    BIAS_WALK = 11
+    LOAD = 13
+    SIBLING = 14
+    GYRO_NOISE = 15
+    GYRO_OFFSET = 16
+
+
+def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
+    """Return the generator of one source, for an axis or other number, at its stream's start."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
 
 
 def first_charge(seed: int) -> Ints:
@@ -74,15 +100,6 @@ class ThermometerModel:
     quantum: float = 0.0
     offset: float = 0.0
     phase: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (self.rate_hz > 0.0 and math.isfinite(self.rate_hz)):
-            raise ValueError(f'`rate_hz` must be positive, got {self.rate_hz}')
-        for name in ('noise_sd', 'quantum'):
-            if not getattr(self, name) >= 0.0:
-                raise ValueError(f'`{name}` must not be negative, got {getattr(self, name)}')
-        if not 0.0 <= self.phase < 1.0:
-            raise ValueError(f'`phase` must lie in [0, 1), got {self.phase}')
 
     def read(
         self, response: ThermalResponse, duration: float, seed: int, noise: Stream
@@ -152,7 +169,7 @@ class UnitModel:
     noise_density: white noise of the acceleration per axis, ug/sqrt(Hz): the mean over `T` seconds
         has the standard deviation ``noise_density / sqrt(T)``
     bias_walk: random walk of the bias per axis within a run, ug per square root of an hour
-    loads: loads beside the constant powers
+    load: what is switched beside the constant powers, if anything
     gyro: the gyroscope beside it, if there is one
     """
 
@@ -167,7 +184,7 @@ class UnitModel:
     noise_density: Triple = (5.0, 5.0, 5.0)
     converter: Callable[[Floats, Ints], tuple[NDArray[np.int32], Ints]] = balanced
     bias_walk: Triple = ZERO
-    loads: tuple[SwitchedLoad, ...] = ()
+    load: SwitchedLoad | None = None
     gyro: GyroModel | None = None
 
     @property
