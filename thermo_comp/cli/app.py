@@ -6,12 +6,10 @@ Owns the one door of the command line: which commands there are and what an exit
 Heavy libraries are imported by the commands when they run, so that ``--help`` is quick.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import sys
-from typing import Annotated
+from typing import Any
 
 import typer
 
@@ -22,12 +20,10 @@ from . import bags, convert, demo, fit, fleet, judge, output, record, simulate
 from .options import expanded, option
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
-_UsageMistake: type[Exception] = typer.BadParameter.__mro__[2]
+_UsageMistake: Any = typer.BadParameter.__mro__[2]
 
 #: How 0.1 spelt `--topic`.
 _OLD_TOPIC = re.compile(r'--(counts|imu|board|case)-topic(?:=(.*))?')
-#: EX_SOFTWARE of sysexits.h.
-_SOFTWARE = 70
 
 app = typer.Typer(
     name='thermo_comp',
@@ -47,9 +43,9 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _top(
-    version: Annotated[
-        bool, option('Print the version.', '--version', callback=_print_version, is_eager=True)
-    ] = False,
+    version: bool = option(
+        'Print the version.', False, '--version', callback=_print_version, is_eager=True
+    ),
 ) -> None:
     """Thermal-drift compensation of a three-axis accelerometer."""
 
@@ -60,7 +56,9 @@ for _command in (
     *(simulate.simulate, demo.demo),
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))
-app.add_typer(fleet.app)
+_fleet = typer.Typer(name='fleet', help='Fit many units, and see what they tell together.')
+_fleet.command('fit')(expanded(fleet.fit))
+app.add_typer(_fleet)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -86,7 +84,11 @@ def run(arguments: list[str]) -> int:
         code = app(arguments, prog_name='thermo_comp', standalone_mode=False, obj=ros_arguments)
         sys.stdout.flush()
     except _UsageMistake as mistake:
-        return _usage(mistake)
+        context = getattr(mistake, 'ctx', None)
+        command = 'thermo_comp' if context is None else context.command_path
+        if said := mistake.format_message():  # nothing where typer has printed the help
+            output.error(f'{said} (see: {command} --help)')
+        return int(mistake.exit_code)
     except typer.Abort:
         return 1
     except ThermoCompError as failure:
@@ -148,15 +150,4 @@ def _unexpected(failure: Exception) -> int:
     output.error(
         f'unexpected {reason:.300}; this is a mistake of the program, its traceback is {name}'
     )
-    return _SOFTWARE
-
-
-def _usage(mistake: Exception) -> int:
-    """Print a mistake in the command line with the next step, return its exit code."""
-    message = getattr(mistake, 'format_message', lambda: str(mistake))()
-    context = getattr(mistake, 'ctx', None)
-    command = 'thermo_comp' if context is None else context.command_path
-    if message:  # empty where typer has printed the help for a missing command
-        output.error(f'{message} (see: {command} --help)')
-    code = getattr(mistake, 'exit_code', 2)
-    return code if isinstance(code, int) else 2
+    return 70  # EX_SOFTWARE of sysexits.h

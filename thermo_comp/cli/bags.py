@@ -5,11 +5,9 @@ Owns what is done with one bag: ``thermo_comp info`` looks at it (or at a calibr
 corrects it, ``play`` sends it onto the live topics.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -21,15 +19,14 @@ from .output import Output, micro_g, picked
 if TYPE_CHECKING:
     from ..recording import Topics
 
-Bag = Annotated[Path, argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')]
+_BAG = argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
 _AS_THE_NODE = 'As the parameter of the node, in s.'
 
 
 def info(
-    *,
-    path: Annotated[Path, argument('Bag or calibration file.', metavar='BAG|YAML')],
-    topics: options.TopicsPart,
-    out: options.Out,
+    path: Path = argument('Bag or calibration file.', metavar='BAG|YAML'),
+    topics: 'Topics' = options.topics_part,
+    out: Output = options.out,
 ) -> None:
     """
     Say what is in a bag or a calibration.
@@ -46,7 +43,7 @@ def info(
         _bag(out, path, topics)
 
 
-def _bag(out: Output, path: Path, topics: Topics) -> None:
+def _bag(out: Output, path: Path, topics: 'Topics') -> None:
     from ..recording.overview import survey_recording
 
     with out.progress(f'reading {path.name}') as done:
@@ -56,10 +53,8 @@ def _bag(out: Output, path: Path, topics: Topics) -> None:
     for key, value in found.metadata.items():
         if key in ('serial', 'converted_from', 'corrected_from', 'simulated_by'):
             out.line(f'  {key.replace("_", " ")}: {value}')
-    out.table(
-        ('topic', 'type', 'messages'),
-        [(name, kind, count) for name, (kind, count) in sorted(found.topics.items())],
-    )
+    rows = sorted((name, kind, count) for name, (kind, count) in found.topics.items())
+    out.table(('topic', 'type', 'messages'), rows)
     if survey.n:
         out.line(
             f'{survey.n} samples of {found.input}, {survey.rate_hz:.4g} Hz, '
@@ -69,15 +64,10 @@ def _bag(out: Output, path: Path, topics: Topics) -> None:
     if found.chosen:
         out.line(found.chosen)
     if thermometers:
+        facts = 'rate_hz lowest highest steepest_heating_k_min steepest_cooling_k_min'
         out.table(
             ('sensor', 'Hz', 'min degC', 'max degC', 'max K/min', 'min K/min'),
-            [
-                (
-                    *(name, one.rate_hz, one.lowest, one.highest),
-                    *(one.steepest_heating_k_min, one.steepest_cooling_k_min),
-                )
-                for name, one in thermometers.items()
-            ],
+            [(name, *picked(one, facts).values()) for name, one in thermometers.items()],
         )
     for finding in survey.findings:
         out.line(f'- {finding}')
@@ -87,10 +77,7 @@ def _bag(out: Output, path: Path, topics: Topics) -> None:
         {
             'path': path,
             **picked(found, 'storage truncated metadata input chosen'),
-            'topics': {
-                name: {'type': kind, 'messages': count}
-                for name, (kind, count) in found.topics.items()
-            },
+            'topics': {name: {'type': kind, 'messages': count} for name, kind, count in rows},
             'samples': survey.n,
             'still_intervals': survey.n_still,
             'board': thermometers.get('board'),
@@ -120,10 +107,12 @@ def _calibration(out: Output, path: Path) -> None:
         ('axis', 'scale factor', 'bias', 'bias ug'),
         [
             (
-                *(name, f'{axis.scale_factor:.8g}', f'{axis.bias:.6g}'),
-                micro_g(axis.bias / axis.scale_factor),
+                name,
+                f'{one.scale_factor:.8g}',
+                f'{one.bias:.6g}',
+                micro_g(one.bias / one.scale_factor),
             )
-            for name, axis in zip('xyz', (axes.x, axes.y, axes.z), strict=True)
+            for name, one in zip('xyz', (axes.x, axes.y, axes.z), strict=True)
         ],
     )
     out.table(
@@ -133,8 +122,7 @@ def _calibration(out: Output, path: Path) -> None:
                 name,
                 '{:.1f} .. {:.1f}'.format(*one.temperature_range_c),
                 '{:.2f} .. {:.2f}'.format(*one.rate_range_k_min),
-                one.x.bias_function.kind,
-                one.x.scale_function.kind,
+                *(one.x.bias_function.kind, one.x.scale_function.kind),
             )
             for name, one in zip(('static', 'dynamic'), calibration.regime_sets(), strict=True)
         ],
@@ -143,11 +131,8 @@ def _calibration(out: Output, path: Path) -> None:
         out.table(
             ('section', 'windows', 'raw ug RMS', 'ug RMS', 'ug max'),
             [
-                (
-                    *(row.section, row.n_windows),
-                    *map(micro_g, (row.raw_rms_m_s2, row.rms_m_s2, row.max_m_s2)),
-                )
-                for row in provenance.residuals
+                (n.section, n.n_windows, *map(micro_g, (n.raw_rms_m_s2, n.rms_m_s2, n.max_m_s2)))
+                for n in provenance.residuals
             ],
         )
     for note in provenance.notes:
@@ -156,24 +141,23 @@ def _calibration(out: Output, path: Path) -> None:
 
 
 def replay(
-    *,
-    bag: Bag,
-    calibration: Annotated[Path, option('Calibration of the unit (YAML).', '--calibration', '-c')],
-    output: Annotated[Path, option('*.mcap, a folder, *.csv or *.parquet.', '--output', '-o')],
-    keep_inputs: Annotated[
-        bool, option('Copy the input messages beside the output.', '--keep-inputs')
-    ] = False,
-    all_topics: Annotated[
-        bool, option('Copy all other topics beside the output, too.', '--all-topics')
-    ] = False,
-    serial: options.Serial = None,
-    frame_id: Annotated[str, option("Frame of the output; empty keeps the input's.")] = '',
-    transition_time: Annotated[float | None, option(_AS_THE_NODE, min=0.0)] = None,
-    temperature_timeout: Annotated[float | None, option(_AS_THE_NODE)] = None,
-    case_timeout: Annotated[float | None, option(_AS_THE_NODE)] = None,
-    reading: options.ReadingOptions,
-    force: options.Force = False,
-    out: options.Out,
+    bag: Path = _BAG,
+    calibration: Path = option('Calibration of the unit (YAML).', ..., '--calibration', '-c'),
+    output: Path = option('*.mcap, a folder, *.csv or *.parquet.', ..., '--output', '-o'),
+    keep_inputs: bool = option(
+        'Copy the input messages beside the output.', False, '--keep-inputs'
+    ),
+    all_topics: bool = option(
+        'Copy all other topics beside the output, too.', False, '--all-topics'
+    ),
+    serial: str | None = options.SERIAL,
+    frame_id: str = option("Frame of the output; empty keeps the input's.", ''),
+    transition_time: float | None = option(_AS_THE_NODE, None, min=0.0),
+    temperature_timeout: float | None = option(_AS_THE_NODE, None),
+    case_timeout: float | None = option(_AS_THE_NODE, None),
+    reading: dict[str, Any] = options.reading,
+    force: bool = options.FORCE,
+    out: Output = options.out,
 ) -> None:
     """
     Correct a whole bag offline, with the values of the live node.
@@ -221,14 +205,13 @@ def replay(
     out.told([(info.path, info.chosen, info.truncated)])
     counts = asdict(counters)
     out.line(f'{output}: {counters.n_out} of {counters.n_in} samples corrected')
-    for name in counts:
-        if name in DROPPED and counts[name]:
-            reason = name.removeprefix('n_').replace('_', ' ')
-            out.line(f'  left out, {reason}: {counts[name]}')
+    for name, count in counts.items():
+        if name in DROPPED and count:
+            out.line(f'  left out, {name.removeprefix("n_").replace("_", " ")}: {count}')
     out.line(f'  regime flags: {result.n_flags}, switches: {max(len(result.switches) - 1, 0)}')
-    for stamp_ns, is_dynamic in result.switches:
-        name = 'dynamic' if is_dynamic else 'static'
-        out.line(f'    {(stamp_ns - info.start_ns) * 1e-9:10.1f} s  {name}')
+    for at, flag in result.switches:
+        regime = 'dynamic' if flag else 'static'
+        out.line(f'    {(at - info.start_ns) * 1e-9:10.1f} s  {regime}')
     out.json(
         {
             'output': output,
@@ -236,10 +219,7 @@ def replay(
             'samples_out': counters.n_out,
             'counters': counts,
             'flags': result.n_flags,
-            'switches': [
-                {'stamp_ns': stamp_ns, 'dynamic': is_dynamic}
-                for stamp_ns, is_dynamic in result.switches
-            ],
+            'switches': [{'stamp_ns': at, 'dynamic': flag} for at, flag in result.switches],
             'truncated': info.truncated,
         }
     )
@@ -247,17 +227,14 @@ def replay(
 
 
 def play(
-    *,
     context: typer.Context,
-    bag: Bag,
-    rate: Annotated[
-        float, option('Seconds of the bag per second; 0 = as fast as it is taken.', min=0.0)
-    ] = 1.0,
-    wait: Annotated[
-        float, option('Longest wait for a subscriber on every topic, in s.', min=0.0)
-    ] = 10.0,
-    reading: options.ReadingOptions,
-    out: options.Out,
+    bag: Path = _BAG,
+    rate: float = option(
+        'Seconds of the bag per second; 0 = as fast as it is taken.', 1.0, min=0.0
+    ),
+    wait: float = option('Longest wait for a subscriber on every topic, in s.', 10.0, min=0.0),
+    reading: dict[str, Any] = options.reading,
+    out: Output = options.out,
 ) -> None:
     """
     Play a bag onto the live topics of the node, with /clock.

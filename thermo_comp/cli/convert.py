@@ -5,13 +5,11 @@ Owns what goes to and fro between other tools and ours: ``thermo_comp convert``,
 bags; ``export`` and ``import``, a calibration into their files and back.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import CalibrationError
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
@@ -44,30 +42,22 @@ _LIMIT = 4 << 20
 
 
 def convert(
-    *,
-    log: Annotated[
-        Path,
-        argument(
-            'Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin), or bag.',
-            metavar='FILE',
-        ),
-    ],
-    output: Annotated[Path, option('Bag to write; *.mcap makes a bare file.', '--output', '-o')],
-    columns: Annotated[
-        Path | None, option('Column map of a table (YAML): what is where, in which unit.')
-    ] = None,
-    rate_hz: options.TableRate = None,
-    imu: Annotated[int | None, option('IMU of a log, counted from 0.')] = None,
-    baro: Annotated[int | None, option('Barometer of a log, for the case temperature.')] = None,
-    allow_compensated: Annotated[
-        bool, option('Take a log that INS_TCAL or TC_A has corrected.')
-    ] = False,
-    names: options.TopicNames,
-    unit: Annotated[
-        Literal['m/s^2', 'g', 'mg'], option('What the Imu topic of a bag is in.')
-    ] = 'm/s^2',
-    force: options.Force = False,
-    out: options.Out,
+    log: Path = argument(
+        'Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin), or bag.',
+        metavar='FILE',
+    ),
+    output: Path = option('Bag to write; *.mcap makes a bare file.', ..., '--output', '-o'),
+    columns: Path | None = option(
+        'Column map of a table (YAML): what is where, in which unit.', None
+    ),
+    rate_hz: float | None = options.TABLE_RATE,
+    imu: int | None = option('IMU of a log, counted from 0.', None),
+    baro: int | None = option('Barometer of a log, for the case temperature.', None),
+    allow_compensated: bool = option('Take a log that INS_TCAL or TC_A has corrected.', False),
+    names: dict[str, str] = options.names,
+    unit: Literal['m/s^2', 'g', 'mg'] = option('What the Imu topic of a bag is in.', 'm/s^2'),
+    force: bool = options.FORCE,
+    out: Output = options.out,
 ) -> None:
     """
     Make a bag of a table of numbers or of an autopilot's log.
@@ -131,7 +121,7 @@ def as_bags(
         yield [bags.get(path, path) for path in paths]
 
 
-def _read(out: Output, path: Path, given: Mapping[str, Any]) -> ForeignLog:
+def _read(out: Output, path: Path, given: Mapping[str, Any]) -> 'ForeignLog':
     """Read a table, log or bag, which its name tells; refuse options that it has no use for."""
     from ..convert import autopilot, bag, columns
 
@@ -161,7 +151,7 @@ def _read(out: Output, path: Path, given: Mapping[str, Any]) -> ForeignLog:
     return columns.table_log(path, guessed)
 
 
-def _say(out: Output, report: ConversionReport) -> None:
+def _say(out: Output, report: 'ConversionReport') -> None:
     """Print the account of a conversion."""
     from ..convert.log import SLOW_HZ
 
@@ -208,31 +198,24 @@ def _say(out: Output, report: ConversionReport) -> None:
 
 
 def export(
-    *,
-    path: Annotated[Path, argument('Calibration of the unit.', metavar='YAML')],
-    to: Annotated[Tool, option('Whose file to write.')],
-    output: Annotated[Path, option('File to write.', '--output', '-o')],
-    number: Annotated[
-        int | None,
-        option(
-            'Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
-            'Kalibr (0).',
-            min=0,
-        ),
-    ] = None,
-    device_id: Annotated[
-        int, option("PX4's id of the sensor (TC_An_ID), which it matches by.")
-    ] = 0,
-    up: Annotated[
-        tuple[float, float, float] | None,
-        option(
-            'Direction of +g in the sensor frame, at which the drift of the scale is folded '
-            'into the offset.',
-            metavar='X Y Z',
-        ),
-    ] = None,
-    force: options.Force = False,
-    out: options.Out,
+    path: Path = argument('Calibration of the unit.', metavar='YAML'),
+    to: Tool = option('Whose file to write.', ...),
+    output: Path = option('File to write.', ..., '--output', '-o'),
+    number: int | None = option(
+        'Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
+        'Kalibr (0).',
+        None,
+        min=0,
+    ),
+    device_id: int = option("PX4's id of the sensor (TC_An_ID), which it matches by.", 0),
+    up: tuple[float, float, float] | None = option(
+        'Direction of +g in the sensor frame, at which the drift of the scale is folded '
+        'into the offset.',
+        None,
+        metavar='X Y Z',
+    ),
+    force: bool = options.FORCE,
+    out: Output = options.out,
 ) -> None:
     """
     Write a calibration as a file of another tool.
@@ -269,27 +252,23 @@ def export(
 
 
 def import_(
-    *,
-    path: Annotated[
-        Path,
-        argument(
-            'Parameters of PX4 or ArduPilot, .calib of imu_tk, YAML of imu_calib or Kalibr.',
-            metavar='FILE',
-        ),
-    ],
-    output: options.NewCalibration,
-    serial: Annotated[str, option('Serial to give the unit.', callback=options.check_serial)],
-    number: Annotated[
-        int | None, option('Which set, where there are several (TC_A0, INS_TCAL1, imu0).')
-    ] = None,
-    gravity: Annotated[float, option('Local gravity in m/s^2.')] = STANDARD_GRAVITY,
-    rate_hz: Annotated[float, option('Samples per second of the unit.', min=0.1)] = 200,
-    full_scale_g: Annotated[float, option('Full scale in g.', min=0.1)] = 16.0,
-    noise_ug: Annotated[
-        float, option('Noise density in ug/sqrt(Hz); it sets the covariance.', min=0.01)
-    ] = 200.0,
-    force: options.Force = False,
-    out: options.Out,
+    path: Path = argument(
+        'Parameters of PX4 or ArduPilot, .calib of imu_tk, YAML of imu_calib or Kalibr.',
+        metavar='FILE',
+    ),
+    output: Path = options.NEW_CALIBRATION,
+    serial: str = option('Serial to give the unit.', ..., callback=options.check_serial),
+    number: int | None = option(
+        'Which set, where there are several (TC_A0, INS_TCAL1, imu0).', None
+    ),
+    gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
+    rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
+    full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),
+    noise_ug: float = option(
+        'Noise density in ug/sqrt(Hz); it sets the covariance.', 200.0, min=0.01
+    ),
+    force: bool = options.FORCE,
+    out: Output = options.out,
 ) -> None:
     """
     Make a calibration of a file of another tool.

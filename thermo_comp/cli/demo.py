@@ -4,16 +4,13 @@
 Owns ``thermo_comp demo``: the main job on the sample bags, end to end, over real DDS.
 
 Fit on nine bags; the tenth is played onto live topics, compensated by the node in a process of
-its own, and recorded from its output. What comes out is held against the offline run, bit for
-bit, and against gravity.
+its own, and recorded. What comes out is held against the offline run, bit for bit, and gravity.
 """
-
-from __future__ import annotations
 
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import ThermoCompError
 from ..unit.gravity import STANDARD_GRAVITY
@@ -25,26 +22,18 @@ if TYPE_CHECKING:
     from ..judging import Evaluation
     from ..unit.calibration import Calibration
 
-_SAMPLES, _OUTPUT = 'accel/counts', 'imu/data_raw'
-# Two hours in eight seconds.
-_RATE = 1000.0
-
-# Column headings and the options of the fit behind them: a curve for all regimes; that and its
-# difference in the dynamic regime; all that the evidence wants, which is what the node runs.
-_MODELS: dict[str, dict[str, Any]] = {
-    'one set': {'groups': ('curve',)},
-    'two sets': {'groups': ('curve', 'set')},
-    'node': {},
-}
+_OUTPUT = 'imu/data_raw'
+# Groups of the fit by column headings: a curve for all regimes; that and its difference in the
+# dynamic regime; all that the evidence wants, which is what the node runs.
+_MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 
 def demo(
-    *,
-    bags: Annotated[Path | None, option('Folder of the sample bags.', metavar='DIR')] = None,
-    output: Annotated[
-        Path, option('Folder for what the demo makes.', '--out', '-o', metavar='DIR')
-    ] = Path('out'),
-    out: options.Out,
+    bags: Path | None = option('Folder of the sample bags.', None, metavar='DIR'),
+    output: Path = option(
+        'Folder for what the demo makes.', Path('out'), '--out', '-o', metavar='DIR'
+    ),
+    out: Output = options.out,
 ) -> None:
     """
     Run the main job on the sample bags, end to end.
@@ -58,25 +47,33 @@ def demo(
     options.require_ros()
     # Before the first import of ROS: on this machine only.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    from ..judging import evaluate, open_bag
+    from ..arrays import fit
+    from ..judging import evaluate
     from ..recording import inspect_recording
     from ..report import evidence_of_bags, write_report
     from ..ros.round_trip import round_trip
+    from ..unit.calibration_file import save_calibration
 
     folder = _sample_bags(bags)
     output.mkdir(parents=True, exist_ok=True)
     held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'
     fit_bags = sorted((folder / 'fit').glob('*.mcap'))
 
-    calibrations = _fit(out, fit_bags, output)
+    calibrations = {}
+    with out.progress('fitting', total=len(_MODELS)) as done:
+        for name, groups in _MODELS.items():
+            calibrations[name] = fit(fit_bags, gravity=STANDARD_GRAVITY, groups=groups)
+            done(len(calibrations))
+    save_calibration(calibrations['node'], unit)
     out.line(f'fitted {unit} from {len(fit_bags)} bags of {folder / "fit"}')
     info = inspect_recording(held_out)
     bag_s = (info.end_ns - info.start_ns) * 1e-9
     with out.progress('playing') as done:
+        # Two hours in eight seconds.
         played, n_recorded = round_trip(
-            held_out, unit, recorded, rate=_RATE, overwrite=recorded.exists(), progress=done
+            held_out, unit, recorded, rate=1e3, overwrite=recorded.exists(), progress=done
         )
-    (n_in,) = (n for name, n in played.n_messages.items() if name.endswith(_SAMPLES))
+    (n_in,) = (n for name, n in played.n_messages.items() if name.endswith('accel/counts'))
     n_out, wall_s = n_recorded[_OUTPUT], played.duration_s
     out.line(
         f'played {held_out} through the node: {bag_s / 60.0:.0f} min in {wall_s:.1f} s, '
@@ -88,18 +85,14 @@ def demo(
     )
     is_same = _equals_offline(recorded, held_out, calibrations['node'])
     out.line(f'node = offline replay, bit for bit: {"yes" if is_same else "NO"}')
-    result = evaluate(
-        [held_out],
-        [(name, calibrations[name]) for name in reversed(_MODELS)],
-        gravity=STANDARD_GRAVITY,
-    )
+    models = [(name, calibrations[name]) for name in reversed(_MODELS)]
+    result = evaluate([held_out], models, gravity=STANDARD_GRAVITY)
     out.line()
     _say(out, result)
     page, figures = output / 'report.html', output / 'figures'
     with out.progress('drawing', total=None):
-        evidence = evidence_of_bags(
-            [open_bag(held_out)], calibrations['node'], gravity=STANDARD_GRAVITY
-        )
+        node = calibrations['node']
+        evidence = evidence_of_bags(result.bags, node, gravity=STANDARD_GRAVITY)
         write_report(evidence, page, figures=figures)
     figure = next(figures.glob('*gravity.png'))
     out.line()
@@ -131,21 +124,7 @@ def _sample_bags(given: Path | None) -> Path:
     )
 
 
-def _fit(out: Output, bags: list[Path], output: Path) -> dict[str, Calibration]:
-    """Fit the three calibrations that are compared, and write the one for the node."""
-    from ..arrays import fit
-    from ..unit.calibration_file import save_calibration
-
-    calibrations = {}
-    with out.progress('fitting', total=len(_MODELS)) as done:
-        for name, chosen in _MODELS.items():
-            calibrations[name] = fit(bags, gravity=STANDARD_GRAVITY, **chosen)
-            done(len(calibrations))
-    save_calibration(calibrations['node'], output / 'unit.yaml')
-    return calibrations
-
-
-def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool:
+def _equals_offline(recorded: Path, bag: Path, calibration: 'Calibration') -> bool:
     """Compare the node's recorded output with the offline run, bit for bit."""
     import numpy as np
 
@@ -162,7 +141,7 @@ def _equals_offline(recorded: Path, bag: Path, calibration: Calibration) -> bool
     return all(map(np.array_equal, columns(recorded), offline))
 
 
-def _say(out: Output, result: Evaluation) -> None:
+def _say(out: Output, result: 'Evaluation') -> None:
     from ..judging import SECTIONS
 
     rows: list[tuple[Cell, ...]] = []

@@ -4,12 +4,10 @@
 Owns ``thermo_comp fit`` and ``prior``: bags to a calibration, calibrations to that of their type.
 """
 
-from __future__ import annotations
-
+import time
 from collections.abc import Callable, Iterable
-from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
@@ -25,52 +23,41 @@ Curve = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
 
 def fit(
-    *,
     context: typer.Context,
-    bags: Annotated[
-        list[Path], argument('Bags of one unit, or tables and logs.', metavar='BAG...')
-    ],
-    output: options.NewCalibration,
-    settings: options.FittingOptions,
-    static_curve: Annotated[
-        Curve | None,
-        option("Bias and scale over temperature; else the model's own.", metavar='CURVE'),
-    ] = None,
-    dynamic_curve: Annotated[
-        Curve | None, option('The same of the dynamic set, by itself.', metavar='CURVE')
-    ] = None,
-    groups: Annotated[
-        str | None, option('Groups that may take part, by commas.', metavar='A,B')
-    ] = None,
-    force_groups: Annotated[
-        str, option('Groups that stay whatever they earn.', metavar='A,B')
-    ] = '',
-    prior: Annotated[
-        Path | None,
-        option('Calibration to begin with: of the type, or an old one.', metavar='YAML'),
-    ] = None,
-    ageing_bias: Annotated[
-        str | None, option("What the biases may have changed by since the prior's: 50ug, 0.1mg.")
-    ] = None,
-    ageing_scale: Annotated[
-        float, option('What the scale may have changed by since, in ppm.', metavar='PPM')
-    ] = 0.0,
-    report: Annotated[Path | None, option('Certificate to write (HTML).', metavar='HTML')] = None,
-    certificate_info: options.CertificateInfo = None,
-    serial: Annotated[
-        str | None, option("Serial, instead of the bags'.", callback=options.check_serial)
-    ] = None,
-    offset: options.Offset = None,
-    columns: Annotated[
-        Path | None, option('Column map of the tables, as for convert.', metavar='YAML')
-    ] = None,
-    rate_hz: options.TableRate = None,
-    reading: options.ReadingPart,
-    force: options.Force = False,
-    verbose: Annotated[
-        bool, option('List the positions that were found, too.', '--verbose', '-v')
-    ] = False,
-    out: options.Out,
+    bags: list[Path] = argument('Bags of one unit, or tables and logs.', metavar='BAG...'),
+    output: Path = options.NEW_CALIBRATION,
+    settings: dict[str, Any] = options.fitting,
+    static_curve: Curve | None = option(
+        "Bias and scale over temperature; else the model's own.", None, metavar='CURVE'
+    ),
+    dynamic_curve: Curve | None = option(
+        'The same of the dynamic set, by itself.', None, metavar='CURVE'
+    ),
+    groups: str | None = option('Groups that may take part, by commas.', None, metavar='A,B'),
+    force_groups: str = option('Groups that stay whatever they earn.', '', metavar='A,B'),
+    prior: Path | None = option(
+        'Calibration to begin with: of the type, or an old one.', None, metavar='YAML'
+    ),
+    ageing_bias: str | None = option(
+        "What the biases may have changed by since the prior's: 50ug, 0.1mg.", None
+    ),
+    ageing_scale: float = option(
+        'What the scale may have changed by since, in ppm.', 0.0, metavar='PPM'
+    ),
+    report: Path | None = option('Certificate to write (HTML).', None, metavar='HTML'),
+    certificate_info: Path | None = options.CERTIFICATE_INFO,
+    serial: str | None = option(
+        "Serial, instead of the bags'.", None, callback=options.check_serial
+    ),
+    offset: float | None = options.OFFSET,
+    columns: Path | None = option(
+        'Column map of the tables, as for convert.', None, metavar='YAML'
+    ),
+    rate_hz: float | None = options.TABLE_RATE,
+    reading: dict[str, Any] = options.reading_part,
+    force: bool = options.FORCE,
+    verbose: bool = option('List the positions that were found, too.', False, '--verbose', '-v'),
+    out: Output = options.out,
 ) -> None:
     """
     Fit a calibration to bags of a thermal test.
@@ -136,13 +123,12 @@ def fit(
 
 
 def prior(
-    *,
-    calibrations: Annotated[
-        list[Path], argument('Calibrations of different units of one type.', metavar='YAML...')
-    ],
-    output: Annotated[Path, option('Prior to write (YAML).', '--output', '-o')],
-    force: options.Force = False,
-    out: options.Out,
+    calibrations: list[Path] = argument(
+        'Calibrations of different units of one type.', metavar='YAML...'
+    ),
+    output: Path = option('Prior to write (YAML).', ..., '--output', '-o'),
+    force: bool = options.FORCE,
+    out: Output = options.out,
 ) -> None:
     """
     Make the prior of a type of unit from the calibrations of some.
@@ -169,7 +155,7 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name for name in map(str.strip, text.split(',')) if name)
 
 
-def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
+def _say(out: Output, result: 'FitResult', output: Path, verbose: bool) -> None:
     from ..text import counted
     from ..unit.gravity import spoken
 
@@ -177,17 +163,27 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
     gyroscope = calibration.gyroscope if result.rates else None
     model, left_out = calibration.provenance.model, result.residuals[-1].left_out
     if verbose:
-        _say_positions(out, result)
+        out.table(
+            ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
+            [
+                (
+                    one.source,
+                    time.strftime('%m-%d %H:%M:%S', time.gmtime(one.start_ns // 10**9)),
+                    f'{one.duration_s / 60.0:.1f}',
+                    *(f'{component:+.3f}' for component in one.up),
+                    *(micro_g(one.residual_rms), micro_g(one.left_out_rms)),
+                )
+                for one in result.positions
+            ],
+            title='positions at rest',
+        )
     if calibration.evidence:
         out.table(
             ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
             [
                 (
-                    one.group,
-                    one.part,
-                    micro_g(one.explains_m_s2),
-                    f'{one.effective_parameters:.1f}',
-                    f'{one.log_evidence_change:.1f}',
+                    *(one.group, one.part, micro_g(one.explains_m_s2)),
+                    *(f'{one.effective_parameters:.1f}', f'{one.log_evidence_change:.1f}'),
                 )
                 for one in calibration.evidence
             ],
@@ -240,27 +236,6 @@ def _say(out: Output, result: FitResult, output: Path, verbose: bool) -> None:
             },
             **picked(result, 'positions least_known findings'),
         }
-    )
-
-
-def _say_positions(out: Output, result: FitResult) -> None:
-    """
-    Print every position: where, when, how long, which way was up; |f| - g by the fit and without.
-    """
-    out.table(
-        ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
-        [
-            (
-                one.source,
-                f'{datetime.fromtimestamp(one.start_ns // 10**9, timezone.utc):%m-%d %H:%M:%S}',
-                f'{one.duration_s / 60.0:.1f}',
-                *(f'{component:+.3f}' for component in one.up),
-                micro_g(one.residual_rms),
-                micro_g(one.left_out_rms),
-            )
-            for one in result.positions
-        ],
-        title='positions at rest',
     )
 
 

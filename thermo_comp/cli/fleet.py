@@ -2,12 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``thermo_comp fleet``: the thermal tests of many units, on all the processors there are."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from ..text import one_line
 from . import options
@@ -17,44 +13,24 @@ from .output import Output, micro, picked
 if TYPE_CHECKING:
     from ..fleet import FleetResult
 
-app = typer.Typer(
-    name='fleet',
-    help='Fit many units, and see what they tell together.',
-    context_settings={'help_option_names': ['-h', '--help']},
-)
 
-
-@app.callback()
-def _fleet() -> None:
-    """Fit many units, and see what they tell together."""
-
-
-@app.command()
-@options.expanded
 def fit(
-    *,
-    folder: Annotated[str, argument('DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR')],
-    output: Annotated[
-        Path, option('Folder of the results; goes on where it was.', '--output', '-o')
-    ],
-    settings: options.FittingOptions,
-    scheduler: Annotated[
-        str | None, option('Dask scheduler (tcp://HOST:PORT), instead of this machine alone.')
-    ] = None,
-    workers: Annotated[
-        int | None, option('Processes on this machine; all processors.', min=1)
-    ] = None,
-    certificates: Annotated[bool, option('Write a certificate for each unit.')] = True,
-    with_prior: Annotated[
-        bool,
-        option('Fit the units that lack data again with what the others share.', '--with-prior'),
-    ] = False,
-    earlier: Annotated[
-        list[Path] | None,
-        option('fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'),
-    ] = None,
-    reading: options.ReadingOptions,
-    out: options.Out,
+    folder: str = argument('DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR'),
+    output: Path = option('Folder of the results; goes on where it was.', ..., '--output', '-o'),
+    settings: dict[str, Any] = options.fitting,
+    scheduler: str | None = option(
+        'Dask scheduler (tcp://HOST:PORT), instead of this machine alone.', None
+    ),
+    workers: int | None = option('Processes on this machine; all processors.', None, min=1),
+    certificates: bool = option('Write a certificate for each unit.', True),
+    with_prior: bool = option(
+        'Fit the units that lack data again with what the others share.', False, '--with-prior'
+    ),
+    earlier: list[Path] | None = option(
+        'fleet.parquet of an earlier fleet, to see drift.', None, metavar='TABLE'
+    ),
+    reading: dict[str, Any] = options.reading,
+    out: Output = options.out,
 ) -> None:
     """
     Fit every unit below a folder.
@@ -90,15 +66,13 @@ def fit(
     out.end(int(not result.is_whole))
 
 
-def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
+def _say(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     summary = result.summary
     out.table(
         ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
         [
             (
-                _short(str(row['name'])),
-                _short(str(row['serial'])),
-                row['verdict'],
+                *(_short(row['name']), _short(row['serial']), row['verdict']),
                 *(_micro(row[name]) for name in ('static_ug', 'dynamic_ug')),
                 f'{row["n_bags"]}-{row["n_left_out"]}' if row['n_left_out'] else row['n_bags'],
             )
@@ -113,10 +87,10 @@ def _say(out: Output, result: FleetResult, with_prior: bool) -> None:
                 out.line(f'- {row["name"]}: {row[said]}')
         if row['n_torn']:
             out.line(f'- {row["name"]}: {row["reservations"]}')
-    for outlier in summary.outliers:
+    for one in summary.outliers:
         out.line(
-            f'- {outlier.name}: {outlier.label} {outlier.value:.4g} {outlier.unit}, median '
-            f'{outlier.middle:.4g}: {outlier.z:+.1f} sd'
+            f'- {one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
+            f'{one.z:+.1f} sd'
         )
     for drift in summary.drifts:
         if drift.is_significant:
@@ -143,7 +117,7 @@ def _micro(value: object) -> str | None:
     return micro(value) if isinstance(value, float) else None
 
 
-def _short(name: str, limit: int = 22) -> str:
+def _short(name: object) -> str:
     """Keep the end of a long name, which tells units apart, so that the table fits 80 columns."""
-    clean = one_line(name)
-    return clean if len(clean) <= limit else f'~{clean[1 - limit :]}'
+    clean = one_line(str(name))
+    return clean if len(clean) <= 22 else f'~{clean[-21:]}'

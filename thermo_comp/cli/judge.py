@@ -5,14 +5,12 @@ Owns ``thermo_comp evaluate``, ``report`` and ``view``: what a calibration leave
 in tables, as a certificate and live.
 """
 
-from __future__ import annotations
-
 import sys
 import webbrowser
 from collections.abc import Callable, Mapping
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import ThermoCompError
 from . import options
@@ -20,24 +18,19 @@ from .options import argument, option
 from .output import Cell, Output, micro, micro_g, millidegrees
 
 if TYPE_CHECKING:
-    from ..fitting import ReducedBag
     from ..judging import Judgement
 
 
 def evaluate(
-    *,
-    bags: Annotated[list[Path], argument('Bags of one unit, any positions.', metavar='BAG...')],
-    calibration: Annotated[
-        list[Path],
-        option('Calibration; the first is judged, more are compared.', '--calibration', '-c'),
-    ],
-    judging: options.JudgingOptions,
-    csv: Annotated[
-        Path | None, option('File for the windows, one a line.', metavar='FILE')
-    ] = None,
-    reading: options.ReadingPart,
-    force: options.Force = False,
-    out: options.Out,
+    bags: list[Path] = argument('Bags of one unit, any positions.', metavar='BAG...'),
+    calibration: list[Path] = option(
+        'Calibration; the first is judged, more are compared.', ..., '--calibration', '-c'
+    ),
+    judging: dict[str, Any] = options.judging,
+    csv: Path | None = option('File for the windows, one a line.', None, metavar='FILE'),
+    reading: dict[str, Any] = options.reading_part,
+    force: bool = options.FORCE,
+    out: Output = options.out,
 ) -> None:
     """
     Judge a calibration on new bags: |f| - g at rest, raw and corrected.
@@ -91,9 +84,8 @@ def evaluate(
             ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
             [
                 (
-                    *(one.earlier[:10], one.later[:10], one.constant),
-                    *(f'{one.change:+.3g}', micro(one.sd), one.unit),
-                    'yes' if one.is_sure else 'no',
+                    *(one.earlier[:10], one.later[:10], one.constant, f'{one.change:+.3g}'),
+                    *(micro(one.sd), one.unit, 'yes' if one.is_sure else 'no'),
                 )
                 for one in drifts
             ],
@@ -137,7 +129,7 @@ def _sections(
     return rows
 
 
-def _say_axes(out: Output, judged: Judgement) -> None:
+def _say_axes(out: Output, judged: 'Judgement') -> None:
     """Print what is known axis by axis: its RMS always, shifts where the positions tell."""
     columns = ['axis', 'static ug', 'dynamic ug']
     title = 'what temperature moves each axis at rest (RMS of its windows)'
@@ -155,21 +147,17 @@ def _say_axes(out: Output, judged: Judgement) -> None:
 
 
 def report(
-    *,
-    output: Annotated[Path, option('Page to write (HTML).', '--output', '-o')],
-    bags: options.JudgedBags = None,
-    calibration: Annotated[
-        list[Path] | None,
-        option('Calibration of the unit; more make its history (YAML).', '--calibration', '-c'),
-    ] = None,
-    figures: Annotated[
-        Path | None, option('Folder for the figures as PNG files.', metavar='DIR')
-    ] = None,
-    certificate_info: options.CertificateInfo = None,
-    judging: options.JudgingOptions,
-    reading: options.ReadingPart,
-    force: options.Force = False,
-    out: options.Out,
+    output: Path = option('Page to write (HTML).', ..., '--output', '-o'),
+    bags: list[Path] | None = options.JUDGED_BAGS,
+    calibration: list[Path] | None = option(
+        'Calibration of the unit; more make its history (YAML).', None, '--calibration', '-c'
+    ),
+    figures: Path | None = option('Folder for the figures as PNG files.', None, metavar='DIR'),
+    certificate_info: Path | None = options.CERTIFICATE_INFO,
+    judging: dict[str, Any] = options.judging,
+    reading: dict[str, Any] = options.reading_part,
+    force: bool = options.FORCE,
+    out: Output = options.out,
 ) -> None:
     """
     Write the certificate of a unit: one HTML page, no network needed.
@@ -197,7 +185,7 @@ def report(
     info = None
     if certificate_info is not None:
         info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
-    opened: list[ReducedBag] = []
+    opened: list[Any] = []
     with out.progress('reading', total=max(len(paths), 1)) as done:
         for path in paths:
             opened.append(
@@ -231,17 +219,14 @@ def report(
 
 
 def view(
-    *,
-    calibration: Annotated[Path, argument('Calibration of the unit (YAML).', metavar='YAML')],
-    bags: options.JudgedBags = None,
-    port: Annotated[
-        int, option('Port on this machine; 0 takes any free one.', min=0, max=65535)
-    ] = 8042,
-    browser: Annotated[bool, option('Open it in the default browser, too.', '--browser')] = False,
-    gravity: options.Place,
-    serial: options.Serial = None,
-    reading: options.ReadingOptions,
-    quiet: options.Quiet = False,
+    calibration: Path = argument('Calibration of the unit (YAML).', metavar='YAML'),
+    bags: list[Path] | None = options.JUDGED_BAGS,
+    port: int = option('Port on this machine; 0 takes any free one.', 8042, min=0, max=65535),
+    browser: bool = option('Open it in the default browser, too.', False, '--browser'),
+    gravity: float | None = options.place,
+    serial: str | None = options.SERIAL,
+    reading: dict[str, Any] = options.reading,
+    quiet: bool = options.QUIET,
 ) -> None:
     """
     Look at a calibration in the browser while you work on it.

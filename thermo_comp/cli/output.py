@@ -8,8 +8,6 @@ carries results only. Everything goes through `_print`: what somebody else chose
 metadata, file names) can neither forge a line nor move the cursor, and any terminal can show it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``thermo_comp record``: a test recorded position by position, with what is missing told."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import sys
@@ -12,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -32,23 +30,21 @@ _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 
 
 def record(
-    *,
     context: typer.Context,
-    output: Annotated[
-        Path, option('Folder of the bags; one that has some is gone on with.', '--output', '-o')
-    ],
-    bag: Annotated[
-        Path | None,
-        argument('Bag that another recorder writes, instead of topics.', metavar='[BAG]'),
-    ] = None,
-    positions: Annotated[int, option('Positions wanted.', min=1, max=999)] = 18,
-    soak: Annotated[str, option('Rest wanted in each: 45min, 1.5h, 30s.')] = '45min',
-    serial: Annotated[
-        str | None, option('Serial of the unit, for the bags.', callback=options.check_serial)
-    ] = None,
-    offset: options.Offset = None,
-    reading: options.ReadingOptions,
-    out: options.Out,
+    output: Path = option(
+        'Folder of the bags; one that has some is gone on with.', ..., '--output', '-o'
+    ),
+    bag: Path | None = argument(
+        'Bag that another recorder writes, instead of topics.', None, metavar='[BAG]'
+    ),
+    positions: int = option('Positions wanted.', 18, min=1, max=999),
+    soak: str = option('Rest wanted in each: 45min, 1.5h, 30s.', '45min'),
+    serial: str | None = option(
+        'Serial of the unit, for the bags.', None, callback=options.check_serial
+    ),
+    offset: float | None = options.OFFSET,
+    reading: dict[str, Any] = options.reading,
+    out: Output = options.out,
 ) -> None:
     """
     Record a test, a bag per position, and say what is still missing.
@@ -102,7 +98,7 @@ def _duration(text: str) -> float:
 
 
 def _take_known(
-    out: Output, test: Acquisition, known: list[Path], serial: str | None
+    out: Output, test: 'Acquisition', known: list[Path], serial: str | None
 ) -> str | None:
     """Go on after the bags that are there, each a position; return whose they are."""
     from ..recording import open_recording
@@ -123,9 +119,9 @@ def _take_known(
 
 def _take(
     out: Output,
-    test: Acquisition,
-    bags: PositionBags,
-    news: Iterator[News | None],
+    test: 'Acquisition',
+    bags: 'PositionBags',
+    news: Iterator['News | None'],
     problems: Callable[[], Sequence[str]],
 ) -> None:
     """Record until all is there or nothing more comes, and show how far it is."""
@@ -152,7 +148,7 @@ def _take(
                 break
 
 
-def _tell(out: Output, account: Account, problems: Sequence[str], told: dict[str, str]) -> None:
+def _tell(out: Output, account: 'Account', problems: Sequence[str], told: dict[str, str]) -> None:
     """Say in a line what has changed since it was last told."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
@@ -170,11 +166,11 @@ def _tell(out: Output, account: Account, problems: Sequence[str], told: dict[str
         out.note(_next(account))
 
 
-def _reading(up: Floats) -> str:
+def _reading(up: 'Floats') -> str:
     return ', '.join(f'{axis} {value:+.2f} g' for axis, value in zip('xyz', up, strict=True))
 
 
-def _rows(positions: Sequence[Position]) -> list[tuple[Cell, ...]]:
+def _rows(positions: Sequence['Position']) -> list[tuple[Cell, ...]]:
     rows: list[tuple[Cell, ...]] = []
     for number, one in enumerate(positions, 1):
         board = one.thermometers.get('board')
@@ -191,20 +187,20 @@ def _rows(positions: Sequence[Position]) -> list[tuple[Cell, ...]]:
     return rows
 
 
-def _now(account: Account) -> str:
+def _now(account: 'Account') -> str:
     if isnan(account.now[0]):
         return 'nothing has come yet'
     return f'now {"at rest" if account.is_still else "moving"}: {_reading(account.now)}'
 
 
-def _next(account: Account) -> str:
+def _next(account: 'Account') -> str:
     from ..fitting.coverage import spoken_direction
 
     by = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from here'
     return f'next: {spoken_direction(account.next_up)}{by}'
 
 
-def _worth(account: Account) -> str:
+def _worth(account: 'Account') -> str:
     bias, scale, skew = account.constants_sd.reshape(3, 3)
     parts = (
         f'{spoken(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
@@ -215,7 +211,7 @@ def _worth(account: Account) -> str:
     return f'known to {", ".join(parts)}'
 
 
-def _lines(account: Account) -> list[str]:
+def _lines(account: 'Account') -> list[str]:
     """Say what there is beside the positions, and what is missing."""
     from ..fitting.coverage import spoken_direction
 
@@ -234,7 +230,7 @@ def _lines(account: Account) -> list[str]:
 
 
 def _say(
-    out: Output, account: Account, output: Path, bags: Sequence[Path], offset: float | None
+    out: Output, account: 'Account', output: Path, bags: Sequence[Path], offset: float | None
 ) -> None:
     positions = [one for one in account.positions if one.n_rests]
     out.table(_COLUMNS, _rows(positions))

@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``thermo_comp simulate``: bags of a thermal test with known truth."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from ..unit.gravity import STANDARD_GRAVITY
 from . import options
 from .options import option
+from .output import Output
 
 if TYPE_CHECKING:
     from ..recording import BagWriter
@@ -19,50 +18,42 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    *,
-    output: Annotated[
-        Path, option('Bag to write; with several positions a directory of them.', '--output', '-o')
-    ],
-    unit: Annotated[
-        str,
-        option(
-            'Kind of unit: thermostatted, bare-quartz, mems; or with one kind of physics: '
-            'own-lags, between, products, hysteresis, even, convection, switched-load, paper, '
-            'slow-noise, plain, demo.'
-        ),
-    ] = 'thermostatted',
-    unit_seed: Annotated[int, option('Which specimen of that kind.', min=0)] = 1,
-    sibling: Annotated[
-        int | None, option('Another unit of its type, +-15 % in everything.', min=0)
-    ] = None,
-    plan: Annotated[
-        str | None,
-        option(
-            'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
-            'tumble, tumble-3, tumble-1 or held-out.'
-        ),
-    ] = None,
-    profile: Annotated[
-        str, option("Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'.")
-    ] = 'chamber',
-    positions: Annotated[int, option('Number of positions, one bag each.', min=1, max=999)] = 1,
-    position_seed: Annotated[int, option('Which set of positions.', min=0)] = 0,
-    rate_hz: Annotated[float, option('Conversion cycles per second.', min=0.1)] = 100.0,
-    temperature_rate_hz: Annotated[
-        float | None, option("Temperature readings per second, else the sensors' own.")
-    ] = None,
-    seed: Annotated[int, option('Seed of the noise.', min=0)] = 0,
-    gravity: Annotated[float, option('Local gravity in m/s^2.')] = STANDARD_GRAVITY,
-    cold_start: Annotated[
-        bool, option('Switch the unit on when the recording starts.', '--cold-start')
-    ] = False,
-    imu: Annotated[
-        bool,
-        option('Write sensor_msgs/Imu, with the angular rate of a unit that has one.', '--imu'),
-    ] = False,
-    level: Annotated[int, option('zstd level, 1 fast to 19 small.', min=1, max=19)] = 3,
-    force: options.Force = False,
-    out: options.Out,
+    output: Path = option(
+        'Bag to write; with several positions a directory of them.', ..., '--output', '-o'
+    ),
+    unit: str = option(
+        'Kind of unit: thermostatted, bare-quartz, mems; or with one kind of physics: '
+        'own-lags, between, products, hysteresis, even, convection, switched-load, paper, '
+        'slow-noise, plain, demo.',
+        'thermostatted',
+    ),
+    unit_seed: int = option('Which specimen of that kind.', 1, min=0),
+    sibling: int | None = option('Another unit of its type, +-15 % in everything.', None, min=0),
+    plan: str | None = option(
+        'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
+        'tumble, tumble-3, tumble-1 or held-out.',
+        None,
+    ),
+    profile: str = option(
+        "Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'.", 'chamber'
+    ),
+    positions: int = option('Number of positions, one bag each.', 1, min=1, max=999),
+    position_seed: int = option('Which set of positions.', 0, min=0),
+    rate_hz: float = option('Conversion cycles per second.', 100.0, min=0.1),
+    temperature_rate_hz: float | None = option(
+        "Temperature readings per second, else the sensors' own.", None
+    ),
+    seed: int = option('Seed of the noise.', 0, min=0),
+    gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
+    cold_start: bool = option(
+        'Switch the unit on when the recording starts.', False, '--cold-start'
+    ),
+    imu: bool = option(
+        'Write sensor_msgs/Imu, with the angular rate of a unit that has one.', False, '--imu'
+    ),
+    level: int = option('zstd level, 1 fast to 19 small.', 3, min=1, max=19),
+    force: bool = options.FORCE,
+    out: Output = options.out,
 ) -> None:
     """
     Make bags of a thermal test whose truth is known.
@@ -136,7 +127,7 @@ def simulate(
 
 
 def _write(
-    writer: BagWriter, runs: Iterator[SimulatedRun], unit: UnitModel, is_imu: bool
+    writer: 'BagWriter', runs: Iterator['SimulatedRun'], unit: 'UnitModel', is_imu: bool
 ) -> Iterator[dict[str, int]]:
     """
     Write a run block by block, from its first temperatures on, as a recorder would; count them.
