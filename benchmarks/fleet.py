@@ -32,8 +32,8 @@ import numpy as np
 
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet import FleetOptions, Row, fit_fleet
-from thermo_comp.fleet.cluster import connected, run
 from thermo_comp.fleet.units import FoundUnit, Storage, find_units
+from thermo_comp.fleet.work import connected, run
 from thermo_comp.recording import BagWriter
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,

@@ -23,10 +23,10 @@ from thermo_comp.cli.app import run as run_command
 from thermo_comp.errors import FleetError
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet import COLUMNS, FleetOptions, fit_fleet, read_parquet
-from thermo_comp.fleet.cluster import connected, outcome_of
 from thermo_comp.fleet.run import Results
 from thermo_comp.fleet.table import is_valid
 from thermo_comp.fleet.units import Storage, find_units
+from thermo_comp.fleet.work import connected, outcome_of
 from thermo_comp.recording import Topics
 from thermo_comp.simulation import unit_preset
 from thermo_comp.unit.calibration_file import load_calibration
@@ -183,12 +183,12 @@ class TestScheduler:
     def test_nobody_answers(
         self, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr('thermo_comp.fleet.cluster._WAIT_S', 0.5)
+        monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.5)
         with pytest.raises(FleetError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers'):
             fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
 
     def test_it_has_no_worker(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr('thermo_comp.fleet.cluster._WAIT_S', 0.5)
+        monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.5)
         with (
             distributed.LocalCluster(
                 n_workers=0, processes=False, protocol='tcp', dashboard_address='127.0.0.1:0'
@@ -206,7 +206,7 @@ class TestScheduler:
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)
         assert [row['verdict'] for row in result.rows] == ['refused']
         # A worker of another version would fit something else under the same key.
-        monkeypatch.setattr('thermo_comp.fleet.cluster.__version__', '9.9')
+        monkeypatch.setattr('thermo_comp.fleet.work.__version__', '9.9')
         with pytest.raises(FleetError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
 

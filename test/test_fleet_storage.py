@@ -19,8 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from thermo_comp.errors import FleetError
 from thermo_comp.fitting.sources import digest
-from thermo_comp.fleet.unit import process_unit
 from thermo_comp.fleet.units import FoundUnit, Storage, StoredFile, find_units, group_files
+from thermo_comp.fleet.work import process_unit
 from thermo_comp.unit.calibration_file import parse_calibration
 
 fsspec = pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')

@@ -14,8 +14,7 @@ import pytest
 from conftest import ROOT
 
 from thermo_comp.errors import FleetError
-from thermo_comp.fleet.page import render_fleet
-from thermo_comp.fleet.run import Results
+from thermo_comp.fleet.run import Results, render_fleet
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
 from thermo_comp.fleet.table import COLUMNS, Row, read_parquet, row_of, to_csv, to_parquet
 

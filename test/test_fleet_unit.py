@@ -14,8 +14,8 @@ from fleet_helpers import OPTIONS, damage, write_unit
 from thermo_comp.fitting import fit
 from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.fleet.table import COLUMNS
-from thermo_comp.fleet.unit import UnitOutcome, process_unit
 from thermo_comp.fleet.units import FoundUnit, Storage, find_units
+from thermo_comp.fleet.work import UnitOutcome, process_unit
 from thermo_comp.unit.calibration_file import parse_calibration
 
 pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')

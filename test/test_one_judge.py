@@ -52,8 +52,8 @@ def test_evaluate_and_report_agree(cli, folder: Path, options: tuple[str, ...]) 
 
 def test_fleet_and_evaluate_agree(cli, tmp_path: Path) -> None:
     pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
-    from thermo_comp.fleet.unit import process_unit
     from thermo_comp.fleet.units import Storage, find_units
+    from thermo_comp.fleet.work import process_unit
 
     bags = write_unit(tmp_path / 'fleet' / 'unit1', 1)
     (unit,) = find_units(Storage(str(tmp_path / 'fleet')))

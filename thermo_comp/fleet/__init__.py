@@ -4,6 +4,6 @@
 
 from .run import FleetResult, fit_fleet
 from .table import COLUMNS, Row, read_parquet
-from .unit import FleetOptions
+from .work import FleetOptions
 
 __all__ = ['COLUMNS', 'FleetOptions', 'FleetResult', 'Row', 'fit_fleet', 'read_parquet']

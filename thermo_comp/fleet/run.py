@@ -10,29 +10,34 @@ unit without it has not been done, whatever else lies there. What was fitted wit
 
 from __future__ import annotations
 
-import hashlib
+import datetime as dt
 import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from .. import files
+import numpy as np
+
+from .. import __version__, files
 from ..errors import FitError, FleetError
 from ..fitting.priors import UNITS_NEEDED, population
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import load_calibration, save_calibration
-from .cluster import connected, require_libraries, run
 from .summary import Summary, summarise
 from .table import FAILED, Row, is_fitted, is_valid, row_of, write_tables
-from .unit import FleetOptions, UnitOutcome
 from .units import FoundUnit, Storage, find_units
+from .work import FleetOptions, UnitOutcome, connected, run, sha256
 
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
 _FORMAT = 2
 _LONGEST_NAME = 100
+# A list longer than this is for the table's readers.
+_MOST_ROWS = 60
 CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'result.json'
 
 
@@ -82,7 +87,11 @@ def fit_fleet(
     Raises FleetError without a library, bags or a scheduler; OutputError where nothing can be
     written.
     """
-    require_libraries()
+    for name in ('distributed', 'fsspec', 'pyarrow'):
+        if find_spec(name) is None:
+            raise FleetError(
+                f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({name} is not installed)"
+            )
     storage = Storage(url)
     units = find_units(storage)
     results = Results(Path(output))
@@ -118,7 +127,9 @@ def fit_fleet(
     ordered = tuple(rows[unit.name] for unit in units)
     summary = summarise(ordered, earlier)
     parquet, csv = write_tables(ordered, results.folder)
-    page = _write_page(ordered, summary, results)
+    page = results.folder / PAGE
+    content = render_fleet(ordered, summary, results.certificate_of).encode()
+    files.write_atomically(page, content, files.PAGE)
     prior_path = None if prior is None else results.folder / PRIOR
     return FleetResult(ordered, summary, n_done, parquet, csv, page, prior_path, no_prior)
 
@@ -144,17 +155,57 @@ def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, 
     return prior, ''
 
 
-def _write_page(rows: Sequence[Row], summary: Summary, results: Results) -> Path:
-    from .page import render_fleet
+def render_fleet(
+    rows: Sequence[Row], summary: Summary, certificate_of: Callable[[Row], str]
+) -> str:
+    """Write the page; `certificate_of` gives a certificate's path beside it, or nothing."""
+    from ..report.figures import ReportFigure, drawn_figures
+    from ..report.figures_fleet import draw_distances, draw_shares
+    from ..report.html import render
 
-    def certificate_of(row: Row) -> str:
-        path = results.folder_of(str(row['name']), row['prior']) / CERTIFICATE
-        return path.relative_to(results.folder).as_posix() if path.is_file() else ''
-
-    page = results.folder / PAGE
-    content = render_fleet(rows, summary, certificate_of).encode()
-    files.write_atomically(page, content, files.PAGE)
-    return page
+    fitted = [row for row in rows if is_fitted(row)]
+    curves = {
+        section: np.array([row[f'{section}_ug'] for row in fitted], np.float64)
+        for section in ('raw', 'static', 'dynamic')
+    }
+    shares = ReportFigure(
+        'residuals',
+        'What is left of |f|, unit by unit?',
+        'Share of the units whose residual at rest is below the value: raw (constants at the '
+        'reference temperature), and with each unit’s calibration. Steep is alike; a tail to '
+        'the right is a unit to look at.',
+        partial(draw_shares, curves),
+    )
+    distances = ReportFigure(
+        'distances',
+        'Which units stand out, and in what?',
+        'Each stroke is a unit: its distance from the fleet’s median in robust standard '
+        'deviations. Diamonds beyond the dashed lines are the units listed above.',
+        partial(
+            draw_distances,
+            [one.quantity.label for one in summary.spreads],
+            [one.z for one in summary.spreads],
+            [one.names for one in summary.spreads],
+            summary.limit,
+        ),
+    )
+    # Of few units nobody knows what is usual.
+    can_tell = np.isfinite(summary.limit)
+    return render(
+        'fleet.html',
+        title='Fleet report',
+        most=_MOST_ROWS,
+        level='good' if all(map(is_valid, rows)) else 'reserved' if fitted else 'poor',
+        rows=rows,
+        summary=summary,
+        n_fitted=len(fitted),
+        refused=[row for row in rows if not is_fitted(row)],
+        can_tell=can_tell,
+        figures=drawn_figures([shares] * bool(fitted) + [distances] * bool(can_tell)),
+        links={row['name']: quote(certificate_of(row)) for row in fitted},
+        now=f'{dt.datetime.now(dt.timezone.utc):%Y-%m-%d %H:%M}',
+        version=__version__,
+    )
 
 
 class Results:
@@ -172,6 +223,11 @@ class Results:
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 
+    def certificate_of(self, row: Row) -> str:
+        """Give the path of a unit's certificate below the folder; nothing where there is none."""
+        path = self.folder_of(str(row['name']), row['prior']) / CERTIFICATE
+        return path.relative_to(self.folder).as_posix() if path.is_file() else ''
+
     def look_up(self, unit: FoundUnit, options: FleetOptions) -> Row | None:
         """Find the row of an earlier run; None where something changed, or was never finished."""
         folder = self.folder_of(unit.name, options.fit.prior)
@@ -183,7 +239,7 @@ class Results:
             if is_fitted(row):
                 content = (folder / CALIBRATION).read_bytes()
                 is_there = (folder / CERTIFICATE).is_file() or not options.certificates
-                if not is_there or _sha256(content) != row['calibration_sha256']:
+                if not is_there or sha256(content) != row['calibration_sha256']:
                     return None
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
@@ -223,17 +279,9 @@ def _key(unit: FoundUnit, options: FleetOptions) -> dict[str, Any]:
     return {'format': _FORMAT, 'options': options.digest(), 'files': found}
 
 
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
 def _safe(part: str) -> str:
     """Make a name that somebody else chose a name of one file."""
     name = quote(part, safe=" +,=@()'") or '%'
     if not name.strip('.'):
         name = name.replace('.', '%2E')
-    return (
-        name
-        if len(name) <= _LONGEST_NAME
-        else f'{name[:_LONGEST_NAME]}-{_sha256(part.encode())[:16]}'
-    )
+    return name if len(name) <= _LONGEST_NAME else f'{name[:_LONGEST_NAME]}-{sha256(part)[:16]}'

@@ -72,7 +72,7 @@ class Storage:
         try:
             self._fs, root = fsspec.core.url_to_fs(url)
         except (ImportError, ValueError) as error:
-            raise FleetError(f'{url}: {_words(error)}') from error
+            raise FleetError(f'{url}: {words(error)}') from error
         self._root = str(root).rstrip('/')
         self._is_local = 'file' in self._fs.protocol
         self.address = self._root if self._is_local else url
@@ -88,7 +88,7 @@ class Storage:
             if not found and not self._fs.isdir(self._root):
                 raise NotADirectoryError(errno.ENOTDIR, 'no such directory')
         except Exception as error:  # each file system has exceptions of its own
-            raise FleetError(f'{self.url}: cannot be listed: {_words(error)}') from error
+            raise FleetError(f'{self.url}: cannot be listed: {words(error)}') from error
         files = []
         for path, facts in found.items():
             name = path.removeprefix(f'{self._root}/')
@@ -110,7 +110,7 @@ class Storage:
             try:
                 self._fs.get(there, copies)
             except Exception as error:  # as above
-                raise OSError(errno.EIO, _words(error)) from error
+                raise OSError(errno.EIO, words(error)) from error
             yield Path(scratch, name)
 
 
@@ -123,7 +123,7 @@ def _walk(root: str) -> Iterator[str]:
         yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
 
 
-def _words(error: Exception) -> str:
+def words(error: Exception) -> str:
     """Say in one line what went wrong."""
     said = getattr(error, 'strerror', None) or ' '.join(str(error).split())
     return said or type(error).__name__

@@ -1,27 +1,40 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the work of one worker: read the bags of a unit one after the other, and fit it."""
+"""
+Owns the work on units, one after the other on each worker: bags read, unit fitted; and the way
+onto Dask: a cluster of this machine or of others, and what its accidents mean.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import os
+import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from .. import __version__
-from ..errors import FitError, RecordingError, ThermoCompError
+from ..errors import FitError, FleetError, RecordingError, ThermoCompError
 from ..fitting import FitOptions, ReducedBag, fit_bags, reduce_bag
 from ..fitting.sources import digest, recording_source
 from ..recording import Input, Topics
 from ..text import one_line
 from ..unit.calibration_file import dump_calibration
 from .table import FAILED, REFUSED, Cell, fitted_cells, row_of
-from .units import FoundUnit, Storage
+from .units import FoundUnit, Storage, words
 
+_WAIT_S = 30.0
 _UNIT_OF: dict[str | None, Literal['counts', 'm/s^2']] = {'counts': 'counts', 'imu': 'm/s^2'}
+
+
+def sha256(content: str | bytes) -> str:
+    """Hash a text or a file."""
+    return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -36,13 +49,13 @@ class FleetOptions:
     @property
     def prior_sha256(self) -> str:
         """Hash of the calibration that fits begin with; empty where there is none."""
-        return '' if self.fit.prior is None else _sha256(dump_calibration(self.fit.prior))
+        return '' if self.fit.prior is None else sha256(dump_calibration(self.fit.prior))
 
     def digest(self) -> str:
         """Hash everything that a result depends on besides its bags."""
         plain = replace(self, fit=replace(self.fit, prior=None))
         said = {'version': __version__, 'prior': self.prior_sha256, **asdict(plain)}
-        return _sha256(json.dumps(said, sort_keys=True, default=repr))
+        return sha256(json.dumps(said, sort_keys=True, default=repr))
 
 
 @dataclass(frozen=True)
@@ -60,7 +73,7 @@ class UnitOutcome:
     certificate: str = ''
 
 
-def started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
+def _started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
     """Make the row of a unit of which nothing is known but its files, and what is given."""
     started = {
         'name': unit.name,
@@ -103,7 +116,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
     infos = [bag.info for bag in bags.values()]
     serials = sorted({serial for info in infos if (serial := info.metadata.get('serial'))})
     serial = serials[0] if serials else unit.name.rpartition('/')[2]
-    row = started_row(
+    row = _started_row(
         unit,
         serial=serial,
         lot=next((lot for info in infos if (lot := info.metadata.get('lot'))), unit.lot),
@@ -149,11 +162,96 @@ def _fitted(
     known = {
         **fitted_cells(result, evidence.judgement),
         'reservations': '; '.join(evidence.findings),
-        'calibration_sha256': _sha256(calibration),
+        'calibration_sha256': sha256(calibration),
     }
     page = render_report(evidence) if has_page else ''
     return row_of(**(row | known)), calibration, page
 
 
-def _sha256(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+def dask_setup(_worker: object) -> None:
+    """Leave Ctrl-C, which a terminal sends to all, to the first process: a preload of Dask."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+
+
+@contextmanager
+def connected(
+    scheduler: str | None = None, n_workers: int | None = None, most: int = 1 << 30
+) -> Iterator[Any]:
+    """
+    Give a client of a cluster with at least one worker: of one that runs, or of one of its own.
+
+    Raises FleetError if nobody answers, there is no worker, or they run another version.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+
+    # What a worker does on its way down is in the fleet table, in words that its reader knows.
+    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    quiet = {'logging.distributed': 'critical', 'distributed.scheduler.http.routes': []}
+    with dask.config.set(quiet), ExitStack() as stack:
+        if scheduler is None:
+            cluster = LocalCluster(
+                n_workers=min(n_workers or os.cpu_count() or 1, most),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address='127.0.0.1:0',
+                host='127.0.0.1',
+                preload=[__name__],
+            )
+            yield stack.enter_context(Client(stack.enter_context(cluster)))
+            return
+        versions = {}
+        try:
+            said = 'no Dask scheduler answers there'
+            client = stack.enter_context(Client(scheduler, timeout=_WAIT_S))
+            said = 'has no worker'
+            client.wait_for_workers(1, timeout=_WAIT_S)
+            said = f'a worker lacks thermo_comp {__version__}'
+            versions = client.run(version)
+        except Exception as error:  # whatever an import fails with over there
+            raise FleetError(f'{scheduler}: {said}') from error
+        for worker, found in versions.items():
+            if found != __version__:
+                said = f'worker {worker} runs thermo_comp {found}, not {__version__}'
+                raise FleetError(f'{scheduler}: {said}')
+        yield client
+
+
+def version() -> str:
+    """Return the version of whoever is asked."""
+    return __version__
+
+
+def run(
+    client: Any, url: str, units: Sequence[FoundUnit], options: FleetOptions
+) -> Iterator[tuple[FoundUnit, UnitOutcome]]:
+    """Do units, and yield each as it is done; one whose task failed comes with the reason."""
+    from distributed import as_completed
+
+    futures = client.map(process_unit, units, url=url, options=options, pure=False, batch_size=256)
+    unit_of = {future.key: unit for future, unit in zip(futures, units, strict=True)}
+    done = as_completed(futures)
+    del futures
+    for future in done:
+        unit = unit_of.pop(future.key)
+        yield unit, outcome_of(future, unit)
+        future.release()
+
+
+def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
+    """Take a task's result, or the words for what became of it: a failure to be done again."""
+    from distributed import KilledWorker
+
+    if future.status == 'finished':
+        result: UnitOutcome = future.result()
+        return result
+    error = future.exception() if future.status == 'error' else None
+    if error is None:
+        problem = 'the scheduler was lost'
+    elif isinstance(error, KilledWorker):
+        n_died = error.allowed_failures + 1
+        problem = f'its worker died {n_died} times at it: too little memory?'
+    else:
+        problem = f'{type(error).__name__}: {words(error)}'
+    return UnitOutcome(_started_row(unit, verdict=FAILED, problem=problem), {}, is_final=False)
