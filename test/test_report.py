@@ -159,7 +159,7 @@ def test_bag_says_whether_its_fit_has_seen_it(bag):
     assert 'positions in bags of its own fit' in Page(certificate()).text
     unseen = evidence_of_bags([open_bag(bag)], calibration)
     assert '1 position in bags that the fit has not seen' in words_of(unseen).text
-    sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].sha256),)
+    sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].source.sha256),)
     provenance = replace(calibration.provenance, sources=sources)
     seen = evidence_of_bags([open_bag(bag)], replace(calibration, provenance=provenance))
     assert '1 position in bags of its own fit' in words_of(seen).text
@@ -231,8 +231,6 @@ def test_hours_of_bag_stay_a_small_page(tmp_path):
     rows = np.resize(np.arange(len(windows)), 8640)
     long = replace(
         evidence(),
-        shown=replace(shown, board=readings, case=readings),
-        bags=tuple(replace(one, duration_s=86400.0) for one in evidence().bags),
         windows=replace(
             windows.select(rows),
             bag=np.zeros(8640, np.int64),
@@ -240,6 +238,8 @@ def test_hours_of_bag_stay_a_small_page(tmp_path):
             time=np.arange(8640) * 10.0,
         ),
     )
+    bag = replace(shown.bag, temperatures={'board': readings, 'case': readings})
+    vars(long)['shown'] = replace(shown, bag=bag, duration_s=86400.0)
     write_report(long, tmp_path / 'long.html')
     assert (tmp_path / 'long.html').stat().st_size < 2_000_000
 

@@ -41,10 +41,10 @@ from thermo_comp.report.figures_unit import (
     soak_measurements,
     step_answer,
 )
-from thermo_comp.report.gather import shown_bag
 from thermo_comp.report.html import label_text, number
 from thermo_comp.report.page import position_error, schuler_peak
 from thermo_comp.report.style import drawing, svg
+from thermo_comp.report.trace import shown_bag
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.gravity import MICRO_G

@@ -134,7 +134,7 @@ def test_bag_is_read_once_and_judged_again(tmp_path):
     bag = write_bag(tmp_path / 'held_out.mcap')
     told = []
     report = LiveReport(unit, [bag], read=lambda info: told.append(info.path.name))
-    assert report.evidence().bags[0].name == 'held_out.mcap'
+    assert report.evidence().bags[0].source.name == 'held_out.mcap'
     ((_, opened),) = report._opened.values()
     save(unit, 'second note', one)
     assert report.evidence().findings == ('second note',)

@@ -3,8 +3,7 @@
 """Owns the report: a unit's certificate, its figures, its live view; has matplotlib and Jinja2."""
 
 from .certificate import CertificateInfo, load_certificate_info
-from .evidence import Evidence
-from .gather import evidence_of_bags, evidence_of_fit
+from .evidence import Evidence, evidence_of_bags, evidence_of_fit
 from .page import render_report, write_report
 
 __all__ = [

@@ -7,22 +7,27 @@ calibration alone; what is missing is None or empty, and its part of the page is
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, TypeVar
 
 import numpy as np
 
-from ..fitting import ResidualRow
+from ..fitting import FitResult, ResidualRow
 from ..fitting.coverage import LeastKnown, least_known
-from ..fitting.reduction import Readings
-from ..judging import Judgement, Verdict, Windows
-from ..judging.history import Epoch
-from ..thermal.regime import Regime
+from ..fitting.reduction import ReducedBag
+from ..fitting.sensors import learn_detector
+from ..fitting.verdict import Finding
+from ..judging import WINDOW_S, Judgement, Verdict, Windows, corrected_windows, judge_bags
+from ..judging.history import Epoch, history_of
+from ..judging.windows import means_by, usual_window
+from ..replay import check_unit
 from ..typing import Floats
 from ..unit.calibration import Calibration, Source
+from ..unit.gravity import spoken
 from ..unit.metrics import norm_residual
+from .trace import ShownBag, shown_bag, widest
 
 _T = TypeVar('_T')
 
@@ -31,55 +36,10 @@ RAW = 'raw'
 CHOSEN = 'calibration'
 #: Beside them, of each position of a fit: the calibration that the other positions alone give.
 LEFT_OUT = 'left out'
-
-
-@dataclass(frozen=True)
-class BagFacts:
-    """One bag in the certificate's table; `remarks` say what of it was lost or is odd."""
-
-    name: str
-    sha256: str  # empty where nobody took it
-    start_ns: int
-    duration_s: float
-    n_samples: int
-    rate_hz: float  # NaN when unknown
-    board_span: tuple[float, float] | None  # lowest and highest reading [degC]
-    remarks: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """A run of one regime and direction (-1 cooling, +1 heating, 0 neither) [s since start]."""
-
-    start: float
-    stop: float
-    regime: Regime
-    direction: int
-
-
-@dataclass(frozen=True)
-class ShownBag:
-    """
-    The bag that the time figures show, and what the node's own tracker makes of its readings.
-
-    `index` of `Evidence.bags`; `time` since `start_ns`; rates [K/s], and the acceleration of the
-    sensor that leads [K/s^2], after a reading each, NaN where not known yet.
-    """
-
-    index: int
-    start_ns: int
-    board: Readings
-    case: Readings
-    time: Floats
-    board_rate: Floats
-    case_rate: Floats
-    acceleration: Floats
-    stretches: tuple[Stretch, ...]
-
-    @property
-    def leader(self) -> str:
-        """The sensor that leads: the case's, where there is one."""
-        return 'case' if len(self.case.value) else 'board'
+# A ramp slower than this says nothing of its direction.
+_SLOWEST_RAMP_K_MIN = 0.05
+#: The key of a bag's metadata under which our simulator tells what it simulated.
+_SIMULATED = 'truth'
 
 
 @dataclass(frozen=True)
@@ -94,7 +54,7 @@ class Position:
     number: int
     bag: int
     duration_s: float
-    up: tuple[float, float, float]
+    up: tuple[float, ...]
     residual_rms: dict[str, float]
 
 
@@ -103,20 +63,18 @@ class Evidence:
     """
     All that a report says; what is missing is None or empty.
 
-    `serial` is the unit's, or what is known instead; `unit` that of the raw samples; `windows` are
-    at rest, of all bags, and `judgement` what they tell of the calibration; `steps` what each
-    step of the model leaves on the windows of the fit; `left_out`, by `Windows.position`, the RMS
-    of ``|f| - g`` with what the other positions alone say of the unit [m/s^2]; `findings` what
-    speaks against calibration or bags, `checks` what the fit looked at and found good; `history`
-    the unit's calibrations by date, where there are several. A fit is shown on its own bags.
+    `serial` is the unit's, or what is known instead; `windows` are at rest, of all bags, and
+    `judgement` what they tell of the calibration; `steps` what each step of the model leaves on
+    the windows of the fit; `left_out`, by `Windows.position`, the RMS of ``|f| - g`` with what the
+    other positions alone say of the unit [m/s^2]; `findings` what speaks against calibration or
+    bags, `checks` what the fit looked at and found good; `history` the unit's calibrations by
+    date, where there are several. A fit is shown on its own bags.
     """
 
     serial: str
-    unit: str
-    gravity: float | None = None
     calibration: Calibration | None = None
-    bags: tuple[BagFacts, ...] = ()
-    shown: ShownBag | None = None
+    gravity: float | None = None
+    bags: tuple[ReducedBag, ...] = ()
     windows: Windows | None = None
     judgement: Judgement | None = None
     steps: tuple[ResidualRow, ...] = ()
@@ -125,7 +83,6 @@ class Evidence:
     checks: tuple[str, ...] = ()
     history: tuple[Epoch, ...] = ()
     is_fit: bool = False
-    is_simulated: bool = False
 
     @property
     def sources(self) -> tuple[Source, ...]:
@@ -136,7 +93,17 @@ class Evidence:
     def is_seen(self) -> bool:
         """Whether the calibration was fitted on one of these bags."""
         known = {source.sha256 for source in self.sources if source.sha256}
-        return self.is_fit or any(bag.sha256 in known for bag in self.bags)
+        return self.is_fit or any(bag.source.sha256 in known for bag in self.bags)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether one of the bags comes from the simulator."""
+        return any(_SIMULATED in bag.info.metadata for bag in self.bags)
+
+    @property
+    def is_imu(self) -> bool:
+        """Whether the raw samples are a specific force, not counts."""
+        return any(bag.info.input == 'imu' for bag in self.bags)
 
     @property
     def headline(self) -> str:
@@ -159,6 +126,15 @@ class Evidence:
         is_good = self.judgement.kind is Verdict.VALID and not self.findings
         return 'good' if is_good else 'reserved'
 
+    @cached_property
+    def shown(self) -> ShownBag | None:
+        """The bag of the time figures, as the node would see it."""
+        if not self.bags:
+            return None
+        one, index = self.calibration, widest(self.bags)
+        detector = learn_detector(self.bags) if one is None else one.detector
+        return shown_bag(self.bags[index], index, detector)
+
     @property
     def forces(self) -> dict[str, Floats]:
         """Specific force over the windows by what corrected it; empty where nothing gave one."""
@@ -167,7 +143,7 @@ class Evidence:
             return {}
         if self.calibration is not None:
             return {RAW: windows.raw, CHOSEN: windows.force}
-        return {RAW: windows.force} if self.unit == 'm/s^2' else {}
+        return {RAW: windows.force} if self.is_imu else {}
 
     @cached_property
     def residuals(self) -> dict[str, Floats]:
@@ -189,28 +165,22 @@ class Evidence:
         windows = self.windows
         if windows is None or not self.forces:
             return ()
-        force = next(reversed(self.forces.values()))
-        found = []
-        for number, p in enumerate(np.unique(windows.position), 1):
-            rows = windows.position == p
-            mean = force[rows].mean(axis=0)
-            x, y, z = (mean / np.linalg.norm(mean)).tolist()
-            rms = {
-                name: float(np.sqrt(np.mean(residual[rows] ** 2)))
-                for name, residual in self.residuals.items()
-            }
-            if np.isfinite(self.left_out.get(int(p), np.nan)):
-                rms[LEFT_OUT] = self.left_out[int(p)]
-            found.append(
-                Position(
-                    number=number,
-                    bag=int(windows.bag[rows][0]),
-                    duration_s=windows.window_s * int(rows.sum()),
-                    up=(x, y, z),
-                    residual_rms=rms,
-                )
+        label = windows.position
+        places, first, n = np.unique(label, return_index=True, return_counts=True)
+        up = means_by(label, next(reversed(self.forces.values())))
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        rms = {rung: np.sqrt(means_by(label, one**2)) for rung, one in self.residuals.items()}
+        rms[LEFT_OUT] = np.array([self.left_out.get(place, np.nan) for place in places.tolist()])
+        return tuple(
+            Position(
+                number=k + 1,
+                bag=int(windows.bag[first[k]]),
+                duration_s=windows.window_s * int(n[k]),
+                up=tuple(up[k].tolist()),
+                residual_rms={r: float(one[k]) for r, one in rms.items() if np.isfinite(one[k])},
             )
-        return tuple(found)
+            for k in range(len(places))
+        )
 
     def axis_residuals(self) -> dict[str, Floats]:
         """
@@ -221,9 +191,8 @@ class Evidence:
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
-        ups = np.array([position.up for position in self.positions]) * self.gravity
         _, place = np.unique(windows.position, return_inverse=True)
-        true = ups[place]
+        true = np.array([position.up for position in self.positions])[place] * self.gravity
         return {name: force - true for name, force in self.forces.items()}
 
 
@@ -232,3 +201,88 @@ def given(value: _T | None) -> _T:
     if value is None:
         raise ValueError('`evidence` lacks what is to be drawn')
     return value
+
+
+def evidence_of_bags(
+    bags: Sequence[ReducedBag],
+    calibration: Calibration | None = None,
+    *,
+    gravity: float | None = None,
+    window_s: float = WINDOW_S,
+    tolerance: float | None = None,
+    serial: str | None = None,
+    others: Sequence[Calibration] = (),
+) -> Evidence:
+    """
+    Judge bags, with a calibration or without; no bags report on the calibration alone.
+
+    Gravity is the calibration's by default; `window_s` and `tolerance` are as for `evaluate`; an
+    empty `serial` accepts any calibration; `others` are further ones of the unit, for its history.
+
+    Raises CalibrationError for a calibration of another unit; RecordingError if samples are too
+    slow for such windows.
+    """
+    found = Evidence(serial or '', calibration, gravity, tuple(bags))
+    if calibration is None:
+        windows = corrected_windows(bags, None, gravity=gravity, window_s=window_s)
+        found = replace(found, windows=windows)
+    else:
+        for bag in bags:
+            check_unit(calibration, bag.info, serial)
+        judgement = judge_bags(
+            bags, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
+        )
+        found = replace(
+            found,
+            serial=calibration.unit.serial,
+            gravity=calibration.gravity_m_s2 if gravity is None else gravity,
+            windows=None if judgement is None else judgement.windows,
+            judgement=judgement,
+            findings=_against(calibration),
+            history=history_of([calibration, *others]) if others else (),
+        )
+    said = sorted({bag.source.serial for bag in bags if bag.source.serial})
+    return replace(found, serial=found.serial or ', '.join(said) or 'unknown')
+
+
+def evidence_of_fit(result: FitResult) -> Evidence:
+    """Gather what a fit has to show, on its own bags."""
+    found = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
+    left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
+    against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
+    window_s = usual_window(result.bags)
+    judged = evidence_of_bags(result.bags, result.calibration, window_s=window_s, serial='')
+    return replace(
+        judged,
+        steps=result.residuals,
+        left_out={k: left_out[one] for k, one in enumerate(found) if one in left_out},
+        findings=tuple(dict.fromkeys((*judged.findings, *against))),
+        checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
+        is_fit=True,
+    )
+
+
+def _is_reservation(finding: Finding) -> bool:
+    # More positions than enough would be better still: no reservation.
+    return finding.level == 'advice' and finding.name != 'positions'
+
+
+def _against(calibration: Calibration) -> tuple[str, ...]:
+    """Give what speaks against a calibration by itself, but for its wish for more positions."""
+    lower, upper = calibration.dynamic.rate_range_k_min
+    found = [
+        f'the dynamic set never saw {name}: its ramps are a guess there'
+        for name, rate in (('heating', upper), ('cooling', -lower))
+        if rate < _SLOWEST_RAMP_K_MIN
+    ]
+    for one in calibration.provenance.residuals:
+        left_out = one.left_out_rms_m_s2
+        if one.section == 'all' and left_out is not None and left_out >= one.raw_rms_m_s2:
+            found.append(
+                f'on positions left out {spoken(left_out)} are no better than '
+                f'{spoken(one.raw_rms_m_s2)} raw: the positions do not tell a new attitude'
+            )
+    if not calibration.has_uncertainty:
+        found.append('the calibration says nothing of its uncertainty')
+    found += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
+    return tuple(dict.fromkeys(found))

@@ -53,7 +53,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     shown, windows = evidence.shown, evidence.windows
     if shown is None:
         return
-    bag = f'Bag {label_text(evidence.bags[shown.index].name, 60)}.'
+    bag = f'Bag {label_text(shown.bag.source.name, 60)}.'
     read = f'Grey: the time in which the flag says dynamic. {bag} After Fig.'
     yield (
         'temperatures',

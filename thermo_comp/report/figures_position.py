@@ -116,7 +116,7 @@ def draw_positions(evidence: Evidence) -> Figure:
     return figure
 
 
-def equal_area(up: tuple[float, float, float], side: int) -> tuple[float, float]:
+def equal_area(up: tuple[float, ...], side: int) -> tuple[float, float]:
     """Map a direction of one hemisphere into the unit disc, the pole its centre, areas kept."""
     x, y, z = up
     factor = 1.0 / np.sqrt(1.0 + max(side * z, 0.0))

@@ -17,8 +17,9 @@ from ..typing import Bools, Floats
 from ..unit.calibration import AXES
 from ..unit.gravity import MICRO_G
 from . import style
-from .evidence import RAW, Evidence, ShownBag, given
+from .evidence import RAW, Evidence, given
 from .html import number
+from .trace import ShownBag
 
 # Where the drift's zero is taken: long enough for the windows' noise, short against any ramp.
 _ZERO_S = 120.0
@@ -29,8 +30,8 @@ def draw_temperatures(evidence: Evidence) -> Figure:
     """Draw the readings of both sensors (the paper's Fig. 3)."""
     figure, (axes,), shown, unit = _panels(evidence, [2.5])
     for label, readings, line in (
-        ('T case', shown.case, style.CASE_LINE),
-        ('T board', shown.board, style.BOARD_LINE),
+        ('T case', shown.bag.case, style.CASE_LINE),
+        ('T board', shown.bag.board, style.BOARD_LINE),
     ):
         if len(readings.value):
             seconds = (readings.stamp_ns - shown.start_ns) * 1e-9
@@ -136,8 +137,7 @@ def _panels(
     Returns the bag, and the seconds in the unit of the time axis, as well.
     """
     shown = given(evidence.shown)
-    duration_s = evidence.bags[shown.index].duration_s
-    unit, name = style.time_unit(duration_s)
+    unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
     panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     spans: list[tuple[float, float]] = []
@@ -150,7 +150,7 @@ def _panels(
         for start, stop in spans:
             axes.axvspan(start / unit, stop / unit, color=_SHADE, lw=0, zorder=0)
     panels[-1].set_xlabel(name)
-    panels[-1].set_xlim(0.0, duration_s / unit)
+    panels[-1].set_xlim(0.0, shown.duration_s / unit)
     return figure, list(panels), shown, unit
 
 
@@ -180,7 +180,7 @@ def _drift(evidence: Evidence) -> tuple[Floats, str]:
     if evidence.calibration is not None:
         axes = evidence.calibration.axes
         return drift / [one.scale_factor for one in (axes.x, axes.y, axes.z)] / MICRO_G, 'µg'
-    return (drift / MICRO_G, 'µg') if evidence.unit == 'm/s^2' else (drift, 'counts')
+    return (drift / MICRO_G, 'µg') if evidence.is_imu else (drift, 'counts')
 
 
 def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:

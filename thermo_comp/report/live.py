@@ -26,9 +26,8 @@ from ..fitting import ReducedBag
 from ..judging import open_bag
 from ..recording import Input, RecordingInfo, Topics
 from ..unit.calibration_file import load_calibration
-from .evidence import Evidence
+from .evidence import Evidence, evidence_of_bags
 from .figures import ReportFigure, drawn_figures, figures_of
-from .gather import evidence_of_bags
 from .page import render_report
 
 _HOST = '127.0.0.1'
@@ -69,7 +68,7 @@ class LiveReport:
         self._lock = threading.Lock()
         self._version = self._notice = ''
         # While nothing good was seen yet: a page with the reason, which goes on asking.
-        self._evidence = Evidence(serial=calibration.name, unit='counts')
+        self._evidence = Evidence(serial=calibration.name)
         self._figures: list[tuple[ReportFigure, str]] = []
 
     def version(self) -> str:

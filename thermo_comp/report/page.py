@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import __version__
 from ..files import PAGE, PICTURE, write_atomically
+from ..fitting.reduction import ReducedBag
 from ..judging.history import drifts_of
 from ..text import counted
 from ..thermal.regime import Regime
@@ -21,6 +22,7 @@ from .evidence import LEFT_OUT, Evidence
 from .figures import ReportFigure, drawn_figures, figures_of
 from .html import render, spelt, utc
 from .style import drawing, png
+from .trace import span_of
 
 # Mean radius of the Earth [m]: GRS 80.
 _EARTH_RADIUS = 6.371e6
@@ -81,6 +83,7 @@ def render_report(
         is_simulated=evidence.is_simulated,
         info=info,
         evidence=evidence,
+        bags=[(one, *span_of(one), remarks_of(one)) for one in evidence.bags],
         verdict=_verdict(evidence),
         seen=_seen(evidence),
         dates=_dates(evidence, info),
@@ -109,6 +112,24 @@ def schuler_peak(bias: float) -> float:
     return 2.0 * _EARTH_RADIUS * bias / STANDARD_GRAVITY
 
 
+def remarks_of(bag: ReducedBag) -> list[str]:
+    """Say what of a bag was lost or is odd."""
+    n = len(bag.intervals)
+    return [
+        text
+        for text, is_so in (
+            (bag.info.truncated or '', bag.info.truncated),
+            (f'{bag.n_saturated} samples saturated, left out', bag.n_saturated),
+            (f'{bag.n_dropped} samples not finite or out of order, left out', bag.n_dropped),
+            ('no accelerometer samples', not bag.n_samples),
+            ('never at rest', bag.n_samples and not n),
+            (f'{n} still intervals', n > 1),
+            ('no case temperature', not len(bag.case.value)),
+        )
+        if is_so
+    ]
+
+
 def _verdict(evidence: Evidence) -> tuple[str, str]:
     """Give the verdict and its numbers, spelt for readers."""
     words, _, numbers = evidence.headline.partition(': ')
@@ -135,7 +156,7 @@ def _seen(evidence: Evidence) -> list[str]:
         dynamic = [s for s in known if s.regime == Regime.DYNAMIC]
         part = sum(s.stop - s.start for s in dynamic) / sum(s.stop - s.start for s in known)
         said.append(
-            f'In bag {evidence.bags[shown.index].name} the flag marked '
+            f'In bag {shown.bag.source.name} the flag marked '
             f'{counted(len(dynamic), "dynamic stretch", "es")}, {100.0 * part:.0f} % of the time '
             'in which the regime was known.'
         )
@@ -146,7 +167,7 @@ def _dates(evidence: Evidence, info: CertificateInfo) -> list[tuple[str, str]]:
     """Give the dates; that of the test is the bags' own unless somebody knows better."""
     test = info.dates.test
     if not test and evidence.bags and evidence.is_seen:
-        days = sorted(f'{utc(bag.start_ns):%Y-%m-%d}' for bag in evidence.bags)
+        days = sorted(f'{utc(span_of(bag)[0]):%Y-%m-%d}' for bag in evidence.bags)
         test = days[0] if days[0] == days[-1] else f'{days[0]} to {days[-1]}'
     calibration = evidence.calibration
     fit = '' if calibration is None else calibration.provenance.created
