@@ -33,7 +33,7 @@ from thermo_comp.errors import OutputError, RecordingError, ThermoCompError
 from thermo_comp.recording import BagWriter, ImuColumns, Topics, read_recording
 from thermo_comp.ros import player
 from thermo_comp.ros.listener import Recorder
-from thermo_comp.ros.player import play
+from thermo_comp.ros.player import opened_player, play
 
 WINDOW = player.WINDOW['accel']
 
@@ -155,7 +155,9 @@ def test_namespace_and_throttle(peer: Peer, tmp_path: Path, rng: np.random.Gener
     bag = bag_of(tmp_path / 'bag', 3 * WINDOW, rng)
     listener = Listener(peer, '/imu0/')
     sent: list[int] = []
-    report = play(bag, rate=0.0, ros_args=['-r', '__ns:=/imu0'], throttle=sent.append)
+    with opened_player(bag, 0.0, ros_args=['-r', '__ns:=/imu0']) as player:
+        peer.poll(lambda: not player.unheard(), 'the listener')
+        report = player.run(lambda _: None, sent.append)
     listener.wait_for(6 * WINDOW * 3 // 5)
     assert listener.topics == by_topic(bag)
     assert report.n_messages['/imu0/accel/counts'] == 3 * WINDOW
@@ -261,7 +263,7 @@ def test_recorder_keeps_every_message_under_its_stamp(peer: Peer, tmp_path: Path
         imu = peer.publisher(Imu, 'imu/data_raw')
         flag = peer.publisher(Bool, 'regime/dynamic')
         stamped = peer.publisher(DiagnosticArray, 'regime/stamped')
-        assert recorder.wait_for_publishers(TIMEOUT)
+        assert recorder.wait_until(lambda _: recorder.has_publishers, TIMEOUT)
         sent = []
         for k in range(500):
             message = Imu()
@@ -324,7 +326,7 @@ def test_a_recorder_says_that_the_disk_is_full(
     def run() -> None:
         with Recorder(tmp_path / 'out', topics={'imu/data_raw': Imu}) as recorder:
             imu = peer.publisher(Imu, 'imu/data_raw')
-            assert recorder.wait_for_publishers(TIMEOUT)
+            assert recorder.wait_until(lambda _: recorder.has_publishers, TIMEOUT)
             imu.publish(Imu())
             recorder.wait_until(lambda counts: counts['imu/data_raw'] > 0, TIMEOUT)
 

@@ -28,7 +28,7 @@ from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from .reader import LoadedCalibration
 from .relay import Relay, open_publisher
-from .waitloop import WaitLoop
+from .waitloop import WaitLoop, type_name
 
 #: After so long without samples [s] readings take effect without them.
 IDLE_S = 5.0
@@ -218,8 +218,7 @@ class Reporter:
 
 def _mismatch(node: Node, subscription: Subscription) -> str:
     """Say why none of the publishers on a topic is heard; nothing where there is none."""
-    topic, kind = subscription.topic_name, subscription.msg_type
-    expected = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+    topic, expected = subscription.topic_name, type_name(subscription.msg_type)
     for found in node.get_publishers_info_by_topic(topic):
         if found.topic_type != expected:
             return f'its type is {found.topic_type}, not {expected}'

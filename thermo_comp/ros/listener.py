@@ -15,17 +15,15 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from struct import Struct
 from typing import Any
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.context import Context
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, Temperature
@@ -37,7 +35,8 @@ from ..recording.growing import News
 from ..recording.messages import Messages, Topic
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
 from ..recording.wire import decode_blocks
-from .waitloop import RawSubscription, WaitLoop
+from ..typing import Ints
+from .waitloop import RawSubscription, WaitLoop, own_node, type_name
 
 #: The node's outputs.
 OUTPUTS: Mapping[str, Any] = {
@@ -47,12 +46,14 @@ OUTPUTS: Mapping[str, Any] = {
 }
 #: Time between two looks at what is published, and between two blocks [s].
 LOOK_S, BLOCK_S = 0.5, 1.0
+#: Time between two looks at what is waited for [s].
+WAIT_S = 0.02
 
 _RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 _AS_OFFERED = QoSProfile(
     history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.BEST_AVAILABLE
 )
-_CLASSES = {VECTOR3_STAMPED: Vector3Stamped, IMU: Imu, TEMPERATURE: Temperature}
+_CLASSES = {type_name(kind): kind for kind in (Vector3Stamped, Imu, Temperature)}
 _STAMP = Struct('<iI')
 
 
@@ -67,27 +68,21 @@ class _Listener(ABC):
 
     def __enter__(self) -> Any:
         """Open the subscriptions and start the thread."""
-        self._context = Context()
-        rclpy.init(args=['--ros-args', *self._ros_args], context=self._context)
-        self._node = rclpy.create_node(self._name, context=self._context)
-        self._loop = WaitLoop(self._node)
-        self._open()
-        self._thread = threading.Thread(target=self._run, name=self._name)
-        self._thread.start()
+        with ExitStack() as stack:
+            self._node = stack.enter_context(own_node(self._name, self._ros_args))
+            self._loop = WaitLoop(self._node)
+            stack.callback(self._loop.close)
+            self._open()
+            thread = threading.Thread(target=self._run, name=self._name)
+            thread.start()
+            stack.callback(thread.join)
+            stack.callback(self._loop.stop)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop listening."""
-        self.close()
-
-    def close(self) -> None:
         """Stop, take what came last, destroy the node; do nothing the second time."""
-        if self._context.ok():
-            self._loop.stop()
-            self._thread.join()
-            self._loop.close()
-            self._node.destroy_node()
-            self._context.try_shutdown()
+        self._stack.close()
 
     @abstractmethod
     def _open(self) -> None:
@@ -116,22 +111,16 @@ class Recorder(_Listener):
         overwrite: bool = False,
     ) -> None:
         super().__init__('thermo_comp_recorder', ros_args)
-        self._path, self._topics, self._overwrite = Path(path), topics, overwrite
+        self._writer, self._topics = BagWriter(path, overwrite=overwrite), topics
         self._counts = dict.fromkeys(topics, 0)
         self._newest: dict[str, bytes] = {}
         self._newest_ns: int | None = None
         # What came before any stamp.
-        self._early: dict[str, list[bytes]] = {}
-
-    def __enter__(self) -> Recorder:
-        """Open the bag and listen."""
-        self._writer = BagWriter(self._path, overwrite=self._overwrite)
-        super().__enter__()
-        return self
+        self._early: list[tuple[str, list[bytes]]] = []
 
     def __exit__(self, *raised: object) -> None:
         """Stop; finish the bag, or drop it after an error."""
-        self.close()
+        super().__exit__()
         if raised[0] is not None:
             self._writer.abort()
             return
@@ -149,49 +138,45 @@ class Recorder(_Listener):
             self._record(*self._waiting.get())
         return self._counts
 
+    @property
+    def has_publishers(self) -> bool:
+        """Whether every topic has a publisher."""
+        return all(one.count_publishers() for one in self._heard.values())
+
     def newest(self, name: str) -> Any:
         """Return the newest message of a topic, be it recorded or not; None before any."""
         data = self._newest.get(name)
         return None if data is None else deserialize_message(data, self._topics[name])
 
-    def wait_for_publishers(
-        self, timeout_s: float, while_true: Callable[[], bool] = lambda: True
-    ) -> bool:
-        """Wait until every topic has a publisher; False after the time-out or at a False."""
-        deadline = time.monotonic() + timeout_s
-        while not all(one.count_publishers() for one in self._heard.values()):
-            if time.monotonic() > deadline or not while_true():
-                return False
-            time.sleep(0.02)
-        return True
-
     def wait_until(self, is_done: Callable[[Mapping[str, int]], bool], timeout_s: float) -> bool:
-        """Record until the counts are as wanted; False after the time-out [s]."""
+        """Record until it is as wanted, by the counts; False after the time-out [s]."""
         deadline = time.monotonic() + timeout_s
-        with suppress(Empty):
-            while not is_done(self.counts):
-                self._record(*self._waiting.get(timeout=max(0.0, deadline - time.monotonic())))
-            return True
-        return False
+        while not is_done(self.counts):
+            left_s = deadline - time.monotonic()
+            if left_s <= 0.0:
+                return False
+            with suppress(Empty):
+                self._record(*self._waiting.get(timeout=min(left_s, WAIT_S)))
+        return True
 
     def _record(self, name: str, messages: list[bytes], _received_ns: list[int]) -> None:
         """Write messages; those without a stamp once there is one."""
-        kind, self._newest[name] = self._topics[name], messages[-1]
-        early: dict[str, list[bytes]] = {}
-        if kind is Imu:
-            log_ns = np.array([_STAMP.unpack_from(data, 4) for data in messages]) @ (10**9, 1)
+        self._newest[name] = messages[-1]
+        if self._topics[name] is Imu:
+            stamps = np.array([_STAMP.unpack_from(data, 4) for data in messages])
+            log_ns = stamps[:, 0] * 10**9 + stamps[:, 1]
             self._newest_ns = int(log_ns[-1])
-            early, self._early = self._early, {}
-        elif self._newest_ns is not None:
-            log_ns = np.full(len(messages), self._newest_ns)
+            self._write(name, messages, log_ns)
         else:
-            self._early.setdefault(name, []).extend(messages)
-            return
-        type_name = f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
-        self._writer.write_raw(name, type_name, log_ns, messages)
+            self._early.append((name, messages))
+        if self._newest_ns is not None:
+            for early in self._early:
+                self._write(*early, np.full(len(early[1]), self._newest_ns))
+            self._early.clear()
+
+    def _write(self, name: str, messages: list[bytes], log_ns: Ints) -> None:
+        self._writer.write_raw(name, type_name(self._topics[name]), log_ns, messages)
         self._counts[name] += len(messages)
-        for other, held in early.items():
-            self._record(other, held, [])
 
 
 class LiveTopics(_Listener):
@@ -223,7 +208,7 @@ class LiveTopics(_Listener):
         while not is_over:
             is_over = wait(BLOCK_S)
             if is_over:
-                self.close()
+                self._stack.close()
             waiting = [self._waiting.get() for _ in range(self._waiting.qsize())]
             if waiting:
                 yield from self._decode(waiting)
@@ -244,6 +229,7 @@ class LiveTopics(_Listener):
     def _look(self) -> None:
         """Subscribe to what is published; say what is not."""
         problems: list[str] = []
+        resolved = self._node.resolve_topic_name
         chosen = self._feeds.get('accel')
         inputs = {
             getattr(self._topics, key): kind
@@ -251,15 +237,15 @@ class LiveTopics(_Listener):
             if self._input in (key, 'auto') and (chosen is None or chosen.type == kind)
         }
         if not any(self._hear('accel', name, kind, problems) for name, kind in inputs.items()):
-            listed = ' or '.join(map(self._node.resolve_topic_name, inputs))
-            problems.append(f'nobody publishes {listed}')
-        front = self._node.resolve_topic_name('temperature/name').removesuffix('name')
+            problems.append(f'nobody publishes {" or ".join(map(resolved, inputs))}')
+        front = resolved('temperature/name').removesuffix('name')
         further = {
             name.removeprefix(front): name
-            for name, kinds_of in self._node.get_topic_names_and_types()
-            if TEMPERATURE in kinds_of and name.startswith(front)
+            for name, kinds in self._node.get_topic_names_and_types()
+            if TEMPERATURE in kinds
+            and name.startswith(front)
+            and is_thermometer(name.removeprefix(front))
         }
-        further = {k: topic for k, topic in further.items() if is_thermometer(k)}
         own = {'board': self._topics.board, 'case': self._topics.case}
         for name, topic in {**own, **further, **self._topics.further}.items():
             self._hear(name, topic, TEMPERATURE, problems)

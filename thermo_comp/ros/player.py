@@ -19,14 +19,15 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import repeat
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -35,6 +36,7 @@ from sensor_msgs.msg import Imu, Temperature
 
 from ..errors import ThermoCompError
 from ..recording import Block, Input, RecordingReader, Role, Topics, open_recording
+from .waitloop import own_node
 
 NODE_NAME = 'thermo_comp_player'
 
@@ -77,49 +79,45 @@ def play(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     ros_args: Sequence[str] = (),
-    awaited: Collection[Role] | None = None,
-    is_found: Callable[[Node], bool] | None = None,
-    throttle: Callable[[int], None] = lambda _: None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> PlayReport:
     """
-    Publish a bag's samples and temperatures.
+    Publish a bag's samples and temperatures, as `opened_player`.
 
-    At `rate` seconds of the bag per second, 0 as fast as they are taken; after at most `wait_s`
-    for subscribers, of all topics or of some roles. `is_found` tells whether these have found the
-    player's node: what is sent before can come late. `throttle` gets the number of samples sent
-    after each window and may block. ThermoCompError if a reliable subscriber stops.
+    Begins when all topics have subscribers, after `wait_s` at most.
     """
+    with opened_player(path, rate, topics, input, ros_args) as player:
+        deadline = time.monotonic() + wait_s
+        while player.unheard() and time.monotonic() < deadline:
+            time.sleep(LOOK)
+        if wait_s > 0.0:
+            time.sleep(SETTLING)
+        return player.run(progress)
+
+
+@contextmanager
+def opened_player(
+    path: str | Path,
+    rate: float,
+    topics: Topics | None = None,
+    input: Input = 'auto',  # noqa: A002
+    ros_args: Sequence[str] = (),
+) -> Iterator[Player]:
+    """Open a bag to be played, `rate` seconds of it per second, 0 as fast as they are taken."""
     if not rate >= 0.0:
         raise ValueError(f'`rate` must be zero or positive, got {rate}')
-    context = Context()
-    with open_recording(path, topics, input, require=('accel',)) as reader:
-        rclpy.init(args=['--ros-args', *ros_args], context=context)
-        try:
-            node = rclpy.create_node(NODE_NAME, context=context)
-            try:
-                player = _Player(node, reader, rate)
-                deadline = time.monotonic() + wait_s
-                while player.unheard(awaited) and time.monotonic() < deadline:
-                    time.sleep(LOOK)
-                if is_found is not None:
-                    while not is_found(node) and time.monotonic() < deadline:
-                        time.sleep(LOOK)
-                elif wait_s > 0.0:
-                    time.sleep(SETTLING)
-                return player.run(throttle, progress)
-            finally:
-                # Else its publishers stay until the garbage collector comes by.
-                node.destroy_node()
-        finally:
-            context.try_shutdown()
+    with (
+        open_recording(path, topics, input, require=('accel',)) as reader,
+        own_node(NODE_NAME, ros_args) as node,
+    ):
+        yield Player(node, reader, rate)
 
 
-class _Player:
+class Player:
     """A node with the publishers of one bag."""
 
     def __init__(self, node: Node, reader: RecordingReader, rate: float) -> None:
-        self._node, self._reader, self._rate = node, reader, rate
+        self.node, self._reader, self._rate = node, reader, rate
         kinds = {role: (Temperature, f'temperature/{role}') for role in reader.topics}
         kinds['accel'] = _ACCEL[reader.info.input or 'counts']
         self._publishers: dict[Role, Any] = {
@@ -140,27 +138,31 @@ class _Player:
             if not one.get_subscription_count() and (awaited is None or role in awaited)
         ]
 
-    def _lossy(self) -> list[str]:
-        return [
-            one.topic_name
-            for one in self._publishers.values()
-            if any(
-                end.qos_profile.reliability != ReliabilityPolicy.RELIABLE
-                for end in self._node.get_subscriptions_info_by_topic(one.topic_name)
-            )
-        ]
-
     def run(
-        self, throttle: Callable[[int], None], progress: Callable[[float], None]
+        self, progress: Callable[[float], None], throttle: Callable[[int], None] = lambda _: None
     ) -> PlayReport:
-        """Send the whole bag, wait until everything has arrived, and account for it."""
+        """
+        Send the whole bag, wait until everything has arrived, and account for it.
+
+        `throttle` gets the number of samples sent after each window and may block. ThermoCompError
+        if a reliable subscriber stops.
+        """
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
-        unheard, lossy = self.unheard(), self._lossy()
+        topics = {one.topic_name: role for role, one in self._publishers.items()}
+        unheard, lossy = (
+            self.unheard(),
+            [
+                name
+                for name in topics
+                for end in self.node.get_subscriptions_info_by_topic(name)
+                if end.qos_profile.reliability != ReliabilityPolicy.RELIABLE
+            ],
+        )
         started = time.monotonic()
         start_ns: int | None = None
         for block in reader.blocks(raw=True):
-            for log_ns, role, data in _in_order(block):
+            for _, log_ns, role, data in _in_order(block):
                 start_ns = log_ns if start_ns is None else start_ns
                 if self._rate:
                     self._pace(started, start_ns, log_ns)
@@ -176,10 +178,10 @@ class _Player:
         for role in self._publishers:
             self._await_acknowledgement(role)
         return PlayReport(
-            {one.topic_name: n_sent[role] for role, one in self._publishers.items()},
+            {name: n_sent[role] for name, role in topics.items()},
             time.monotonic() - started,
             unheard,
-            lossy,
+            list(dict.fromkeys(lossy)),
             reader.info.chosen,
             reader.info.truncated,
         )
@@ -213,15 +215,13 @@ class _Player:
             time.sleep(ACKNOWLEDGEMENT_NAP)
 
 
-def _in_order(block: Block) -> Iterator[tuple[int, Role, bytes]]:
-    """Give a block's messages in the order of the bag: log time, role, bytes."""
-    messages = {role: iter(one) for role, one in block.raw.items()}
-    roles: list[Role] = [*block.temperatures, 'accel']
-    places: list[Any] = [one.after - 0.5 for one in block.temperatures.values()]
-    places.append(np.arange(len(block)))
-    log_ns = np.concatenate([block.log_ns[role] for role in roles])
-    which = np.repeat(np.arange(len(roles)), [len(one) for one in places])
+def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:
+    """Give a block's messages in the order of the bag: place, log time, role, bytes."""
+    rows: list[tuple[float, int, Role, bytes]] = []
+    places: dict[Role, Any] = {role: one.after - 0.5 for role, one in block.temperatures.items()}
+    places['accel'] = np.arange(len(block))
+    for role, messages in block.raw.items():
+        log_ns = block.log_ns[role].tolist()
+        rows += zip(places[role].tolist(), log_ns, repeat(role), messages, strict=False)
     # Readings between the same two samples: by log time.
-    for index in np.lexsort((log_ns, np.concatenate(places))).tolist():
-        role = roles[which[index]]
-        yield int(log_ns[index]), role, next(messages[role])
+    return sorted(rows, key=itemgetter(0, 1))

@@ -16,10 +16,10 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
@@ -31,7 +31,7 @@ from ..recording import ROLES
 from ..unit.calibration_file import load_calibration
 from .listener import OUTPUTS, Recorder
 from .node import NODE_NAME
-from .player import PlayReport, play
+from .player import LOOK, PlayReport, opened_player
 
 #: What the node makes of samples.
 SAMPLES = 'imu/data_raw'
@@ -87,8 +87,8 @@ class NodeProcess:
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         """Send a signal, wait for the end, return the exit code."""
-        if self.is_alive:
-            self.process.send_signal(number)
+        # Popen sends nothing to a process that has ended.
+        self.process.send_signal(number)
         try:
             return self.process.wait(timeout=STOPPING_S)
         except subprocess.TimeoutExpired:
@@ -106,11 +106,7 @@ def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> li
         'regime/dynamic.publisher.depth:=1000',
         f'{STAMPED_TOPIC}.publisher.depth:=1000',
     ]
-    return [
-        argument
-        for override in overrides
-        for argument in ('-p', f'qos_overrides.{namespace}/{override}')
-    ]
+    return [word for one in overrides for word in ('-p', f'qos_overrides.{namespace}/{one}')]
 
 
 def round_trip(
@@ -138,14 +134,14 @@ def round_trip(
         NodeProcess(*arguments) as node,
         Recorder(output, topics=_TOPICS, ros_args=ros_args, overwrite=overwrite) as recorder,
     ):
-        if not (
-            recorder.wait_for_publishers(DISCOVERY_S, lambda: node.is_alive)
-            # The node learns of the recorder's subscriptions in the order in which they were
-            # made: once it is heard on the last one it sends on all of them.
-            and recorder.wait_until(
-                lambda _: recorder.newest('diagnostics') is not None, DISCOVERY_S
-            )
-        ):
+
+        def is_connected(_: object) -> bool:
+            # The node learns of the recorder's subscriptions in the order in which they were made:
+            # once it is heard on the last one it sends on all of them.
+            return recorder.has_publishers and recorder.newest('diagnostics') is not None
+
+        recorder.wait_until(lambda _: is_connected(_) or not node.is_alive, DISCOVERY_S)
+        if not is_connected(None):
             raise ThermoCompError(' '.join(node.said.split()) or 'the node was not found')
         n_dropped = 0
 
@@ -155,20 +151,17 @@ def round_trip(
             n_out = recorder.counts[SAMPLES]
             while n_sent - n_dropped - n_out > IN_FLIGHT:
                 # Diagnostics go on coming, whatever becomes of the samples.
-                if not recorder.wait_until(lambda now, n=n_out: now[SAMPLES] > n, DROPPED_S):  # type: ignore[misc]
+                if not recorder.wait_until(lambda now, n=n_out: now[SAMPLES] > n, DROPPED_S):
                     n_dropped = n_sent - n_out
                 n_out = recorder.counts[SAMPLES]
 
-        played = play(
-            bag,
-            rate=rate,
-            wait_s=DISCOVERY_S,
-            ros_args=ros_args,
-            awaited=['accel', *thermometers],
-            is_found=_answers,
-            throttle=throttle,
-            progress=progress,
-        )
+        with opened_player(bag, rate, ros_args=ros_args) as player:
+            deadline, awaited = time.monotonic() + DISCOVERY_S, ['accel', *thermometers]
+            while player.unheard(awaited) or not _answers(player.node):
+                if time.monotonic() > deadline:
+                    break
+                time.sleep(LOOK)
+            played = player.run(progress, throttle)
 
         def is_complete(counts: Mapping[str, int]) -> bool:
             """Tell whether the node has taken all, and the recorder all that it published."""
@@ -198,7 +191,8 @@ def _answers(player: Node) -> bool:
         if not client.wait_for_service(ANSWER_S):
             return False
         answer = client.call_async(GetParameters.Request(names=['calibration_file']))
-        rclpy.spin_until_future_complete(player, answer, executor, ANSWER_S)
+        executor.add_node(player)
+        executor.spin_until_future_complete(answer, ANSWER_S)
         return bool(answer.done())
     finally:
         executor.shutdown()

@@ -22,12 +22,13 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from copy import copy
 from functools import partial
 from typing import Any
 
+import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException
@@ -324,6 +325,27 @@ def _take_message(subscription: Subscription) -> bool:
     if taken is not None:
         subscription.callback(taken[0])
     return taken is not None
+
+
+@contextmanager
+def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
+    """Open a node in a context of its own."""
+    context = Context()
+    rclpy.init(args=['--ros-args', *ros_args], context=context)
+    try:
+        node = rclpy.create_node(name, context=context)
+        try:
+            yield node
+        finally:
+            # Else its publishers stay until the garbage collector comes by.
+            node.destroy_node()
+    finally:
+        context.try_shutdown()
+
+
+def type_name(message_type: Any) -> str:
+    """Name a message type as ROS tools and bags do."""
+    return f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'
 
 
 def undeclared_overrides(node: Node) -> list[str]:
