@@ -43,6 +43,11 @@ class Truth:
     walk: float = 0.0
     offset_sd: float = 0.0
 
+    @property
+    def weights(self) -> Floats:
+        """Weights in bias and scale, shape (2, 3, m)."""
+        return np.stack((self.on_bias, self.on_scale))
+
 
 def table_of(
     truth: Truth,
@@ -108,9 +113,9 @@ def _columns(time: Floats, step_s: float, turns: float) -> Floats:
     return np.column_stack([np.interp(time, fine, column) for column in table.T])
 
 
-def widths(names: tuple[str, ...], sd: float) -> Floats:
-    """Width of each column: 0 where it takes no part."""
-    return np.where(np.isin(GROUPS, names), sd, 0.0)
+def widths(names: tuple[str, ...], bias_sd: float, scale_sd: float) -> Floats:
+    """Width of each column in bias and scale: 0 where it takes no part."""
+    return np.outer((bias_sd, scale_sd), np.isin(GROUPS, names))
 
 
 def prior_of(
@@ -122,8 +127,7 @@ def prior_of(
         'bias_sd': np.full(3, 1.0),
         'scale_sd': 0.05,
         'skew_sd': 1e-2,
-        'on_bias': widths(names, 1e-2),
-        'on_scale': widths(names, 1e-3),
+        'widths': widths(names, 1e-2, 1e-3),
         'offset_sd': max(truth.offset_sd, 1e-9),
         'sigma': truth.sigma,
         'rho': (truth.walk / truth.sigma) ** 2,

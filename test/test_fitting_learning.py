@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, widths
 
-from thermo_comp.fitting.learning import Learnt, _downweight, _longer_gain, _within, learn
+from thermo_comp.fitting.learning import Learnt, _downweight, _longer_gain, _without, learn
 from thermo_comp.fitting.posterior import Regression
 from thermo_comp.fitting.unknowns import Known, Prior
 from thermo_comp.fitting.worth import group_worth
@@ -24,8 +24,7 @@ def wide(truth: Truth) -> Prior:
     """All groups as wide as the fit begins with, and noises that are wrong."""
     return prior_of(
         truth,
-        on_bias=widths(ALL, 1e-3),
-        on_scale=widths(ALL, 1e-4),
+        widths=widths(ALL, 1e-3, 1e-4),
         offset_sd=MICRO,
         sigma=np.full(3, 5.0 * MICRO),
         rho=np.zeros(3),
@@ -33,7 +32,7 @@ def wide(truth: Truth) -> Prior:
 
 
 def learnt_of(
-    truth: Truth, n_positions: int, seed: int, forced: Bools | None = None
+    truth: Truth, n_positions: int, seed: int, forced: Bools | bool = False
 ) -> tuple[Regression, Learnt]:
     windows, up = table_of(truth, n_positions, np.random.default_rng(seed), n_windows=60)
     regression, state = begin(windows, up)
@@ -62,22 +61,19 @@ def calm() -> tuple[Regression, Learnt, Truth]:
 def test_what_explains_nothing_leaves(calm: tuple[Regression, Learnt, Truth]) -> None:
     _, found, _ = calm
     used = np.array(GROUPS) != 'idle'
-    np.testing.assert_array_equal(found.prior.on_bias > 0.0, used)
-    np.testing.assert_array_equal(found.prior.on_scale > 0.0, used)
+    np.testing.assert_array_equal(found.prior.widths > 0.0, [used, used])
     assert {(worth.part, worth.group) for worth in found.worth} == {
         (part, group) for part in ('bias', 'scale') for group in ('curve', 'board')
     }
     # Its weights are 0, not small.
     idle = np.array(GROUPS) == 'idle'
-    assert not found.posterior.state.on_bias[:, idle].any()
-    assert not found.posterior.state.on_scale[:, idle].any()
+    assert not found.posterior.state.weights[..., idle].any()
 
 
 def test_what_is_forced_stays() -> None:
     kept = np.array([False, False, False, False, True, False])
     _, found = learnt_of(Truth(), 18, 4, kept)
-    assert (found.prior.on_bias > 0.0).tolist() == [True, True, True, True, True, False]
-    assert (found.prior.on_scale > 0.0).tolist() == [True, True, True, True, True, False]
+    assert (found.prior.widths > 0.0).tolist() == 2 * [[True, True, True, True, True, False]]
 
 
 def test_noises_come_out(noisy: tuple[Regression, Learnt, Truth]) -> None:
@@ -104,7 +100,7 @@ def test_widths_are_those_of_the_weights(calm: tuple[Regression, Learnt, Truth])
     # The fixed point: sd^2 = sum of squares / effective parameters, three where all is seen.
     regression, found, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
-    np.testing.assert_allclose(found.prior.on_bias[:4], true[:4], rtol=0.15)
+    np.testing.assert_allclose(found.prior.widths[0, :4], true[:4], rtol=0.15)
     for worth in found.worth:
         assert 0.0 < worth.effective_parameters <= 6.0 + 1e-9
         assert len(worth.prior_sd) == 2
@@ -115,11 +111,13 @@ def test_truth_lies_within_the_claimed_sd(noisy: tuple[Regression, Learnt, Truth
     posterior = found.posterior
     sd = np.sqrt(posterior.variance)
     pulls: list[Floats] = []
-    for name in ('kappa', 'bias', 'skew', 'on_bias'):
-        places = getattr(posterior.layout, name)
+    for name in ('kappa', 'bias', 'skew', 'weights'):
+        places, error = getattr(posterior.layout, name), getattr(posterior.state, name)
+        error = error - getattr(truth, name) * (regression.rms if name == 'weights' else 1.0)
+        if name == 'weights':
+            # Those of the bias.
+            places, error = places[0], error[0]
         used = places >= 0
-        scale = regression.rms if name == 'on_bias' else 1.0
-        error = getattr(posterior.state, name) - getattr(truth, name) * scale
         pulls.append((error[used] / sd[places[used]]).ravel())
     every = np.concatenate(pulls)
     # Some twenty numbers: their rms is known to 16 %, and learnt widths make it a little less so.
@@ -138,17 +136,17 @@ def test_worth_is_the_fall_of_the_evidence_without_it() -> None:
         start_covariance=np.zeros((0, 0)),
     )  # fmt: skip
     regression, state = begin(windows, up)
-    prior = prior_of(truth, on_bias=widths(ALL, 3e-4), on_scale=widths(ALL, 3e-5))
+    prior = prior_of(truth, widths=widths(ALL, 3e-4, 3e-5))
     posterior = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-9)
     worths = group_worth(regression, posterior, prior)
     assert [(worth.part, worth.group) for worth in worths] == [
         (part, group) for part in ('bias', 'scale') for group in ALL
     ]
     for worth in worths:
-        name = f'on_{worth.part}'
-        rest = np.where(np.array(GROUPS) == worth.group, 0.0, getattr(prior, name))
+        rest = prior.widths.copy()
+        rest[['bias', 'scale'].index(worth.part), np.array(GROUPS) == worth.group] = 0.0
         without = regression.solve(
-            posterior.state, replace(prior, **{name: rest}), n_steps=STEPS, tolerance=1e-9
+            posterior.state, replace(prior, widths=rest), n_steps=STEPS, tolerance=1e-9
         )
         fall = posterior.log_evidence - without.log_evidence
         assert worth.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), worth
@@ -183,7 +181,7 @@ def test_outliers_do_not_pull() -> None:
     # 100, and beside them the curve is not seen.
     assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.prior.sigma, truth.sigma, rtol=0.2)
-    np.testing.assert_array_equal(other.prior.on_bias > 0.0, one.prior.on_bias > 0.0)
+    np.testing.assert_array_equal(other.prior.widths[0] > 0.0, one.prior.widths[0] > 0.0)
 
 
 def test_means_of_few_values_are_no_knocks() -> None:
@@ -219,8 +217,8 @@ def test_of_two_that_are_almost_one_the_better_stays() -> None:
     columns[:, 4] = columns[:, 2] + 0.02 * columns[:, 2].std() * noise
     regression, state = begin(replace(windows, columns=columns), up)
     found = learn(regression, state, wide(truth))
-    assert found.prior.on_bias[2] > 0.0
-    assert found.prior.on_bias[4] == 0.0
+    assert found.prior.widths[0, 2] > 0.0
+    assert found.prior.widths[0, 4] == 0.0
     left = regression.residual(found.posterior.state) / truth.sigma
     assert np.sqrt(np.mean(left**2)) < 1.05
 
@@ -230,14 +228,14 @@ def test_a_longer_memory_promises_what_it_brings() -> None:
     windows, up = table_of(truth, 12, np.random.default_rng(8), n_windows=60)
     regression, state = begin(windows, up)
     allowed = prior_of(truth)
-    short = _within(allowed, 2000.0, windows.tau, np.zeros(6, dtype=bool))
-    assert (short.on_bias > 0.0).tolist() == [True, True, True, False, False, False]
+    short = _without(allowed, windows.tau > 2000.0)
+    assert (short.widths[0] > 0.0).tolist() == [True, True, True, False, False, False]
     posterior = regression.solve(state, short, n_steps=12, tolerance=1e-9)
     promised = _longer_gain(regression, posterior, short, allowed, 2000.0)
 
     def gain(width: float) -> float:
-        on_bias = np.where(windows.tau > 2000.0, width, short.on_bias)
-        longer = replace(short, on_bias=on_bias)
+        longer = replace(short, widths=short.widths.copy())
+        longer.widths[0, windows.tau > 2000.0] = width
         return regression.solve(state, longer, 12, 1e-9).log_evidence - posterior.log_evidence
 
     # The bias needs it more than the scale. What its start state takes beside it is not promised.
@@ -267,16 +265,16 @@ def test_what_is_known_beforehand_is_believed_as_far_as_the_data_do(
     # WHY: siblings, or a unit's last calibration, may be nearer to this unit than they look, or
     # farther. WHAT: of a narrow and a wide knowledge the evidence takes the one that is true.
     regression, found, truth = calm
-    layout = regression.layout(wide(truth))
+    layout = regression.layout(wide(truth).widths > 0.0)
     mean = regression.vector(found.posterior.state, layout)[: layout.n_unit].copy()
     sd = np.full(layout.n_unit, 1e-5)
-    mean[layout.on_bias[:, 0]] += away * sd[0]
+    mean[layout.weights[0, :, 0]] += away * sd[0]
     knowns = [Known(mean, np.diag((part * sd) ** -2.0)) for part in (1.0, 100.0)]
     prior = replace(wide(truth), known=knowns[-1])
     told = learn(regression, found.posterior.state, prior, knowns=knowns)
     assert told.prior.known is knowns[int(away > 0.0)]
-    curve = regression.vector(told.posterior.state, layout)[layout.on_bias[:, 0]]
-    true = regression.vector(found.posterior.state, layout)[layout.on_bias[:, 0]]
+    curve = regression.vector(told.posterior.state, layout)[layout.weights[0, :, 0]]
+    true = regression.vector(found.posterior.state, layout)[layout.weights[0, :, 0]]
     # The same data say it: the two differ by less than each is uncertain.
-    sd = np.sqrt(told.posterior.variance[layout.on_bias[:, 0]])
+    sd = np.sqrt(told.posterior.variance[layout.weights[0, :, 0]])
     assert np.abs(curve - true).max() < 2.0 * sd.max()

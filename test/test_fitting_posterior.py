@@ -54,8 +54,7 @@ class Dense:
         return State(
             at.kappa + x[layout.kappa],
             at.bias + x[layout.bias],
-            at.on_bias + padded[layout.on_bias],
-            at.on_scale + padded[layout.on_scale],
+            at.weights + padded[layout.weights],
             at.skew + x[layout.skew],
             up / np.linalg.norm(up, axis=1, keepdims=True),
             at.offset + x[layout.offset],
@@ -71,8 +70,8 @@ class Dense:
             moved[:, k] += w.start[:, k] * state.start[w.bag, w.lag[k]]
         moved /= rms
         force = GRAVITY * state.up[w.position] @ inverse_misalignment(state.skew).T
-        predicted = state.kappa * force * (1.0 + moved @ state.on_scale.T)
-        predicted += state.bias + moved @ state.on_bias.T + state.offset[w.position]
+        predicted = state.kappa * force * (1.0 + moved @ state.weights[1].T)
+        predicted += state.bias + moved @ state.weights[0].T + state.offset[w.position]
         left = w.mean / NOMINAL - predicted
         parts = [self.roots[axis] @ left[:, axis] for axis in range(3)]
         parts += [
@@ -82,7 +81,7 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             np.linalg.solve(np.linalg.cholesky(w.start_covariance), state.start.T).ravel(),
         ]
-        for weights, sd in ((state.on_bias, prior.on_bias), (state.on_scale, prior.on_scale)):
+        for weights, sd in zip(state.weights, prior.widths, strict=True):
             parts.append((weights[:, sd > 0.0] / sd[sd > 0.0]).ravel())
         return np.concatenate(parts)
 
@@ -175,8 +174,9 @@ def test_truth_comes_out_without_noise(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(found.bias, truth.bias, atol=1e-8)
     np.testing.assert_allclose(found.skew, truth.skew, atol=1e-8)
     np.testing.assert_allclose(found.up, up, atol=1e-8)
-    np.testing.assert_allclose(found.on_bias / regression.rms, truth.on_bias, atol=1e-8)
-    np.testing.assert_allclose(found.on_scale / regression.rms, truth.on_scale, atol=1e-9)
+    for part, atol in ((0, 1e-8), (1, 1e-9)):
+        weights = found.weights[part] / regression.rms
+        np.testing.assert_allclose(weights, truth.weights[part], atol=atol)
     np.testing.assert_allclose(found.start, 0.0, atol=1e-2)
     # As the compensator would: forward and back again.
     force = regression.force(found)
@@ -189,7 +189,7 @@ def test_claimed_sd_is_the_scatter() -> None:
     # each kind is known to 6 % at the worst.
     rng = np.random.default_rng(11)
     truth = Truth(walk=0.05 * MICRO, offset_sd=MICRO, start_sd=0.3)
-    pulls: dict[str, list[Floats]] = {name: [] for name in ('kappa', 'bias', 'skew', 'on_bias')}
+    pulls: dict[str, list[Floats]] = {name: [] for name in ('kappa', 'bias', 'skew', 'weights')}
     for _ in range(100):
         windows, up = table_of(truth, 12, rng, n_windows=15, step_s=320.0)
         regression, state = begin(windows, up)
@@ -199,7 +199,7 @@ def test_claimed_sd_is_the_scatter() -> None:
         for name, values in pulls.items():
             places = getattr(found.layout, name)
             used = places >= 0
-            true = getattr(truth, name) * (regression.rms if name == 'on_bias' else 1.0)
+            true = getattr(truth, name) * (regression.rms if name == 'weights' else 1.0)
             error = getattr(found.state, name) - true
             values.append((error[used] / sd[places[used]]).ravel())
     for name, values in pulls.items():
@@ -263,11 +263,11 @@ def test_a_position_that_tells_what_no_other_does_is_not_left_out(
 
 def test_what_takes_no_part_any_more_is_gone(solved: tuple[Regression, Prior, Posterior]) -> None:
     regression, prior, found = solved
-    narrow = replace(prior, on_bias=prior.on_bias * [1, 1, 0, 0, 0, 0])
+    narrow = replace(prior, widths=prior.widths * [[1, 1, 0, 0, 0, 0], 6 * [1]])
     # Even where no step is made.
     state = regression.solve(found.state, narrow, tolerance=np.inf).state
-    assert not state.on_bias[:, 2:4].any()
-    np.testing.assert_array_equal(state.on_scale, found.state.on_scale)
+    assert not state.weights[0, :, 2:4].any()
+    np.testing.assert_array_equal(state.weights[1], found.state.weights[1])
 
 
 def test_axes_may_be_renamed(rng: np.random.Generator) -> None:
@@ -282,10 +282,11 @@ def test_axes_may_be_renamed(rng: np.random.Generator) -> None:
     other = turned.solve(
         replace(state, up=state.up[:, order]), prior, n_steps=STEPS, tolerance=1e-9
     )
-    for name in ('kappa', 'bias', 'on_bias', 'on_scale'):
+    for name in ('kappa', 'bias', 'weights'):
         places = getattr(one.layout, name)
         sd = np.sqrt(one.variance[places])
-        difference = getattr(other.state, name) - getattr(one.state, name)[order]
+        renamed = np.take(getattr(one.state, name), order, axis=int(name == 'weights'))
+        difference = getattr(other.state, name) - renamed
         assert np.abs(difference / sd).max() < 1e-3, name
     assert other.log_evidence == pytest.approx(one.log_evidence, abs=1e-4)
 
@@ -363,14 +364,11 @@ def test_published_huygens_coefficients_come_back(rng: np.random.Generator) -> N
     regression, state = begin(table, up)
     regression = Regression(table, GRAVITY, np.full(3, K0))
     prior = prior_of(
-        Truth(),
-        on_bias=np.full(4, 1e-2),
-        on_scale=np.full(4, 1e-3),
-        sigma=np.full(3, 1e-6 * MICRO),
+        Truth(), widths=np.repeat([[1e-2], [1e-3]], 4, axis=1), sigma=np.full(3, 1e-6 * MICRO)
     )
     found = regression.solve(state, prior, n_steps=STEPS, tolerance=1e-12).state
     for axis in range(3):
-        relative = np.append(1.0, found.on_scale[axis] / regression.rms)
+        relative = np.append(1.0, found.weights[1, axis] / regression.rms)
         scale = K0 * found.kappa[axis] * relative
         shifted = np.polynomial.Polynomial([-293.15, 1.0])
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
@@ -378,7 +376,7 @@ def test_published_huygens_coefficients_come_back(rng: np.random.Generator) -> N
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
         # The bias is in counts, sf times offset: the offset in g is their ratio.
         bias = K0 * polynomial.polyval(
-            t[:40], np.append(found.bias[axis], found.on_bias[axis] / regression.rms)
+            t[:40], np.append(found.bias[axis], found.weights[0, axis] / regression.rms)
         )
         ratio = bias / (polynomial.polyval(t[:40], scale) * GRAVITY)
         got = np.polynomial.Polynomial.fit(kelvin[:40], ratio, 2).convert().coef

@@ -73,14 +73,6 @@ class UnitFacts:
     sensors: tuple[str, ...] = ('case',)
 
 
-@dataclass(frozen=True)
-class _Weights:
-    """Physical weights, shape (3, m): input units, and relative, per unit of the column."""
-
-    bias: Floats
-    scale: Floats
-
-
 def build_calibration(
     windows: ThermalWindows,
     regression: Regression,
@@ -99,21 +91,17 @@ def build_calibration(
     `nominal`: K0 [input units per m/s^2], shape (3,).
     """
     state, prior, layout = learnt.posterior.state, learnt.prior, learnt.claim.layout
-    weights = _Weights(
-        state.on_bias / regression.rms * nominal[:, None], state.on_scale / regression.rms
-    )
+    # Of bias in input units, of scale relative, per unit of the column.
+    weights = state.weights / regression.rms
+    weights[0] *= nominal[:, None]
     n_sets = len(sets.levels())
-    used = [
-        k
-        for k in range(len(columns))
-        if layout.on_bias[0, n_sets + k] >= 0 or layout.on_scale[0, n_sets + k] >= 0
-    ]
+    used = [k for k in range(len(columns)) if (layout.weights[:, 0, n_sets + k] >= 0).any()]
     terms = tuple(
         ResponseTerm(
             **{field.name: getattr(columns[k], field.name) for field in fields(Column)}
             | {'range': _column_range(columns[k], windows.raw[:, k])},
-            bias=_triple(weights.bias[:, n_sets + k]),
-            scale=_triple(weights.scale[:, n_sets + k]),
+            bias=_triple(weights[0, :, n_sets + k]),
+            scale=_triple(weights[1, :, n_sets + k]),
         )
         for k in used
     )
@@ -125,7 +113,10 @@ def build_calibration(
             _widened(
                 windows.rate * 60.0, _LINEAR_REACH, _RATE_MARGIN if is_seen else _UNSEEN_RATE
             ),
-            *(_axis_set(sets, weights, axis, is_dynamic, float(slow[axis])) for axis in range(3)),
+            *(
+                _axis_set(sets, weights[:, axis], is_dynamic, float(slow[axis]))
+                for axis in range(3)
+            ),
         )
         for name, is_dynamic in (('static', False), ('dynamic', True))
     }
@@ -190,10 +181,10 @@ def build_calibration(
     )
 
 
-def _axis_set(sets: Sets, weights: _Weights, axis: int, is_dynamic: bool, slow: float) -> AxisSet:
+def _axis_set(sets: Sets, weights: Floats, is_dynamic: bool, slow: float) -> AxisSet:
     """Make the curves of one axis in one regime."""
     n = sets.static.n_free
-    bias, scale = weights.bias[axis], weights.scale[axis]
+    bias, scale = weights
     family = sets.dynamic if is_dynamic else sets.static
     delta = 0.0
     of_bias, of_scale = bias[:n], scale[:n]
@@ -253,8 +244,8 @@ def file_parameters(
 
     for axis in range(3):
         for places, level, unit in (
-            (layout.on_bias[axis], (int(layout.bias[axis]), nominal[axis]), nominal[axis]),
-            (layout.on_scale[axis], (int(layout.kappa[axis]), 1.0 / state.kappa[axis]), 1.0),
+            (layout.weights[0, axis], (int(layout.bias[axis]), nominal[axis]), nominal[axis]),
+            (layout.weights[1, axis], (int(layout.kappa[axis]), 1.0 / state.kappa[axis]), 1.0),
         ):
             each = [(int(p), unit / r) for p, r in zip(places, regression.rms, strict=True)]
             row(level)

@@ -26,7 +26,7 @@ from .windows import CURVE, SET, Sets, ThermalWindows
 # Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
 _COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
 # What temperature does to a unit that no thermometer has seen, per K: a cheap sensor's data sheet.
-_UNSEEN_BIAS_SLOPE, _UNSEEN_SCALE_SLOPE = 5e-3, 2e-4
+_UNSEEN_SLOPES = 5e-3, 2e-4
 # A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
 _OFFSET_SD, _SIGMA = 1e-6, 1e-5
 
@@ -55,12 +55,7 @@ def regress(
     if known is not None:
         state = state_of(known, regression, up)
         knowns = known_of(known, regression, state, sets, options)
-        prior = replace(
-            prior,
-            on_bias=np.ones(len(windows.data.groups)),
-            on_scale=windows.data.in_scale.astype(np.float64),
-            known=knowns[-1],
-        )
+        prior = replace(prior, widths=windows.data.parts.astype(np.float64), known=knowns[-1])
     forced = [
         options.model == 'golovach' or group == CURVE or group in options.forced
         for group in windows.data.groups
@@ -71,7 +66,7 @@ def regress(
         prior,
         np.array(forced),
         lambda part: tell(0.7 + 0.25 * part),
-        held=(prior.on_scale > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
+        held=(prior.widths[1] > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
         # What the sets alone leave is a response, and no noise.
         walks=windows.raw.shape[1] > 0
         and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
@@ -124,17 +119,15 @@ def _wide_prior(
     if options.model == 'golovach':
         # The paper's sets stay whatever they earn: their prior says nothing.
         wide, scale_wide = 50.0 * wide, 50.0 * scale_wide
-    on_bias = np.where(allowed, wide * _COLUMN_BIAS_SD, 0.0)
-    on_scale = np.where(in_scale, scale_wide * _COLUMN_SCALE_SD, 0.0)
+    widths = np.stack((allowed * wide * _COLUMN_BIAS_SD, in_scale * scale_wide * _COLUMN_SCALE_SD))
     if not windows.was_measured:
-        on_bias[0], on_scale[0] = _UNSEEN_BIAS_SLOPE, _UNSEEN_SCALE_SLOPE
+        widths[:, 0] = _UNSEEN_SLOPES
     return Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
         skew_sd=SKEW_SD,
-        on_bias=on_bias,
-        on_scale=on_scale,
+        widths=widths,
         offset_sd=_OFFSET_SD,
         sigma=np.full(3, _SIGMA),
         rho=np.zeros(3),

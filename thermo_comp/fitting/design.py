@@ -6,14 +6,17 @@ Owns the equations of the windows: base columns, whitened once for each noise, a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from ..typing import Floats, Ints
+from ..typing import Bools, Floats, Ints
 from .unknowns import Layout, Prior, State, Windows
 from .whitening import Whitener
+
+# Unknowns that a step is added to; the last ones may take no part.
+_ADDED = ('kappa', 'bias', 'weights', 'skew', 'offset', 'start')
 
 
 @dataclass(frozen=True)
@@ -74,26 +77,10 @@ class Design:
             found = self._cache[axis] = _Whitened(rho, gains, base, grams, determinant)
         return found
 
-    def plain_prior(self) -> Prior:
-        """Make a prior in which every column takes part, of widths that say nothing."""
-        n = len(self.windows.groups)
-        return Prior(
-            bias_mean=np.zeros(3),
-            bias_sd=np.ones(3),
-            scale_sd=1.0,
-            skew_sd=1.0,
-            on_bias=np.ones(n),
-            on_scale=self.windows.in_scale.astype(np.float64),
-            offset_sd=1e-6,
-            sigma=np.full(3, 1e-5),
-            rho=np.zeros(3),
-        )
-
-    def layout(self, prior: Prior) -> Layout:
+    def layout(self, used: Bools) -> Layout:
         """
-        Give every unknown its place, those of the unit first; -1 for columns that take no part.
+        Give every unknown its place; `used`: columns that bias and scale have, shape (2, m).
         """
-        n_columns = len(self.windows.groups)
         n = 0
 
         def take(*shape: int) -> Ints:
@@ -102,18 +89,15 @@ class Design:
             n += size
             return np.arange(n - size, n).reshape(shape)
 
-        uses = {'bias': prior.on_bias > 0.0, 'scale': prior.on_scale > 0.0}
-        n_axis = 2 + sum(int(used.sum()) for used in uses.values())
-        axis = take(3, n_axis)
-        n_bias = int(uses['bias'].sum())
-        on_bias, on_scale = np.full((2, 3, n_columns), -1)
-        on_bias[:, uses['bias']] = axis[:, 2 : 2 + n_bias]
-        on_scale[:, uses['scale']] = axis[:, 2 + n_bias :]
+        axis = take(3, 2 + int(used.sum()))
+        weights = np.full((2, 3, used.shape[1]), -1)
+        weights.transpose(1, 0, 2)[:, used] = axis[:, 2:]
         skew = take(3)
         n_unit = n
         n_positions = self.windows.n_positions
-        moves = uses['bias'] | uses['scale']
-        n_lags = len(self.windows.start_covariance) if (self.windows.lag[moves] >= 0).any() else 0
+        taken: Bools = np.any(used, axis=0)
+        moved = taken[self.moved]
+        n_lags = len(self.windows.start_covariance) if moved.any() else 0
         up = np.empty((n_positions, 2), dtype=np.int64)
         offset = np.empty((n_positions, 3), dtype=np.int64)
         start = np.empty((self.n_bags, n_lags), dtype=np.int64)
@@ -124,29 +108,15 @@ class Design:
                 up[p], offset[p] = take(2), take(3)
             start[bag] = take(n_lags)
             blocks.append(slice(first, n))
-        return Layout(
-            axis[:, 0],
-            axis[:, 1],
-            on_bias,
-            on_scale,
-            skew,
-            up,
-            offset,
-            start,
-            axis,
-            n_unit,
-            tuple(blocks),
-            n,
-        )
+        base = np.flatnonzero(np.concatenate(([True], taken, moved)))
+        return Layout(axis, weights, skew, up, offset, start, n_unit, tuple(blocks), n, base)
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """Inverse variances of the prior, shape (n,); where there is a matrix instead, 0."""
         result = np.zeros(layout.n + 1)
         result[layout.kappa] = prior.scale_sd**-2
         result[layout.bias] = prior.bias_sd**-2.0
-        for places, sd in ((layout.on_bias, prior.on_bias), (layout.on_scale, prior.on_scale)):
-            used = sd > 0.0
-            result[places[:, used]] = sd[used] ** -2.0
+        result[layout.axis[:, 2:]] = prior.widths[prior.widths > 0.0] ** -2.0
         result[layout.skew] = prior.skew_sd**-2
         if prior.known is not None:
             result[: layout.n_unit] = 0.0
@@ -181,34 +151,25 @@ class Design:
     def vector(self, state: State, layout: Layout) -> Floats:
         """Give the unknowns as a vector; attitudes as 0, they move in the tangent plane."""
         result = np.zeros(layout.n + 1)
-        for name in ('kappa', 'bias', 'on_bias', 'on_scale', 'skew', 'offset'):
+        for name in _ADDED if layout.start.size else _ADDED[:-1]:
             result[getattr(layout, name)] = getattr(state, name)
-        if layout.start.size:
-            result[layout.start] = state.start
         return result[:-1]
 
     def _moved(self, state: State, step: Floats, layout: Layout) -> State:
         padded = np.append(step, 0.0)
         up = state.up + np.einsum('pij,pj->pi', state.tangents, padded[layout.up])
-        start = state.start
-        if layout.start.size:
-            start = start + padded[layout.start]
-        return State(
-            kappa=state.kappa + padded[layout.kappa],
-            bias=state.bias + padded[layout.bias],
-            on_bias=np.where(layout.on_bias >= 0, state.on_bias + padded[layout.on_bias], 0.0),
-            on_scale=np.where(layout.on_scale >= 0, state.on_scale + padded[layout.on_scale], 0.0),
-            skew=state.skew + padded[layout.skew],
-            up=up / np.linalg.norm(up, axis=1, keepdims=True),
-            offset=state.offset + padded[layout.offset],
-            start=start,
-        )
+        moved = {
+            name: getattr(state, name) + padded[getattr(layout, name)]
+            for name in (_ADDED if layout.start.size else _ADDED[:-1])
+        }
+        moved['weights'] = np.where(layout.weights >= 0, moved['weights'], 0.0)
+        return replace(state, up=up / np.linalg.norm(up, axis=1, keepdims=True), **moved)
 
     def _combination(self, state: State, p: int, axis: int, force: float) -> Floats:
         """Predict one position and axis, as a combination of the base columns."""
         n_columns = len(self.windows.groups)
         # Eq. (7) with (8) and (9): bias, and scale times input.
-        weight = state.on_bias[axis] + state.kappa[axis] * force * state.on_scale[axis]
+        weight = state.weights[0, axis] + state.kappa[axis] * force * state.weights[1, axis]
         result = np.zeros(self._base.shape[1])
         result[0] = state.kappa[axis] * force + state.bias[axis] + state.offset[p, axis]
         result[1 : n_columns + 1] = weight
@@ -232,6 +193,6 @@ class Design:
         """
         Correct the windows as the compensator would: offsets and start states unknown, (n, 3).
         """
-        along = self.measured - state.bias - self._columns @ state.on_bias.T
-        along /= state.kappa * (1.0 + self._columns @ state.on_scale.T)
+        along = self.measured - state.bias - self._columns @ state.weights[0].T
+        along /= state.kappa * (1.0 + self._columns @ state.weights[1].T)
         return np.asarray(along @ np.linalg.inv(state.inverse).T)

@@ -73,8 +73,7 @@ def residual_rows(
     Returns ``|f| - g`` of each window by the other positions [m/s^2].
     """
     state = learnt.posterior.state
-    nothing = np.zeros_like(state.on_bias)
-    steps = [regression.force(replace(state, on_bias=nothing, on_scale=nothing))]
+    steps = [regression.force(replace(state, weights=np.zeros_like(state.weights)))]
     rungs = (_with_only(regression, learnt, groups) for groups in ((CURVE,), (CURVE, SET)))
     steps += [regression.force(step) for step in (*rungs, state)]
     residuals = [norm_residual(force, regression.gravity) for force in steps]
@@ -96,8 +95,7 @@ def _with_only(regression: Regression, learnt: Learnt, groups: tuple[str, ...]) 
     # What such a model leaves is no noise of the windows; it counts for all of them alike.
     prior = replace(
         learnt.prior,
-        on_bias=np.where(only, 0.05, 0.0),
-        on_scale=np.where(only & regression.windows.in_scale, 0.005, 0.0),
+        widths=only * regression.windows.parts * [[0.05], [0.005]],
         offset_sd=1e-7,
         rho=np.zeros(3),
         known=None,

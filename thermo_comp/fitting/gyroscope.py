@@ -86,8 +86,8 @@ def add_gyroscope(
         bias_sd=np.full(3, _BIAS_SD),
         scale_sd=1.0,
         skew_sd=1.0,
-        on_bias=np.where(is_curve, max(_COLUMN_SD, drift), _COLUMN_SD) * takes_part,
-        on_scale=np.zeros(len(is_curve)),
+        widths=np.outer((1.0, 0.0), np.where(is_curve, max(_COLUMN_SD, drift), _COLUMN_SD))
+        * takes_part,
         offset_sd=_EARTH_SD,
         sigma=np.full(3, _SIGMA),
         rho=np.zeros(3),

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -28,7 +29,7 @@ from ..typing import Bools, Floats, Ints
 from ..unit.calibration import GroupEvidence
 from .posterior import Posterior, Regression
 from .unknowns import Known, Prior, State
-from .worth import earned, group_worth, mode_of, places_of, told_of, widths_of
+from .worth import earned, group_worth, told_of
 
 # Of the three weights of a column, what the data must tell under a wide prior to be asked.
 _SILENT = 0.05
@@ -79,45 +80,44 @@ def learn(
     regression: Regression,
     state: State,
     prior: Prior,
-    forced: Bools | None = None,
+    forced: Bools | bool = False,
     tell: Callable[[float], None] | None = None,
-    held: Bools | None = None,
+    held: Bools | bool = False,
     walks: bool = True,
     knowns: Sequence[Known] = (),
 ) -> Learnt:
     """
     Find widths, noises and columns by the evidence.
 
-    `knowns`: what may be known beforehand, for `prior.known`.
-
     `forced`: columns that stay whatever they earn, shape (m,). `held`: columns of the scale that
     keep their width, and their place: the data cannot tell them from those of the bias, shape
-    (m,).
+    (m,). `knowns`: what may be known beforehand, for `prior.known`.
     """
     tell = tell or (lambda _part: None)
-    kept = np.zeros(len(prior.on_bias), dtype=bool) if forced is None else forced
-    held = np.zeros(len(prior.on_bias), dtype=bool) if held is None else held
+    kept = np.broadcast_to(forced, prior.widths.shape).copy()
+    kept[1] |= held
     allowed = prior
     asks = prior.known is None and not kept.all()
     if asks:
-        silent = _silent(regression.solve(state, prior), prior)
+        silent = told_of(regression.solve(state, prior)) < _SILENT
+        silent &= prior.widths > 0.0
     else:
         # Nothing is asked of columns whose weights are known beforehand, nor where all must stay.
-        kept = np.ones(len(prior.on_bias), dtype=bool)
-        silent = {part: widths_of(prior, part) > 0.0 for part in ('bias', 'scale')}
-    silent['scale'] |= held
-    fixed = _Fixed(silent, kept)
+        kept = np.ones(prior.widths.shape, dtype=bool)
+        silent = prior.widths > 0.0
+    silent[1] |= held
+    settle = partial(_settle, regression, silent=silent, kept=kept)
     for reach in _REACHES_S if asks else (np.inf,):
-        prior = _within(allowed, reach, regression.windows.tau, kept)
+        prior = _without(allowed, (regression.windows.tau > reach) & ~kept)
         # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
-        posterior, prior = _settle(regression, state, prior, fixed, rounds=_PATIENCE)
+        posterior, prior = settle(state, prior, rounds=_PATIENCE)
         _downweight(regression, posterior)
-        posterior, prior = _settle(regression, posterior.state, prior, fixed)
+        posterior, prior = settle(posterior.state, prior)
         tell(0.4)
         _downweight(regression, posterior)
         if walks:
             prior = _walk(regression, posterior, prior)
-        posterior, prior = _settle(regression, posterior.state, prior, fixed)
+        posterior, prior = settle(posterior.state, prior)
         tell(0.7)
         if not asks or _longer_gain(regression, posterior, prior, allowed, reach) < _LONGER_EARNED:
             break
@@ -128,17 +128,14 @@ def learn(
         ]
         best = int(np.argmax([one.log_evidence for one in tried]))
         prior = replace(prior, known=knowns[best])
-        posterior, prior = _settle(regression, tried[best].state, prior, fixed)
-    while True:
-        idle = _idle(posterior, prior, {'bias': kept, 'scale': kept | held})
-        if not any(idle.values()):
-            break
+        posterior, prior = settle(tried[best].state, prior)
+    while (idle := _idle(regression, posterior, prior, kept)).any():
         prior = _without(prior, idle)
-        posterior, prior = _settle(regression, posterior.state, prior, fixed, rounds=6)
+        posterior, prior = settle(posterior.state, prior, rounds=6)
     tell(0.9)
     if walks:
         prior = _walk(regression, posterior, prior)
-    posterior, prior = _settle(regression, posterior.state, prior, fixed)
+    posterior, prior = settle(posterior.state, prior)
     claim = posterior
     if asks:
         wider = _left_open(regression, posterior, prior, allowed)
@@ -147,14 +144,9 @@ def learn(
     return Learnt(posterior, prior, group_worth(regression, posterior, prior), claim)
 
 
-def _within(allowed: Prior, reach: float, tau: Floats, kept: Bools) -> Prior:
-    """Leave out the columns of a longer memory than `reach`."""
-    stays = (tau <= reach) | kept
-    return replace(
-        allowed,
-        on_bias=np.where(stays, allowed.on_bias, 0.0),
-        on_scale=np.where(stays, allowed.on_scale, 0.0),
-    )
+def _without(prior: Prior, gone: Bools) -> Prior:
+    """Leave out columns, of bias and scale or of both, shape (2, m) or (m,)."""
+    return replace(prior, widths=np.where(gone, 0.0, prior.widths))
 
 
 def _longer_gain(
@@ -166,36 +158,36 @@ def _longer_gain(
     With S and q of its weights, and their width at its best, it adds ``sum(q^2 / (1 / sd^2 + S) -
     log(1 + S sd^2)) / 2``.
     """
-    asked = regression.asked_of_absent(posterior.state, prior, allowed)
     longer = regression.windows.tau > reach
+    S, q = (
+        one[..., longer] for one in regression.asked_of_absent(posterior.state, prior, allowed)
+    )
     most = 0.0
-    for part in ('bias', 'scale'):
-        S, q = (values[:, longer] for values in asked[part])
-        for width in widths_of(allowed, part)[longer] * _WIDTHS[:, None]:
-            with np.errstate(divide='ignore'):
-                gain = q**2 / (1.0 / width**2 + S) - np.log1p(S * width**2)
-            most = max(most, 0.5 * float(gain.sum(axis=0).max(initial=0.0)))
+    for part in _WIDTHS:
+        width = part * allowed.widths[:, None, longer]
+        with np.errstate(divide='ignore'):
+            gain = q**2 / (1.0 / width**2 + S) - np.log1p(S * width**2)
+        most = max(most, 0.5 * float(gain.sum(axis=1).max(initial=0.0)))
     return most
 
 
-def _idle(posterior: Posterior, prior: Prior, kept: dict[str, Bools]) -> dict[str, list[int]]:
+def _idle(regression: Regression, posterior: Posterior, prior: Prior, kept: Bools) -> Bools:
     """Find the columns that earn no place: the least first, the others then without it."""
-    mode, covariance = mode_of(posterior), posterior.covariance
-    asked = []
-    for part in ('bias', 'scale'):
-        places, sd = places_of(posterior, part), widths_of(prior, part)
-        asked += [
-            (part, column, places[:, column], float(sd[column]))
-            for column in np.flatnonzero((sd > 0.0) & ~kept[part]).tolist()
-        ]
-    result: dict[str, list[int]] = {'bias': [], 'scale': []}
+    mode, covariance = regression.vector(posterior.state, posterior.layout), posterior.covariance
+    mode = mode[: len(covariance)]
+    asked = np.argwhere((prior.widths > 0.0) & ~kept).tolist()
+    result = np.zeros(prior.widths.shape, dtype=bool)
     while asked:
-        gains = [earned(mode, covariance, at, sd) for _, _, at, sd in asked]
+        places = [posterior.layout.weights[part, :, column] for part, column in asked]
+        gains = [
+            earned(mode, covariance, at, prior.widths[part, column])
+            for at, (part, column) in zip(places, asked, strict=True)
+        ]
         least = int(np.argmin(gains))
         if gains[least] >= _EARNED:
             break
-        part, column, at, _ = asked.pop(least)
-        result[part].append(column)
+        result[tuple(asked.pop(least))] = True
+        at = places[least]
         gone = np.linalg.solve(covariance[np.ix_(at, at)], covariance[at])
         mode = mode - gone.T @ mode[at]
         covariance = covariance - covariance[:, at] @ gone
@@ -212,68 +204,46 @@ def _left_open(
     they say of it beside the columns that stayed. Where that is more than some sds of a window's
     noise the covariance has it back, with this width; its weight stays 0, the likeliest.
     """
-    asked = regression.asked_of_absent(posterior.state, prior, allowed)
-    widths = {}
-    for part, unit in (('bias', 1.0), ('scale', 1.0 / (regression.gravity or 1.0))):
-        wide, S = widths_of(allowed, part), asked[part][0].mean(axis=0)
-        sd = np.minimum(1.0 / np.sqrt(np.maximum(S, 1e-300)), wide)
-        matters = (widths_of(prior, part) == 0.0) & (wide > 0.0)
-        matters &= sd > _OPEN * float(np.mean(prior.sigma)) * unit
-        widths[part] = np.where(matters, sd, widths_of(prior, part))
-    return replace(prior, on_bias=widths['bias'], on_scale=widths['scale'])
+    S = regression.asked_of_absent(posterior.state, prior, allowed)[0].mean(axis=1)
+    sd = np.minimum(1.0 / np.sqrt(np.maximum(S, 1e-300)), allowed.widths)
+    matters = (prior.widths == 0.0) & (allowed.widths > 0.0)
+    matters &= sd > _OPEN * float(np.mean(prior.sigma)) * _units(regression)
+    return replace(prior, widths=np.where(matters, sd, prior.widths))
 
 
-@dataclass(frozen=True)
-class _Fixed:
-    """Columns whose width the data cannot tell, by part; and columns that may not leave."""
-
-    silent: dict[str, Bools]
-    kept: Bools
-
-
-def _without(prior: Prior, gone: dict[str, list[int]]) -> Prior:
-    on_bias, on_scale = prior.on_bias.copy(), prior.on_scale.copy()
-    on_bias[gone['bias']] = 0.0
-    on_scale[gone['scale']] = 0.0
-    return replace(prior, on_bias=on_bias, on_scale=on_scale)
-
-
-def _silent(posterior: Posterior, prior: Prior) -> dict[str, Bools]:
-    return {
-        part: (told_of(posterior, part) < _SILENT) & (widths_of(prior, part) > 0.0)
-        for part in ('bias', 'scale')
-    }
+def _units(regression: Regression) -> Floats:
+    """Return what 1 m/s^2 is to a weight in the bias, and in the scale, shape (2, 1)."""
+    return np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
 
 
 def _settle(
     regression: Regression,
     state: State,
     prior: Prior,
-    fixed: _Fixed,
     *,
+    silent: Bools,
+    kept: Bools,
     rounds: int = _MOST_ROUNDS,
 ) -> tuple[Posterior, Prior]:
-    """Repeat the fixed point of widths and white noise until nothing moves."""
+    """
+    Repeat the fixed point of widths and white noise until nothing moves.
+
+    `silent`: columns whose width the data cannot tell; `kept`: that may not leave, shape (2, m).
+    """
     for k in range(rounds):
         posterior = regression.solve(state, prior, n_steps=2)
         state = posterior.state
-        vector = np.append(regression.vector(state, posterior.layout), 0.0)
-        moved, change = {}, 0.0
-        gone: dict[str, list[int]] = {}
-        for part in ('bias', 'scale'):
-            sd = widths_of(prior, part)
-            told = told_of(posterior, part)
-            places = places_of(posterior, part)
-            power = np.where(places >= 0, vector[places] ** 2, 0.0).sum(axis=0)
-            asked = (sd > 0.0) & ~fixed.silent[part]
-            new = np.where(asked, np.sqrt(power / np.maximum(told, 1e-9)), sd)
-            new = np.where(asked, np.maximum(new, _smallest(regression, prior, part)), sd)
-            lively = asked & (told > _IDLE)
-            if lively.any():
-                change = max(change, float(np.abs(np.log(new[lively] / sd[lively])).max()))
-            moved[part] = new
-            idle = asked & (told < _IDLE) & ~fixed.kept & (k >= _PATIENCE)
-            gone[part] = np.flatnonzero(idle).tolist()
+        vector = regression.vector(state, posterior.layout)
+        sd, told = prior.widths, told_of(posterior)
+        power = np.sum(state.weights**2, axis=1)
+        asked = (sd > 0.0) & ~silent
+        # A width that is as good as 0; a column that stays all the same keeps it.
+        smallest = 1e-2 * float(np.mean(prior.sigma) / np.sqrt(len(regression.windows.time)))
+        new = np.maximum(np.sqrt(power / np.maximum(told, 1e-9)), smallest * _units(regression))
+        new = np.where(asked, new, sd)
+        lively = asked & (told > _IDLE)
+        change = float(np.abs(np.log(new[lively] / sd[lively])).max(initial=0.0))
+        gone = asked & (told < _IDLE) & ~kept & (k >= _PATIENCE)
         offset_sd, skew_sd = prior.offset_sd, prior.skew_sd
         told_offset, power = _told_of(posterior, vector, posterior.layout.offset)
         if told_offset > 0.3:
@@ -292,23 +262,15 @@ def _settle(
         change = max(change, float(np.abs(np.log(sigma / prior.sigma)).max()))
         prior = replace(
             prior,
-            on_bias=moved['bias'],
-            on_scale=moved['scale'],
+            widths=np.where(gone, 0.0, new),
             offset_sd=float(offset_sd),
             skew_sd=float(skew_sd),
             sigma=sigma,
             start_share=start_share,
         )
-        prior = _without(prior, gone)
-        if change < _SETTLED and not any(gone.values()):
+        if change < _SETTLED and not gone.any():
             break
     return regression.solve(state, prior), prior
-
-
-def _smallest(regression: Regression, prior: Prior, part: str) -> float:
-    """Return a width that is as good as 0; a column that stays all the same keeps it."""
-    sd = 1e-2 * float(np.mean(prior.sigma) / np.sqrt(len(regression.windows.time)))
-    return sd if part == 'bias' else sd / (regression.gravity or 1.0)
 
 
 def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float, float]:

@@ -29,12 +29,63 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ..typing import Floats, Ints
 from .design import Design
-from .factor import JITTER, Factor
 from .unknowns import Layout, Prior, State
 
 # Of what is known of a direction, the least that is left without one position.
 _LEAST_LEFT = 1e-5
+# Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
+_JITTER = 1e-13
+# Start states of neighbouring lags are told apart to fewer digits.
+_START_JITTER = 1e-10
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
+
+
+class Factor:
+    """The Hessian, factored: what belongs to one bag alone is eliminated first."""
+
+    def __init__(self, hessian: Floats, layout: Layout) -> None:
+        n = layout.n_unit
+        self._n, self._blocks = n, layout.blocks
+        root = np.sqrt(np.diag(hessian))
+        self._root = root
+        scaled = hessian / np.outer(root, root)
+        unit = scaled[:n, :n].copy()
+        self.log_determinant = 2.0 * float(np.log(root).sum())
+        self._locals = []
+        jitter = np.full(len(hessian), _JITTER)
+        jitter[layout.start] = _START_JITTER
+        for block in layout.blocks:
+            factor = cho_factor(scaled[block, block] + np.diag(jitter[block]))
+            cross = cho_solve(factor, scaled[block, :n])
+            unit -= scaled[:n, block] @ cross
+            self._locals.append((factor, cross))
+            self.log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
+        self._unit = cho_factor(unit + _JITTER * np.eye(n))
+        self.log_determinant += 2.0 * float(np.log(np.diag(self._unit[0])).sum())
+
+    def solve(self, right: Floats) -> Floats:
+        """Solve for one right side."""
+        n = self._n
+        right = right / self._root
+        first = right[:n].copy()
+        for block, (_, cross) in zip(self._blocks, self._locals, strict=True):
+            first -= cross.T @ right[block]
+        result = np.empty_like(right)
+        result[:n] = cho_solve(self._unit, first)
+        for block, (factor, cross) in zip(self._blocks, self._locals, strict=True):
+            result[block] = cho_solve(factor, right[block]) - cross @ result[:n]
+        return np.asarray(result / self._root)
+
+    def covariances(self) -> tuple[Floats, list[Floats]]:
+        """Covariance of what belongs to the unit, and of what belongs to each bag."""
+        n, root = self._n, self._root
+        unit = cho_solve(self._unit, np.eye(n))
+        blocks = []
+        for block, (factor, cross) in zip(self._blocks, self._locals, strict=True):
+            alone = cho_solve(factor, np.eye(block.stop - block.start))
+            both = alone + cross @ unit @ cross.T
+            blocks.append(both / np.outer(root[block], root[block]))
+        return unit / np.outer(root[:n], root[:n]), blocks
 
 
 @dataclass(frozen=True)
@@ -76,21 +127,6 @@ class _Equations:
     size: float
 
 
-@dataclass(frozen=True)
-class _Part:
-    """
-    What takes part: its place in the base, where come one, columns and their start states.
-
-    taken, moved, bias, scale: the columns; those that start states move, bias and scale have
-    """
-
-    base: Ints
-    taken: Ints
-    moved: Ints
-    bias: Ints
-    scale: Ints
-
-
 class Regression(Design):
     """The Gauss-Newton on the data of a fit; see `Design` for the parameters."""
 
@@ -125,46 +161,32 @@ class Regression(Design):
             ].T
         return _Equations(hessian, gradient, residual, white, size)
 
-    def _part(self, layout: Layout) -> _Part:
-        bias, scale = (np.flatnonzero(on[0] >= 0) for on in (layout.on_bias, layout.on_scale))
-        taken = np.union1d(bias, scale)
-        stays = np.isin(self.moved, taken)
-        behind = 1 + len(self.windows.groups) + np.flatnonzero(stays)
-        base = np.concatenate(([0], 1 + taken, behind))
-        return _Part(base, taken, self.moved[stays], bias, scale)
-
     def _block(
         self, state: State, prior: Prior, layout: Layout, p: int, axis: int, filtered: Floats
     ) -> tuple[Ints, Floats, Floats]:
         """Say what one axis in one position tells: places behind its own, Hessian, gradient."""
         found = self._whitened(axis, float(prior.rho[axis]))
-        part = self._part(layout)
         A = state.inverse
         a = self.gravity * float(A[axis] @ state.up[p])
         kappa = float(state.kappa[axis])
-        width = layout.axis.shape[1]
+        width, first = layout.axis.shape[1], layout.axis[axis, 0]
+        moved, lag = self.moved, self.windows.lag[self.moved]
+        m0 = state.start[self._bags[p], lag]
+        behind = len(self._base[0]) - len(moved) + np.arange(len(moved))
         # How each unknown acts on the base: T; a weight takes its column along with what the
         # start states add to it.
-        T = np.zeros((len(part.base), width + 6 + layout.start.shape[1]))
-        scaled = np.zeros(len(T))
-        scaled[0] = 1.0
-        scaled[1 : len(part.taken) + 1] = state.on_scale[axis, part.taken]
+        T = np.zeros((len(self._base[0]), width + 6 + layout.start.shape[1]))
         T[0, 1] = 1.0
-        at = 2 + np.arange(len(part.bias))
-        at_scale = np.arange(2 + len(part.bias), width)
-        T[1 + np.searchsorted(part.taken, part.bias), at] = 1.0
-        T[1 + np.searchsorted(part.taken, part.scale), at_scale] = kappa * a
-        moved, lag = part.moved, self.windows.lag[part.moved]
-        if len(moved):
-            behind = np.arange(len(T) - len(moved), len(T))
-            m0 = state.start[self._bags[p], lag]
-            scaled[behind] = state.on_scale[axis, moved] * m0
-            T[behind[:, None], at] = np.where(moved[:, None] == part.bias, m0[:, None], 0.0)
-            T[behind[:, None], at_scale] = np.where(
-                moved[:, None] == part.scale, kappa * a * m0[:, None], 0.0
-            )
-            weight = state.on_bias[axis] + kappa * a * state.on_scale[axis]
-            T[behind, width + 6 + lag] = weight[moved]
+        for places, factor in zip(layout.weights[:, axis], (1.0, kappa * a), strict=True):
+            used = np.flatnonzero(places >= 0)
+            T[1 + used, places[used] - first] = factor
+            used = np.flatnonzero(places[moved] >= 0)
+            T[behind[used], places[moved[used]] - first] = factor * m0[used]
+        on_bias, on_scale = state.weights[:, axis]
+        if layout.start.size:
+            T[behind, width + 6 + lag] = (on_bias + kappa * a * on_scale)[moved]
+        T = T[layout.base]
+        scaled = np.concatenate(([1.0], on_scale, on_scale[moved] * m0))[layout.base]
         T[:, 0] = a * scaled
         turned = kappa * self.gravity * scaled
         for k, (row, source) in enumerate(_SKEW_ROWS):
@@ -173,8 +195,8 @@ class Regression(Design):
         T[:, width + 3 : width + 5] = np.outer(turned, A[axis] @ state.tangents[p])
         T[0, width + 5] = 1.0
         rows, variance = self._rows[p], float(prior.sigma[axis]) ** 2
-        G = T.T @ (found.grams[p][np.ix_(part.base, part.base)] @ T) / variance
-        g = T.T @ (found.base[rows].T @ filtered[rows, axis])[part.base] / variance
+        G = T.T @ (found.grams[p][np.ix_(layout.base, layout.base)] @ T) / variance
+        g = T.T @ (found.base[rows].T @ filtered[rows, axis])[layout.base] / variance
         other = np.concatenate(
             (
                 layout.skew,
@@ -185,31 +207,20 @@ class Regression(Design):
         )
         return other, G, g
 
-    def asked_of_absent(
-        self, state: State, prior: Prior, allowed: Prior
-    ) -> dict[str, tuple[Floats, Floats]]:
+    def asked_of_absent(self, state: State, prior: Prior, allowed: Prior) -> tuple[Floats, Floats]:
         """
         Ask the data for columns that take no part, each alone beside those that do.
 
-        `state`: the mode under `prior`. Returns by part S and q, shape (3, m): the data's
-        information on each weight, and its pull on it; 0 for columns that take part.
+        `state`: the mode under `prior`. Returns S and q, shape (2, 3, m): the data's information
+        on each weight, and its pull on it; 0 for columns that take part.
         """
-        everything = replace(
-            prior,
-            on_bias=np.maximum(prior.on_bias, allowed.on_bias),
-            on_scale=np.maximum(prior.on_scale, allowed.on_scale),
-        )
-        layout = self.layout(everything)
+        everything = replace(prior, widths=np.maximum(prior.widths, allowed.widths))
+        layout = self.layout(everything.widths > 0.0)
         equations = self._equations(state, everything, layout)
         hessian, precision = equations.hessian, self.precision(everything, layout)
-        told, pull = np.zeros((2, layout.n + 1))
-        parts = (
-            ('bias', layout.on_bias, prior.on_bias),
-            ('scale', layout.on_scale, prior.on_scale),
-        )
-        absent = np.zeros(layout.n, dtype=bool)
-        for _, places, sd in parts:
-            absent[places[:, (sd == 0.0) & (places[0] >= 0)]] = True
+        places = np.where(prior.widths[:, None] == 0.0, layout.weights, -1)
+        is_absent = np.isin(np.arange(layout.n), places)
+        absent, present = np.flatnonzero(is_absent), np.flatnonzero(~is_absent)
         away = self.vector(state, layout) - self.prior_mean(everything, layout)
         gradient = equations.gradient - precision * away
         information = np.diag(hessian).copy()
@@ -217,20 +228,16 @@ class Regression(Design):
         for where, matrix in self._inform(prior, layout):
             hessian[where, where] += matrix
             gradient[where] -= matrix @ away[where]
-        present = np.flatnonzero(~absent)
         kept = hessian[np.ix_(present, present)]
         root = np.sqrt(np.diag(kept))
-        factor = cho_factor(kept / np.outer(root, root) + JITTER * np.eye(len(root)))
-        cross = hessian[np.ix_(present, np.flatnonzero(absent))] / root[:, None]
+        factor = cho_factor(kept / np.outer(root, root) + _JITTER * np.eye(len(root)))
+        cross = hessian[np.ix_(present, absent)] / root[:, None]
         solved = cho_solve(factor, cross)
-        told[:-1][absent] = np.maximum(information[absent] - np.sum(cross * solved, axis=0), 0.0)
+        told, pull = np.zeros((2, layout.n + 1))
+        told[absent] = np.maximum(information[absent] - np.sum(cross * solved, axis=0), 0.0)
         # A mode is one to some digits: columns that are almost others' sums would feel the rest.
-        pull[:-1][absent] = gradient[absent] - solved.T @ (gradient[present] / root)
-        result = {}
-        for part, places, sd in parts:
-            at = np.where((places >= 0) & (sd == 0.0), places, -1)
-            result[part] = told[at], pull[at]
-        return result
+        pull[absent] = gradient[absent] - solved.T @ (gradient[present] / root)
+        return told[places], pull[places]
 
     def without(self, posterior: Posterior, prior: Prior, p: int) -> State | None:
         """
@@ -266,7 +273,7 @@ class Regression(Design):
         # In coordinates of unit variance: what this position alone told is near 1.
         scale = np.sqrt(np.diag(posterior.covariance))
         root = np.linalg.cholesky(
-            posterior.covariance / np.outer(scale, scale) + JITTER * np.eye(n)
+            posterior.covariance / np.outer(scale, scale) + _JITTER * np.eye(n)
         )
         root *= scale[:, None]
         shares, directions = np.linalg.eigh(root.T @ told @ root)
@@ -281,7 +288,7 @@ class Regression(Design):
         self, state: State, prior: Prior, n_steps: int = 6, tolerance: float = 1e-3
     ) -> Posterior:
         """Find the mode under a prior."""
-        layout = self.layout(prior)
+        layout = self.layout(prior.widths > 0.0)
         precision = self.precision(prior, layout)
         matrices = self._inform(prior, layout)
         mean = self.prior_mean(prior, layout)

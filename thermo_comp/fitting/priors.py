@@ -115,8 +115,7 @@ def state_of(calibration: Calibration, regression: Regression, up: Floats) -> St
     return State(
         kappa=np.ones(3),
         bias=bias / K,
-        on_bias=np.array(on_bias) / K[:, None] * regression.rms,
-        on_scale=np.array(on_scale) * regression.rms,
+        weights=np.stack((np.array(on_bias) / K[:, None], on_scale)) * regression.rms,
         skew=np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
         up=up,
         offset=np.zeros((len(up), 3)),
@@ -149,7 +148,7 @@ def known_of(
             covariance[np.ix_(levels, levels)] += sd * sd
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
-    layout = regression.layout(regression.plain_prior())
+    layout = regression.layout(regression.windows.parts)
     to_file = file_parameters(regression, layout, state, sets, K, range(len(calibration.response)))
     root = np.sqrt(floor)
     scaled, correlation = to_file / root[:, None], covariance / np.outer(root, root)

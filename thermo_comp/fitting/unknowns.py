@@ -53,6 +53,11 @@ class Windows:
         return int(self.position[-1]) + 1
 
     @property
+    def parts(self) -> Bools:
+        """Which columns bias and scale may have, shape (2, m)."""
+        return np.stack((np.ones_like(self.in_scale), self.in_scale))
+
+    @property
     def bag_of_position(self) -> Ints:
         """Bag of each position."""
         return self.bag[np.searchsorted(self.position, np.arange(self.n_positions))]
@@ -80,8 +85,8 @@ class Prior:
     bias_mean, bias_sd: [m/s^2], shape (3,)
     scale_sd: of kappa, about 1
     skew_sd: of the elements of M [rad]
-    on_bias, on_scale: of the weights of each column, in units of its RMS ([m/s^2], relative); 0
-        for a column that takes no part, shape (m,)
+    widths: of the weights of each column, in units of its RMS, in the bias [m/s^2] and in the
+        scale (relative); 0 for a column that takes no part, shape (2, m)
     offset_sd: of the offset of each position and axis [m/s^2]
     sigma: white noise of a typical window [m/s^2], shape (3,)
     rho: variance per second of the walk over that of the white noise, shape (3,)
@@ -95,8 +100,7 @@ class Prior:
     bias_sd: Floats
     scale_sd: float
     skew_sd: float
-    on_bias: Floats
-    on_scale: Floats
+    widths: Floats
     offset_sd: float
     sigma: Floats
     rho: Floats
@@ -107,12 +111,13 @@ class Prior:
 
 @dataclass(frozen=True)
 class State:
-    """The unknowns; weights are of columns in units of their RMS."""
+    """
+    The unknowns; weights are of columns in units of their RMS, in bias and scale, shape (2, 3, m).
+    """
 
     kappa: Floats
     bias: Floats
-    on_bias: Floats
-    on_scale: Floats
+    weights: Floats
     skew: Floats
     up: Floats
     offset: Floats
@@ -131,21 +136,35 @@ class State:
 
 @dataclass(frozen=True)
 class Layout:
-    """Places of the unknowns in the vector of parameters."""
+    """
+    Places of the unknowns in the vector of parameters, those of the unit first.
 
-    kappa: Ints
-    bias: Ints
-    on_bias: Ints
-    on_scale: Ints
+    axis: all unknowns of each axis: kappa, bias, weights, shape (3, k)
+    weights: shape (2, 3, m); -1 for columns that take no part
+    blocks: those of each bag
+    base: what takes part of the base columns
+    """
+
+    axis: Ints
+    weights: Ints
     skew: Ints
     up: Ints
     offset: Ints
     start: Ints
-    #: All unknowns of each axis, shape (3, k); all of the unit; those of each bag.
-    axis: Ints
     n_unit: int
     blocks: tuple[slice, ...]
     n: int
+    base: Ints
+
+    @property
+    def kappa(self) -> Ints:
+        """Places of kappa, shape (3,)."""
+        return self.axis[:, 0]
+
+    @property
+    def bias(self) -> Ints:
+        """Places of the bias, shape (3,)."""
+        return self.axis[:, 1]
 
 
 def tangent_basis(up: Floats) -> Floats:
@@ -168,12 +187,10 @@ def initial_state(
     windows: Windows, n_bags: int, bias: Floats, kappa: Floats, skew: Floats, up: Floats
 ) -> State:
     """Make a state without any thermal term."""
-    m = len(windows.groups)
     return State(
         kappa=kappa,
         bias=bias,
-        on_bias=np.zeros((3, m)),
-        on_scale=np.zeros((3, m)),
+        weights=np.zeros((2, 3, len(windows.groups))),
         skew=skew,
         up=up,
         offset=np.zeros((len(up), 3)),

@@ -22,30 +22,9 @@ from .posterior import Posterior, Regression
 from .unknowns import Prior
 
 
-def told_of(posterior: Posterior, part: str) -> Floats:
-    """Effective parameters of each column, of all axes; 0 for those without a part, shape (m,)."""
-    places = places_of(posterior, part)
-    told = np.append(posterior.told, 0.0)
-    return np.asarray(np.where(places >= 0, told[places], 0.0).sum(axis=0))
-
-
-def places_of(posterior: Posterior, part: str) -> Ints:
-    """Return the places of the weights of a part, shape (3, m); -1 for columns without one."""
-    return posterior.layout.on_bias if part == 'bias' else posterior.layout.on_scale
-
-
-def widths_of(prior: Prior, part: str) -> Floats:
-    """Return the widths of a part, shape (m,)."""
-    return prior.on_bias if part == 'bias' else prior.on_scale
-
-
-def mode_of(posterior: Posterior) -> Floats:
-    """Return the weights of all columns at their places among what belongs to the unit."""
-    layout, state = posterior.layout, posterior.state
-    vector = np.zeros(layout.n + 1)
-    vector[layout.on_bias] = state.on_bias
-    vector[layout.on_scale] = state.on_scale
-    return vector[: layout.n_unit]
+def told_of(posterior: Posterior) -> Floats:
+    """Effective parameters of each column in bias and scale, of all axes, shape (2, m)."""
+    return np.asarray(np.append(posterior.told, 0.0)[posterior.layout.weights].sum(axis=1))
 
 
 def earned(mode: Floats, covariance: Floats, places: Ints, sd: float | Floats) -> float:
@@ -71,29 +50,28 @@ def group_worth(
     """Say what each group explains, spends and earns."""
     names = np.array(regression.windows.groups)
     columns = regression.windows.columns / regression.rms
-    mode = mode_of(posterior)
+    mode = regression.vector(posterior.state, posterior.layout)[: len(posterior.covariance)]
     force = regression.gravity * posterior.state.up[regression.windows.position]
+    told = told_of(posterior)
     result = []
     parts: tuple[Literal['bias', 'scale'], ...] = ('bias', 'scale')
-    for part in parts:
-        weights = posterior.state.on_bias if part == 'bias' else posterior.state.on_scale
-        sd, told = widths_of(prior, part), told_of(posterior, part)
+    for k, part in enumerate(parts):
         for group in dict.fromkeys(regression.windows.groups):
-            used = (names == group) & (sd > 0.0)
+            used = (names == group) & (prior.widths[k] > 0.0)
             if not used.any():
                 continue
-            added = columns[:, used] @ weights[:, used].T
+            added = columns[:, used] @ posterior.state.weights[k][:, used].T
             if part == 'scale':
                 added = added * force
-            places = places_of(posterior, part)[:, used]
+            places, sd = posterior.layout.weights[k][:, used], prior.widths[k][used]
             result.append(
                 GroupEvidence(
                     group,
                     part,
                     float(np.sqrt(np.mean(added**2))),
-                    max(float(told[used].sum()), 0.0),
-                    earned(mode, posterior.covariance, places.ravel(), np.tile(sd[used], 3)),
-                    tuple(float(value) for value in sd[used]),
+                    max(float(told[k][used].sum()), 0.0),
+                    earned(mode, posterior.covariance, places.ravel(), np.tile(sd, 3)),
+                    tuple(sd.tolist()),
                 )
             )
     return tuple(result)
