@@ -341,7 +341,7 @@ class TestColumnMap:
         with pytest.raises(RecordingError, match=message) as caught:
             load_column_map(path)
         assert str(path) in str(caught.value)
-        assert key is None or (caught.value.topic or '').startswith(key)
+        assert key is None or (caught.value.key or '').startswith(key)
 
     def test_files_that_are_no_maps(self, tmp_path: Path) -> None:
         path = tmp_path / 'map.yaml'

@@ -16,16 +16,8 @@ from .text import one_line
 
 
 class ThermoCompError(Exception):
-    """Any failure that a user can cause and mend; its text is one complete line."""
-
-    def __init__(self, *parts: str | None) -> None:
-        # A file, a bag or the network may have chosen some of it.
-        super().__init__(one_line(': '.join(part for part in parts if part)))
-
-
-class CalibrationError(ThermoCompError):
     """
-    A calibration that cannot be used, with the file and the dotted path of the key that is wrong.
+    Any failure that a user can cause and mend; its text is one complete line: file, key, message.
 
     `rule` is what may be said to those who may not read the file, where message or key quote one
     that is no calibration.
@@ -40,26 +32,20 @@ class CalibrationError(ThermoCompError):
     ) -> None:
         self.message, self.key, self.rule = message, key, rule
         self.path = None if path is None else str(path)
-        super().__init__(self.path, key, message)
+        # A file, a bag or the network may have chosen some of it.
+        super().__init__(one_line(': '.join(part for part in (self.path, key, message) if part)))
+
+
+class CalibrationError(ThermoCompError):
+    """A calibration that cannot be used, with the file and the dotted path of the wrong key."""
 
 
 class RecordingError(ThermoCompError):
     """A recording that cannot be read or written, with the file and the topic or column."""
 
-    def __init__(
-        self, message: str, path: str | Path | None = None, topic: str | None = None
-    ) -> None:
-        self.message, self.topic = message, topic
-        self.path = None if path is None else str(path)
-        super().__init__(self.path, topic, message)
-
 
 class OutputError(ThermoCompError):
     """An output that may not or cannot be written, with its name."""
-
-    def __init__(self, message: str, path: str | Path) -> None:
-        self.message, self.path = message, str(path)
-        super().__init__(self.path, message)
 
 
 class FleetError(ThermoCompError):

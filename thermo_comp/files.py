@@ -31,11 +31,8 @@ _INDEX = 'metadata.yaml'
 @dataclass(frozen=True)
 class Kind:
     """
-    What an output is, by the name that a message calls it, and how a file of that kind is known: a
-    pattern in its first 4 KiB.
-
-    An empty file is of any kind. Of a folder the mark is found in the name of each file in it, and
-    its index is there.
+    What an output is, and how it is known: a file by a pattern in its first 4 KiB, or empty; a
+    folder by one in the name of each file, and by its index.
     """
 
     name: str
@@ -175,9 +172,21 @@ class Draft:
         with _told(self._path):
             if self.partial.is_dir():
                 _sync(self.partial)
-                self._publish_folder()
+                self._move_folder()
+            elif self._is_replacing:
+                with suppress(FileNotFoundError):
+                    self.partial.chmod(stat.S_IMODE(self._target.stat().st_mode))
+                self.partial.replace(self._target)
             else:
-                self._publish_file()
+                try:
+                    os.link(self.partial, self._target)
+                    self.partial.unlink()
+                except FileExistsError:
+                    raise
+                except OSError:
+                    # No hard links here, as on FAT: whoever makes the name has it.
+                    os.close(os.open(self._target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+                    self.partial.replace(self._target)
             _sync(self._target.parent)
 
     def drop(self) -> None:
@@ -188,35 +197,18 @@ class Draft:
             else:
                 self.partial.unlink(missing_ok=True)
 
-    def _publish_file(self) -> None:
-        if self._is_replacing:
-            with suppress(FileNotFoundError):
-                self.partial.chmod(stat.S_IMODE(self._target.stat().st_mode))
-        else:
-            try:
-                os.link(self.partial, self._target)
-            except FileExistsError:
-                raise
-            except OSError:
-                # No hard links here, as on FAT: whoever makes the name has it.
-                os.close(os.open(self._target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
-            else:
-                self.partial.unlink()
-                return
-        self.partial.replace(self._target)
-
-    def _publish_folder(self) -> None:
-        if not (self._is_replacing and self._target.exists()):
+    def _move_folder(self) -> None:
+        old = None
+        if self._is_replacing and self._target.exists():
             # Of folders the system replaces none but an empty one.
+            old = self._target.rename(_hidden_sibling(self._target))
+        try:
             self.partial.rename(self._target)
-        else:
-            old = _hidden_sibling(self._target)
-            self._target.rename(old)
-            try:
-                self.partial.rename(self._target)
-            except OSError:
+        except OSError:
+            if old is not None:
                 old.rename(self._target)
-                raise
+            raise
+        if old is not None:
             shutil.rmtree(old)
 
 

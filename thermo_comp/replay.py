@@ -17,7 +17,7 @@ from itertools import groupby
 from math import inf
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,16 +53,6 @@ BLOCK_MESSAGES = 1 << 15
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
 
-class CorrectedBlock(NamedTuple):
-    """
-    One block of a recording, and what the compensator made of it: flags are stamp and regime.
-    """
-
-    block: Block
-    corrected: CompensatedBlock
-    flags: list[tuple[int, bool]]
-
-
 @dataclass(frozen=True)
 class ReplayResult:
     """
@@ -78,7 +68,8 @@ class ReplayResult:
     switches: list[tuple[int, bool]]
 
 
-WriteBlock = Callable[[CorrectedBlock], None]
+#: Takes a block of a recording, what the compensator made of it, and flags: stamp and regime.
+WriteBlock = Callable[[Block, CompensatedBlock, list[tuple[int, bool]]], None]
 
 
 def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None = None) -> None:
@@ -163,7 +154,7 @@ def replay(
                 rate = None if block.imu is None else block.imu.angular_velocity
                 corrected = process_block(compensator, block, rate)
                 new = compensator.take_flags()
-                write(CorrectedBlock(block, corrected, new))
+                write(block, corrected, new)
                 flags += new
                 if progress is not None:
                     progress(compensator.counters.n_in / max(total, 1))
@@ -198,8 +189,9 @@ def _messages_of(
                 copy(topic.name, topic.type, messages, messages.log_ns)
                 one = next(following, None)
 
-        def write(item: CorrectedBlock) -> None:
-            corrected, block = item.corrected, item.block
+        def write(
+            block: Block, corrected: CompensatedBlock, flags: list[tuple[int, bool]]
+        ) -> None:
             if len(corrected.stamp_ns):
                 writer.write_imu(
                     OUTPUT_TOPIC,
@@ -207,13 +199,13 @@ def _messages_of(
                     corrected.specific_force,
                     corrected.covariance,
                     frame_id or block.frame_id,
-                    imu=_imu_of(item),
+                    imu=_imu_of(block, corrected),
                 )
-            if item.flags:
-                stamps, values = zip(*item.flags, strict=True)
+            if flags:
+                stamps, values = zip(*flags, strict=True)
                 times = np.array(stamps, dtype=np.int64)
                 writer.write_bool(REGIME_TOPIC, times, np.array(values))
-                stamped = [stamped_flag(*flag, serial) for flag in item.flags]
+                stamped = [stamped_flag(*flag, serial) for flag in flags]
                 writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
             # Their log time becomes their stamp, as that of the outputs is.
             for role, messages in block.raw.items():
@@ -233,20 +225,19 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
     """Write blocks as rows, one for each corrected sample."""
     regime = 0
 
-    def write(item: CorrectedBlock) -> None:
+    def write(block: Block, corrected: CompensatedBlock, flags: list[tuple[int, bool]]) -> None:
         nonlocal regime
-        corrected = item.corrected
         columns: dict[str, NDArray[Any]] = {'stamp_ns': corrected.stamp_ns}
         for axis, name in enumerate('xyz'):
             columns[f'specific_force_{name}_m_s2'] = corrected.specific_force[:, axis]
         for name, at in (('xx', 0), ('xy', 1), ('xz', 2), ('yy', 4), ('yz', 5), ('zz', 8)):
             columns[f'covariance_{name}_m2_s4'] = corrected.covariance[:, at]
-        flags = [regime, *(1 + is_dynamic for _, is_dynamic in item.flags)]
-        switched = np.array([stamp for stamp, _ in item.flags], np.int64)
+        regimes = [regime, *(1 + is_dynamic for _, is_dynamic in flags)]
+        switched = np.array([stamp for stamp, _ in flags], np.int64)
         after = np.searchsorted(switched, corrected.stamp_ns, 'right')
-        columns['regime'] = _REGIMES[np.array(flags)[after]]
-        regime = flags[-1]
-        imu = _imu_of(item)
+        columns['regime'] = _REGIMES[np.array(regimes)[after]]
+        regime = regimes[-1]
+        imu = _imu_of(block, corrected)
         if imu is not None:
             for axis, name in enumerate('xyz'):
                 columns[f'angular_velocity_{name}_rad_s'] = imu.angular_velocity[:, axis]
@@ -256,11 +247,11 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
         yield write
 
 
-def _imu_of(item: CorrectedBlock) -> ImuColumns | None:
+def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
     """Give what goes out beside the force; a rate that is none (-1 in its covariance) stays."""
-    if item.block.imu is None:
+    if block.imu is None:
         return None
-    imu, corrected = item.block.imu.take(item.corrected.index), item.corrected
+    imu = block.imu.take(corrected.index)
     if corrected.angular_rate is None or corrected.angular_rate_variance is None:
         return imu
     before = imu.angular_velocity_covariance

@@ -166,7 +166,7 @@ def load_column_map(path: str | Path) -> ColumnMap:
             raise SchemaError('', 'a column map is a mapping of keys (see config/columns)')
         return build(ColumnMap, data)
     except SchemaError as failure:
-        raise RecordingError(failure.message, path=path, topic=failure.key or None) from failure
+        raise RecordingError(failure.message, path, failure.key or None) from failure
     except UnicodeDecodeError as failure:
         raise RecordingError('a column map is YAML text in UTF-8', path=path) from failure
     except (OSError, ValueError) as failure:

@@ -106,7 +106,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
         except RecordingError as error:  # noqa: PERF203 - no bag stops the others
             # Named as the fleet does, wherever it lies.
-            problems.append(': '.join(one for one in (name, error.topic, error.message) if one))
+            problems.append(': '.join(one for one in (name, error.key, error.message) if one))
             is_final = is_final and not isinstance(error.__cause__, OSError)
         except OSError as error:
             problems.append(f'{name}: {error.strerror or error}')

@@ -170,9 +170,7 @@ class RecordingReader:
             else:
                 yield from self._cut.blocks(without_jumps(self._blocks()))
         except RecordingError as error:
-            raise RecordingError(
-                error.message, error.path or self.info.path, error.topic
-            ) from error
+            raise RecordingError(error.message, error.path or self.info.path, error.key) from error
 
     @property
     def since_s(self) -> float:

@@ -175,7 +175,7 @@ def select_topics(
             taken = key if role == 'accel' else taken
             chosen.append(said_choice(name, key, getattr(topics, key)))
         elif role in require:
-            raise RecordingError('the topic has no messages', topic=shown(name))
+            raise RecordingError('the topic has no messages', key=shown(name))
     further = _further(present, topics, found, is_read=bool(require))
     return Selection(
         {**found, **further},
@@ -212,7 +212,7 @@ def _of_type(present: Present, name: str, expected: str) -> str:
     kind = present[name][0]
     if kind != expected:
         reason = f'the topic has type {shown(kind)}, expected {expected}'
-        raise RecordingError(reason, topic=shown(name))
+        raise RecordingError(reason, key=shown(name))
     return name
 
 
@@ -231,7 +231,7 @@ def _match(present: Present, wanted: str, key: str) -> str | None:
         raise RecordingError(
             f'several topics end in it: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
             f'choose one with --topic {key}=TOPIC',
-            topic=wanted,
+            key=wanted,
         )
     return spaced[0] if spaced else None
 
@@ -265,5 +265,5 @@ def _missing(present: Present, wanted: Mapping[str, str]) -> RecordingError:
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',
-        topic=' or '.join(wanted.values()),
+        key=' or '.join(wanted.values()),
     )

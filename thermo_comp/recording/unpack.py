@@ -44,7 +44,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
     try:
         yield
     except RecordingError as error:
-        raise RecordingError(error.message, path, error.topic) from error
+        raise RecordingError(error.message, path, error.key) from error
     except DamagedError as error:
         raise RecordingError(f'damaged: {error}', path) from error
     except OSError as error:

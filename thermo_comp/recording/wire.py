@@ -75,7 +75,7 @@ def decode_blocks(
                 own = as_cdr(own, kind)
             stamp_ns, numbers, frame = decode_stamped(own, kind)
         except RecordingError as error:
-            raise RecordingError(error.message, topic=shown(roles[role].name)) from error
+            raise RecordingError(error.message, key=shown(roles[role].name)) from error
         if role == 'accel':
             changes = rank[1:][frame[1:] != frame[:-1]].tolist()
             if changes:
