@@ -16,7 +16,7 @@ from conftest import ROOT
 from thermo_comp.errors import FleetError
 from thermo_comp.fleet.run import Results, render_fleet
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
-from thermo_comp.fleet.table import COLUMNS, Row, read_parquet, row_of, to_csv, to_parquet
+from thermo_comp.fleet.table import COLUMNS, Row, read_parquet, row_of, write_tables
 
 pa = pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
 
@@ -134,8 +134,8 @@ class TestDrift:
 
     def test_an_earlier_table_counts(self, rng: np.random.Generator, tmp_path: Path) -> None:
         first = fleet_of(3, rng)
-        (tmp_path / 'fleet.parquet').write_bytes(to_parquet(first))
-        before = read_parquet(tmp_path / 'fleet.parquet')
+        table, _ = write_tables(first, tmp_path)
+        before = read_parquet(table)
         assert before == first
         later = fleet_of(3, rng, day=90.0, like=first)
         drifts = summarise(later, before).drifts
@@ -183,9 +183,10 @@ class TestPage:
 
 
 class TestTable:
-    def test_a_spreadsheet_runs_nothing(self) -> None:
-        text = to_csv([row_of(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)])
-        heading, line = text.splitlines()
+    def test_a_spreadsheet_runs_nothing(self, tmp_path: Path) -> None:
+        row = row_of(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)
+        _, path = write_tables([row], tmp_path)
+        heading, line = path.read_text().splitlines()
         assert heading.split(',') == [column.name for column in COLUMNS]
         cells = dict(zip(heading.split(','), line.split(','), strict=True))
         assert (cells['name'], cells['serial']) == ("'=cmd()", "'-1")

@@ -121,9 +121,9 @@ def fit_fleet(
             ]
             again = fitted(rest, replace(options, fit=replace(options.fit, prior=prior)))
             for name, row in again.items():
-                said = f'not fitted with the prior: {row["problem"]}'
-                said = '; '.join(filter(None, (str(rows[name]['reservations']), said)))
-                rows[name] = row if is_fitted(row) else {**rows[name], 'reservations': said}
+                said = rows[name]['reservations'], f'not fitted with the prior: {row["problem"]}'
+                kept = {'reservations': '; '.join(map(str, filter(None, said)))}
+                rows[name] = row if is_fitted(row) else {**rows[name], **kept}
     ordered = tuple(rows[unit.name] for unit in units)
     summary = summarise(ordered, earlier)
     parquet, csv = write_tables(ordered, results.folder)
@@ -254,21 +254,18 @@ class Results:
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):
-            kept = f'{folder / CALIBRATION} of an earlier run stays'
-            return row_of(
-                **{**row, 'problem': '; '.join(filter(None, (str(row['problem']), kept)))}
-            )
+            said = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
+            return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, said)))})
         if outcome.calibration:
             # Until the record is written its hash is not the file's: the unit is not done.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
+            (folder / CERTIFICATE).unlink(missing_ok=True)
             if outcome.certificate:
                 content = outcome.certificate.encode()
                 files.write_atomically(folder / CERTIFICATE, content, files.PAGE)
-            else:
-                (folder / CERTIFICATE).unlink(missing_ok=True)
-        said = {'is_final': outcome.is_final, 'bags': outcome.hashes, 'row': row}
-        content = (json.dumps(_key(unit, options) | said, indent=1) + '\n').encode()
+        record = {'is_final': outcome.is_final, 'bags': outcome.hashes, 'row': row}
+        content = (json.dumps(_key(unit, options) | record, indent=1) + '\n').encode()
         files.write_atomically(folder / RESULT, content, files.RECORD)
         return row
 
@@ -281,7 +278,7 @@ def _key(unit: FoundUnit, options: FleetOptions) -> dict[str, Any]:
 
 def _safe(part: str) -> str:
     """Make a name that somebody else chose a name of one file."""
-    name = quote(part, safe=" +,=@()'") or '%'
-    if not name.strip('.'):
-        name = name.replace('.', '%2E')
-    return name if len(name) <= _LONGEST_NAME else f'{name[:_LONGEST_NAME]}-{sha256(part)[:16]}'
+    name = quote(part, safe=" +,=@()'")
+    if name.strip('.') and len(name) <= _LONGEST_NAME:
+        return name
+    return f'{name[:_LONGEST_NAME].strip(".")}-{sha256(part)[:16]}'

@@ -9,11 +9,12 @@ them. Every limit is set so that a fleet without anything to find raises an alar
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -106,7 +107,8 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
     ]
     wide = Verdict.WIDE.value
     # Without its amount, so that like ones count together.
-    verdicts = (f'{wide} little' if v.startswith(wide) else v for v in _texts(rows, 'verdict'))
+    said = (str(row['verdict']) for row in rows)
+    verdicts = (f'{wide} little' if one.startswith(wide) else one for one in said)
     return Summary(
         verdicts=dict(Counter(verdicts)),
         spreads=spreads,
@@ -129,9 +131,8 @@ def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
     away = compared - np.median(compared)
     middle, sd = float(np.median(values)), 1.4826 * float(np.median(np.abs(away)))
     z = away / sd if sd > 0.0 else np.zeros_like(away)
-    return Spread(
-        quantity, _texts(known, 'name'), values, middle, sd * middle if is_size else sd, z
-    )
+    names = tuple(str(row['name']) for row in known)
+    return Spread(quantity, names, values, middle, sd * middle if is_size else sd, z)
 
 
 def outlier_limit(n_units: int, n_quantities: int) -> float:
@@ -147,39 +148,32 @@ def outlier_limit(n_units: int, n_quantities: int) -> float:
 def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
     from scipy.stats import norm
 
-    by_serial: dict[str, list[tuple[str, str, Row]]] = defaultdict(list)
-    for source, some in (('earlier ', earlier), ('', rows)):
-        for row in some:
-            test = (str(row['start']), f'{source}{row["name"]}', row)
-            by_serial[str(row['serial'])].append(test)
+    tests = [
+        (str(row['serial']), str(row['start']), f'{source}{row["name"]}', row)
+        for source, some in (('earlier ', earlier), ('', rows))
+        for row in some
+    ]
     pairs = [
-        (serial, before, after)
-        for serial, tests in sorted(by_serial.items())
-        for before, after in pairwise(sorted(tests, key=lambda test: test[:2]))
-        if before[2]['calibration_sha256'] != after[2]['calibration_sha256']
+        (before, after)
+        for before, after in pairwise(sorted(tests, key=itemgetter(0, 1, 2)))
+        if before[0] == after[0]
+        and before[3]['calibration_sha256'] != after[3]['calibration_sha256']
     ]
     compared = [one for one in QUANTITIES if one.sd]
-    is_relative = [one.by == 'ppm' for one in compared]
     limit = norm.isf(0.5 * _FALSE_ALARMS / max(len(pairs) * len(compared), 1))
     found = []
-    for serial, (begun, before, old), (again, after, new) in pairs:
-        was, was_sd, now, now_sd = (
-            np.array([row[name] for name in names], dtype=np.float64)
-            for row in (old, new)
-            for names in ([one.name for one in compared], [one.sd for one in compared])
-        )
-        changes = tuple(
-            Drift(before, after, one.label, one.unit, change, sd)
-            for one, change, sd in zip(
-                compared,
-                np.where(is_relative, (now / was - 1.0) * 1e6, now - was).tolist(),
-                np.nan_to_num(np.hypot(was_sd, now_sd)).tolist(),
-                strict=True,
-            )
-        )
+    for (serial, begun, before, old), (_, again, after, new) in pairs:
+        changes = []
+        for one in compared:
+            was, was_sd, now, now_sd = np.array(
+                [row[name] for row in (old, new) for name in (one.name, one.sd)], np.float64
+            ).tolist()
+            change = (now / was - 1.0) * 1e6 if one.by == 'ppm' else now - was
+            sd = np.nan_to_num(np.hypot(was_sd, now_sd)).item()
+            changes.append(Drift(before, after, one.label, one.unit, change, sd))
         is_significant = any(_sds(one) > limit for one in changes)
         days = _days(begun, again)
-        found.append(Retest(serial, before, after, days, changes, is_significant))
+        found.append(Retest(serial, before, after, days, tuple(changes), is_significant))
     return sorted(found, key=lambda one: -_sds(one.worst))
 
 
@@ -194,7 +188,3 @@ def _days(begun: str, again: str) -> float:
     except ValueError:
         return float('nan')
     return (second - first).total_seconds() / 86400.0
-
-
-def _texts(rows: Sequence[Row], column: str) -> tuple[str, ...]:
-    return tuple(str(row[column]) for row in rows)

@@ -34,6 +34,8 @@ Row = Mapping[str, Cell]
 
 #: What stands in the column `verdict` where there is no verdict of the judge.
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
+# How a formula of a spreadsheet begins.
+_FORMULA = ('=', '+', '-', '@')
 # What the fit has to say of bags that leave something of the unit to its prior.
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
@@ -221,15 +223,10 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
 
 
 def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
-    """Write the table as fleet.parquet and fleet.csv; each is replaced as a whole."""
-    parquet, text = folder / 'fleet.parquet', folder / 'fleet.csv'
-    write_atomically(parquet, to_parquet(rows), PARQUET)
-    write_atomically(text, to_csv(rows).encode(), CSV)
-    return parquet, text
-
-
-def to_parquet(rows: Sequence[Row]) -> bytes:
-    """Return the table as Parquet; what a column means stands in its metadata."""
+    """
+    Write the table as fleet.parquet, with the columns' meaning in its metadata, and as fleet.csv,
+    with all digits; each is replaced as a whole.
+    """
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -239,23 +236,17 @@ def to_parquet(rows: Sequence[Row]) -> bytes:
     )
     buffer = pa.BufferOutputStream()
     parquet.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer)
-    return bytes(buffer.getvalue())
-
-
-def to_csv(rows: Sequence[Row]) -> str:
-    """Return the table as CSV with a heading; numbers have all their digits."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, [one.name for one in COLUMNS], lineterminator='\n')
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [one.name for one in COLUMNS], lineterminator='\n')
     writer.writeheader()
     for row in rows:
-        writer.writerow({name: _unarmed(cell) for name, cell in row.items()})
-    return out.getvalue()
-
-
-def _unarmed(cell: Cell) -> Cell:
-    """Quote a text that a spreadsheet would run as a formula."""
-    armed = isinstance(cell, str) and cell.startswith(('=', '+', '-', '@'))
-    return f"'{cell}" if armed else cell
+        # A spreadsheet would run such a text as a formula.
+        armed = [k for k, v in row.items() if isinstance(v, str) and v.startswith(_FORMULA)]
+        writer.writerow({**row, **{name: f"'{row[name]}" for name in armed}})
+    paths = folder / 'fleet.parquet', folder / 'fleet.csv'
+    write_atomically(paths[0], bytes(buffer.getvalue()), PARQUET)
+    write_atomically(paths[1], text.getvalue().encode(), CSV)
+    return paths
 
 
 def read_parquet(path: Path) -> list[Row]:
