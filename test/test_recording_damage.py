@@ -260,7 +260,7 @@ HUGE = 1 << 60
         (chunk_record(b'\x05' + struct.pack('<Q', 3) + bytes(91), '', 100), '3 bytes'),
         (chunk_record(b'\x0f' + struct.pack('<Q', 91) + bytes(91), '', 100, 99), 'checksum'),
         (chunk_record(bytes(10), '', (1 << 26) + 1), 'a chunk may have 67108864'),
-        (struct.pack('<BQ', Opcode.CHUNK, 10) + bytes(10), 'shorter than its content'),
+        (struct.pack('<BQ', Opcode.CHUNK, 10) + bytes(10), 'damaged head'),
         (struct.pack('<BQ', Opcode.CHUNK, 40) + bytes(28) + b'\xff' * 12, 'damaged head'),
         (struct.pack('<BQ', Opcode.CHUNK, HUGE) + bytes(10), 'not whole'),
         (struct.pack('<BQ', Opcode.MESSAGE, 3) + bytes(3), 'message record has 3 bytes'),

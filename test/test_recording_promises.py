@@ -131,7 +131,7 @@ def test_a_compressed_file_expands_within_limits_and_leaves_nothing(
     with packed.open('wb') as out, zstandard.ZstdCompressor(19).stream_writer(out) as writer:
         for _ in range(128):
             writer.write(bytes(1 << 20))
-    with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: \d+ bytes hold more than'):
+    with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: it holds more than'):
         read_recording(bag)
     assert not list(temporary.iterdir())
 
@@ -141,7 +141,9 @@ def test_a_compressed_message_expands_within_limits(tmp_path: Path) -> None:
     with sqlite3.connect(bag / 'bag.db3') as database:
         bomb = zstandard.compress(bytes(1 << 28))
         database.execute('update messages set data = ? where id = 1', (bomb,))
-    with pytest.raises(RecordingError, match=r'bag\.db3: .*a message of 268435456 bytes'):
+    with pytest.raises(
+        RecordingError, match=r'bag\.db3: damaged: it holds more than the 67108864 bytes'
+    ):
         read_recording(bag)
 
 
@@ -171,7 +173,9 @@ def test_a_chunk_of_a_ros1_bag_expands_within_limits(
             columns = read_recording(path, require=('board',)).columns
             assert columns.temperatures['board'].celsius.tolist() == [20.5]
         else:
-            with pytest.raises(RecordingError, match=r'a chunk of \d+ bytes holds more than'):
+            with pytest.raises(
+                RecordingError, match='damaged: it holds more than the 4194304 bytes'
+            ):
                 read_recording(path, require=('board',))
 
 

@@ -113,7 +113,7 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     (tmp_path / 'begun.mcap').write_bytes(b'\x89MCAP0\r\n\x01')
     refused(tmp_path / 'begun.mcap', 'cut off inside its header')
     (tmp_path / 'odd.mcap').write_bytes(b'\x89MCAP0\r\n\x02' + bytes(50))
-    refused(tmp_path / 'odd.mcap', 'does not begin with a header')
+    refused(tmp_path / 'odd.mcap', 'not an MCAP file')
     (tmp_path / 'text.bag').write_text('hello')
     refused(tmp_path / 'text.bag', r'text\.bag: the bag cannot be read')
     (tmp_path / 'text.db3').write_text('hello')

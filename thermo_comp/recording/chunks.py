@@ -3,14 +3,15 @@
 """
 Owns the stretches of an MCAP file that hold messages: read one, and find the messages in it.
 
-The message index behind a chunk is never trusted. What it points at must be message records that,
-together with the few other records between them, tile the chunk without gap or overlap; where
-they do not, or there is no index, the records are walked one by one. Layout: https://mcap.dev/spec.
+The message index behind a chunk is never trusted. What it points at must be message records that
+tile the chunk without gap or overlap; where they do not, because other records stand between them
+or there is no index, the records are walked one by one. Layout: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..typing import Bytes, Ints
 from .messages import Messages, field, gather
-from .unpack import MAX_CHUNK_BYTES, DamagedError, unpack, unpack_beginning
+from .unpack import MAX_CHUNK_BYTES, DamagedError, inflate
 
 #: Opcode and length in front of each record.
 PREFIX = struct.Struct('<BQ')
@@ -70,92 +71,78 @@ def parse_chunk_head(head: bytes, position: int) -> tuple[Span, str, int, int]:
     try:
         found = _CHUNK_HEAD.unpack_from(head)
         opcode, content, start_ns, end_ns, size, checksum, n_name = found
-        if opcode != Opcode.CHUNK:
-            raise DamagedError(f'no chunk at byte {position}')
-        name_end = _CHUNK_HEAD.size + n_name
-        data_at = name_end + 8
-        if n_name <= 64 and len(head) < data_at:
-            raise DamagedError('a record is shorter than its content')
+        name, n_packed = struct.unpack_from(f'<{n_name}sQ', head, _CHUNK_HEAD.size)
     except struct.error as error:
-        raise DamagedError('a record is shorter than its content') from error
-    n_packed = int.from_bytes(head[name_end:data_at], 'little')
-    length = PREFIX.size + content
-    if n_name > 64 or data_at + n_packed != length:
+        raise DamagedError(f'the chunk at byte {position} has a damaged head') from error
+    length, data_at = PREFIX.size + content, _CHUNK_HEAD.size + n_name + 8
+    if opcode != Opcode.CHUNK or data_at + n_packed != length:
         raise DamagedError(f'the chunk at byte {position} has a damaged head')
-    compression = head[_CHUNK_HEAD.size : name_end].decode('utf-8', 'replace')
-    return Span(position, length, 0, size, start_ns, end_ns), compression, data_at, checksum
+    span = Span(position, length, 0, size, start_ns, end_ns)
+    return span, name.decode('utf-8', 'replace'), data_at, checksum
 
 
 def load(read_at: ReadAt, span: Span, on_record: OnRecord) -> Messages:
     """Read a stretch of the file and find its messages, in the order of their places."""
+    n_bytes = span.length + span.index_length
     try:
-        if span.kind == 'chunk':
-            return _load_chunk(read_at, span, on_record)
-        record = read_at(span.position, min(span.length, MAX_CHUNK_BYTES))
+        if span.kind == 'chunk' and max(span.size, n_bytes) > MAX_CHUNK_BYTES:
+            raise DamagedError(
+                f'{n_bytes} bytes claim to hold {span.size}, a chunk may have {MAX_CHUNK_BYTES}'
+            )
+        record = read_at(span.position, min(n_bytes, MAX_CHUNK_BYTES))
         data = np.frombuffer(record, np.uint8)
+        if span.kind == 'loose':
+            messages, reason = walk(data, on_record)
+            if reason not in {'', _ZERO_OPCODE}:
+                raise DamagedError(reason)
+            return messages
+        head, compression, data_at, checksum = parse_chunk_head(record[:HEAD_BYTES], span.position)
         if span.kind == 'torn':
-            _, compression, data_at, _ = parse_chunk_head(record[:HEAD_BYTES], span.position)
-            data = unpack_beginning(compression, data[data_at:])
-        messages, _, reason = walk(data, on_record)
-        if span.kind == 'loose' and reason not in {'', _ZERO_OPCODE}:
-            raise DamagedError(reason)
-        # The message before a stretch of zeros may itself end in zeros that are none of its own.
-        return messages.take(slice(-1)) if reason == _ZERO_OPCODE else messages
+            data = inflate(compression, data[data_at:], MAX_CHUNK_BYTES, is_torn=True)
+            return walk(data, on_record)[0]
+        if head.length != span.length or head.size != span.size:
+            raise DamagedError('its size is not what the index of the file says')
+        data = inflate(compression, data[data_at : span.length], span.size, span.size + 1)
+        if len(data) != span.size:
+            raise DamagedError(f'{len(data)} bytes after decompression, expected {span.size}')
+        if checksum and zlib.crc32(data.data) != checksum:
+            raise DamagedError('the checksum does not fit the content')
+        messages = locate(data, memoryview(record)[span.length :], on_record)
+        log_ns = messages.log_ns
+        if len(log_ns) and (np.min(log_ns) < span.start_ns or np.max(log_ns) > span.end_ns):
+            raise DamagedError('its messages are outside the time it claims')
     except DamagedError as error:
         place = 'at' if span.kind == 'loose' else 'chunk at'
         raise DamagedError(f'{place} byte {span.position}: {error}') from error
-
-
-def _load_chunk(read_at: ReadAt, span: Span, on_record: OnRecord) -> Messages:
-    n_bytes = span.length + span.index_length
-    if max(span.size, n_bytes) > MAX_CHUNK_BYTES:
-        raise DamagedError(
-            f'{span.length} bytes claim to hold {span.size}, a chunk may have {MAX_CHUNK_BYTES}'
-        )
-    record = read_at(span.position, n_bytes)
-    if len(record) < n_bytes:
-        raise DamagedError('the file ends inside it')
-    head, compression, data_at, checksum = parse_chunk_head(record[:HEAD_BYTES], span.position)
-    if head.length != span.length or head.size != span.size:
-        raise DamagedError('its size is not what the index of the file says')
-    packed = np.frombuffer(record, np.uint8, span.length - data_at, data_at)
-    data = unpack(compression, packed, span.size, checksum)
-    messages = locate(data, memoryview(record)[span.length :], on_record)
-    log_ns = messages.log_ns
-    if len(log_ns) and (np.min(log_ns) < span.start_ns or np.max(log_ns) > span.end_ns):
-        raise DamagedError('its messages are outside the time it claims')
     return messages
 
 
 def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
     """Find all messages of a whole chunk, with the message index records behind it as a hint."""
-    messages = _indexed(data, index, on_record)
+    messages = _indexed(data, index)
     if messages is None:
-        messages, end, reason = walk(data, on_record)
-        if end != len(data):
+        messages, reason = walk(data, on_record)
+        if reason:
             raise DamagedError(reason)
     return messages
 
 
-def _indexed(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages | None:
-    """Find the messages by the index; None where it is not the whole truth."""
+def _indexed(data: Bytes, index: memoryview) -> Messages | None:
+    """Find the messages by the index; None where they are not all that the chunk holds."""
     columns: list[Ints] = []
     begin = 0
     while begin + _INDEX_HEAD.size <= len(index):
         opcode, content, _, length = _INDEX_HEAD.unpack_from(index, begin)
         begin += _INDEX_HEAD.size
-        if opcode != Opcode.MESSAGE_INDEX:
-            raise DamagedError('what follows it is not its message index')
-        if content != length + 6 or length % _INDEX_ROW_BYTES or begin + length > len(index):
+        is_sound = opcode == Opcode.MESSAGE_INDEX and content == length + 6
+        if not is_sound or length % _INDEX_ROW_BYTES or begin + length > len(index):
             return None
-        if length:
-            # An offset that no chunk can have comes out negative.
-            rows = (length // _INDEX_ROW_BYTES,)
-            columns.append(np.ndarray(rows, '<i8', index, begin + 8, (_INDEX_ROW_BYTES,)))
+        # An offset that no chunk can have comes out negative.
+        columns.append(np.frombuffer(index, '<i8', length // 8, begin)[1::2])
         begin += length
-    if begin != len(index) or not columns:
+    at = np.sort(np.concatenate(columns), kind='stable') if columns else np.empty(0, np.int64)
+    if begin != len(index) or not len(at):
         return None
-    at = np.sort(np.concatenate(columns), kind='stable')
     if at[0] < 0 or at[-1] > len(data) - MESSAGE_HEAD_BYTES:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
@@ -165,26 +152,18 @@ def _indexed(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages | 
         return None
     size = length.view(np.int64)
     begins = np.concatenate(([0], at + size + MESSAGE_HEAD_BYTES))
-    ends = np.concatenate((at, [len(data)]))
-    if (begins > ends).any():
+    if at[0] or begins[-1] != len(data) or (begins[1:-1] != at[1:]).any():
         return None
-    found: list[tuple[int, bytes]] = []
-    for gap in np.flatnonzero(begins < ends).tolist():
-        between = data[begins[gap] : ends[gap]]
-        extra, stop, _ = walk(between, lambda *record: found.append(record))
-        if len(extra) or stop != len(between):
-            return None
-    for record in found:
-        on_record(*record)
     return _messages(data, at, size, head)
 
 
-def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, int, str]:
+def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
     Go from record to record as far as they are whole.
 
-    Returns the messages, where the first record begins that is not whole (the length of `data`
-    where all are), and what is wrong with that one. Raises DamagedError for impossible times.
+    Returns the messages and what is wrong with the first record that is not whole, if there is
+    one. Before zeros, which are no record, the last message is left out: its own end may be zeros,
+    too. Raises DamagedError for impossible times.
     """
     view = data.data
     places: list[int] = []
@@ -208,10 +187,10 @@ def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, int, str]:
         else:
             on_record(opcode, bytes(view[at + PREFIX.size : end]))
         at = end
-    found = np.array(places, np.int64)
+    found = np.array(places[:-1] if reason == _ZERO_OPCODE else places, np.int64)
     head = gather(data, found, MESSAGE_HEAD_BYTES)
     size = field(head, 1, '<i8') - _MESSAGE_FIELDS_BYTES
-    return _messages(data, found, size, head), at, reason
+    return _messages(data, found, size, head), reason
 
 
 def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Messages:

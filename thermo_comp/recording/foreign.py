@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import RecordingError
 from .messages import BagFile, Done, Messages, Topic, Work
-from .unpack import translated, unpack_message, unpack_ros1_chunk
+from .unpack import inflate_message, inflate_ros1_chunk, translated
 
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
@@ -37,7 +37,7 @@ class ForeignFile(BagFile):
             self._reader = reader
             reader.open()
             for at, chunk in reader.chunks.items() if is_ros1 else ():
-                reader.chunks[at] = chunk._replace(decompressor=unpack_ros1_chunk)
+                reader.chunks[at] = chunk._replace(decompressor=inflate_ros1_chunk)
             if reader.message_count:
                 self.start_ns = int(reader.start_time)
                 self.end_ns = int(reader.end_time) - 1
@@ -67,7 +67,7 @@ class ForeignFile(BagFile):
         for one, log_ns, data in self._reader.messages(connections=list(chosen.values())):
             numbers.append(known[one.topic, one.msgtype])
             times.append(log_ns)
-            pieces.append(unpack_message(data) if self._is_packed else data)
+            pieces.append(inflate_message(data) if self._is_packed else data)
             n_bytes += len(pieces[-1])
             is_long = n_bytes >= _BATCH_BYTES or log_ns - times[0] > _BATCH_NS
             if is_long or len(pieces) >= _BATCH_MESSAGES:

@@ -15,12 +15,13 @@ from __future__ import annotations
 
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from io import BytesIO
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,10 @@ from ..errors import RecordingError
 from ..files import open_regular
 from .chunks import HEAD_BYTES, PREFIX, Span, load, parse_chunk_head
 from .messages import BagFile, Done, Messages, Topic, Work, join_messages
-from .unpack import MAX_CHUNK_BYTES, DamagedError, translated
+from .unpack import DamagedError, translated
 
 MAGIC = b'\x89MCAP0\r\n'
+_BEGIN = MAGIC + bytes([Opcode.HEADER])
 #: Name of the metadata record with the key-value pairs of this package's writer.
 METADATA_NAME = 'thermo_comp'
 
@@ -49,6 +51,24 @@ _N_AHEAD = 8
 _AHEAD_BYTES = 1 << 26
 #: Messages of overlapping chunks that are held back at most [bytes].
 _MAX_HELD_BYTES = 1 << 26
+#: What ends inside a record, by its opcode, or -1 for the others.
+_CUTS = {
+    0: 'it is unreadable from byte {at} on',
+    int(Opcode.CHUNK): 'it ends inside a chunk, of which the first {} messages are read',
+    int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk, which is read whole',
+    -1: 'it ends inside a record, everything before that is read',
+}
+#: The records beside messages that matter.
+_KINDS: Mapping[int, Any] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+}
+#: What the summary says of a chunk, in the order of the fields of a `Span`.
+_SPAN_FIELDS = attrgetter(
+    *('chunk_start_offset', 'chunk_length', 'message_index_length'),
+    *('uncompressed_size', 'message_start_time', 'message_end_time'),
+)
 # Versions of mcap differ in what of it is typed.
 _new_stream: Any = ReadDataStream
 
@@ -112,10 +132,16 @@ class McapFile(BagFile):
         return os.pread(self._file.fileno(), n_bytes, at)
 
     def _map(self) -> None:
-        begin = self._read_header()
+        head = self._read_at(0, len(_BEGIN) + 8)
+        if not head:
+            raise RecordingError('the file is empty')
+        if not _BEGIN.startswith(head[: len(_BEGIN)]):
+            raise RecordingError('not an MCAP file')
+        begin = len(head) + int.from_bytes(head[len(_BEGIN) :], 'little')
+        if len(head) < len(_BEGIN) + 8 or begin > self._size:
+            raise RecordingError('cut off inside its header, there is nothing to read')
         end = self._read_footer(begin)
         if not self.spans:
-            self._counts.clear()
             self._scan(begin, end)
         for number, channel in self._channels.items():
             schema = self._schemas.get(channel.schema_id)
@@ -129,21 +155,6 @@ class McapFile(BagFile):
             if schema.data:
                 text = schema.data.decode('utf-8', 'replace')
                 self.definitions[schema.name] = (schema.encoding, text)
-
-    def _read_header(self) -> int:
-        """Check how the file begins; gives where its records begin."""
-        head = self._read_at(0, len(MAGIC) + PREFIX.size)
-        if not head:
-            raise RecordingError('the file is empty')
-        if not MAGIC.startswith(head[: len(MAGIC)]):
-            raise RecordingError('not an MCAP file')
-        if len(head) == len(MAGIC) + PREFIX.size:
-            opcode, length = PREFIX.unpack_from(head, len(MAGIC))
-            if opcode != Opcode.HEADER:
-                raise RecordingError('not an MCAP file: it does not begin with a header')
-            if len(head) + length <= self._size:
-                return len(head) + int(length)
-        raise RecordingError('cut off inside its header, there is nothing to read')
 
     def _read_footer(self, begin: int) -> int | None:
         """Where the data section ends, and what the summary says; None where there is no end."""
@@ -167,37 +178,27 @@ class McapFile(BagFile):
             reader = StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True)
             for record in reader.records:
                 found.setdefault(type(record), []).append(record)
+            (said,) = found[Statistics]
         except Exception:  # noqa: BLE001 - damaged bytes surface as nearly any exception type
             return
-        said: list[Statistics] = found.get(Statistics, [])
-        chunks: list[ChunkIndex] = found.get(ChunkIndex, [])
+        counts, n_messages = said.channel_message_counts, said.message_count
         channels: dict[int, Channel] = {one.id: one for one in found.get(Channel, [])}
-        if len(said) != 1:
-            return
-        counts = said[0].channel_message_counts
-        if sum(counts.values()) != said[0].message_count or not counts.keys() <= channels.keys():
-            return
-        if not len(chunks) == len({c.chunk_start_offset for c in chunks}) == said[0].chunk_count:
-            return
-        spans = [
-            Span(
-                one.chunk_start_offset,
-                one.chunk_length,
-                one.message_index_length,
-                one.uncompressed_size,
-                one.message_start_time,
-                one.message_end_time,
-            )
-            for one in sorted(chunks, key=lambda one: one.chunk_start_offset)
-        ]
-        if any(one.position + one.length + one.index_length > self._size for one in spans):
+        chunks = sorted(found.get(ChunkIndex, []), key=lambda one: one.chunk_start_offset)
+        spans = [Span(*_SPAN_FIELDS(one)) for one in chunks]
+        if (
+            sum(counts.values()) != n_messages
+            or not counts.keys() <= channels.keys()
+            or not len(spans) == len({one.position for one in spans}) == said.chunk_count
+            or any(one.position + one.length + one.index_length > self._size for one in spans)
+        ):
             return
         self._channels = channels
         self._schemas = {one.id: one for one in found.get(Schema, [])}
-        self._counts.update(counts)
-        if said[0].message_count:
-            self.start_ns, self.end_ns = said[0].message_start_time, said[0].message_end_time
         self.spans = [one for one in spans if one.size]
+        if self.spans:
+            self._counts.update(counts)
+            if n_messages:
+                self.start_ns, self.end_ns = said.message_start_time, said.message_end_time
         for index in found.get(MetadataIndex, []):
             is_small = PREFIX.size <= index.length <= _MAX_SMALL_RECORD
             if index.name == METADATA_NAME and is_small and index.offset < self._size:
@@ -206,15 +207,10 @@ class McapFile(BagFile):
 
     def _on_record(self, opcode: int, content: bytes) -> None:
         """Take a record of the data section that is no message."""
-        kinds: Mapping[int, Any] = {
-            Opcode.SCHEMA: Schema,
-            Opcode.CHANNEL: Channel,
-            Opcode.METADATA: Metadata,
-        }
-        if opcode not in kinds:
+        if opcode not in _KINDS:
             return
         try:
-            record = kinds[opcode].read(_new_stream(BytesIO(content)))
+            record = _KINDS[opcode].read(_new_stream(BytesIO(content)))
         except Exception as error:  # see above
             raise DamagedError('a record is shorter than its content') from error
         if opcode == Opcode.SCHEMA:
@@ -228,83 +224,65 @@ class McapFile(BagFile):
         """Go through the file's records; where it has no end, up to the last whole message."""
         stop = self._size if end is None else end
         words = 'it ends between two records, so more may have followed'
+        spans = [Span(0, 0)]
         while at < stop:
             head = self._read_at(at, min(HEAD_BYTES, stop - at))
             opcode, length = head[0], int.from_bytes(head[1 : PREFIX.size], 'little')
-            step = PREFIX.size + length
+            step, last = PREFIX.size + length, spans[-1]
+            is_next = at == last.position + last.length + last.index_length
             if len(head) < PREFIX.size or at + step > stop or opcode == 0:
                 if end is not None:
                     raise DamagedError(f'the record at byte {at} is not whole')
-                words = self._torn(at, head)
+                words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
+                if opcode == 0 and at == last.position + last.length:
+                    # With the zeros that follow, which end the walk: its own end may be zeros too.
+                    kind = last.kind if last.kind == 'loose' else 'torn'
+                    spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
+                elif opcode == Opcode.CHUNK:
+                    with suppress(DamagedError):
+                        span, length = parse_chunk_head(head, at)[0], self._size - at
+                        spans.append(replace(span, length=length, kind='torn'))
                 break
-            last = self.spans[-1] if self.spans else Span(0, 0)
-            is_next = at == last.position + last.length + last.index_length
             if opcode == Opcode.CHUNK:
-                span = parse_chunk_head(head, at)[0]
-                self.spans += [span] if span.size else []
+                spans.append(parse_chunk_head(head, at)[0])
             elif opcode == Opcode.MESSAGE_INDEX and is_next:
-                self.spans[-1] = replace(last, index_length=last.index_length + step)
+                spans[-1] = replace(last, index_length=last.index_length + step)
             elif opcode == Opcode.MESSAGE:
-                if length > MAX_CHUNK_BYTES:
-                    raise DamagedError(f'at byte {at}: a record of {length} bytes')
                 if is_next and last.kind == 'loose' and last.length + step < _WINDOW_BYTES:
-                    self.spans[-1] = replace(last, length=last.length + step)
+                    spans[-1] = replace(last, length=last.length + step)
                 else:
-                    self.spans.append(Span(at, step, kind='loose'))
-            elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA}:
-                if length <= _MAX_SMALL_RECORD:
-                    self._on_record(opcode, self._read_at(at + PREFIX.size, length))
-                elif opcode != Opcode.METADATA:
-                    raise DamagedError(f'the record at byte {at} has {length} bytes')
+                    spans.append(Span(at, step, kind='loose'))
+            elif opcode in _KINDS and length <= _MAX_SMALL_RECORD:
+                self._on_record(opcode, self._read_at(at + PREFIX.size, length))
+            elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                raise DamagedError(f'the record at byte {at} has {length} bytes')
             elif opcode in {Opcode.DATA_END, Opcode.FOOTER}:
                 words = 'its summary is missing, but no message is'
                 break
             at += step
-        words = self._count(words, end is not None)
+        words = self._count(spans[1:], words, end is not None)
         if end is None:
             self.truncated = f'the file is cut off at byte {self._size}: {words}'
 
-    def _torn(self, at: int, head: bytes) -> str:
-        """Take what is left of a record that is not whole; says what that is."""
-        if head[0] == 0:
-            last = self.spans[-1] if self.spans else None
-            if last is not None and at == last.position + last.length:
-                # With the zeros that follow, which end the walk: its own end may be zeros too.
-                kind = last.kind if last.kind == 'loose' else 'torn'
-                self.spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
-            return f'it is unreadable from byte {at} on'
-        if head[0] == Opcode.CHUNK:
-            try:
-                span = parse_chunk_head(head, at)[0]
-            except DamagedError:
-                pass
-            else:
-                self.spans.append(replace(span, length=self._size - at, kind='torn'))
-            return 'it ends inside a chunk, of which the first {} messages are read'
-        if head[0] == Opcode.MESSAGE_INDEX:
-            return 'it ends inside the index of its last chunk, which is read whole'
-        return 'it ends inside a record, everything before that is read'
-
-    def _count(self, words: str, is_whole: bool) -> str:
+    def _count(self, spans: Sequence[Span], words: str, is_whole: bool) -> str:
         """Read all messages once: how many there are, and from when to when."""
-        for row, span in enumerate(list(self.spans)):
+        n_torn = 0
+        for span in spans:
             try:
                 messages = load(self._read_at, span, self._on_record)
             except DamagedError:
-                if is_whole or row + 1 < len(self.spans) or span.kind != 'chunk':
+                if is_whole or span is not spans[-1] or span.kind != 'chunk':
                     raise
-                self.spans.pop()
-                words = f'{words}; its last chunk is damaged and left out'
-                continue
-            if span.kind == 'torn':
-                words = words.format(len(messages))
+                words += '; its last chunk is damaged and left out'
+                break
+            n_torn = len(messages) if span.kind == 'torn' else 0
             if len(messages):
                 self._counts.update(messages.channel.tolist())
                 start, end = int(np.min(messages.log_ns)), int(np.max(messages.log_ns))
-                self.spans[row] = replace(span, start_ns=start, end_ns=end)
-                self.start_ns = start if self.start_ns is None else min(self.start_ns, start)
-                self.end_ns = end if self.end_ns is None else max(self.end_ns, end)
-        return words.format(0)
+                self.spans.append(replace(span, start_ns=start, end_ns=end))
+        self.start_ns = min((one.start_ns for one in self.spans), default=None)
+        self.end_ns = max((one.end_ns for one in self.spans), default=None)
+        return words.format(n_torn)
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:

@@ -9,9 +9,9 @@ What a chunk or a frame claims about its size is only ever an upper limit of wha
 from __future__ import annotations
 
 import bz2
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,10 @@ _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
 #: Up to so much before a damage is lost with it.
 _STEP_BYTES = 1 << 16
-_ERRORS = (zstandard.ZstdError, RuntimeError, EOFError)
+_ENGINES: Mapping[str, Callable[[], Any]] = {
+    'lz4': lz4.frame.LZ4FrameDecompressor,
+    'bz2': bz2.BZ2Decompressor,
+}
 
 
 class DamagedError(Exception):
@@ -59,13 +62,10 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 def expand(packed: Path, target: Path) -> str | None:
     """Decompress a ``.zstd`` file of rosbag2; say where it is unreadable, None if it is whole."""
     with open_regular(packed) as source, target.open('wb') as file:
-        size = packed.stat().st_size
-        limit = size * _MAX_GROWTH + _FREE_GROWTH_BYTES
+        limit = packed.stat().st_size * _MAX_GROWTH + _FREE_GROWTH_BYTES
         loss = None
         try:
-            for data in _pieces('zstd', source, _STEP_BYTES):
-                if file.tell() + len(data) > limit:
-                    raise DamagedError(f'{size} bytes hold more than {limit}')
+            for data in _pieces('zstd', source, limit, _STEP_BYTES):
                 file.write(data)
         except zstandard.ZstdError as error:
             n_bytes = file.tell()
@@ -75,79 +75,55 @@ def expand(packed: Path, target: Path) -> str | None:
         return loss
 
 
-def unpack_message(packed: bytes) -> bytes:
-    """Decompress one message that rosbag2 has compressed by itself."""
-    size = zstandard.frame_content_size(packed)
-    if size > _FREE_GROWTH_BYTES:
-        raise DamagedError(f'a message of {size} bytes')
-    decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
-    return decompressor.decompress(packed, max_output_size=_FREE_GROWTH_BYTES)
-
-
-def unpack_ros1_chunk(packed: bytes) -> bytes:
-    """Decompress a chunk of a ROS 1 bag; DamagedError where it holds more than a chunk may."""
-    engine: Any
-    if packed[:3] == b'BZh':
-        engine = bz2.BZ2Decompressor()
-    elif packed[:4] == b'\x04\x22\x4d\x18':
-        engine = lz4.frame.LZ4FrameDecompressor()
-    else:
-        return packed
-    data: bytes = engine.decompress(packed, max_length=MAX_CHUNK_BYTES + 1)
-    if len(data) > MAX_CHUNK_BYTES:
-        raise DamagedError(f'a chunk of {len(packed)} bytes holds more than {MAX_CHUNK_BYTES}')
-    if not engine.eof:
-        raise DamagedError('a chunk is cut off')
-    return data
-
-
-def unpack(compression: str, packed: Bytes, size: int, checksum: int) -> Bytes:
-    """Decompress a whole chunk that claims this size and CRC-32 (0 = none), or DamagedError."""
-    data = packed
-    if compression:
-        pieces = []
-        try:
-            for piece in _pieces(compression, packed.data, size + 1):
-                pieces.append(piece)
-                if sum(map(len, pieces)) > size:
-                    raise DamagedError(f'more than the {size} bytes that it claims')
-        except _ERRORS as error:
-            raise DamagedError(f'{compression}: {error}') from error
-        data = np.frombuffer(b''.join(pieces), np.uint8)
-    if len(data) != size:
-        raise DamagedError(f'{len(data)} bytes after decompression, expected {size}')
-    if checksum and zlib.crc32(data.data) != checksum:
-        raise DamagedError('the checksum does not fit the content')
-    return data
-
-
-def unpack_beginning(compression: str, packed: Bytes) -> Bytes:
-    """Decompress a torn chunk as far as its bytes go."""
-    if compression == '':
-        return packed
+def inflate(
+    compression: str, packed: Any, limit: int, step: int = _STEP_BYTES, *, is_torn: bool = False
+) -> Bytes:
+    """Decompress bytes, a torn piece as far as they go; DamagedError for more than the limit."""
+    if not compression:
+        return np.asarray(packed)
     pieces: list[bytes] = []
-    with suppress(*_ERRORS):
-        for piece in _pieces(compression, packed.data, _STEP_BYTES):
-            pieces.append(piece)
-            if len(pieces) * _STEP_BYTES > MAX_CHUNK_BYTES:
-                break
+    try:
+        pieces.extend(_pieces(compression, memoryview(packed), limit, step))
+    except (zstandard.ZstdError, RuntimeError, EOFError, OSError) as error:
+        if not is_torn:
+            raise DamagedError(f'{compression}: {error}') from error
     return np.frombuffer(b''.join(pieces), np.uint8)
 
 
-def _pieces(compression: str, source: Any, step: int) -> Iterator[bytes]:
-    """Decompress bytes, or with zstd a file, so many at a time."""
+def inflate_message(packed: bytes) -> bytes:
+    """Decompress one message that rosbag2 has compressed by itself."""
+    return inflate('zstd', packed, _FREE_GROWTH_BYTES).tobytes()
+
+
+def inflate_ros1_chunk(packed: bytes) -> bytes:
+    """Decompress a chunk of a ROS 1 bag, which begins as its compression does."""
+    compression = {b'BZh': 'bz2', b'\x04\x22\x4d': 'lz4'}.get(packed[:3], '')
+    return inflate(compression, packed, MAX_CHUNK_BYTES).tobytes() if compression else packed
+
+
+def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[bytes]:
+    """Decompress bytes, or with zstd a file, so many at a time; DamagedError beyond the limit."""
+    n_left = limit
+    for piece in iter(partial(_reader(compression, source), step), b''):
+        n_left -= len(piece)
+        if n_left < 0:
+            raise DamagedError(f'it holds more than the {limit} bytes that it may')
+        yield piece
+
+
+def _reader(compression: str, source: Any) -> Callable[[int], bytes]:
+    """Give what decompresses so many bytes; none at the end."""
     if compression == 'zstd':
         decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
-        with decompressor.stream_reader(source, read_across_frames=True) as reader:
-            while piece := reader.read(step):
-                yield piece
-        return
-    if compression != 'lz4':
+        return decompressor.stream_reader(source, read_across_frames=True).read
+    if compression not in _ENGINES:
         raise DamagedError(f'unknown compression {compression!r}, expected zstd, lz4 or none')
-    engine = lz4.frame.LZ4FrameDecompressor()
-    piece = engine.decompress(source, max_length=step)
-    while piece:
-        yield piece
-        if engine.eof or engine.needs_input:
-            return
-        piece = engine.decompress(b'', max_length=step)
+    engine, left = _ENGINES[compression](), [source]
+
+    def read(n_bytes: int) -> bytes:
+        if not left and (engine.eof or engine.needs_input):
+            return b''
+        data: bytes = engine.decompress(left.pop() if left else b'', max_length=n_bytes)
+        return data
+
+    return read
