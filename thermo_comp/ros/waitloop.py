@@ -6,11 +6,7 @@ Owns the loop around a node's wait sets, and everything that leaves rclpy's docu
 rclpy's executor builds a wait set, a generator and a coroutine for each message, which costs ten
 times the compensation itself, and converts it. Here messages stay serialized, and while samples
 flow a wake-up waits for them alone and empties their queue; services and ordinary subscriptions
-are looked at now and then. Timers, clients and middleware events are nobody's: `call_every` is the
-timer. With best effort, where wake-ups cost the most, messages that come faster than anybody waits
-for them may gather a little, so that one wake-up serves several.
-
-No exception of a callback ends the loop: it is logged and counted, and samples go on.
+are looked at now and then. Timers, clients and middleware events are nobody's.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message`, `get_publisher_count`, `service_take_request` and `publish_raw` of handles, and the
@@ -53,6 +49,8 @@ _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 #: A failure is logged with all its lines, but not more often than this [ns].
 _LOG_PERIOD_NS = 10 * 10**9
 
+_KINDS = {Subscription: 'subscription', Service: 'service', GuardCondition: 'guard_condition'}
+
 RCLError = rclpy_implementation.RCLError
 
 #: Takes a request and what sends the answer, now or later, in the loop's thread.
@@ -86,9 +84,7 @@ class RawSubscription:
             message, info = taken
             messages.append(message)
             received_ns.append(info['received_timestamp'])
-            if len(messages) == DRAIN_LIMIT:
-                break
-            taken = take()
+            taken = take() if len(messages) < DRAIN_LIMIT else None
         before_ns, self._newest_ns = self._newest_ns, received_ns[-1]
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
         before, self._sequence = self._sequence, info['publication_sequence_number']
@@ -116,10 +112,8 @@ class WaitLoop:
         #: Callbacks that ended in an exception.
         self.n_failures = 0
         self._logged_ns = -_LOG_PERIOD_NS
-        self._is_stopping = False
-        self._is_stale = True
-        self._period_ns = _NEVER_NS
-        self._call_ns = _NEVER_NS
+        self._is_stopping, self._is_stale = False, True
+        self._period_ns = self._call_ns = _NEVER_NS
         self._callback: Callable[[], None] = lambda: None
         node.context.on_shutdown(self.stop)
 
@@ -168,15 +162,14 @@ class WaitLoop:
             self._guard.trigger()
 
     def run(self, on_data: Callable[[], None]) -> None:
-        """Serve until the end; `on_data` is called when woken and drains all subscriptions."""
+        """
+        Serve until the end; `on_data` is called when woken and drains all subscriptions.
+
+        No exception of a callback ends it: it is logged and counted, and samples go on.
+        """
         try:
             while not self._is_stopping:
-                try:
-                    self._serve(on_data)
-                except Exception as error:  # noqa: PERF203 - whatever it was
-                    if isinstance(error, RCLError | ExternalShutdownException):
-                        raise
-                    self._note_failure(error)
+                self._guarded(partial(self._serve, on_data), (RCLError, ExternalShutdownException))
         except (RCLError, ExternalShutdownException):
             if self._node.context.ok():
                 raise
@@ -188,9 +181,9 @@ class WaitLoop:
     def _serve(self, on_data: Callable[[], None]) -> None:
         """Wait and serve until the entities change or the loop is to stop."""
         node, self._is_stale = self._node, False
-        subscriptions, services = list(node.subscriptions), list(node.services)
         raw = [one.subscription for one in self._raw]
-        others = [one for one in subscriptions if one not in raw]
+        others = {one: partial(_take_message, one) for one in node.subscriptions if one not in raw}
+        others |= {one: partial(self._take_request, one) for one in node.services}
         hot = next((one for one in self._raw if one.is_hot), None)
         rest_ns = 0
         # Only there a wake-up costs more than to sleep a little.
@@ -200,9 +193,10 @@ class WaitLoop:
         now_ns, look_ns = time.monotonic_ns, 0
         is_flowing = False
         with ExitStack() as in_use:
-            for entity in (*subscriptions, *services, self._guard, node.context):
+            entities = [*raw, *others, self._guard]
+            for entity in (*entities, node.context):
                 in_use.enter_context(entity.handle)
-            everything = _WaitSet(node.context, subscriptions, services, [self._guard])
+            everything = _WaitSet(node.context, entities)
             alone = _WaitSet(node.context, [hot.subscription] if hot else [])
             while not (self._is_stopping or self._is_stale):
                 if self._soon:
@@ -213,40 +207,28 @@ class WaitLoop:
                     continue
                 now = now_ns()
                 if now >= self._call_ns:
-                    self._call_ns += self._period_ns
-                    if self._call_ns <= now:
-                        # One that was missed is not made up for.
-                        self._call_ns = now + self._period_ns
+                    # One that was missed is not made up for.
+                    late_ns = (now - self._call_ns) % self._period_ns
+                    self._call_ns = now - late_ns + self._period_ns
                     self._guarded(self._callback)
                     continue
                 if is_flowing:
-                    alone.wait(min(self._call_ns - now, OTHERS_PERIOD_NS))
-                    is_flowing = alone.is_ready(hot.subscription) if hot else False
+                    is_flowing = bool(alone.wait(min(self._call_ns - now, OTHERS_PERIOD_NS)))
                 else:
                     everything.wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
                     is_flowing, look_ns = hot is not None, 0
                 woken_ns = now_ns()
                 on_data()
                 if woken_ns >= look_ns:
+                    ready = [others[one] for one in everything.wait(0) if one in others]
+                    served = [self._guarded(serve) for serve in ready]
                     # After a request the next one may wait already.
-                    everything.wait(0)
-                    ready = [one for one in others if everything.is_ready(one)]
-                    asked = [one for one in services if everything.is_ready(one)]
-                    is_busy = self._look_after(ready, asked)
-                    look_ns = 0 if is_busy else woken_ns + OTHERS_PERIOD_NS
+                    look_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
                 # No interval at all: the middleware does not tell the time.
                 if hot and 0 < hot.interval_ns < crowd_ns:
                     left_ns = woken_ns + rest_ns - now_ns()
                     if left_ns > 0:
                         time.sleep(left_ns * 1e-9)
-
-    def _look_after(self, subscriptions: list[Subscription], services: list[Service]) -> bool:
-        """Serve one message or request of each; tell whether there was any."""
-        served = [
-            *[self._guarded(partial(_take_message, one)) for one in subscriptions],
-            *[self._guarded(partial(self._take_request, one)) for one in services],
-        ]
-        return any(served)
 
     def _take_request(self, service: Service) -> bool:
         request, header = service.handle.service_take_request(service.srv_type.Request)
@@ -262,62 +244,47 @@ class WaitLoop:
             answer(service.callback(request, service.srv_type.Response()))
         return True
 
-    def _guarded(self, callback: Callable[[], bool | None]) -> bool | None:
-        """Call back; samples go on where that fails."""
+    def _guarded(
+        self,
+        callback: Callable[[], bool | None],
+        fatal: tuple[type[Exception], ...] = (ExternalShutdownException,),
+    ) -> bool | None:
+        """Call back; samples go on where that fails, which is logged now and then."""
         try:
             return callback()
-        except ExternalShutdownException:
+        except fatal:
             raise
         except Exception as error:
             if not self._node.context.ok():
                 raise ExternalShutdownException from error
-            self._note_failure(error)
+            self.n_failures += 1
+            now = time.monotonic_ns()
+            if now - self._logged_ns >= _LOG_PERIOD_NS:
+                self._logged_ns = now
+                lines = ''.join(traceback.format_exception(error)).splitlines()
+                text = '\n'.join(['a callback failed, samples go on:', *map(one_line, lines)])
+                self._node.get_logger().error(text)
             return None
-
-    def _note_failure(self, error: Exception) -> None:
-        """Count an exception, and log it unless another one has just been."""
-        self.n_failures += 1
-        now = time.monotonic_ns()
-        if now - self._logged_ns >= _LOG_PERIOD_NS:
-            self._logged_ns = now
-            lines = ''.join(traceback.format_exception(error)).splitlines()
-            text = '\n'.join(['a callback failed, samples go on:', *map(one_line, lines)])
-            self._node.get_logger().error(text)
 
 
 class _WaitSet:
     """A wait set, filled anew for each wait."""
 
-    def __init__(
-        self,
-        context: Context,
-        subscriptions: Sequence[Subscription],
-        services: Sequence[Service] = (),
-        guards: Sequence[GuardCondition] = (),
-    ) -> None:
-        counts = len(subscriptions), len(guards), 0, 0, len(services), 0
-        self._set = rclpy_implementation.WaitSet(*counts, context.handle)
+    def __init__(self, context: Context, entities: Sequence[Any]) -> None:
+        types = [type(one) for one in entities]
+        counts = types.count(Subscription), types.count(GuardCondition), 0, 0, types.count(Service)
+        self._set = rclpy_implementation.WaitSet(*counts, 0, context.handle)
         self._content = [
-            *[(self._set.add_subscription, one.handle) for one in subscriptions],
-            *[(self._set.add_service, one.handle) for one in services],
-            *[(self._set.add_guard_condition, one.handle) for one in guards],
+            (one, _KINDS[kind], getattr(self._set, f'add_{_KINDS[kind]}'), one.handle)
+            for one, kind in zip(entities, types, strict=True)
         ]
-        self._places = {
-            one: (kind, place)
-            for kind, many in (('subscription', subscriptions), ('service', services))
-            for place, one in enumerate(many)
-        }
 
-    def wait(self, timeout_ns: int) -> None:
-        """Wait at most so long [ns]."""
+    def wait(self, timeout_ns: int) -> list[Any]:
+        """Wait at most so long [ns]; return the entities at which something waits."""
         self._set.clear_entities()
-        for add, handle in self._content:
-            add(handle)
+        places = [(one, kind, add(handle)) for one, kind, add, handle in self._content]
         self._set.wait(timeout_ns)
-
-    def is_ready(self, entity: Subscription | Service) -> bool:
-        """Tell whether something waits at an entity, as the last wait has found."""
-        return bool(self._set.is_ready(*self._places[entity]))
+        return [one for one, kind, place in places if self._set.is_ready(kind, place)]
 
 
 def _take_message(subscription: Subscription) -> bool:
