@@ -157,9 +157,8 @@ def check_parameters(data: bytes) -> None:
     from rclpy.serialization import deserialize_message
 
     from thermo_comp.errors import CalibrationError
-    from thermo_comp.ros.parameters import NodeConfig, ParameterError, coerce, updated
+    from thermo_comp.ros.parameters import NodeConfig, ParameterError, read_parameter, updated
     from thermo_comp.ros.reader import read
-    from thermo_comp.ros.requests import RequestError, read_parameter
 
     try:
         messages = deserialize_message(data, SetParameters.Request).parameters
@@ -171,10 +170,10 @@ def check_parameters(data: bytes) -> None:
 
     def ask(message: Parameter) -> None:
         try:
-            config = updated(NodeConfig(), coerce([read_parameter(message)]))
+            config = updated(NodeConfig(), [read_parameter(message)])
             if config.calibration_file:
                 read(config.calibration_file, '/nowhere')
-        except (RequestError, ParameterError, CalibrationError) as error:
+        except (ParameterError, CalibrationError) as error:
             assert str(error)
             assert '\n' not in str(error), error
 

@@ -35,9 +35,8 @@ from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
-from thermo_comp.ros.parameters import NodeConfig
+from thermo_comp.ros.parameters import PARAMETERS_LIMIT, NodeConfig
 from thermo_comp.ros.reader import Reader
-from thermo_comp.ros.requests import PARAMETERS_LIMIT
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
 

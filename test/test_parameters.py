@@ -120,7 +120,7 @@ def test_only_whole_numbers_for_float_parameters_are_turned_into_floats() -> Non
         Parameter('use_sim_time', value=True),
         Parameter('unknown', value=5),
     ]
-    found = parameters.coerce(changes)
+    found = [parameters.read_parameter(one.to_parameter_msg()) for one in changes]
     assert [one.value for one in found] == [5.0, 5, True, 5]
     assert [one.type_ for one in found] == [
         Parameter.Type.DOUBLE,

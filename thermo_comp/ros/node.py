@@ -31,7 +31,6 @@ from .diagnostics import Reporter
 from .process import SignalWatch, use_profile
 from .reader import LoadedCalibration, Reader, read
 from .relay import INPUTS, Relay
-from .requests import ParameterRequests
 from .waitloop import WaitLoop, undeclared_overrides
 
 NODE_NAME = 'thermo_comp'
@@ -82,7 +81,9 @@ class CompensationNode:
         self._relay = Relay(self.node, self._loop, self._compensator, config)
         self._reporter = Reporter(self.node, self._loop, self._relay, self._compensator)
         self._reader = Reader()
-        self._requests = ParameterRequests(self.node, self._loop, self._prepare, self._set)
+        self._requests = parameters.ParameterRequests(
+            self.node, self._loop, self._prepare, self._set
+        )
         self._report_every(config.diagnostics_period)
         topics = [self.node.resolve_topic_name(topic) for _, topic in INPUTS.values()]
         # The input that is not open may be opened later, with these.
@@ -120,7 +121,7 @@ class CompensationNode:
         self, changes: list[Parameter], loaded: LoadedCalibration | None
     ) -> SetParametersResult:
         """Check a change as a whole, set and apply it, between two samples."""
-        changes, loaded = parameters.coerce(changes), loaded or self._loaded
+        loaded = loaded or self._loaded
         before, samples, result = self._config, self._relay.samples, SetParametersResult()
         config = parameters.updated(before, changes)
         self._check(loaded, config)

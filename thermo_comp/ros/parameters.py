@@ -1,27 +1,42 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the node's parameters: one table gives types, defaults, ranges, descriptors and documentation.
+Owns the node's parameters: the table of what they are, and the services that set them.
 
 The table is `NodeConfig` itself, a frozen dataclass: what the node runs with at any moment is one
-such object, and a change makes another one or is refused as a whole.
+such object, and a change makes another one or is refused as a whole. rclpy serves a request in one
+go, in the thread of the samples. Here a thread of its own waits for what takes time, the reading
+of a file; what is left for the loop is to exchange one reference. Requests are answered in the
+order in which they came, whatever is wrong with them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import Field, dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces import srv
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.service import Service
 
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
-from ..text import LONGEST_SERIAL
+from ..text import LONGEST_SERIAL, one_line
 from .conversions import LONGEST_FRAME
+from .waitloop import WaitLoop
+
+#: More requests than this that wait, or parameters in one of them, are refused.
+WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
+#: Of a reason, which may repeat what came in.
+_LONGEST_REASON = 1000
 
 _DEFAULTS = CompensatorConfig()
 
@@ -146,18 +161,6 @@ def descriptor(name: str) -> ParameterDescriptor:
     return described
 
 
-def coerce(parameters: Iterable[Parameter]) -> list[Parameter]:
-    """Turn whole numbers into floats where this node wants floats (``ros2 param set ... 5``)."""
-    return [
-        Parameter(one.name, Parameter.Type.DOUBLE, float(one.value))
-        if one.type_ == Parameter.Type.INTEGER
-        and one.name in _TABLE
-        and isinstance(_TABLE[one.name].default, float)
-        else one
-        for one in parameters
-    ]
-
-
 def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
     """Apply values set together, passing over others' parameters; ParameterError as above."""
     values = {one.name: _checked(one.name, one.value) for one in parameters if one.name in _TABLE}
@@ -211,3 +214,122 @@ def _checked(name: str, value: Any) -> Any:
     if rule:
         raise ParameterError(f'parameter `{name}` must be {rule}, got {got}')
     return value
+
+
+#: Runs beside the samples: what takes time about a change.
+Prepare = Callable[[list[Parameter]], Any]
+#: Runs between two samples: sets what was prepared.
+Apply = Callable[[list[Parameter], Any], SetParametersResult]
+
+
+class ParameterRequests:
+    """
+    What answers a node's parameter services; exceptions of the halves of a change are refusals.
+    """
+
+    def __init__(self, node: Node, loop: WaitLoop, prepare: Prepare, apply: Apply) -> None:
+        self._node, self._loop, self._prepare, self._apply = node, loop, prepare, apply
+        self._n_waiting = 0
+        self._beside = ThreadPoolExecutor(1, 'parameters')
+        for service in node.services:
+            if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
+                loop.serve(service, partial(self._take, service.srv_type))
+            elif service.srv_type.__module__.startswith('rcl_interfaces.'):
+                loop.serve(service, partial(_reply, service))
+
+    def close(self) -> None:
+        """Finish what is being prepared; nothing is applied any more."""
+        self._beside.shutdown(cancel_futures=True)
+
+    def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
+        """Let a request wait for its turn."""
+        is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
+        groups = [[one] for one in request.parameters] if is_each else [request.parameters]
+        results: list[SetParametersResult] = []
+
+        def respond() -> None:
+            answer(kind.Response(results=results) if is_each else kind.Response(result=results[0]))
+
+        def end(prepared: Future[Any]) -> None:
+            """Apply a group in the loop's thread; after the last one answer."""
+            try:
+                self._set(prepared, results)
+            finally:
+                if len(results) == len(groups):
+                    self._n_waiting -= 1
+                    respond()
+
+        if n > PARAMETERS_LIMIT:
+            reason = f'{n} parameters at once, at most {PARAMETERS_LIMIT}'
+        elif self._n_waiting >= WAITING_LIMIT:
+            reason = 'too many requests wait already, try again'
+        elif groups:
+            self._n_waiting += 1
+            for group in groups:
+                future = self._beside.submit(self._read, group)
+                future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
+            return
+        # Not one for each: to write so many would take as long as to read them.
+        results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
+        respond()
+
+    def _read(self, group: list[ParameterMessage]) -> tuple[list[Parameter], Any]:
+        changes = [read_parameter(message) for message in group]
+        return changes, self._prepare(changes)
+
+    def _set(self, prepared: Future[Any], results: list[SetParametersResult]) -> None:
+        """Apply one group; what nobody foresaw is refused and logged by the loop."""
+        try:
+            changes, found = prepared.result()
+            news = [one for one in changes if not self._is_in_force(one)]
+            result = self._apply(news, found) if news else SetParametersResult(successful=True)
+            results.append(result if result.successful else _refusal(result.reason))
+        except (ThermoCompError, ParameterNotDeclaredException) as error:
+            results.append(_refusal(str(error)))
+        except Exception as error:
+            results.append(
+                _refusal(f"internal error ({type(error).__name__}), see the node's log")
+            )
+            raise
+
+    def _is_in_force(self, change: Parameter) -> bool:
+        """Tell whether it leaves a fixed parameter as it is, as `param load` of a dump does."""
+        node = self._node
+        return bool(
+            node.has_parameter(change.name)
+            and node.describe_parameter(change.name).read_only
+            and node.get_parameter(change.name).value == change.value
+        )
+
+
+def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> None:
+    """Let rclpy answer a question; one of too many names as if it knew none of them."""
+    names = request.prefixes if service.srv_type is srv.ListParameters else request.names
+    response = service.srv_type.Response()
+    answer(response if len(names) > PARAMETERS_LIMIT else service.callback(request, response))
+
+
+def read_parameter(message: ParameterMessage) -> Parameter:
+    """
+    Read a parameter off the network, whole numbers as floats where this node wants floats.
+
+    ParameterError if it has no name, or a value of no type.
+    """
+    if not message.name:
+        # rclpy takes it for declared.
+        raise ParameterError('a parameter without a name')
+    try:
+        one = Parameter.from_parameter_msg(message)
+    except (ValueError, TypeError) as error:
+        raise ParameterError(
+            f'parameter {message.name!r:.60} has no value that can be read '
+            f'(type {message.value.type})'
+        ) from error
+    is_whole = one.type_ == Parameter.Type.INTEGER and one.name in _TABLE
+    if is_whole and isinstance(_TABLE[one.name].default, float):
+        return Parameter(one.name, Parameter.Type.DOUBLE, float(one.value))
+    return one
+
+
+def _refusal(reason: str) -> SetParametersResult:
+    return SetParametersResult(successful=False, reason=one_line(reason[:_LONGEST_REASON]))
