@@ -9,15 +9,26 @@ Run ``python docs/make_reference.py`` after changing a key or a parameter; a tes
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from thermo_comp.ros.parameters import parameters_table
-from thermo_comp.unit.calibration_file import calibration_schema
+from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.schema import Bounds, fields_of, parts_of, plain
 
 ROOT = Path(__file__).resolve().parent.parent
+TYPES = {str: 'string', int: 'integer', float: 'number', bool: 'boolean', type(None): 'null'}
+KEYWORDS = {
+    'above': 'exclusiveMinimum',
+    'at_least': 'minimum',
+    'below': 'exclusiveMaximum',
+    'shortest': 'minLength',
+    'longest': 'maxLength',
+}
 AXES = ('x', 'y', 'z')
 
 CALIBRATION_HEAD = """\
@@ -122,6 +133,65 @@ Every fault with its test: [faults](faults.md).
 """
 
 
+def json_schema(cls: type) -> dict[str, Any]:
+    """Return the JSON Schema of a dataclass and of all that it holds."""
+    definitions: dict[str, Any] = {}
+    top = _schema(cls, definitions)['$ref'].rpartition('/')[2]
+    result = definitions.pop(top)
+    return {'$defs': dict(sorted(definitions.items())), **result}
+
+
+def calibration_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the calibration file."""
+    return {'$schema': 'https://json-schema.org/draft/2020-12/schema', **json_schema(Calibration)}
+
+
+def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
+    if hint in TYPES:
+        return {'type': TYPES[hint]}
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        _define(hint, definitions)
+        return {'$ref': f'#/$defs/{hint.__name__}'}
+    origin, arguments = parts_of(hint)
+    if origin is Annotated:
+        result = _schema(arguments[0], definitions)
+        for note in arguments[1:]:
+            if isinstance(note, Bounds):
+                limits = vars(note).items()
+                result |= {KEYWORDS[name]: limit for name, limit in limits if limit is not None}
+            else:
+                result['description'] = note
+        return result
+    if origin is Literal:
+        one = len(arguments) == 1
+        return {'const': arguments[0]} if one else {'enum': list(arguments), 'type': 'string'}
+    if origin is not tuple:
+        return {'anyOf': [_schema(one, definitions) for one in arguments]}
+    if arguments[-1] is Ellipsis:
+        return {'type': 'array', 'items': _schema(arguments[0], definitions)}
+    items = [_schema(one, definitions) for one in arguments]
+    return {'type': 'array', 'prefixItems': items, 'minItems': len(items), 'maxItems': len(items)}
+
+
+def _define(cls: Any, definitions: dict[str, Any]) -> None:
+    if cls.__name__ in definitions:
+        return
+    hints, required = fields_of(cls)
+    # It stands before those that it holds.
+    result = definitions[cls.__name__] = {
+        'type': 'object',
+        'description': inspect.cleandoc(cls.__doc__),
+        'additionalProperties': False,
+    }
+    result['properties'] = {name: _schema(hint, definitions) for name, hint in hints.items()}
+    for field in dataclasses.fields(cls):
+        if field.name not in required:
+            factory = field.default_factory
+            value = field.default if factory is dataclasses.MISSING else factory()
+            result['properties'][field.name]['default'] = plain(value)
+    result['required'] = list(required)
+
+
 def calibration_page() -> str:
     """
     Return the calibration file's reference.
@@ -163,35 +233,15 @@ def _section(
     lines = [f'{"#" * heading} {name}', '', text if heading > 2 else '', '']
     lines += ['| key | type | default | meaning |', '|---|---|---|---|']
     required = part.get('required', [])
-    told = _parameters(part.get('description', ''))
     for key, value in part.get('properties', {}).items():
         default = 'required' if key in required else f'`{json.dumps(value.get("default"))}`'
         if len(default) > 40:
             default = 'see there'
-        meaning = (
-            value.get('description', '') or told.get(key, '') or _described(value, definitions)
-        )
+        meaning = value.get('description', '') or _described(value, definitions)
         # An element of a matrix is no link.
         meaning = re.sub(r'\w+(\[\d\]){2}', r'`\g<0>`', meaning)
         lines.append(f'| `{key}` | {_type(value)} | {default} | {meaning} |')
     return [*lines, '']
-
-
-def _parameters(docstring: str) -> dict[str, str]:
-    """
-    Read the meanings out of a numpydoc `Parameters` section.
-
-    """
-    result: dict[str, str] = {}
-    names: list[str] = []
-    _, _, section = docstring.partition('Parameters\n----------\n')
-    for line in section.partition('\n\n')[0].splitlines():
-        if not line.startswith(' '):
-            names = [name.strip() for name in line.partition(' : ')[0].split(',')]
-        else:
-            for name in names:
-                result[name] = f'{result.get(name, "")} {line.strip()}'.strip()
-    return result
 
 
 def _described(value: dict[str, Any], definitions: dict[str, Any]) -> str:

@@ -3,7 +3,6 @@
 """The calibration value and its file: round trip to the bit, and every refusal with its key."""
 
 import contextlib
-import json
 import os
 import re
 from dataclasses import replace
@@ -19,7 +18,6 @@ from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import GroupEvidence, parameter_layout
 from thermo_comp.unit.calibration_file import (
     SIZE_LIMIT,
-    calibration_schema,
     dump_calibration,
     load_calibration,
     parse_calibration,
@@ -341,11 +339,6 @@ def test_posterior_of_other_size_is_refused():
         ValueError, match=rf'`posterior.rest` .*per parameter \({n + 6}\), got {n}'
     ):
         replace(RICH, response=(term('now'), *RICH.response))
-
-
-def test_shipped_schema_is_the_schema():
-    path = REPOSITORY / 'config' / 'calibration.schema.json'
-    assert json.loads(path.read_text()) == calibration_schema()
 
 
 def test_shipped_example_loads():

@@ -5,17 +5,54 @@
 import importlib.util
 from pathlib import Path
 
+from test_schema import Drawing
+
 ROOT = Path(__file__).resolve().parent.parent
+_spec = importlib.util.spec_from_file_location('make_reference', ROOT / 'docs/make_reference.py')
+make_reference = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(make_reference)
 
 
 def test_generated_pages_are_up_to_date():
-    spec = importlib.util.spec_from_file_location(
-        'make_reference', ROOT / 'docs/make_reference.py'
-    )
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    stale = [str(path) for path, text in module.pages().items() if path.read_text() != text]
+    stale = [
+        str(path) for path, text in make_reference.pages().items() if path.read_text() != text
+    ]
     assert not stale, 'run: python docs/make_reference.py'
+
+
+def test_json_schema_says_the_same() -> None:
+    schema = make_reference.json_schema(Drawing)
+    assert schema['required'] == ['name']
+    assert schema['additionalProperties'] is False
+    assert schema['description'] == 'Something of everything.'
+    assert schema['properties']['name'] == {'type': 'string', 'minLength': 2, 'maxLength': 20}
+    assert schema['properties']['shapes'] == {
+        'type': 'array',
+        'items': {'anyOf': [{'$ref': '#/$defs/Circle'}, {'$ref': '#/$defs/Square'}]},
+        'default': [],
+    }
+    assert schema['properties']['corner'] == {
+        'type': 'array',
+        'prefixItems': [{'type': 'number'}, {'type': 'number'}],
+        'minItems': 2,
+        'maxItems': 2,
+        'default': [0.0, 0.0],
+    }
+    assert schema['properties']['colour'] == {
+        'anyOf': [{'enum': ['red', 'green', 'blue'], 'type': 'string'}, {'type': 'null'}],
+        'default': None,
+    }
+    assert schema['properties']['frame']['default'] == {'kind': 'circle', 'radius': 1.0}
+    assert schema['$defs']['Circle']['properties'] == {
+        'radius': {
+            'type': 'number',
+            'exclusiveMinimum': 0.0,
+            'exclusiveMaximum': 10.0,
+            'description': 'In metres.',
+        },
+        'kind': {'const': 'circle', 'default': 'circle'},
+    }
+    assert schema['$defs']['Circle']['required'] == ['radius']
 
 
 def test_links_between_pages_lead_somewhere():

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermo_comp.unit.schema import Bounds, SchemaError, build, json_schema, plain
+from thermo_comp.unit.schema import Bounds, SchemaError, build, plain
 
 
 @dataclass(frozen=True)
@@ -112,38 +112,3 @@ def test_what_does_not_fit_is_refused(data: Any, key: str, message: str) -> None
 def test_a_hint_that_no_schema_knows_is_a_mistake_of_the_code() -> None:
     with pytest.raises(TypeError, match='no hint that a schema knows'):
         build(dict[str, int], {})
-
-
-def test_json_schema_says_the_same() -> None:
-    schema = json_schema(Drawing)
-    assert schema['required'] == ['name']
-    assert schema['additionalProperties'] is False
-    assert schema['description'] == 'Something of everything.'
-    assert schema['properties']['name'] == {'type': 'string', 'minLength': 2, 'maxLength': 20}
-    assert schema['properties']['shapes'] == {
-        'type': 'array',
-        'items': {'anyOf': [{'$ref': '#/$defs/Circle'}, {'$ref': '#/$defs/Square'}]},
-        'default': [],
-    }
-    assert schema['properties']['corner'] == {
-        'type': 'array',
-        'prefixItems': [{'type': 'number'}, {'type': 'number'}],
-        'minItems': 2,
-        'maxItems': 2,
-        'default': [0.0, 0.0],
-    }
-    assert schema['properties']['colour'] == {
-        'anyOf': [{'enum': ['red', 'green', 'blue'], 'type': 'string'}, {'type': 'null'}],
-        'default': None,
-    }
-    assert schema['properties']['frame']['default'] == {'kind': 'circle', 'radius': 1.0}
-    assert schema['$defs']['Circle']['properties'] == {
-        'radius': {
-            'type': 'number',
-            'exclusiveMinimum': 0.0,
-            'exclusiveMaximum': 10.0,
-            'description': 'In metres.',
-        },
-        'kind': {'const': 'circle', 'default': 'circle'},
-    }
-    assert schema['$defs']['Circle']['required'] == ['radius']

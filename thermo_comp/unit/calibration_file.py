@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the calibration file: YAML to a validated Calibration and back, and its JSON Schema.
+Owns the calibration file: YAML to a validated Calibration and back.
 
 The reader takes any bytes at all and answers with a Calibration or a CalibrationError that names
 the file and the key: size, nesting and the YAML features it accepts are bounded before anything
@@ -19,7 +19,7 @@ from ..errors import CalibrationError
 from ..files import CALIBRATION, read_bounded, write_atomically
 from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
 from .calibration import FORMAT_VERSION, Calibration
-from .schema import SchemaError, build, json_schema, plain, required_keys
+from .schema import SchemaError, build, fields_of, plain
 from .version_1 import read_version_1
 
 #: With the whole bank of columns and one thermometer beside the board a calibration takes some
@@ -52,7 +52,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
         raise CalibrationError(str(error), path, rule=error.rule) from error
     if not isinstance(data, dict):
         raise CalibrationError('expected a mapping of keys at the top level', path)
-    missing = [key for key in required_keys(Calibration) if key not in data]
+    missing = [key for key in fields_of(Calibration)[1] if key not in data]
     rule = f'not a calibration: the key `{missing[0]}` is missing' if missing else None
     version = data.get('format_version')
     if type(version) is int and version > FORMAT_VERSION:
@@ -106,11 +106,6 @@ def save_calibration(
     """
     text = dump_calibration(calibration)
     write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)
-
-
-def calibration_schema() -> dict[str, Any]:
-    """Return the JSON Schema of the calibration file."""
-    return {'$schema': 'https://json-schema.org/draft/2020-12/schema', **json_schema(Calibration)}
 
 
 _BASE: type[yaml.SafeDumper] = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)

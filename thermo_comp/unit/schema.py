@@ -12,7 +12,6 @@ it raises a ValueError that starts with the key in backticks.
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import math
 import operator
 import re
@@ -39,9 +38,6 @@ from ..text import counted
 _LONGEST_NAME = 60
 _NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)', re.DOTALL)
 _WORDS: dict[Any, str] = {str: 'text', int: 'integer', float: 'number', bool: 'true or false'}
-_JSON_TYPES: dict[Any, str] = {
-    str: 'string', int: 'integer', float: 'number', bool: 'boolean', type(None): 'null',
-}  # fmt: skip
 
 Value = TypeVar('Value')
 
@@ -55,13 +51,13 @@ class SchemaError(ValueError):
         super().__init__(f'{key}: {message}' if key else message)
 
 
-#: When a bound is kept, what is said where it is not, and its word in JSON Schema.
-_RULES: dict[str, tuple[Callable[[Any, Any], bool], str, str]] = {
-    'above': (operator.gt, 'be greater than', 'exclusiveMinimum'),
-    'at_least': (operator.ge, 'be at least', 'minimum'),
-    'below': (operator.lt, 'be less than', 'exclusiveMaximum'),
-    'shortest': (operator.ge, 'have at least', 'minLength'),
-    'longest': (operator.le, 'have at most', 'maxLength'),
+#: When a bound is kept, and what is said where it is not.
+_RULES: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
+    'above': (operator.gt, 'be greater than'),
+    'at_least': (operator.ge, 'be at least'),
+    'below': (operator.lt, 'be less than'),
+    'shortest': (operator.ge, 'have at least'),
+    'longest': (operator.le, 'have at most'),
 }
 
 
@@ -78,19 +74,12 @@ class Bounds:
     def fault(self, value: Any) -> str | None:
         """Say what is expected of a value that does not comply."""
         is_text = isinstance(value, str)
-        for name, limit in self._given():
-            is_kept, said, _ = _RULES[name]
-            if not is_kept(len(value) if is_text else value, limit):
+        for name, (is_kept, said) in _RULES.items():
+            limit = getattr(self, name)
+            if limit is not None and not is_kept(len(value) if is_text else value, limit):
                 shown = counted(limit, 'character') if is_text else f'{limit:g}'
                 return f'must {said} {shown}'
         return None
-
-    def keywords(self) -> dict[str, float]:
-        """Return the same in the words of JSON Schema."""
-        return {_RULES[name][2]: limit for name, limit in self._given()}
-
-    def _given(self) -> list[tuple[str, Any]]:
-        return [(name, limit) for name, limit in vars(self).items() if limit is not None]
 
 
 Positive = Annotated[float, Bounds(above=0.0)]
@@ -142,25 +131,12 @@ def plain(value: Any) -> Any:
     return [plain(item) for item in value] if isinstance(value, tuple) else value
 
 
-def required_keys(cls: type) -> tuple[str, ...]:
-    """Return the keys of a dataclass that must be given."""
-    return _fields(cls)[1]
-
-
-def json_schema(cls: type) -> dict[str, Any]:
-    """Return the JSON Schema of a dataclass and of all that it holds."""
-    definitions: dict[str, Any] = {}
-    top = _schema(cls, definitions)['$ref'].rpartition('/')[2]
-    result = definitions.pop(top)
-    return {'$defs': dict(sorted(definitions.items())), **result}
-
-
 def _build(hint: Any, data: Any, key: str) -> Any:
     if hint in _WORDS:
         return _scalar(hint, data, key)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return _object(hint, data, key)
-    origin, arguments = _parts(hint)
+    origin, arguments = parts_of(hint)
     if origin is Annotated:
         value = _build(arguments[0], data, key)
         for bounds in arguments[1:]:
@@ -177,7 +153,8 @@ def _build(hint: Any, data: Any, key: str) -> Any:
     return _either(arguments, data, key)
 
 
-def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+def parts_of(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Take a hint apart that is neither a plain type nor a dataclass."""
     if get_origin(hint) is Annotated:
         return Annotated, (hint.__origin__, *hint.__metadata__)
     origin = get_origin(hint)
@@ -187,7 +164,7 @@ def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 @lru_cache(maxsize=256)
-def _fields(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
+def fields_of(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the hints of a dataclass by key, and which keys must be given."""
     hints = get_type_hints(cls, include_extras=True)
     fields = dataclasses.fields(cls)
@@ -211,7 +188,7 @@ def _scalar(hint: type, data: Any, key: str) -> Any:
 def _object(cls: type, data: Any, key: str) -> Any:
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
-    hints, required = _fields(cls)
+    hints, required = fields_of(cls)
     # A misspelt key is unknown and missing at once, and the spelling is the one to be told about.
     for name in data:
         if name not in hints:
@@ -251,7 +228,7 @@ def _either(arguments: tuple[Any, ...], data: Any, key: str) -> Any:
         return data
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
-    kinds = {get_args(_fields(hint)[0]['kind'])[0]: hint for hint in hints}
+    kinds = {get_args(fields_of(hint)[0]['kind'])[0]: hint for hint in hints}
     if 'kind' not in data:
         raise SchemaError(_joined(key, 'kind'), 'this key is missing')
     kind = data['kind']
@@ -278,45 +255,3 @@ def _shown_name(name: str) -> str:
 
 def _choice(words: list[str]) -> str:
     return ' or '.join(part for part in (', '.join(words[:-1]), words[-1]) if part)
-
-
-def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
-    if hint in _JSON_TYPES:
-        return {'type': _JSON_TYPES[hint]}
-    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        _define(hint, definitions)
-        return {'$ref': f'#/$defs/{hint.__name__}'}
-    origin, arguments = _parts(hint)
-    if origin is Annotated:
-        result = _schema(arguments[0], definitions)
-        for note in arguments[1:]:
-            result |= note.keywords() if isinstance(note, Bounds) else {'description': note}
-        return result
-    if origin is Literal:
-        one = len(arguments) == 1
-        return {'const': arguments[0]} if one else {'enum': list(arguments), 'type': 'string'}
-    if origin is not tuple:
-        return {'anyOf': [_schema(one, definitions) for one in arguments]}
-    if arguments[-1] is Ellipsis:
-        return {'type': 'array', 'items': _schema(arguments[0], definitions)}
-    items = [_schema(one, definitions) for one in arguments]
-    return {'type': 'array', 'prefixItems': items, 'minItems': len(items), 'maxItems': len(items)}
-
-
-def _define(cls: Any, definitions: dict[str, Any]) -> None:
-    if cls.__name__ in definitions:
-        return
-    hints, required = _fields(cls)
-    # It stands before those that it holds.
-    result = definitions[cls.__name__] = {
-        'type': 'object',
-        'description': inspect.cleandoc(cls.__doc__),
-        'additionalProperties': False,
-    }
-    result['properties'] = {name: _schema(hint, definitions) for name, hint in hints.items()}
-    for field in dataclasses.fields(cls):
-        if field.name not in required:
-            factory = field.default_factory
-            value = field.default if factory is dataclasses.MISSING else factory()
-            result['properties'][field.name]['default'] = plain(value)
-    result['required'] = list(required)
