@@ -23,13 +23,17 @@ Triple = tuple[float, float, float]
 ZERO: Triple = (0.0, 0.0, 0.0)
 
 
+def triple(values: Floats) -> Triple:
+    """Give the values of three axes as plain numbers."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
 @dataclass(frozen=True, eq=False)
 class PartHistory:
     """
-    What the parts went through, on an even grid of `step` seconds.
-
-    `deviation`, shape (m, n_parts), are the temperatures from the reference's still state, K, and
-    `origin`, shape (n_parts,), those in that state, degC; columns in the order of `nodes`.
+    What the parts went through, on an even grid of `step` seconds: deviations from the reference's
+    still state [K], shape (m, n_parts), and the temperatures in that state [degC].
     """
 
     nodes: tuple[str, ...]
@@ -68,28 +72,20 @@ class Effect(ABC):
 
 @dataclass(frozen=True)
 class PartEffect(Effect):
-    """Tempco of one part: its deviation [K] and the square of it."""
+    """
+    Tempco of a part, or a stress or thermo-EMF between two: the deviation of `part` less that of
+    `cold` [K] and, where coefficients change with temperature, of the squares.
+    """
 
     part: str
+    cold: str = ''
 
     def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
         d = history.of(self.part)
-        return d, d * d
-
-
-@dataclass(frozen=True)
-class DifferenceEffect(Effect):
-    """
-    Stress or thermo-EMF between two parts: the difference of their deviations [K] and, where
-    expansion or Seebeck coefficients grow with temperature, of the squares.
-    """
-
-    hot: str
-    cold: str
-
-    def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
-        hot, cold = history.of(self.hot), history.of(self.cold)
-        return hot - cold, hot * hot - cold * cold
+        if not self.cold:
+            return d, d * d
+        cold = history.of(self.cold)
+        return d - cold, d * d - cold * cold
 
 
 @dataclass(frozen=True)

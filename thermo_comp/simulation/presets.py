@@ -21,25 +21,16 @@ from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from .drift import (
     ZERO,
     CreepEffect,
-    DifferenceEffect,
     Effect,
     FlowEffect,
     LeakageEffect,
     PartEffect,
     SlipEffect,
     Triple,
-)
-from .network import AIR, Link, ThermalNetwork, Thermostat
-from .unit import (
-    GyroModel,
-    Stream,
-    SwitchedLoad,
-    ThermometerModel,
-    UnitModel,
-    generator,
-    rounded,
     triple,
 )
+from .network import AIR, Link, ThermalNetwork, Thermostat
+from .unit import GyroModel, Stream, SwitchedLoad, ThermometerModel, UnitModel, generator, rounded
 
 
 class _Specimen:
@@ -127,8 +118,8 @@ def _thermostatted(draw: _Specimen) -> UnitModel:
         PartEffect('integrator', scale=draw.normal(3.0), bias=draw.signed(6.0, 14.0)),
         PartEffect('board', bias=draw.normal(1.0), bias_curvature=draw.normal(0.03)),
         PartEffect('head', scale=draw.axes(80.0, 0.1), bias=draw.signed(0.3, 5.0)),
-        DifferenceEffect('board', 'reference', bias=draw.normal(3.0)),
-        DifferenceEffect('oven', 'head', bias=draw.normal(2.0)),
+        PartEffect('board', 'reference', bias=draw.normal(3.0)),
+        PartEffect('oven', 'head', bias=draw.normal(2.0)),
         CreepEffect('reference', 5.0 * 3600.0, bias=draw.normal(0.02)),
     )
     return draw.unit(network, drift, full_scale_g=11.0, bias_ug=1500.0)
@@ -153,9 +144,9 @@ def _bare_quartz(draw: _Specimen) -> UnitModel:
         PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
         # The shunt that offsets the magnet's own tempco, and the coil on the pendulum, are
         # not at one temperature in a ramp: parts that balance in still air do not then.
-        DifferenceEffect('head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)),
+        PartEffect('head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)),
         # Stress through the joint to the mounting ring, heavy and slow, bolted to the case.
-        DifferenceEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
+        PartEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
         CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),
     )
     return draw.unit(network, drift, full_scale_g=11.0, bias_ug=2000.0)
@@ -177,7 +168,7 @@ def _mems(draw: _Specimen) -> UnitModel:
             bias=draw.signed(100.0, 500.0),
             bias_curvature=draw.normal(3.0),
         ),
-        DifferenceEffect('board', 'package', bias=draw.normal(300.0)),
+        PartEffect('board', 'package', bias=draw.normal(300.0)),
         CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),
     )
     unit = draw.unit(
@@ -194,7 +185,7 @@ def _mems(draw: _Specimen) -> UnitModel:
     )
     rate = (
         PartEffect('die', bias=draw.signed(5.0, 20.0), bias_curvature=draw.normal(0.1)),
-        DifferenceEffect('board', 'package', bias=draw.normal(30.0)),
+        PartEffect('board', 'package', bias=draw.normal(30.0)),
         CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(0.1)),
     )
     gyro = GyroModel(rate, draw.normal(500.0), (5.0, 5.0, 5.0), turn_on=2.0)
@@ -242,7 +233,7 @@ def _triad(draw: _Specimen) -> UnitModel:
 
 
 def _tempcos(draw: _Specimen, parts: list[str]) -> list[Effect]:
-    values = {
+    values: dict[str, Any] = {
         'bias': draw.signed(2.0, 12.0),
         'bias_curvature': draw.normal(0.08),
         'scale': draw.axes(60.0, 0.4),
@@ -250,10 +241,11 @@ def _tempcos(draw: _Specimen, parts: list[str]) -> list[Effect]:
     }
     if len(parts) == 1:
         return [PartEffect(parts[0], **values)]
-    return [
-        PartEffect(part, **{name: _only(i, value[i]) for name, value in values.items()})
-        for i, part in enumerate(parts)
-    ]
+    effects: list[Effect] = []
+    for i, part in enumerate(parts):
+        own: dict[str, Any] = {name: _only(i, value[i]) for name, value in values.items()}
+        effects.append(PartEffect(part, **own))
+    return effects
 
 
 def _slips(draw: _Specimen) -> list[Effect]:
@@ -283,7 +275,7 @@ def _loads(draw: _Specimen) -> list[Effect]:
 
 def _sample(draw: _Specimen) -> list[Effect]:
     # Loads of the paper, large ones, and a stress that dies away with the lag of the heads.
-    stress = DifferenceEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
+    stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
     load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
     return [*_loads(draw), load, stress]
 
@@ -296,7 +288,7 @@ _ON_BOARD = ('paper', 'demo')
 _EXTRA: dict[str, Callable[[_Specimen], list[Effect]]] = {
     # Quartz against metal: the expansion coefficients differ, and the more the warmer it is.
     'products': lambda draw: [
-        DifferenceEffect(
+        PartEffect(
             'board', 'head', bias=draw.signed(3.0, 12.0), bias_curvature=draw.signed(0.1, 0.5),
             scale=draw.signed(10.0, 40.0), scale_curvature=draw.signed(0.3, 1.5),
         )

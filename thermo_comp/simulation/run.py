@@ -29,16 +29,10 @@ _GRID_S = 1.0  # step of the thermal grid; bias and scale are straight between i
 @dataclass(frozen=True, eq=False)
 class Truth:
     """
-    What really happened, on the thermal grid and at the accelerometer's cycles.
+    What really happened, on the thermal grid, m points, and at the accelerometer's n cycles.
 
-    grid_s, air: instants of the grid from the start of the run, s, and air temperature, degC,
-        shape (m,)
-    temperatures: of the parts, degC, shape (m, n_parts)
-    thermal_bias, scale_grid: their bias [counts/cycle] and relative scale, shape (m, 3)
-    rate_bias: of a gyroscope, rad/s, shape (m, 3)
-    bias_grid: the bias with its walk, which no model can know, shape (m, 3)
-    specific_force: in the orthogonal frame, m/s^2, shape (3,)
-    cycle_s: middles of the accelerometer's cycles from the start of the run, s, shape (n,)
+    Bias is in counts per cycle, scale is relative, that of a gyroscope in rad/s; `bias_grid` has
+    the walk, too, which no model can know. `cycle_s` are the middles of the cycles.
     """
 
     unit: UnitModel
@@ -55,12 +49,12 @@ class Truth:
 
     @property
     def bias(self) -> Floats:
-        """Bias of each cycle, shape (n, 3), counts/cycle."""
+        """Bias of each cycle, shape (n, 3)."""
         return self.on_cycles(self.bias_grid)
 
     @property
     def scale(self) -> Floats:
-        """Scale of each cycle relative to the one at the reference temperature, shape (n, 3)."""
+        """Relative scale of each cycle, shape (n, 3)."""
         return self.on_cycles(self.scale_grid)
 
     def on_cycles(self, grid: Floats) -> Floats:
@@ -81,11 +75,8 @@ class Truth:
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
     """
-    What a recorder would have stored, and the truth.
-
-    Ends of the conversion cycles [ns], shape (n,), and their counts, shape (n, 3); instants and
-    values [degC] of the thermometers' readings, shape (m,). Of a unit with a gyroscope also the
-    mean angular rate of each cycle [rad/s], shape (n, 3).
+    What a recorder would have stored, and the truth: ends and counts of the conversion cycles,
+    readings [degC], and of a unit with a gyroscope the mean angular rate of each cycle [rad/s].
     """
 
     accel_stamp_ns: Ints
@@ -121,20 +112,10 @@ def simulate_blocks(
     """
     Run a unit through a program in bounded memory; blocks of any size have the same bits.
 
-    A reading of a thermometer is in the block whose cycles it falls among: after the last stamp of
-    the block before, up to the last of its own; those after the very last cycle are in the last
-    block. Each truth holds the whole thermal grid.
-
-    up: direction of the specific force in the orthogonal frame of the accelerometer, shape (3,)
-    block_size: conversion cycles in a block
-    rate_hz: conversion cycles per second. The elementary charge is sized to the cycle, so K in
-        counts per cycle does not depend on it
-    temperature_rate_hz: readings per second of both thermometers; None takes each one's own
-    seed: seed of everything random in this run; the specimen has its own
-    start_ns: stamp of the start of the run, ns
-    gravity: local gravity, m/s^2
-    warm: true starts in thermal equilibrium; False switches the unit on at the start
-    like: the truth of another run of this unit through this program: the same heat flow
+    A reading is in the block among whose cycles it falls, or in the last. `up` is the direction of
+    the specific force; K in counts per cycle does not depend on `rate_hz`. `seed` is of all that
+    is random in this run, the specimen has its own. Unless `warm`, the unit is switched on at the
+    start. `like` is the truth of another run of this unit through this program: its heat flow.
     """
     if block_size < 1:
         raise ValueError(f'`block_size` must be at least 1, got {block_size}')

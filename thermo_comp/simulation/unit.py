@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..typing import Floats, Ints
 from ..unit.gravity import EARTH_RATE, MICRO_G
 from ..unit.gyroscope import MILLIDEGREE
-from .drift import ZERO, Effect, PartHistory, Triple, drift_of
+from .drift import ZERO, Effect, PartHistory, Triple, drift_of, triple
 from .network import ThermalNetwork, ThermalResponse
 
 _NS = 1_000_000_000
@@ -63,10 +63,9 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
     """
     Convert the real-valued counts of consecutive cycles, shape (n, 3), to whole ones of 16 bits.
 
-    What is left over when a cycle ends, `remainder`, counts in the next one, so the sum of the
-    counts follows the integral of the input to within one count for ever. It is kept in fixed
-    point: a long run loses nothing and blocks of any size give the same counts. Charge beyond the
-    output range is lost, as in an integrator at its rail; the fraction is carried on even then.
+    What a cycle leaves over, `remainder`, counts in the next one, in fixed point: the sum of the
+    counts follows the integral of the input to within one count for ever, whatever the blocks.
+    Charge beyond the output range is lost, as in an integrator at its rail.
     """
     counts = np.empty(charge.shape, dtype=np.int32)
     for first in range(0, len(charge), _ROWS):
@@ -90,15 +89,14 @@ def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
 @dataclass(frozen=True)
 class ThermometerModel:
     """
-    One thermometer on one part: ``reading = quantum * round((T + offset + noise) / quantum)``, all
-    in K, a quantum of 0 continuous; `phase`, 0..1, is when in its period it reads first.
+    One thermometer on one part: ``reading = quantum * round((T + noise) / quantum)``, all in K, a
+    quantum of 0 continuous; `phase`, 0..1, is when in its period it reads first.
     """
 
     node: str
     rate_hz: float = 1.0
     noise_sd: float = 0.005
     quantum: float = 0.0
-    offset: float = 0.0
     phase: float = 0.0
 
     def read(
@@ -110,7 +108,7 @@ class ThermometerModel:
         time = stamp_ns / _NS
         true = response.temperatures(time)[:, response.network.nodes.index(self.node)]
         white = generator(seed, noise).standard_normal(len(time))
-        reading = true + self.offset + self.noise_sd * white
+        reading = true + self.noise_sd * white
         if self.quantum > 0.0:
             reading = self.quantum * np.rint(reading / self.quantum)
         return stamp_ns.astype(np.int64), reading
@@ -119,12 +117,8 @@ class ThermometerModel:
 @dataclass(frozen=True)
 class GyroModel:
     """
-    The gyroscope of a unit at rest: a bias driven by the parts' temperatures, of scale 1.
-
-    drift: as of the accelerometer, but with biases in mdeg/s instead of ug
-    bias_at_reference: in still air at the reference temperature, mdeg/s
-    noise_density: white noise per axis, mdeg/s per sqrt(Hz)
-    turn_on: what the bias differs by from run to run, sd, mdeg/s
+    The gyroscope of a unit at rest, of scale 1, in mdeg/s where the accelerometer has ug; from
+    run to run its bias differs by `turn_on`, a standard deviation.
     """
 
     drift: tuple[Effect, ...]
@@ -160,17 +154,9 @@ class UnitModel:
     One physical unit with all its constants: the truth that a calibration looks for.
 
     Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where ``s =
-    inverse(M) @ f`` is the specific force along the sensitivity axes.
-
-    scale_factor: K per axis at the reference temperature, counts/cycle per m/s^2
-    bias_at_reference: bias per axis at the reference temperature, counts/cycle
-    misalignment: M, lower triangular with unit diagonal: from the sensitivity axes to the
-        orthogonal frame, shape (3, 3)
-    noise_density: white noise of the acceleration per axis, ug/sqrt(Hz): the mean over `T` seconds
-        has the standard deviation ``noise_density / sqrt(T)``
-    bias_walk: random walk of the bias per axis within a run, ug per square root of an hour
-    load: what is switched beside the constant powers, if anything
-    gyro: the gyroscope beside it, if there is one
+    inverse(M) @ f`` is the specific force along the sensitivity axes. K [counts/cycle per m/s^2]
+    and bias [counts/cycle] are those at the reference. `noise_density` is in ug/sqrt(Hz): the mean
+    over T seconds has the deviation ``noise_density / sqrt(T)``; `bias_walk` in ug/sqrt(h).
     """
 
     serial: str
@@ -240,9 +226,3 @@ class UnitModel:
             bias_at_reference=triple(bias),
             misalignment=(triple(M[0]), triple(M[1]), triple(M[2])),
         )
-
-
-def triple(values: Floats) -> Triple:
-    """Give the values of three axes as plain numbers."""
-    x, y, z = values.tolist()
-    return x, y, z
