@@ -31,7 +31,7 @@ from thermo_comp.report import (
 )
 from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.figures import figures_of
-from thermo_comp.report.figures_position import draw_positions
+from thermo_comp.report.figures_bags import draw_positions
 from thermo_comp.report.html import spelt
 from thermo_comp.report.style import drawing
 from thermo_comp.simulation import STANDARD_GRAVITY

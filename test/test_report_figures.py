@@ -18,17 +18,15 @@ from report_helpers import evidence, fitted
 
 from thermo_comp.judging.history import history_of
 from thermo_comp.report.figures import figures_of
-from thermo_comp.report.figures_position import (
+from thermo_comp.report.figures_bags import (
+    draw_dynamics,
     draw_every_position,
+    draw_gravity,
     draw_histograms,
     draw_positions,
-    equal_area,
-)
-from thermo_comp.report.figures_time import (
-    draw_dynamics,
-    draw_gravity,
     draw_residuals,
     draw_temperatures,
+    equal_area,
 )
 from thermo_comp.report.figures_unit import (
     curves,
@@ -66,12 +64,12 @@ def test_bias_and_scale_curves_by_hand():
     assert (soak.name, heating.name) == ('soak', 'heating at 1 K/min')
     count = 1.0 / 300.0 / MICRO_G
     t = soak.temperature - 20.0
-    assert soak.bias == pytest.approx(np.outer(0.3 * count * t, np.ones(3)))
-    assert soak.scale == pytest.approx(np.outer(70.0 * t, np.ones(3)))
+    assert soak.value[:, :3] == pytest.approx(np.outer(0.3 * count * t, np.ones(3)))
+    assert soak.value[:, 3:] == pytest.approx(np.outer(70.0 * t, np.ones(3)))
     behind = 10.0 * (1.0 - np.exp(-(heating.temperature - heating.temperature[0]) / 10.0))
-    assert heating.bias[:, 0] == pytest.approx((0.3 * t + 0.5 + 0.3 * behind) * count)
-    assert heating.bias[:, 2] == pytest.approx((0.3 * t + 0.5) * count)
-    assert heating.scale[:, 1] == pytest.approx(70.0 * t + behind)
+    assert heating.value[:, 0] == pytest.approx((0.3 * t + 0.5 + 0.3 * behind) * count)
+    assert heating.value[:, 2] == pytest.approx((0.3 * t + 0.5) * count)
+    assert heating.value[:, 4] == pytest.approx(70.0 * t + behind)
     minutes, bias, scale = step_answer(one)
     left = np.exp(-minutes / 10.0)
     assert bias[:, 0] == pytest.approx(0.3 * left * count)
@@ -98,12 +96,13 @@ def test_a_soak_measures_what_the_calibration_lacks():
     up = np.array([one.up for one in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
     wrong = replace(evidence(), windows=replace(windows, force=up * length[:, None]))
-    found = soak_measurements(wrong)
-    assert len(found.temperature) >= len(wrong.positions)
-    known = np.isfinite(found.scale)
+    temperature, errors = soak_measurements(wrong)
+    assert len(temperature) >= len(wrong.positions)
+    bias, scale = errors[:, :3], errors[:, 3:]
+    known = np.isfinite(scale)
     assert known.any(axis=1).all()  # of three axes one has more than half of gravity
-    assert found.scale[known] == pytest.approx(30.0, rel=1e-4)
-    assert np.linalg.norm(found.bias, axis=1) == pytest.approx(30.0, rel=1e-4)
+    assert scale[known] == pytest.approx(30.0, rel=1e-4)
+    assert np.linalg.norm(bias, axis=1) == pytest.approx(30.0, rel=1e-4)
 
 
 def test_metres_of_a_navigator_by_hand():

@@ -5,22 +5,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
 from .evidence import Evidence
-from .figures_position import draw_every_position, draw_histograms, draw_positions
-from .figures_time import draw_dynamics, draw_gravity, draw_residuals, draw_temperatures
+from .figures_bags import (
+    draw_dynamics,
+    draw_every_position,
+    draw_gravity,
+    draw_histograms,
+    draw_positions,
+    draw_residuals,
+    draw_temperatures,
+)
 from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_rates, draw_step
 from .html import label_text
 from .style import drawing, svg
 
 
-@dataclass(frozen=True)
-class ReportFigure:
+class ReportFigure(NamedTuple):
     """One figure: its file's name, the question it answers, how that is read, the drawing."""
 
     name: str
@@ -40,11 +45,15 @@ def drawn_figures(figures: Sequence[ReportFigure]) -> list[tuple[ReportFigure, s
 
 def figures_of(evidence: Evidence) -> list[ReportFigure]:
     """List the figures that the evidence allows, in order."""
-    parts = (_of_time, _of_unit, _of_positions)
     return [
-        ReportFigure(name, question, ' '.join(filter(None, reading)), partial(draw, evidence))
-        for part in parts
-        for name, question, draw, *reading in part(evidence)
+        ReportFigure(
+            draw.__name__.removeprefix('draw_'),
+            question,
+            ' '.join(filter(None, reading)),
+            partial(draw, evidence),
+        )
+        for of in (_of_time, _of_unit, _of_positions)
+        for question, draw, *reading in of(evidence)
     ]
 
 
@@ -56,7 +65,6 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     bag = f'Bag {label_text(shown.bag.source.name, 60)}.'
     read = f'Grey: the time in which the flag says dynamic. {bag} After Fig.'
     yield (
-        'temperatures',
         'How did the unit follow the chamber?',
         draw_temperatures,
         'Readings of both thermometers. The board lags behind the case, so the case '
@@ -64,7 +72,6 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     )
     window_s = 0.0 if windows is None else windows.window_s
     yield (
-        'dynamics',
         'When do the readings drift, and does the flag mark it?',
         draw_dynamics,
         f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
@@ -76,7 +83,6 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
         return
     yield (
-        'residuals',
         'What does the correction leave on each axis?',
         draw_residuals,
         'Residual of each axis in the output frame. The attitude in a position is not known: '
@@ -84,7 +90,6 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         f'{read} 6 of the paper.',
     )
     yield (
-        'gravity',
         'Does |f| stay constant over the whole program?',
         draw_gravity,
         f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
@@ -101,7 +106,6 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         return
     has_band = calibration.posterior is not None
     yield (
-        'functions',
         'What is corrected, and how well is it known?',
         draw_functions,
         'Bias and scale factor over temperature, in a soak and in ramps through the whole range '
@@ -120,7 +124,6 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if calibration.gyroscope is not None:
         judged = None if evidence.judgement is None else evidence.judgement.rate
         yield (
-            'rates',
             'What is corrected of the angular rate?',
             draw_rates,
             'Bias of the gyroscope over temperature, in a soak and in ramps as above, less the '
@@ -131,7 +134,6 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         )
     if any(term.lag for term in calibration.response):
         yield (
-            'step',
             'For how long does the unit remember a change of temperature?',
             draw_step,
             'Board and case jump by 1 K together: how far bias and scale are from where they '
@@ -139,7 +141,6 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         )
     if any(term.kind == 'play' for term in calibration.response):
         yield (
-            'hysteresis',
             'Does the bias come back on another way than it went?',
             draw_hysteresis,
             'A run through the whole range and back, too slow for any lag: bias of each axis less '
@@ -148,7 +149,6 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         )
     if len(evidence.history) > 1:
         yield (
-            'history',
             'What has drifted between the calibrations of this unit?',
             draw_history,
             'Bias and scale in a soak at the reference temperature, by the date of each '
@@ -160,7 +160,6 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     """Give the figures of all positions."""
     if evidence.residuals and evidence.positions:
         yield (
-            'histograms',
             'Is what is left noise, or is there something to model?',
             draw_histograms,
             '|f| − g over all windows of all positions, by regime, with the normal distribution '
@@ -168,7 +167,6 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         )
     if evidence.residuals and len(evidence.positions) > 1:
         yield (
-            'every_position',
             'Does the correction hold in every position?',
             draw_every_position,
             'A row for each position: |f| − g after the correction, over the time since the '
@@ -177,16 +175,16 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         )
     if evidence.positions:
         yield (
-            'positions',
             'Are the positions well spread, and does one stand out?',
             draw_positions,
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
-            'of elevation. Where gravity is known, what is left in each position stands beside '
-            'it: one that stands out was moved, or is not of this unit.',
-            'Red rings and diamonds: what is left of it by a fit of the other positions alone, '
-            'which is what a new attitude will see; the area of a ring is in proportion.'
+            'of elevation. A position that stands out was moved, or is not of this unit.',
+            'The area of a red ring is in proportion to what is left there by a fit of the other '
+            'positions alone, which is what a new attitude will see.'
             if evidence.left_out
+            else 'The area of a red ring is in proportion to what is left there.'
+            if evidence.residuals
             else '',
             'Red cross: the direction of which the calibration knows least, and the standard '
             'deviation of |f| there: a position would tell most.'

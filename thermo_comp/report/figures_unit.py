@@ -37,18 +37,18 @@ def draw_functions(evidence: Evidence) -> Figure:
     figure = style.new_figure(4.4)
     panels = figure.subplots(2, 3, sharex=True)
     drawn = curves(calibration)
-    soak = drawn[0]
-    measured = soak_measurements(evidence)
-    for part, (name, unit) in enumerate((('bias', 'µg'), ('scale', 'ppm'))):
-        for i, axes in enumerate(panels[part]):
-            slope = _draw_less_line(axes, calibration, drawn, (name, i), unit)
-            temperature, error = measured.temperature, getattr(measured, name)[:, i]
-            if np.isfinite(error).any():
-                level = np.interp(temperature, soak.temperature, getattr(soak, name)[:, i])
-                line = slope * (temperature - calibration.reference_temperature_c)
-                left = level - line + error
-                axes.plot(temperature, left, 'o', label='measured in a soak', **_POINT)
-        panels[part, 0].set_ylabel(f'{name} less the line, {unit}')
+    temperature, errors = soak_measurements(evidence)
+    level = errors - np.outer(temperature - calibration.reference_temperature_c, slopes(drawn[0]))
+    for k, axes in enumerate(panels.flat):
+        _draw_less_line(axes, calibration, drawn, k, 'µg' if k < 3 else 'ppm')
+        if np.isfinite(errors[:, k]).any():
+            soak = np.interp(temperature, drawn[0].temperature, drawn[0].value[:, k])
+            axes.plot(temperature, soak + level[:, k], 'o', label='measured in a soak', **_POINT)
+    for name, row in (
+        ('bias less the line, µg', panels[0]),
+        ('scale less the line, ppm', panels[1]),
+    ):
+        row[0].set_ylabel(name)
     for axes in panels[1]:
         axes.set_xlabel('T board, °C')
     style.shared_legend(figure, panels[0, 0], 4)
@@ -59,10 +59,11 @@ def draw_rates(evidence: Evidence) -> Figure:
     """Draw the bias of the angular rate over temperature, less a line, with bands."""
     triad = rate_triad(given(evidence.calibration))
     figure, panels = _axis_panels('bias less the line, mdeg/s')
-    drawn = curves(triad)
+    # What is said in m/s^2 of a triad is rad/s of this one.
+    factor = MICRO_G / MILLIDEGREE
+    drawn = [one._replace(value=factor * one.value, sd=factor * one.sd) for one in curves(triad)]
     for i, axes in enumerate(panels):
-        # What is said in m/s^2 of a triad is rad/s of this one.
-        _draw_less_line(axes, triad, drawn, ('bias', i), 'mdeg/s', MICRO_G / MILLIDEGREE)
+        _draw_less_line(axes, triad, drawn, i, 'mdeg/s')
     style.shared_legend(figure, panels[0], 3)
     return figure
 
@@ -77,57 +78,45 @@ def _axis_panels(name: str, *, sharey: bool = False) -> tuple[Figure, list[Axes]
     return figure, panels
 
 
+def slopes(soak: Curve) -> Floats:
+    """Fit the lines that are left out of what is drawn, through 0 at the reference, shape (6,)."""
+    return np.asarray(np.polyfit(soak.temperature, soak.value, 1)[0])
+
+
 def _draw_less_line(
-    axes: Axes,
-    calibration: Calibration,
-    drawn: list[Curve],
-    part: tuple[str, int],
-    unit: str,
-    factor: float = 1.0,
-) -> float:
-    """Draw the curves of one axis, with bands, less the line of the soak; give its slope."""
-    name, i = part
-    reference = calibration.reference_temperature_c
-    # All curves are 0 in a soak at the reference, and so is the line.
-    soak = factor * getattr(drawn[0], name)[:, i]
-    slope = float(np.polyfit(drawn[0].temperature, soak, 1)[0])
+    axes: Axes, calibration: Calibration, drawn: list[Curve], k: int, unit: str
+) -> None:
+    """Draw column `k` of the curves, with bands, less the line of the soak."""
+    reference, slope = calibration.reference_temperature_c, slopes(drawn[0])[k]
     widest = 0.0
     for curve in drawn:
         at, color = curve.temperature, curve.line['color']
-        value = factor * getattr(curve, name)[:, i] - slope * (at - reference)
+        value = curve.value[:, k] - slope * (at - reference)
         if calibration.posterior is not None:
-            half = BAND_SDS * factor * getattr(curve, f'sd_{name}')[:, i]
+            half = BAND_SDS * curve.sd[:, k]
             look: style.Line = {'facecolor': color, 'edgecolor': color, 'hatch': curve.hatch}
             axes.fill_between(at, value - half, value + half, alpha=0.25, linewidth=0, **look)
             widest = max(widest, float(half.max()))
         # The ends of the valid range are marked; a range of a few K stays visible so.
         look = {'marker': curve.marker, 'markersize': 3.5, 'markevery': [0, -1]}
         axes.plot(at, value, label=curve.name, **look, **curve.line)
-    title = f'{AXES[i]}: {minus(f"{slope:+.3g}")} {unit}/K'
+    title = f'{AXES[k % 3]}: {minus(f"{slope:+.3g}")} {unit}/K'
     axes.set_title(f'{title}, ±{number(widest, 2)} {unit}' if widest else title)
     axes.axvline(reference, color=style.GREY, linewidth=0.8)
     style.few_ticks(axes)
-    return slope
 
 
-class SoakMeasurements(NamedTuple):
+def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
-    What each soak of each position measured against the calibration, shapes (n,) and (n, 3).
+    Average what is left over each soak of each position: its windows in the static regime.
 
-    Bias [micro-g] and scale [ppm] as if all of the residual were one of them; the scale is NaN of
-    an axis that has less than half of gravity.
+    Returns temperatures, shape (n,), and bias [micro-g] and scale [ppm] against the calibration,
+    shape (n, 6), as if all of the residual were one of them; the scale is NaN of an axis that has
+    less than half of gravity.
     """
-
-    temperature: Floats
-    bias: Floats
-    scale: Floats
-
-
-def soak_measurements(evidence: Evidence) -> SoakMeasurements:
-    """Average what is left over each soak of each position: its windows in the static regime."""
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:
-        return SoakMeasurements(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+        return np.zeros(0), np.zeros((0, 6))
     changes = (np.diff(windows.position) != 0) | (np.diff(windows.is_dynamic) != 0)
     soak = np.concatenate(([0], np.cumsum(changes)))[~windows.is_dynamic]
     values = np.column_stack((windows.board, residual, windows.force - residual))
@@ -135,13 +124,13 @@ def soak_measurements(evidence: Evidence) -> SoakMeasurements:
     error, force = mean[:, 1:4], mean[:, 4:]
     known = np.abs(force) >= 0.5 * windows.gravity
     scale = np.divide(error, force, out=np.full(error.shape, np.nan), where=known)
-    return SoakMeasurements(mean[:, 0], error / MICRO_G, scale * 1e6)
+    return mean[:, 0], np.hstack((error / MICRO_G, scale * 1e6))
 
 
 class Curve(NamedTuple):
     """
     Bias [micro-g] and scale [ppm] over the board temperature in one thermal state, against a soak
-    at the reference, shapes (n, 3); line, hatch and marker are how it is drawn.
+    at the reference, shape (n, 6), with their sd; line, hatch and marker are how they are drawn.
     """
 
     name: str
@@ -149,10 +138,8 @@ class Curve(NamedTuple):
     hatch: str
     marker: str
     temperature: Floats
-    bias: Floats
-    sd_bias: Floats
-    scale: Floats
-    sd_scale: Floats
+    value: Floats
+    sd: Floats
 
 
 def curves(calibration: Calibration) -> list[Curve]:
@@ -179,26 +166,22 @@ def curves(calibration: Calibration) -> list[Curve]:
         states = ramp_states(calibration, temperature, rate, lasted_s)
         bias, scale = bias_and_scale(calibration, states)
         sd_bias, sd_scale = sd_of_states(calibration, states)
-        bias, sd_bias = (bias - bias_0) / MICRO_G, sd_bias / MICRO_G
-        look, scale = (line, hatch, marker), (scale / scale_0 - 1.0) * 1e6
-        found.append(Curve(name, *look, temperature, bias, sd_bias, scale, sd_scale * 1e6))
+        value = np.hstack(((bias - bias_0) / MICRO_G, (scale / scale_0 - 1.0) * 1e6))
+        sd = np.hstack((sd_bias / MICRO_G, sd_scale * 1e6))
+        found.append(Curve(name, line, hatch, marker, temperature, value, sd))
     return found
 
 
 def draw_step(evidence: Evidence) -> Figure:
     """Draw what a step of the temperature does to each axis over time."""
-    minutes, bias, scale = step_answer(given(evidence.calibration))
-    figure = style.new_figure(2.5)
-    for axes, title, value, unit in zip(
-        figure.subplots(1, 2), ('bias', 'scale'), (bias, scale), ('µg', 'ppm'), strict=True
-    ):
-        for i, axis in enumerate(AXES):
-            axes.plot(minutes, value[:, i], label=axis, **style.AXIS_LINES[i])
-        axes.axhline(0.0, color='black', linewidth=0.5)
+    minutes, *values = step_answer(given(evidence.calibration))
+    figure, panels = _bias_and_scale(2.5, 'still to come', '/K')
+    for axes, name, value in zip(panels, ('bias', 'scale'), values, strict=True):
+        axes.set_prop_cycle(style.AXIS_CYCLE)
+        axes.plot(minutes, value, label=AXES)
         style.log_axis(axes, float(minutes[0]), float(minutes[-1]))
-        axes.set_ylabel(f'still to come, {unit}/K')
         axes.set_xlabel('time since the step, min')
-        style.legend_above(axes, share=0.5, title=title, alignment='left')
+        style.legend_above(axes, name, share=0.5)
     return figure
 
 
@@ -254,25 +237,27 @@ def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 def draw_history(evidence: Evidence) -> Figure:
     """Draw bias and scale of each calibration of the unit against the first one, by date."""
     history = evidence.history
-    figure = style.new_figure(2.6)
+    figure, panels = _bias_and_scale(2.6, 'change')
     places = np.arange(len(history))
-    for axes, name, unit in zip(
-        figure.subplots(1, 2), ('bias', 'scale'), ('µg', 'ppm'), strict=True
-    ):
+    for axes, name in zip(panels, ('bias', 'scale'), strict=True):
         value, sd = (
             np.array([getattr(one, key) for one in history]) for key in (name, f'{name}_sd')
         )
+        change, half = value - value[0], BAND_SDS * np.nan_to_num(sd)
         for i, (axis, marker) in enumerate(zip(AXES, 'os^', strict=True)):
-            change, half = value[:, i] - value[0, i], BAND_SDS * np.nan_to_num(sd[:, i])
-            look: style.Line = {
-                'marker': marker,
-                'markersize': 3.5,
-                'capsize': 2.0,
-                **style.AXIS_LINES[i],
-            }
-            axes.errorbar(places + 0.08 * (i - 1), change, yerr=half, label=axis, **look)
-        axes.axhline(0.0, color='black', linewidth=0.5)
+            look: style.Line = {'marker': marker, 'markersize': 3.5, **style.AXIS_LINES[i]}
+            at = places + 0.08 * (i - 1)
+            axes.errorbar(at, change[:, i], half[:, i], label=axis, capsize=2.0, **look)
         axes.set_xticks(places, [label_text(one.created[:10]) for one in history])
-        axes.set_ylabel(f'change, {unit}')
-        style.legend_above(axes, share=0.5, title=name, alignment='left')
+        style.legend_above(axes, name, share=0.5)
     return figure
+
+
+def _bias_and_scale(height: float, what: str, per: str = '') -> tuple[Figure, list[Axes]]:
+    """Make a panel for the bias and one for the scale factor of all axes."""
+    figure = style.new_figure(height)
+    panels = list(figure.subplots(1, 2))
+    for axes, unit in zip(panels, ('µg', 'ppm'), strict=True):
+        axes.set_ylabel(f'{what}, {unit}{per}')
+        axes.axhline(0.0, color='black', linewidth=0.5)
+    return figure, panels

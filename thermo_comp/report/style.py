@@ -20,6 +20,7 @@ import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ..typing import Floats, Ints
@@ -30,11 +31,11 @@ Line = dict[str, Any]
 BLACK, BLUE, RED, GREEN, GREY = '#000000', '#0072B2', '#D55E00', '#007A5A', '#8A8A8A'
 _DASHED, _DOTTED = (0, (5, 2)), (0, (1.2, 1.6))
 
-AXIS_LINES: tuple[Line, ...] = (
-    {'color': BLUE, 'linestyle': '-', 'linewidth': 1.1},
-    {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.1},
-    {'color': GREEN, 'linestyle': _DOTTED, 'linewidth': 1.5},
+#: For `set_prop_cycle`: one plot of three columns draws all axes.
+AXIS_CYCLE = cycler(
+    color=(BLUE, RED, GREEN), linestyle=('-', _DASHED, _DOTTED), linewidth=(1.1, 1.1, 1.5)
 )
+AXIS_LINES: tuple[Line, ...] = tuple(AXIS_CYCLE)
 RUNG_LINES: dict[str, Line] = {
     RAW: {'color': GREY, 'linestyle': '-', 'linewidth': 0.9},
     CHOSEN: {'color': BLACK, 'linestyle': '-', 'linewidth': 1.3},
@@ -131,19 +132,16 @@ def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]
     steps = np.diff(time)
     gap = (np.diff(position) != 0) | (steps > 5.0 * np.median(steps))
     at = np.flatnonzero(gap) + 1
-    return np.insert(time, at, time[at - 1]), np.insert(value, at, np.nan)
+    return np.insert(time, at, time[at - 1]), np.insert(value, at, np.nan, axis=0)
 
 
-def legend_above(axes: Axes, *, share: float = 1.0, **keys: Any) -> None:
+def legend_above(axes: Axes, title: str | None = None, *, share: float = 1.0) -> None:
     """Put the legend above axes with a `share` of the width, in as many columns as fit."""
-    labels = axes.get_legend_handles_labels()[1]
-    if not labels:
-        return
-    # An entry takes its label and a handle as wide as some eight letters.
-    columns = max(1, int(share * 100 / (8 + max(map(len, labels)))))
-    axes.legend(
-        loc='lower left', bbox_to_anchor=(0.0, 1.01), ncols=min(columns, len(labels)), **keys
-    )
+    if labels := axes.get_legend_handles_labels()[1]:
+        # An entry takes its label and a handle as wide as some eight letters.
+        n = min(max(1, int(share * 100 / (8 + max(map(len, labels))))), len(labels))
+        look: Line = {'ncols': n, 'title': title, 'alignment': 'left'}
+        axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.01), **look)
 
 
 def shared_legend(figure: Figure, axes: Axes, n_columns: int) -> None:

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures over the time of a bag: the paper's Fig. 3, 4, 6 and 7 from the user's data."""
+"""
+Owns the figures of bags: over the time of one, as the paper's Fig. 3, 4, 6 and 7 from the user's
+data, and over all positions: where they point, what is left in each, how it scatters.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +13,24 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from ..thermal.regime import Regime
 from ..typing import Bools, Floats
 from ..unit.calibration import AXES
-from ..unit.gravity import MICRO_G
+from ..unit.gravity import MICRO_G, spoken
 from . import style
-from .evidence import RAW, Evidence, given
+from .evidence import LEFT_OUT, RAW, Evidence, Position, given
 from .html import number
 from .trace import ShownBag
 
 # Where the drift's zero is taken: long enough for the windows' noise, short against any ramp.
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
+# Diameter of the ring of the position of which most is left [pt].
+_RING = 22.0
+# More number labels of a dot plot would overlap, and more rows fill no page.
+_MOST = 24
 
 
 def draw_temperatures(evidence: Evidence) -> Figure:
@@ -47,11 +54,10 @@ def draw_dynamics(evidence: Evidence) -> Figure:
     heights = [1.725] * bool(len(drift)) + [1.495, 1.15, 0.8625]
     figure, panels, shown, unit = _panels(evidence, heights, is_flagged=True)
     if len(drift):
-        for i, axis in enumerate(AXES):
-            _plot(panels[0], evidence, drift[:, i], unit, label=axis, **style.AXIS_LINES[i])
+        panels[0].set_prop_cycle(style.AXIS_CYCLE)
+        _plot(panels[0], evidence, drift, unit, label=AXES)
         panels[0].set_ylabel(name)
-        title = 'a  drift of the readings since the start'
-        style.legend_above(panels[0], title=title, alignment='left')
+        style.legend_above(panels[0], 'a  drift of the readings since the start')
     rates, bend, flag = panels[-3:]
     for label, rate, line in (
         ('dT case/dt', shown.case_rate, style.CASE_LINE),
@@ -60,7 +66,7 @@ def draw_dynamics(evidence: Evidence) -> Figure:
         if np.isfinite(rate).any():
             rates.plot(shown.time / unit, rate * 60.0, label=label, **line)
     rates.set_ylabel('K/min')
-    style.legend_above(rates, title='b  first derivatives', alignment='left')
+    style.legend_above(rates, 'b  first derivatives')
     line = style.CASE_LINE if shown.leader == 'case' else style.BOARD_LINE
     bend.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
     bend.set_ylabel('K/min²')
@@ -78,10 +84,8 @@ def draw_residuals(evidence: Evidence) -> Figure:
     dynamic = given(evidence.windows).is_dynamic[rows]
     figure, panels, _, unit = _panels(evidence, [1.05] * len(residuals), more=0.5)
     for axes, (rung, residual) in zip(panels, residuals.items(), strict=True):
-        for i, axis in enumerate(AXES):
-            _plot(
-                axes, evidence, residual[:, i] / MICRO_G, unit, label=axis, **style.AXIS_LINES[i]
-            )
+        axes.set_prop_cycle(style.AXIS_CYCLE)
+        _plot(axes, evidence, residual / MICRO_G, unit, label=AXES)
         axes.set_ylabel('µg')
         axes.axhline(0.0, color='black', linewidth=0.5)
         style.few_ticks(axes)
@@ -94,7 +98,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
         ]
         title = f'{rung}: RMS {", ".join(parts)} µg'
         if axes is panels[0]:
-            style.legend_above(axes, title=title, alignment='left')
+            style.legend_above(axes, title)
         else:
             axes.set_title(title)
     figure.align_ylabels(panels)
@@ -210,3 +214,135 @@ def _symmetric(axes: Axes, residual: Floats) -> None:
     limit = 1.15 * float(np.quantile(np.abs(residual), 0.998)) / MICRO_G
     if limit > 0.0:
         axes.set_ylim(-limit, limit)
+
+
+def draw_histograms(evidence: Evidence) -> Figure:
+    """Draw how what is left is distributed, by regime, with the normal distribution beside it."""
+    name, residual = list(evidence.residuals.items())[-1]
+    dynamic = given(evidence.windows).is_dynamic
+    parts = [
+        (label, residual[rows] / MICRO_G, line)
+        for label, rows, line in (
+            ('static', ~dynamic, style.STATIC_LINE),
+            ('dynamic', dynamic, style.DYNAMIC_LINE),
+        )
+        if rows.any()
+    ]
+    figure = style.new_figure(2.0)
+    panels = figure.subplots(1, len(parts), squeeze=False)[0]
+    for axes, (label, values, line) in zip(panels, parts, strict=True):
+        limit = max(float(np.quantile(np.abs(values), 0.998)) * 1.1, 1e-3)
+        n_bins = int(np.clip(np.sqrt(len(values)), 9, 33))
+        edges = np.linspace(-limit, limit, n_bins + 1)
+        share = np.histogram(values, edges)[0] / len(values) * 100.0
+        axes.stairs(share, edges, fill=True, color='#CCCCCC')
+        axes.stairs(share, edges, color='#666666', linewidth=0.7)
+        sd, mean = float(values.std()), float(values.mean())
+        if sd > 0.0:
+            middle = np.linspace(-limit, limit, 121)
+            bell = np.exp(-0.5 * ((middle - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
+            axes.plot(middle, bell * (edges[1] - edges[0]) * 100.0, **line)
+        axes.axvline(0.0, color='black', linewidth=0.5)
+        axes.set_xlim(-limit, limit)
+        axes.set_ylim(0.0, None)
+        axes.set_ylabel('windows, %')
+        axes.xaxis.set_major_locator(MaxNLocator(6))
+        style.few_ticks(axes, 4)
+        axes.set_title(f'{name}, {label}: sd {number(sd)} µg')
+        axes.set_xlabel('|f| − g, µg')
+    return figure
+
+
+def draw_every_position(evidence: Evidence) -> Figure:
+    """Draw what is left of |f| over the time in every position, or in those with most of it."""
+    windows = given(evidence.windows)
+    judged, residual = list(evidence.residuals.items())[-1]
+    worst = sorted(evidence.positions, key=lambda one: -one.residual_rms[judged])[:_MOST]
+    shown = sorted(worst, key=lambda one: one.number)
+    numbers = np.unique(windows.position)
+    limit = float(np.quantile(np.abs(residual), 0.998)) * 1.15
+    unit, name = style.time_unit(max(one.duration_s for one in shown))
+    figure = style.new_figure(0.8 + 0.24 * len(shown))
+    axes = figure.subplots()
+    for row, one in enumerate(shown):
+        rows = windows.position == numbers[one.number - 1]
+        time = (windows.time[rows] - windows.time[rows][0]) / unit
+        value = row - 0.5 * residual[rows] / limit
+        dynamic = windows.is_dynamic[rows]
+        axes.axhline(row, color='black', linewidth=0.4)
+        # Dashes would hide what is noise: the regimes differ by width.
+        for is_drawn, color, width in ((~dynamic, style.BLACK, 1.4), (dynamic, style.RED, 0.7)):
+            axes.plot(time, np.where(is_drawn, value, np.nan), color=color, linewidth=width)
+    axes.set_ylim(len(shown) - 0.4, -0.6)
+    axes.set_yticks(range(len(shown)), [str(one.number) for one in shown])
+    right = axes.secondary_yaxis('right')
+    right.set_yticks(
+        range(len(shown)), [number(one.residual_rms[judged] / MICRO_G) for one in shown]
+    )
+    right.set_ylabel('RMS, µg')
+    axes.set_ylabel('position')
+    axes.set_xlabel(name)
+    axes.set_xlim(0.0, None)
+    part = f'; the {_MOST} largest' if len(evidence.positions) > _MOST else ''
+    axes.set_title(f'{judged}: a row is ±{number(limit / MICRO_G, 2)} µg high{part}')
+    return figure
+
+
+def draw_positions(evidence: Evidence) -> Figure:
+    """Draw where the positions point on the sphere, and what is left on each of them."""
+    figure = style.new_figure(3.0)
+    up, down = figure.subplots(1, 2)
+    least = evidence.least_known
+    rung = LEFT_OUT if evidence.left_out else next(reversed(evidence.residuals), RAW)
+    for side, axes, name in ((1, up, 'z up'), (-1, down, 'z down')):
+        _draw_hemisphere(axes, evidence.positions, side, rung)
+        if least is not None and (least.up[2] >= 0.0) == (side > 0):
+            place = equal_area(least.up, side)
+            axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
+            said = '±' + spoken(least.sd_m_s2).replace('ug', 'µg')
+            # Towards the middle: outside stand the names of the axes.
+            by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
+            _note(axes, said, place, by, ha='center', color=style.RED)
+        axes.set_title(name, loc='center')
+    return figure
+
+
+def equal_area(up: tuple[float, ...], side: int) -> tuple[float, float]:
+    """Map a direction of one hemisphere into the unit disc, the pole its centre, areas kept."""
+    x, y, z = up
+    factor = 1.0 / np.sqrt(1.0 + max(side * z, 0.0))
+    return float(x * factor), float(y * factor)
+
+
+def _note(
+    axes: Axes, text: str, place: tuple[float, float], by: tuple[float, float], **look: Any
+) -> None:
+    axes.annotate(text, place, by, textcoords='offset points', fontsize=7.5, **look)
+
+
+def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, rung: str) -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    axes.plot(np.cos(angle), np.sin(angle), color='black', linewidth=0.8)
+    # 45 degrees of elevation, in the same projection.
+    ring = np.sqrt(1.0 - np.sin(np.pi / 4.0))
+    for line in (
+        (ring * np.cos(angle), ring * np.sin(angle)),
+        ([-1, 1], [0, 0]),
+        ([0, 0], [-1, 1]),
+    ):
+        axes.plot(*line, color='#BBBBBB', linewidth=0.6)
+    for label, x, y in (('+x', 1.2, 0), ('−x', -1.2, 0), ('+y', 0, 1.2), ('−y', 0, -1.2)):
+        axes.text(x, y, label, ha='center', va='center', color='#555555', fontsize=7.5)
+    largest = max((p.residual_rms.get(rung, 0.0) for p in positions), default=0.0)
+    for position in positions:
+        if (position.up[2] >= 0.0) == (side > 0):
+            place = equal_area(position.up, side)
+            axes.plot(*place, 'o', markersize=4.5, color='black')
+            if largest > 0.0:
+                size = _RING * np.sqrt(position.residual_rms.get(rung, 0.0) / largest)
+                axes.plot(*place, 'o', markersize=size, mfc='none', mec=style.RED, mew=1.1)
+            _note(axes, str(position.number), place, (3.5, 2.5))
+    axes.set_xlim(-1.32, 1.32)
+    axes.set_ylim(-1.32, 1.32)
+    axes.set_aspect('equal')
+    axes.set_axis_off()
