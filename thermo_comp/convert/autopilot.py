@@ -28,7 +28,6 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
-from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -39,7 +38,7 @@ import numpy.typing as npt
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Floats, Ints
-from .log import NO_STAMP, SLOW_HZ, ForeignLog, Readings, find_stillness, thin
+from .log import NO_STAMP, SLOW_HZ, ForeignLog, Readings, find_stillness, library, thin
 
 T = TypeVar('T')
 _Columns = dict[str, npt.NDArray[Any]]
@@ -128,45 +127,47 @@ def _ulog(path: Path) -> _Held:
         metadata['px4_dropouts'] = f'{len(log.dropouts)}, {lost_ms} ms in all'
     if log.file_corruption:
         metadata['px4_corruption'] = 'parts of the file could not be read'
-    imus, compensated = {}, {}
-    for number, columns in by_topic['sensor_accel'].items():
+    accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
+    compensated = {}
+    if not accels:
+        both = {number: _combined(one) for number, one in by_topic['sensor_combined'].items()}
+        accels, gyros = ({number: one[part] for number, one in both.items()} for part in (0, 1))
+        metadata['px4_topic'] = 'sensor_combined'
+        hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
+        if log.initial_parameters.get('TC_A_ENABLE') == 1:
+            said = (
+                'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
+                f'thermal drift out of these readings; {_PROFILE}'
+            )
+            compensated = dict.fromkeys(accels, said)
+    imus = {}
+    for number, columns in accels.items():
         stamp_ns = _stamps(columns)
         is_slow = len(stamp_ns) > 1 and np.median(np.diff(stamp_ns[:100])) > 1e9 / SLOW_HZ
         imus[number] = ForeignLog(
             str(path),
             stamp_ns,
             _vectors(columns, _AXES),
-            _matched(stamp_ns, by_topic['sensor_gyro'].get(number)),
+            _matched(stamp_ns, gyros.get(number)),
             {'imu': Readings(stamp_ns, _column(columns, 'temperature'))},
             serial=f'px4-accel-{int(columns["device_id"][0])}' if 'device_id' in columns else '',
             metadata=metadata,
-            hint=_PROFILE if is_slow else '',
+            hint=hint or (_PROFILE if is_slow else ''),
         )
-    for number, columns in by_topic['sensor_combined'].items() if not imus else ():
-        stamp_ns, accel, gyro = _combined(columns)
-        metadata = {**metadata, 'px4_topic': 'sensor_combined'}
-        hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
-        imus[number] = ForeignLog(str(path), stamp_ns, accel, gyro, metadata=metadata, hint=hint)
-        if log.initial_parameters.get('TC_A_ENABLE') == 1:
-            compensated[number] = (
-                'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
-                f'thermal drift out of these readings; {_PROFILE}'
-            )
     return _Held(imus, baros, compensated)
 
 
-def _combined(columns: _Columns) -> tuple[Ints, Floats, Floats | None]:
+def _combined(columns: _Columns) -> list[_Columns]:
+    """Take ``sensor_combined`` apart into an accelerometer and a gyroscope."""
     relative = _column(columns, 'accelerometer_timestamp_relative')
-    is_there = np.isfinite(relative) & (relative != _NOT_THERE)
-    published = columns['timestamp'][is_there].astype(np.int64)
-    stamp_ns = _stamps_ns(published + relative[is_there].astype(np.int64))
+    rows = np.flatnonzero(np.isfinite(relative) & (relative != _NOT_THERE))
+    stamp_us = columns['timestamp'][rows].astype(np.int64) + relative[rows].astype(np.int64)
     # A message with news of the gyroscope alone repeats what the accelerometer said last.
-    is_new = np.concatenate((np.ones(len(stamp_ns[:1]), bool), np.diff(stamp_ns) != 0))
-    accel, gyro = (
-        _vectors(columns, [f'{name}[{axis}]' for axis in range(3)])[is_there][is_new]
-        for name in ('accelerometer_m_s2', 'gyro_rad')
-    )
-    return stamp_ns[is_new], accel, gyro if np.isfinite(gyro).all() else None
+    is_new = np.diff(stamp_us, prepend=stamp_us[:1] - 1) != 0
+    names = [f'{name}[{i}]' for name in ('accelerometer_m_s2', 'gyro_rad') for i in range(3)]
+    parts = _vectors(columns, names)[rows[is_new]].T.reshape(2, 3, -1)
+    stamps = {'timestamp': stamp_us[is_new]}
+    return [stamps | dict(zip(_AXES, part, strict=True)) for part in parts]
 
 
 def _stamps(columns: _Columns) -> Ints:
@@ -191,7 +192,8 @@ def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
     use = gyro_ns != NO_STAMP
     gyro_ns, gyro = gyro_ns[use], gyro[use]
-    if 2 * len(gyro_ns) < len(stamp_ns) or not np.isfinite(gyro).all():
+    is_sparse = not len(gyro_ns) or 2 * len(gyro_ns) < len(stamp_ns)
+    if is_sparse or not np.isfinite(gyro).all():
         return None
     at, where = (stamp_ns - stamp_ns[0]) * 1e-9, (gyro_ns - stamp_ns[0]) * 1e-9
     return np.column_stack([np.interp(at, where, gyro[:, i]) for i in range(3)])
@@ -215,27 +217,22 @@ def _dataflash(path: Path) -> _Held:
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d', name):
                 continue
             found, n_short = _messages(reader, name, path)
-            if 'TimeMS' in found:
-                found['TimeUS'] = found['TimeMS'].astype(np.int64) * 1000
-            n = len(found.get('TimeUS', ()))
+            stamp_us = found.get('TimeUS', found.get('TimeMS', np.empty(0)) * 1000.0)
             # The second IMU's old type is IMU2: counted from 1, the first without its number.
             old = int(name[-1]) - 1 if name[-1].isdigit() else 0
-            instance = found.get('I', np.full(n, old))
-            for number in np.unique(instance[:n]).tolist():
-                columns = {title: one[instance == number] for title, one in found.items()}
-                stamp_ns = _stamps_ns(columns['TimeUS'])
-                celsius = columns.get('T', columns.get('Temp', np.full(len(stamp_ns), np.nan)))
-                readings = Readings(stamp_ns, celsius.astype(np.float64))
+            found |= {'timestamp': stamp_us, 'I': found.get('I', np.full(len(stamp_us), old))}
+            for number in np.unique(found['I'][: len(stamp_us)]).tolist():
+                columns = {title: one[found['I'] == number] for title, one in found.items()}
+                stamp_ns = _stamps(columns)
+                readings = Readings(stamp_ns, _column(columns, 'T' if 'T' in columns else 'Temp'))
                 if not name.startswith('IMU'):
                     baros[number] = readings
                 elif columns.keys() >= {*_VECTORS}:
-                    both = np.column_stack([columns[title] for title in _VECTORS])
-                    accel, gyro = both.astype(np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
                     imus[number] = ForeignLog(
                         str(path),
                         stamp_ns,
-                        accel,
-                        gyro,
+                        _vectors(columns, _VECTORS[:3]),
+                        _vectors(columns, _VECTORS[3:]),
                         {'imu': readings},
                         n_short=n_short,
                         metadata=metadata,
@@ -274,15 +271,9 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     return columns, len(offsets) - len(begins)
 
 
-def _read(module: str, name: str, extra: str, what: str, path: str | Path, *arguments: Any) -> Any:
+def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments: Any) -> Any:
     """Let the library of an extra read a file."""
-    try:
-        read = getattr(import_module(module), name)
-    except ImportError as failure:
-        package = module.partition('.')[0]
-        raise RecordingError(
-            f"{what} needs {package}: pip install 'thermo_comp[{extra}]'", path=path
-        ) from failure
+    read = getattr(library(module, extra, what, path), name)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         # They raise whatever a damaged file makes Python raise.
         try:

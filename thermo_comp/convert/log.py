@@ -12,8 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -152,6 +153,17 @@ class ConversionReport:
     findings: dict[str, Finding]
     believed: str
     stillness: Stillness
+
+
+def library(module: str, extra: str, what: str, path: Path) -> Any:
+    """Import what an extra brings to read a file with."""
+    try:
+        return import_module(module)
+    except ImportError as failure:
+        package = module.partition('.')[0]
+        raise RecordingError(
+            f"{what} needs {package}: pip install 'thermo_comp[{extra}]'", path=path
+        ) from failure
 
 
 def thin(readings: Readings) -> Readings:

@@ -13,7 +13,7 @@ import csv
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from io import TextIOWrapper
 from itertools import chain, islice
 from operator import itemgetter
@@ -25,7 +25,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Floats, Ints
-from .log import NO_STAMP
+from .log import NO_STAMP, library
 
 Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns']
@@ -234,17 +234,14 @@ def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
     Return stamps in nanoseconds, exact to the last digit, of decimal numbers in 10^`exponent` ns;
     `NO_STAMP` where a cell is no finite number or out of range.
     """
-    factor = 10**exponent
     stamps = np.full(len(cells), NO_STAMP, dtype=np.int64)
     for i, cell in enumerate(cells):
         try:
-            number = Decimal(cell.strip())
-        except InvalidOperation:
+            number = Decimal(cell.strip()) * 10**exponent
+            if abs(number) < 2**63 - 1:
+                stamps[i] = round(number)
+        except ArithmeticError:  # noqa: PERF203 - no cell stops the others
             continue
-        if number.is_finite() and abs(number.adjusted()) <= 30:
-            value = round(number * factor)
-            if abs(value) < 2**63:
-                stamps[i] = value
     return stamps
 
 
@@ -255,13 +252,9 @@ def read_parquet(
     Read some columns of a Parquet file, as `read_text` does of text; a stamp column of Parquet's
     own timestamp type states its unit itself.
     """
-    try:
-        import pyarrow as pa
-        from pyarrow import parquet as pq
-    except ImportError as failure:
-        raise RecordingError(
-            "a Parquet file needs pyarrow: pip install 'thermo_comp[parquet]'", path=path
-        ) from failure
+    pq = library('pyarrow.parquet', 'parquet', 'a Parquet file', path)
+    import pyarrow as pa
+
     try:
         with open_regular(path) as file:
             found = pq.ParquetFile(file)
@@ -278,21 +271,21 @@ def read_parquet(
         raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
     if not table.num_rows:
         raise RecordingError('the table is empty', path=path)
-
-    def floats(name: Column) -> Floats:
-        column = table.column(headings[places[name]])
+    cells: dict[Column, Any] = {name: table.column(headings[i]) for name, i in places.items()}
+    values = {}
+    for name in columns:
         try:
-            values = column.cast(pa.float64(), safe=False).to_numpy()
+            column = cells[name].cast(pa.float64(), safe=False).to_numpy()
         except (pa.ArrowException, ValueError) as failure:
-            raise RecordingError(f'column {name!r} holds {column.type}', path=path) from failure
-        return np.asarray(values, dtype=np.float64)
-
+            said = f'column {name!r} holds {cells[name].type}'
+            raise RecordingError(said, path=path) from failure
+        values[name] = np.asarray(column, dtype=np.float64)
     stamp_ns = None
     if stamp is not None:
-        column: Any = table.column(headings[places[stamp]])
-        if pa.types.is_timestamp(column.type):
-            stamp_exponent = STAMP_EXPONENTS[column.type.unit]
-            column = column.cast(pa.int64())
-        stamp_ns = exact_ns([str(cell) for cell in column.to_pylist()], stamp_exponent)
+        stamps = cells[stamp]
+        if pa.types.is_timestamp(stamps.type):
+            stamp_exponent = STAMP_EXPONENTS[stamps.type.unit]
+            stamps = stamps.cast(pa.int64())
+        stamp_ns = exact_ns([str(cell) for cell in stamps.to_pylist()], stamp_exponent)
     line = np.arange(1, table.num_rows + 1, dtype=np.int64)
-    return Table(line, {name: floats(name) for name in columns}, stamp_ns)
+    return Table(line, values, stamp_ns)
