@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from ..errors import CalibrationError
 from ..text import one_line
@@ -144,11 +145,8 @@ def _content(
 
 def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
     """Fit a cubic to the offset of each axis, and say by how much it is off at most."""
-    cubics = np.zeros((3, 4))
-    for axis, values in enumerate(offset):
-        fitted = np.polynomial.Polynomial.fit(d, values, 3).convert().coef
-        cubics[axis, : len(fitted)] = fitted
-    return cubics, float(np.max(np.abs(np.polynomial.polynomial.polyval(d, cubics.T) - offset)))
+    cubics = polynomial.polyfit(d, offset.T, 3)
+    return cubics.T, float(np.max(np.abs(polynomial.polyval(d, cubics) - offset)))
 
 
 def _losses(calibration: Calibration) -> list[str]:

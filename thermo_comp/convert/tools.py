@@ -160,16 +160,13 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
         raise CalibrationError('is not 1: the set is not in use', key=f'{prefix}ENABLE')
 
     def cubics(sensor: str) -> Floats:
-        bias = np.zeros((3, 4))
-        for axis, name in enumerate(_AXES):
-            for power in (1, 2, 3):
-                bias[axis, power] = values[f'{prefix}{sensor}{power}_{name}'] / _ARDUPILOT_SCALE
+        names = [[f'{prefix}{sensor}{power}_{axis}' for power in (1, 2, 3)] for axis in _AXES]
+        slopes = np.array([[values[name] for name in row] for row in names]) / _ARDUPILOT_SCALE
         # The correction is relative to the temperature of the offset calibration: no offset there.
         calibrated = values.get(f'INS_{sensor}{number}_CALTEMP', _NO_TEMPERATURE)
         held = min(max(calibrated, values[f'{prefix}TMIN']), values[f'{prefix}TMAX'])
-        d = held - _ARDUPILOT_REFERENCE_C
-        bias[:, 0] = -(bias[:, 1] * d + bias[:, 2] * d**2 + bias[:, 3] * d**3)
-        return bias
+        powers = (held - _ARDUPILOT_REFERENCE_C) ** np.arange(1, 4)
+        return np.column_stack((-slopes @ powers, slopes))
 
     # An autopilot that has learnt nothing of its gyroscope lists zeros.
     has_rate = values.has(f'{prefix}GYR')
