@@ -16,7 +16,7 @@ import typer
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import bags, convert, demo, fit, fleet, judge, output, record, simulate
+from . import bags, convert, demo, fit, judge, output, record, simulate
 from .options import expanded, option
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
@@ -57,7 +57,7 @@ for _command in (
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))
 _fleet = typer.Typer(name='fleet', help='Fit many units, and see what they tell together.')
-_fleet.command('fit')(expanded(fleet.fit))
+_fleet.command('fit')(expanded(fit.fleet_fit))
 app.add_typer(_fleet)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from ..files import bag_kind, check_output
 from ..text import counted
 from . import options
 from .options import argument, option
@@ -73,19 +74,17 @@ def _bag(out: Output, path: Path, topics: 'Topics') -> None:
         out.line(f'- {finding}')
     if not survey.findings:
         out.line('fit for a fit, together with other positions')
-    out.json(
-        {
-            'path': path,
-            **picked(found, 'storage truncated metadata input chosen'),
-            'topics': {name: {'type': kind, 'messages': count} for name, kind, count in rows},
-            'samples': survey.n,
-            'still_intervals': survey.n_still,
-            'board': thermometers.get('board'),
-            'case': thermometers.get('case'),
-            **picked(survey, 'rate_hz duration_s still_s thermometers findings'),
-        }
+    out.end(
+        int(bool(found.truncated)),
+        path=path,
+        **picked(found, 'storage truncated metadata input chosen'),
+        topics={name: {'type': kind, 'messages': count} for name, kind, count in rows},
+        samples=survey.n,
+        still_intervals=survey.n_still,
+        board=thermometers.get('board'),
+        case=thermometers.get('case'),
+        **picked(survey, 'rate_hz duration_s still_s thermometers findings'),
     )
-    out.end(int(bool(found.truncated)))
 
 
 def _calibration(out: Output, path: Path) -> None:
@@ -137,7 +136,7 @@ def _calibration(out: Output, path: Path) -> None:
         )
     for note in provenance.notes:
         out.line(f'- {note}')
-    out.json({'path': path, 'calibration': calibration})
+    out.end(path=path, calibration=calibration)
 
 
 def replay(
@@ -170,7 +169,6 @@ def replay(
     Example:
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
     """
-    from ..files import bag_kind, check_output
     from ..online.status import DROPPED, CompensatorConfig
     from ..recording.table_out import TABLES
     from ..replay import replay as run
@@ -212,18 +210,16 @@ def replay(
     for at, flag in result.switches:
         regime = 'dynamic' if flag else 'static'
         out.line(f'    {(at - info.start_ns) * 1e-9:10.1f} s  {regime}')
-    out.json(
-        {
-            'output': output,
-            'samples_in': counters.n_in,
-            'samples_out': counters.n_out,
-            'counters': counts,
-            'flags': result.n_flags,
-            'switches': [{'stamp_ns': at, 'dynamic': flag} for at, flag in result.switches],
-            'truncated': info.truncated,
-        }
+    out.end(
+        int(not counters.n_out),
+        output=output,
+        samples_in=counters.n_in,
+        samples_out=counters.n_out,
+        counters=counts,
+        flags=result.n_flags,
+        switches=[{'stamp_ns': at, 'dynamic': flag} for at, flag in result.switches],
+        truncated=info.truncated,
     )
-    out.end(int(not counters.n_out))
 
 
 def play(
@@ -264,5 +260,4 @@ def play(
     out.told([(bag, report.chosen, report.missing)])
     out.table(('topic', 'messages'), sorted(report.n_messages.items()))
     out.line(f'played in {report.duration_s:.1f} s')
-    out.json({'messages': report.n_messages, **picked(report, 'duration_s unheard lossy')})
-    out.end()
+    out.end(messages=report.n_messages, **picked(report, 'duration_s unheard lossy'))

@@ -5,13 +5,14 @@ Owns what goes to and fro between other tools and ours: ``thermo_comp convert``,
 bags; ``export`` and ``import``, a calibration into their files and back.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import CalibrationError
+from ..files import CALIBRATION, PARAMETERS, bag_kind, check_output, read_bounded, write_atomically
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from . import options
 from .options import argument, option
@@ -24,9 +25,9 @@ Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
 #: What may be said of each kind of input.
 _OPTIONS = {
-    'table': ('--columns', '--rate-hz'),
-    'log': ('--imu', '--baro', '--allow-compensated'),
-    'bag': ('--topic', '--unit'),
+    'table': ('columns', 'rate_hz'),
+    'log': ('imu', 'baro', 'allow_compensated'),
+    'bag': ('topic', 'unit'),
 }
 #: What rows of a log have in common, by the findings of its conversion.
 _FINDINGS = {
@@ -74,24 +75,21 @@ def convert(
       thermo_comp convert flight.ulg --imu 1 -o unit43
     """
     from ..convert.log import write_log
-    from ..files import bag_kind, check_output
 
     read_too = [] if columns is None else [columns]
     check_output(output, bag_kind(output), overwrite=force, others=[log, *read_too])
     given = {
-        '--columns': columns,
-        '--rate-hz': rate_hz,
-        '--imu': imu,
-        '--baro': baro,
-        '--allow-compensated': allow_compensated or None,
-        '--topic': names or None,
-        '--unit': None if unit == 'm/s^2' else unit,
+        'columns': columns,
+        'rate_hz': rate_hz,
+        'imu': imu,
+        'baro': baro,
+        'allow_compensated': allow_compensated or None,
+        'topic': names or None,
+        'unit': None if unit == 'm/s^2' else unit,
     }
     with out.progress('converting') as done:
-        report = write_log(_read(out, log, given), output, force, done)
+        report = write_log(_read(out, log, **given), output, force, done)
     _say(out, report)
-    out.told([(log, report.log.chosen, report.log.missing)])
-    out.end()
 
 
 def _kind_of(path: Path) -> str:
@@ -116,29 +114,29 @@ def as_bags(
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
             bags[path].parent.mkdir()
-            given = {'--columns': columns, '--rate-hz': rate_hz}
-            write_log(_read(out, path, given), bags[path])
+            write_log(_read(out, path, columns=columns, rate_hz=rate_hz), bags[path])
         yield [bags.get(path, path) for path in paths]
 
 
-def _read(out: Output, path: Path, given: Mapping[str, Any]) -> 'ForeignLog':
+def _read(out: Output, path: Path, **given: Any) -> 'ForeignLog':
     """Read a table, log or bag, which its name tells; refuse options that it has no use for."""
     from ..convert import autopilot, bag, columns
 
     kind = _kind_of(path)
-    said = {flag: value for flag, value in given.items() if value is not None}
-    for flag in said:
-        if flag not in _OPTIONS[kind]:
-            raise options.usage(f'a {kind} needs no {flag}; it has {", ".join(_OPTIONS[kind])}')
+    said = {name: value for name, value in given.items() if value is not None}
+    flags = {name: f'--{name.replace("_", "-")}' for name in (*_OPTIONS[kind], *said)}
+    for name in said:
+        if name not in _OPTIONS[kind]:
+            has = ', '.join(flags[one] for one in _OPTIONS[kind])
+            raise options.usage(f'a {kind} needs no {flags[name]}; it has {has}')
     if kind == 'bag':
-        names = said.get('--topic', {})
+        names = said.pop('topic', {})
         if not names.keys() <= {'imu', 'board', 'case'}:
             raise options.usage('--topic: of a bag, imu, board and case are converted')
-        return bag.bag_log(path, **names, unit=said.get('--unit', 'm/s^2'))
+        return bag.bag_log(path, **names, **said)
     if kind == 'log':
-        imu, baro, is_allowed = (said.get(flag) for flag in _OPTIONS['log'])
-        return autopilot.read_autopilot(path, imu, baro, bool(is_allowed))
-    chart, rate_hz = said.get('--columns'), said.get('--rate-hz')
+        return autopilot.read_autopilot(path, **said)
+    chart, rate_hz = said.get('columns'), said.get('rate_hz')
     if chart is not None and rate_hz is not None:
         raise options.usage('--rate-hz: a column map says that')
     if chart is not None:
@@ -188,12 +186,17 @@ def _say(out: Output, report: 'ConversionReport') -> None:
         for stretch in report.stillness.moving_ns:
             begin, end = ((stamp_ns - start_ns) * 1e-9 for stamp_ns in stretch)
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
-    out.json(
-        picked(report, 'output rows rate_hz duration_s believed stillness')
-        | picked(log, 'input unit missing chosen hint')
-        | {'source': log.path, 'start_ns': start_ns, 'accel_messages': accel}
-        | {'board_messages': board, 'case_messages': case, 'further_messages': messages}
-        | report.findings
+    out.told([(log.path, log.chosen, log.missing)])
+    out.end(
+        **picked(report, 'output rows rate_hz duration_s believed stillness'),
+        **picked(log, 'input unit missing chosen hint'),
+        source=log.path,
+        start_ns=start_ns,
+        accel_messages=accel,
+        board_messages=board,
+        case_messages=case,
+        further_messages=messages,
+        **report.findings,
     )
 
 
@@ -231,7 +234,6 @@ def export(
       thermo_comp export unit42.yaml --to imu_tk -o unit42.calib
     """
     from ..convert.exchange import export_calibration
-    from ..files import PARAMETERS, check_output, write_atomically
     from ..unit.calibration_file import load_calibration
 
     if device_id and to != 'px4':
@@ -246,9 +248,7 @@ def export(
     out.line(f'{output}: parameters of {to} for unit {calibration.unit.serial}')
     for note in result.notes:
         out.line(f'- {note}')
-    out.json(
-        {'output': output, 'to': to, 'serial': calibration.unit.serial, 'notes': result.notes}
-    )
+    out.end(output=output, to=to, serial=calibration.unit.serial, notes=result.notes)
 
 
 def import_(
@@ -284,7 +284,6 @@ def import_(
       thermo_comp import xsens_acc.calib --serial 42 -o unit42.yaml
     """
     from ..convert.exchange import import_calibration
-    from ..files import CALIBRATION, check_output, read_bounded
     from ..unit.calibration_file import save_calibration
 
     check_output(output, CALIBRATION, overwrite=force, others=[path])
@@ -306,4 +305,4 @@ def import_(
     out.line(f'{output}: unit {serial}, {source}, {lower:g} .. {upper:g} degC')
     for note in calibration.provenance.notes:
         out.line(f'- {note}')
-    out.json({'output': output, 'calibration': calibration})
+    out.end(output=output, calibration=calibration)

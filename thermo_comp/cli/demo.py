@@ -97,17 +97,15 @@ def demo(
     figure = next(figures.glob('*gravity.png'))
     out.line()
     out.line(f'figure {figure}, certificate {page}')
-    out.json(
-        {
-            'messages_in': n_in,
-            'messages_out': n_out,
-            'is_equal_to_offline': is_same,
-            'bag_s': bag_s,
-            'wall_s': wall_s,
-            'judgements': {name: one.facts() for name, one in result.judgements.items()},
-            'recorded': recorded,
-            'figure': figure,
-        }
+    out.end(
+        messages_in=n_in,
+        messages_out=n_out,
+        is_equal_to_offline=is_same,
+        bag_s=bag_s,
+        wall_s=wall_s,
+        judgements={name: one.facts() for name, one in result.judgements.items()},
+        recorded=recorded,
+        figure=figure,
     )
     if not is_same or n_out != n_in:
         raise ThermoCompError('the node lost messages or differs from the offline replay')

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns ``thermo_comp fit`` and ``prior``: bags to a calibration, calibrations to that of their type.
+Owns ``thermo_comp fit``, ``prior`` and ``fleet fit``: bags of a unit to its calibration,
+calibrations to that of their type, bags of many units to all of these.
 """
 
 import time
@@ -11,10 +12,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
+from ..files import CALIBRATION, PAGE, check_output
+from ..text import counted, one_line
 from . import options
 from .convert import as_bags
 from .options import argument, option
-from .output import Cell, Output, micro_g, millidegrees, picked
+from .output import Cell, Output, micro, micro_g, millidegrees, picked
 
 if TYPE_CHECKING:
     from ..fitting import FitResult
@@ -74,7 +77,6 @@ def fit(
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
       thermo_comp fit tumble.txt -o unit42.yaml --gravity 9.8154
     """
-    from ..files import CALIBRATION, PAGE, check_output
     from ..fitting import FitOptions
     from ..fitting import fit as run
     from ..fitting.sources import fit_sources
@@ -116,10 +118,7 @@ def fit(
         from ..report import evidence_of_fit, write_report
 
         write_report(evidence_of_fit(result), report, info=info, overwrite=force)
-    _say(out, result, output, verbose)
-    if report is not None:
-        out.line(f'{report}: certificate')
-    out.end()
+    _say(out, result, output, report, verbose)
 
 
 def prior(
@@ -139,7 +138,6 @@ def prior(
     Example:
       thermo_comp prior unit01.yaml unit02.yaml unit03.yaml -o type.yaml
     """
-    from ..files import CALIBRATION, check_output
     from ..fitting.priors import population
     from ..unit.calibration_file import load_calibration, save_calibration
 
@@ -148,19 +146,116 @@ def prior(
     found = population(units)
     save_calibration(found, output, overwrite=force)
     out.line(f'{output}: what {len(units)} units have in common, {len(found.response)} columns')
-    out.json({'output': output, 'units': [one.unit.serial for one in units]})
+    out.end(output=output, units=[one.unit.serial for one in units])
+
+
+def fleet_fit(
+    folder: str = argument('DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR'),
+    output: Path = option('Folder of the results; goes on where it was.', ..., '--output', '-o'),
+    settings: dict[str, Any] = options.fitting,
+    scheduler: str | None = option(
+        'Dask scheduler (tcp://HOST:PORT), instead of this machine alone.', None
+    ),
+    workers: int | None = option('Processes on this machine; all processors.', None, min=1),
+    certificates: bool = option('Write a certificate for each unit.', True),
+    with_prior: bool = option(
+        'Fit the units that lack data again with what the others share.', False, '--with-prior'
+    ),
+    earlier: list[Path] | None = option(
+        'fleet.parquet of an earlier fleet, to see drift.', None, metavar='TABLE'
+    ),
+    reading: dict[str, Any] = options.reading,
+    out: Output = options.out,
+) -> None:
+    """
+    Fit every unit below a folder.
+
+    Each folder of bags is one thermal test of one unit; bags that lie in
+    DIR itself are sorted by the serial in them. Results go to OUT/units,
+    the table of all to OUT/fleet.parquet and .csv, what it tells to
+    OUT/fleet.html, what the units that hold have in common to OUT/prior.yaml,
+    a prior as `thermo_comp prior` makes it. A second run does only what is missing or has changed.
+    Exit code 1 if a unit has no valid calibration, or not of all of its bags.
+
+    Example:
+      thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
+    """
+    from ..fitting import FitOptions
+    from ..fleet import FleetOptions, fit_fleet, read_parquet
+
+    with options.usage_of():
+        wanted = FleetOptions(fit=FitOptions(**settings), **reading, certificates=certificates)
+    before = [row for path in earlier or () for row in read_parquet(path)]
+    with out.progress('fitting') as done:
+        result = fit_fleet(
+            folder,
+            output,
+            wanted,
+            with_prior=with_prior,
+            scheduler=scheduler,
+            n_workers=workers,
+            earlier=before,
+            tell=lambda n, total, _row: done(n / total),
+        )
+    summary = result.summary
+    out.table(
+        ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
+        [
+            (
+                *(_short(row['name']), _short(row['serial']), row['verdict']),
+                *(_micro(row[name]) for name in ('static_ug', 'dynamic_ug')),
+                f'{row["n_bags"]}-{row["n_left_out"]}' if row['n_left_out'] else row['n_bags'],
+            )
+            for row in result.rows
+        ],
+        title='|f| - g at rest, RMS',
+    )
+    out.told((row['name'], str(row['chosen']), None) for row in result.rows)
+    for row in result.rows:
+        for said in ('problem', 'left_out'):
+            if row[said]:
+                out.line(f'- {row["name"]}: {row[said]}')
+        if row['n_torn']:
+            out.line(f'- {row["name"]}: {row["reservations"]}')
+    for one in summary.outliers:
+        out.line(
+            f'- {one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
+            f'{one.z:+.1f} sd'
+        )
+    for drift in summary.drifts:
+        if drift.is_significant:
+            worst = drift.worst
+            out.line(
+                f'- {drift.serial}: {worst.constant} changed by {worst.change:+.4g} {worst.unit} '
+                f'(sd {worst.sd:.2g}) from {drift.earlier} to {drift.later}'
+            )
+    if result.prior is not None:
+        out.line(f'{result.prior}: what the units that hold have in common')
+    elif with_prior:
+        out.line(f'- fitted without a prior: {result.no_prior}')
+    out.line(
+        f'{result.page}: {result.n_fitted} of {len(result.rows)} tests calibrated, '
+        f'{result.n_done} of them in this run'
+    )
+    out.end(
+        int(not result.is_whole),
+        **picked(result, 'rows n_fitted n_done parquet csv page prior'),
+        **picked(summary, 'verdicts outliers drifts'),
+    )
 
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(name for name in map(str.strip, text.split(',')) if name)
 
 
-def _say(out: Output, result: 'FitResult', output: Path, verbose: bool) -> None:
-    from ..text import counted
+def _say(
+    out: Output, result: 'FitResult', output: Path, report: Path | None, verbose: bool
+) -> None:
     from ..unit.gravity import spoken
 
     calibration = result.calibration
     gyroscope = calibration.gyroscope if result.rates else None
+    rates = 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
     model, left_out = calibration.provenance.model, result.residuals[-1].left_out
     if verbose:
         out.table(
@@ -204,9 +299,9 @@ def _say(out: Output, result: 'FitResult', output: Path, verbose: bool) -> None:
             _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, n_axes=3),
             title='angular rate at rest less the mean of each position, RMS of an axis in mdeg/s',
         )
-        bias = _of_axes(gyroscope.bias_rad_s, millidegrees)
-        white = _of_axes(gyroscope.noise_density_rad_s_sqrt_hz, millidegrees)
-        walk = _of_axes(gyroscope.slow_noise_rad_s_sqrt_h, millidegrees)
+        bias, white, walk = (
+            _of_axes(values, millidegrees) for values in picked(gyroscope, rates).values()
+        )
         out.line(
             f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
             f'walk {walk} mdeg/s/sqrt(h)'
@@ -218,24 +313,18 @@ def _say(out: Output, result: 'FitResult', output: Path, verbose: bool) -> None:
     if left_out.n:
         headline += f', {spoken(left_out.rms)} RMS of |f| - g on each by the others alone'
     out.line(f'{output}: unit {calibration.unit.serial}, {model}, {headline}')
-    out.json(
-        {
-            'output': output,
-            'serial': calibration.unit.serial,
-            'model': model,
-            'gravity': calibration.gravity_m_s2,
-            'left_out_rms_m_s2': left_out.rms,
-            'residuals_m_s2': result.residuals,
-            **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
-            'gyroscope': gyroscope
-            and {
-                **picked(
-                    gyroscope, 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
-                ),
-                'residuals_rad_s': result.rates,
-            },
-            **picked(result, 'positions least_known findings'),
-        }
+    if report is not None:
+        out.line(f'{report}: certificate')
+    out.end(
+        output=output,
+        serial=calibration.unit.serial,
+        model=model,
+        gravity=calibration.gravity_m_s2,
+        left_out_rms_m_s2=left_out.rms,
+        residuals_m_s2=result.residuals,
+        **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
+        gyroscope=gyroscope and picked(gyroscope, rates) | {'residuals_rad_s': result.rates},
+        **picked(result, 'positions least_known findings'),
     )
 
 
@@ -255,3 +344,13 @@ def _steps(
         for row in residuals
         if row.fitted.n
     ]
+
+
+def _micro(value: object) -> str | None:
+    return micro(value) if isinstance(value, float) else None
+
+
+def _short(name: object) -> str:
+    """Keep the end of a long name, which tells units apart, so that the table fits 80 columns."""
+    clean = one_line(str(name))
+    return clean if len(clean) <= 22 else f'~{clean[-21:]}'

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ThermoCompError
+from ..files import CSV, PAGE, check_output, write_atomically
 from . import options
 from .options import argument, option
-from .output import Cell, Output, micro, micro_g, millidegrees
+from .output import Cell, Output, micro, micro_g, millidegrees, picked
 
 if TYPE_CHECKING:
     from ..judging import Judgement
@@ -43,7 +44,6 @@ def evaluate(
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
     """
-    from ..files import CSV, check_output, write_atomically
     from ..judging import evaluate as run
     from ..judging.history import drifts_of, history_of
     from ..judging.windows import csv_of
@@ -51,16 +51,14 @@ def evaluate(
 
     if csv is not None:
         check_output(csv, CSV, overwrite=force, others=[*bags, *calibration])
-    names = [path.stem for path in calibration]
-    if len(set(names)) < len(names):
-        names = [str(path) for path in calibration]
+    is_named = len({path.stem for path in calibration}) == len(calibration)
     models = [
-        (name, load_calibration(path)) for name, path in zip(names, calibration, strict=True)
+        (path.stem if is_named else str(path), load_calibration(path)) for path in calibration
     ]
     with out.progress('evaluating') as done:
         result = run(bags, models, **judging, **reading, progress=done)
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
-    judged = result.judgements[names[0]]
+    judged = result.judgements[models[0][0]]
     if csv is not None:
         text = csv_of(judged.windows, [bag.name for bag in bags])
         write_atomically(csv, text.encode(), CSV, overwrite=force)
@@ -96,16 +94,14 @@ def evaluate(
     out.line(str(judged))
     if judged.rate is not None:
         out.line(str(judged.rate))
-    out.json(
-        {
-            'bags': bags,
-            'notes': result.notes,
-            **judged.facts(),
-            'history': drifts,
-            'calibrations': {name: one.facts() for name, one in result.judgements.items()},
-        }
+    out.end(
+        judged.exit_code,
+        bags=bags,
+        notes=result.notes,
+        **judged.facts(),
+        history=drifts,
+        calibrations={name: one.facts() for name, one in result.judgements.items()},
     )
-    out.end(judged.exit_code)
 
 
 def _sections(
@@ -136,13 +132,10 @@ def _say_axes(out: Output, judged: 'Judgement') -> None:
     if judged.shifts:
         columns += ['bias ug', '+-', 'scale ppm', '+-']
         title += '; shift since the fit'
-    rows: list[list[Cell]] = []
-    for axis, name in enumerate('xyz'):
-        rows.append([name, *map(micro_g, judged.axis_rms[:, axis])])
-        if judged.shifts:
-            one = judged.shifts[axis]
-            rows[-1] += [micro_g(one.bias), micro_g(one.bias_sd)]
-            rows[-1] += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
+    rows = [[name, *map(micro_g, rms)] for name, rms in zip('xyz', judged.axis_rms.T, strict=True)]
+    for row, one in zip(rows, judged.shifts, strict=False):
+        row += [micro_g(one.bias), micro_g(one.bias_sd)]
+        row += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
     out.table(columns, rows, title=title)
 
 
@@ -169,7 +162,6 @@ def report(
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
     """
-    from ..files import PAGE, check_output
     from ..judging import open_bag
     from ..judging.history import drifts_of
     from ..replay import needed_roles
@@ -206,16 +198,13 @@ def report(
         out.line(f'- {finding}')
     judgement = evidence.judgement
     out.line(f'{output}: {evidence.headline}')
-    out.json(
-        {
-            'output': output,
-            'headline': evidence.headline,
-            'findings': evidence.findings,
-            'history': drifts_of(evidence.history),
-            **({} if judgement is None else judgement.facts()),
-        }
+    out.end(
+        judgement.exit_code if judgement else 0,
+        output=output,
+        **picked(evidence, 'headline findings'),
+        history=drifts_of(evidence.history),
+        **(judgement.facts() if judgement else {}),
     )
-    out.end(0 if judgement is None else judgement.exit_code)
 
 
 def view(

@@ -195,18 +195,16 @@ def place(
 @given
 def judging(
     gravity: float | None = place,
-    window: float = option('Length of a window at rest, in s.', 60.0, metavar='S'),
+    window_s: float = option('Length of a window at rest, in s.', 60.0, '--window', metavar='S'),
     tolerance: str | None = option(
         'Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.', None
     ),
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
     """Give keywords of what judges."""
-    return {
-        'gravity': gravity,
-        'window_s': positive(window, '--window'),
+    return locals() | {
+        'window_s': positive(window_s, '--window'),
         'tolerance': acceleration(tolerance, '--tolerance'),
-        'serial': serial,
     }
 
 
@@ -220,9 +218,10 @@ def fitting(
     reference_temperature: float = option(
         'Reference temperature in degC.', 20.0, min=-273.15, max=1000.0
     ),
-    min_rest: float | None = option(
+    min_rest_s: float | None = option(
         'Shortest rest used, in s; else 3, or less where short ones tell more.',
         None,
+        '--min-rest',
         metavar='S',
         show_default=False,
     ),
@@ -232,16 +231,13 @@ def fitting(
     allow: list[str] | None = option('Refusal to override, as its message names it.', None),
 ) -> dict[str, Any]:
     """Give keywords of FitOptions; FitError where gravity is none that is found on Earth."""
+    given = locals()
     from ..fitting import resolve_gravity
 
     if gravity is None:
         raise usage('give --gravity, or --latitude and --height')
-    return {
+    return given | {
         'gravity': resolve_gravity(gravity, None, None),
-        'model': model,
-        'full_scale': full_scale,
-        'reference_temperature': reference_temperature,
-        'min_rest_s': min_rest,
         'still_sd': acceleration(still_sd, '--still-sd'),
         'allow': tuple(allow or ()),
     }

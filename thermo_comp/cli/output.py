@@ -61,15 +61,15 @@ class Output:
             self.note(one)
         self._is_torn |= bool(torn)
 
-    def end(self, code: int = 0) -> None:
-        """End a command that has done its work; what it read was not whole, if a bag was torn."""
-        if code or self._is_torn:
-            raise typer.Exit(code or 1)
-
-    def json(self, data: Mapping[str, Any]) -> None:
-        """Print the result for machines, in ASCII; numbers that JSON does not know become null."""
+    def end(self, code: int = 0, /, **data: Any) -> None:
+        """
+        End a command: its result for machines, in ASCII, where it is asked for; an exit code that
+        tells, too, if a bag was torn.
+        """
         if self.as_json:
             print(json.dumps(plain(data), indent=2, allow_nan=False))
+        if code or self._is_torn:
+            raise typer.Exit(code or 1)
 
     def table(
         self, columns: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''

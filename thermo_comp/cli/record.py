@@ -6,7 +6,7 @@ import re
 import shlex
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from math import isnan
 from pathlib import Path
@@ -23,7 +23,6 @@ from .output import Cell, Output, micro, picked
 
 if TYPE_CHECKING:
     from ..fitting.acquisition import Account, Acquisition, Position
-    from ..recording.growing import News, PositionBags
     from ..typing import Floats
 
 _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
@@ -67,6 +66,8 @@ def record(
     bags = PositionBags(output, _take_known(out, test, known, serial))
     over = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
+    told: dict[str, str] = {}
+    chosen: str | None = None
     # A second signal ends the process at once.
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
         signals.on_signal(over.set)
@@ -80,12 +81,50 @@ def record(
             news, problems = live.blocks(over.wait), lambda: live.problems
             out.line('listening; Ctrl-C ends it with whole bags')
             sys.stdout.flush()  # whoever reads this through a pipe waits for it
-        _take(out, test, bags, news, problems)
+        show = stack.enter_context(out.live())
+        for new in news:
+            if new is not None:
+                if new.info is not None and new.info.chosen != chosen:
+                    chosen = new.info.chosen
+                    out.told([(new.info.path, chosen, None)])
+                bags.add(new)
+                for begin_ns in test.add(new.block):
+                    bags.cut(begin_ns)
+                bags.release(test.settled_ns)
+                continue
+            account = test.account()
+            if show is None:
+                _tell(out, account, problems(), told)
+            else:
+                lines = [*problems(), _now(account), *_lines(account)]
+                show(_COLUMNS, _rows(account.positions), lines)
+            if account.is_complete:
+                break
     if bag is None and live.n_lost:
         out.note(f'{live.n_lost} messages were lost on the way')
-    account = test.account()
-    _say(out, account, output, [*known, *bags.written], offset)
-    out.end(int(not account.is_complete and not over.is_set()))
+    account, written = test.account(), [*known, *bags.written]
+    there = [one for one in account.positions if one.n_rests]
+    out.table(_COLUMNS, _rows(there))
+    for line in _lines(account):
+        out.line(line)
+    command = f'thermo_comp fit {shlex.quote(str(output))}/*.mcap -o unit.yaml --gravity G'
+    if offset is not None:
+        command += f' --offset {offset:g}'
+    out.line(f'{counted(len(written), "bag")} in {output}')
+    if written:
+        out.line('now fit them, with the local gravity in m/s^2:')
+        out.line(f'  {command}')
+    bias, scale, skew = account.constants_sd.reshape(3, 3)
+    out.end(
+        int(not account.is_complete and not over.is_set()),
+        bags=written,
+        command=command if written else None,
+        positions=there,
+        bias_sd_g=bias,
+        scale_sd=scale,
+        misalignment_sd_rad=skew,
+        **picked(account, 'n_good is_complete worst_sd_g thermometers next_up findings'),
+    )
 
 
 def _duration(text: str) -> float:
@@ -115,37 +154,6 @@ def _take_known(
             test.begin()
             done(number)
     return serial
-
-
-def _take(
-    out: Output,
-    test: 'Acquisition',
-    bags: 'PositionBags',
-    news: Iterator['News | None'],
-    problems: Callable[[], Sequence[str]],
-) -> None:
-    """Record until all is there or nothing more comes, and show how far it is."""
-    told: dict[str, str] = {}
-    chosen: str | None = None
-    with out.live() as show:
-        for new in news:
-            if new is not None:
-                if new.info is not None and new.info.chosen != chosen:
-                    chosen = new.info.chosen
-                    out.told([(new.info.path, chosen, None)])
-                bags.add(new)
-                for begin_ns in test.add(new.block):
-                    bags.cut(begin_ns)
-                bags.release(test.settled_ns)
-                continue
-            account = test.account()
-            if show is not None:
-                lines = [*problems(), _now(account), *_lines(account)]
-                show(_COLUMNS, _rows(account.positions), lines)
-            else:
-                _tell(out, account, problems(), told)
-            if account.is_complete:
-                break
 
 
 def _tell(out: Output, account: 'Account', problems: Sequence[str], told: dict[str, str]) -> None:
@@ -227,31 +235,3 @@ def _lines(account: 'Account') -> list[str]:
     if not account.is_complete:
         lines.append(_next(account))
     return [*lines, *(f'- {finding}' for finding in account.findings)]
-
-
-def _say(
-    out: Output, account: 'Account', output: Path, bags: Sequence[Path], offset: float | None
-) -> None:
-    positions = [one for one in account.positions if one.n_rests]
-    out.table(_COLUMNS, _rows(positions))
-    for line in _lines(account):
-        out.line(line)
-    command = f'thermo_comp fit {shlex.quote(str(output))}/*.mcap -o unit.yaml --gravity G'
-    if offset is not None:
-        command += f' --offset {offset:g}'
-    out.line(f'{counted(len(bags), "bag")} in {output}')
-    if bags:
-        out.line('now fit them, with the local gravity in m/s^2:')
-        out.line(f'  {command}')
-    bias, scale, skew = account.constants_sd.reshape(3, 3)
-    out.json(
-        {
-            'bags': bags,
-            'command': command if bags else None,
-            'positions': positions,
-            'bias_sd_g': bias,
-            'scale_sd': scale,
-            'misalignment_sd_rad': skew,
-            **picked(account, 'n_good is_complete worst_sd_g thermometers next_up findings'),
-        }
-    )

@@ -3,14 +3,16 @@
 """Owns ``thermo_comp simulate``: bags of a thermal test with known truth."""
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..files import bag_kind, check_output
 from ..unit.gravity import STANDARD_GRAVITY
 from . import options
 from .options import option
-from .output import Output
+from .output import Output, picked
 
 if TYPE_CHECKING:
     from ..recording import BagWriter
@@ -66,7 +68,6 @@ def simulate(
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
     """
     from .. import __version__, simulation
-    from ..files import bag_kind, check_output
     from ..recording import BagWriter
 
     with options.usage_of():
@@ -96,9 +97,8 @@ def simulate(
                 'position_seed': position_seed,
                 **settings,
                 'up': station.up.tolist(),
-                'scale_factor': list(specimen.scale_factor),
-                'bias_at_reference': list(specimen.bias_at_reference),
-                'misalignment': [list(row) for row in specimen.M],
+                **picked(specimen, 'scale_factor bias_at_reference'),
+                'misalignment': specimen.M.tolist(),
             }
             metadata = {
                 'serial': specimen.serial,
@@ -115,15 +115,15 @@ def simulate(
                     **settings,
                 )
             n_cycles = station.program.duration_s * rate_hz
-            count = {'counts': 0, 'board': 0, 'case': 0}
+            count = Counter(counts=0, board=0, case=0)
             with BagWriter(name, metadata=metadata, level=level, overwrite=force) as writer:
                 for more in _write(writer, runs, specimen, imu):
-                    count = {key: count[key] + more[key] for key in count}
+                    count.update(more)
                     done(i + count['counts'] / n_cycles)
             written.append({'bag': str(name), **count})
     out.table(('bag', 'counts', 'board', 'case'), [tuple(row.values()) for row in written])
     seconds = max(station.program.duration_s for station in stations)
-    out.json({'serial': specimen.serial, 'duration_s': seconds, 'bags': written})
+    out.end(serial=specimen.serial, duration_s=seconds, bags=written)
 
 
 def _write(
