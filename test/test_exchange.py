@@ -146,7 +146,7 @@ def test_the_angular_rate_goes_both_ways(cubic: Calibration) -> None:
     def again(text: str) -> np.ndarray:
         found = import_calibration(text, serial='7')
         triad = rate_triad(found)
-        return bias_and_scale(triad, ramp_states(triad, celsius, 0.0, 0.0))[0]
+        return bias_and_scale(triad, ramp_states(triad, celsius))[0]
 
     px4 = export_calibration(unit, 'px4')
     value = numbers(px4.text, '\t')

@@ -161,7 +161,7 @@ def test_file_and_triad_round_trip():
     assert gyroscope_of(triad) == whole.gyroscope
     assert triad.gyroscope is None
     # Its scale is 1, and the posterior says nothing of it.
-    states = ramp_states(triad, np.array([10.0, 20.0, 30.0]), 0.0, 0.0)
+    states = ramp_states(triad, np.array([10.0, 20.0, 30.0]))
     bias, scale = bias_and_scale(triad, states)
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])

@@ -110,7 +110,7 @@ def _content(
         matrix = np.eye(3)
         if calibration.gyroscope is not None:
             triad = rate_triad(calibration)
-            rate, _ = bias_and_scale(triad, ramp_states(triad, temperature, 0.0, 0.0))
+            rate, _ = bias_and_scale(triad, ramp_states(triad, temperature))
             rate_bias, misfit = _cubics(d, rate.T)
             if misfit > 1e-3 * MILLIDEGREE:
                 off = f'{misfit / MILLIDEGREE:.2g} mdeg/s'

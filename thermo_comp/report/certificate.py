@@ -263,7 +263,7 @@ def conformity_rule(evidence: Evidence) -> str:
 def _slope(calibration: Calibration) -> float:
     """RMS over the static range and the axes of the bias per kelvin [m/s^2/K]."""
     temperature = np.linspace(*calibration.static.temperature_range_c, _N_SLOPE)
-    bias, _ = bias_and_scale(calibration, ramp_states(calibration, temperature, 0.0, 0.0))
+    bias, _ = bias_and_scale(calibration, ramp_states(calibration, temperature))
     return _rms(np.diff(bias, axis=0) / np.diff(temperature)[:, None])
 
 

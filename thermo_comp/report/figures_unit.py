@@ -156,7 +156,7 @@ def curves(calibration: Calibration) -> list[Curve]:
                 name = f'{word} at {abs(rate):g} K/min'
                 looks.append((name, dynamic, rate / 60.0, line, hatch, marker))
     reference = np.array([calibration.reference_temperature_c])
-    bias_0, scale_0 = bias_and_scale(calibration, ramp_states(calibration, reference, 0.0, 0.0))
+    bias_0, scale_0 = bias_and_scale(calibration, ramp_states(calibration, reference))
     found = []
     for name, part, rate, line, hatch, marker in looks:
         lower, upper = part.temperature_range_c
@@ -227,7 +227,7 @@ def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     plays = StateLayout(Correction(calibration).memory).plays
     ways = []
     for sign, travelled in ((1.0, temperature - lower), (-1.0, upper - temperature)):
-        states = ramp_states(calibration, temperature, 0.0, 0.0)
+        states = ramp_states(calibration, temperature)
         for (_, width), place in plays.items():
             states[:, place] = sign * np.maximum(width - travelled, -width)
         ways.append(bias_and_scale(calibration, states)[0] / MICRO_G)

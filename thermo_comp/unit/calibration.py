@@ -32,7 +32,7 @@ from .columns import Column
 from .functions import TemperatureFunction, check_reference
 from .gyroscope import Gyroscope, RateCurve, RateSet
 from .posterior import ParameterLayout, Posterior, lay_out
-from .schema import Bounds, NotNegative, Positive, check_ranges
+from .schema import Bounds, NotNegative, NotNegatives, Positive, Positives, Vector, check_ranges
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -48,7 +48,6 @@ SMALLEST_RELATIVE_SCALE = 0.1
 _GRID = 513
 
 Celsius = Annotated[float, Bounds(at_least=-273.15, below=1000.0)]
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -219,20 +218,17 @@ class Calibration:
     static: Annotated[RegimeSet, 'The set of the static regime, S = 0.']
     dynamic: Annotated[RegimeSet, 'The set of the dynamic regime, S = 1.']
     noise_density_m_s2_sqrt_hz: Annotated[
-        tuple[Positive, Positive, Positive],
-        'White noise of each axis; variance of a sample = density^2 / cycle, and rounding.',
+        Positives, 'White noise of each axis; of a sample density^2 / cycle, and rounding.'
     ]
     slow_noise_m_s2_sqrt_h: Annotated[
-        tuple[NotNegative, NotNegative, NotNegative],
-        'Random walk of the bias of each axis, per root hour.',
+        NotNegatives, 'Random walk of the bias of each axis, per root hour.'
     ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
         tuple[Vector, Vector, Vector],
         'M: lower triangular, unit diagonal; sensitivity axes to frame.',
     ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     misalignment_sd: Annotated[
-        tuple[NotNegative, NotNegative, NotNegative],
-        'Standard deviations of M[1][0], M[2][0], M[2][1], where there is no `posterior`.',
+        NotNegatives, 'Deviations of M[1][0], M[2][0], M[2][1], where there is no `posterior`.'
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
         tuple[str, ...], 'Thermometers beside the board; the first one leads in a ramp.'
@@ -272,17 +268,14 @@ class Calibration:
             self.posterior.check_size(parameter_layout(self).n_parameters)
 
     def _check_misalignment(self) -> None:
-        for row, values in enumerate(self.misalignment):
-            for column, value in enumerate(values):
-                is_good, rule = value == 1.0, '1'
-                if column > row:
-                    is_good, rule = not value, '0 (M is lower triangular)'
-                elif column < row:
-                    is_good, rule = abs(value) < 0.5, 'below 0.5 in magnitude'
-                if not is_good:
-                    raise ValueError(
-                        f'`misalignment[{row}][{column}]` must be {rule}, got {value:g}'
-                    )
+        for (row, column), value in np.ndenumerate(np.array(self.misalignment)):
+            is_good, rule = value == 1.0, '1'
+            if column > row:
+                is_good, rule = not value, '0 (M is lower triangular)'
+            elif column < row:
+                is_good, rule = abs(value) < 0.5, 'below 0.5 in magnitude'
+            if not is_good:
+                raise ValueError(f'`misalignment[{row}][{column}]` must be {rule}, got {value:g}')
 
     def _check_sensors(self) -> None:
         names = self.sensors
@@ -351,9 +344,8 @@ class Calibration:
             weights += (axis.delta, *axis.bias_function.free_coefficients)
             weights += axis.scale_function.free_coefficients
         own = self.gyroscope
-        if own is not None:
-            for rate in (*own.static.axes(), *own.dynamic.axes()):
-                weights += (rate.delta, *rate.bias_function.free_coefficients)
+        for rate in (*own.static.axes(), *own.dynamic.axes()) if own else ():
+            weights += (rate.delta, *rate.bias_function.free_coefficients)
         return any(weights) or bool(self.response or (own and own.response))
 
     @property
@@ -369,14 +361,10 @@ class Calibration:
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
     """Say where each parameter of a calibration stands in its posterior."""
     axes = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
-    pairs = [
-        pair
-        for static, dynamic in axes
-        for pair in (
-            (static.bias_function, dynamic.bias_function),
-            (static.scale_function, dynamic.scale_function),
-        )
-    ]
+    pairs: list[tuple[TemperatureFunction, TemperatureFunction]] = []
+    for static, dynamic in axes:
+        pairs.append((static.bias_function, dynamic.bias_function))
+        pairs.append((static.scale_function, dynamic.scale_function))
     blocks = lay_out(pairs, len(calibration.response))
     end = blocks[-1].end
     return ParameterLayout(blocks[0::2], blocks[1::2], end, end + 3)

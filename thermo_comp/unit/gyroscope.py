@@ -16,7 +16,7 @@ from typing import Annotated
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
 from .posterior import Posterior, lay_out
-from .schema import NotNegative, Positive
+from .schema import NotNegatives, Positives, Vector
 
 #: A unit of angular rates [rad/s].
 MILLIDEGREE = math.radians(1e-3)
@@ -50,9 +50,7 @@ class RateSet:
 class RateTerm(Column):
     """A column of the thermal response with its weights on the three axes."""
 
-    bias: Annotated[tuple[float, float, float], 'rad/s per unit of the column.'] = field(
-        kw_only=True
-    )
+    bias: Annotated[Vector, 'rad/s per unit of the column.'] = field(kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -64,21 +62,15 @@ class Gyroscope:
     and the free coefficients of the static set, those of the dynamic one, and the weights.
     """
 
-    bias_rad_s: Annotated[
-        tuple[float, float, float], 'At the reference temperature, in the mean over positions.'
-    ]
+    bias_rad_s: Annotated[Vector, 'At the reference temperature, in the mean over positions.']
     static: RateSet
     dynamic: RateSet
-    noise_density_rad_s_sqrt_hz: Annotated[
-        tuple[Positive, Positive, Positive], 'White noise of each axis.'
-    ]
+    noise_density_rad_s_sqrt_hz: Annotated[Positives, 'White noise of each axis.']
     slow_noise_rad_s_sqrt_h: Annotated[
-        tuple[NotNegative, NotNegative, NotNegative],
-        'Random walk of the bias of each axis, per root hour.',
+        NotNegatives, 'Random walk of the bias of each axis, per root hour.'
     ] = (0.0, 0.0, 0.0)
     residual_sd_rad_s: Annotated[
-        tuple[NotNegative, NotNegative, NotNegative],
-        'What the curves leave unexplained, as a slow error: a turn-on is one.',
+        NotNegatives, 'What the curves leave unexplained, as a slow error: a turn-on is one.'
     ] = (0.0, 0.0, 0.0)
     response: Annotated[tuple[RateTerm, ...], 'The thermal response, common to both sets.'] = ()
     posterior: Annotated[

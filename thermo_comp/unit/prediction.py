@@ -30,10 +30,9 @@ def in_a_soak(
     Returns bias [m/s^2] and its sd, scale [input units per m/s^2] and its relative sd.
     """
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
-    states = ramp_states(calibration, at, 0.0, 0.0)
-    (bias, scale), (sd_bias, sd_scale) = (
-        of_states(calibration, states) for of_states in (bias_and_scale, sd_of_states)
-    )
+    states = ramp_states(calibration, at)
+    bias, scale = bias_and_scale(calibration, states)
+    sd_bias, sd_scale = sd_of_states(calibration, states)
     return bias[0], sd_bias[0], scale[0], sd_scale[0]
 
 
@@ -62,18 +61,20 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
 
 
 def ramp_states(
-    calibration: Calibration, temperature: Floats, rate: float, lasted_s: Floats | float
+    calibration: Calibration,
+    temperature: Floats,
+    rate: float = 0.0,
+    lasted_s: Floats | float = 0.0,
 ) -> Floats:
     """
-    Think up the states of a soak or of a ramp.
+    Think up the states of a ramp, or of a soak, at board temperatures, shape (n,).
 
-    `temperature`: board temperatures, shape (n,). `rate`: rate of the board [K/s]; 0 in a soak.
-    `lasted_s`: for how long the ramp has lasted, inf for ever [s], shape (n,).
+    `rate` is the board's [K/s]; `lasted_s` for how long it has lasted, inf for ever, shape (n,).
     """
+    layout = Layout(Correction(calibration).memory)
+    states = np.zeros((len(temperature), layout.width))
     gradient = calibration.board_lag_s * rate
-    states, layout = _soaked(calibration, temperature)
-    states[:, RATE] = rate
-    states[:, WEIGHT] = float(rate != 0.0)
+    states[:, BOARD], states[:, RATE], states[:, WEIGHT] = temperature, rate, float(rate != 0.0)
     states[:, list(layout.gradients.values())] = gradient
     for (name, tau), place in layout.lags.items():
         end = tau * rate if name == BOARD_INPUT else gradient
@@ -85,19 +86,11 @@ def ramp_states(
 
 def step_states(calibration: Calibration, temperature: float, since_s: Floats) -> Floats:
     """
-    Think up the states after board and case have jumped by 1 K together, out of a soak.
-
-    `since_s`: time since the step [s]; inf gives the soak that follows, shape (n,).
+    Think up the states at times [s] after board and case have jumped by 1 K together, out of a
+    soak; inf gives the soak that follows, shape (n,).
     """
-    states, layout = _soaked(calibration, np.full(len(since_s), temperature))
-    for (name, tau), place in layout.lags.items():
+    states = ramp_states(calibration, np.full(len(since_s), temperature))
+    for (name, tau), place in Layout(Correction(calibration).memory).lags.items():
         if name == BOARD_INPUT:
             states[:, place] = np.exp(-since_s / tau)
     return states
-
-
-def _soaked(calibration: Calibration, temperature: Floats) -> tuple[Floats, Layout]:
-    layout = Layout(Correction(calibration).memory)
-    states = np.zeros((len(temperature), layout.width))
-    states[:, BOARD] = temperature
-    return states, layout

@@ -84,6 +84,10 @@ class Bounds:
 
 Positive = Annotated[float, Bounds(above=0.0)]
 NotNegative = Annotated[float, Bounds(at_least=0.0)]
+#: Of three axes.
+Vector = tuple[float, float, float]
+Positives = tuple[Positive, Positive, Positive]
+NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 
 
 def build(hint: type[Value], data: Any, key: str = '') -> Value:
