@@ -30,8 +30,6 @@ def test_nothing_to_count_gives_nan() -> None:
 
 
 def test_micro_g_is_a_millionth_of_standard_gravity() -> None:
-    found = residual_statistics(np.array([-MICRO_G])).micro_g
-    assert (found.mean, found.rms, found.peak) == (-1.0, 1.0, 1.0)
     assert pytest.approx(9.80665e-6) == MICRO_G
 
 

@@ -205,7 +205,7 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
             for name, value in zip(map(pattern.format, _places(pattern)), values, strict=True)
         },
         'board_lag_s': calibration.board_lag_s,
-        'unseen_ug': unseen.micro_g.rms,
+        'unseen_ug': unseen.rms / MICRO_G,
     }
     if judgement is not None:
         found = judgement.sections

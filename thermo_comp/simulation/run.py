@@ -19,7 +19,7 @@ from ..unit.gyroscope import MILLIDEGREE
 from .cyclogram import Cyclogram
 from .drift import PartHistory, drift_of
 from .network import AIR, ThermalResponse
-from .unit import Stream, SwitchedLoad, UnitModel, first_charge, generator
+from .unit import Stream, SwitchedLoad, UnitModel, first_charge, generator, white
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
@@ -154,8 +154,7 @@ def simulate_blocks(
         # A mean over one cycle of white noise: density times the root of the cycle rate.
         root = math.sqrt(rate_hz)
         noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
-        noise = [generator(seed, Stream.ACCEL_NOISE, i) for i in range(3)]
-        rate_noise = [generator(seed, Stream.GYRO_NOISE, i) for i in range(3)]
+        noise, rate_noise = white(seed, Stream.ACCEL_NOISE), white(seed, Stream.GYRO_NOISE)
         remainder = first_charge(seed)
         passed = -1
         for first in range(0, n_cycles, block_size):
@@ -164,16 +163,13 @@ def simulate_blocks(
             stamp_ns = np.rint((cycle + 1.0) * (_NS / rate_hz)).astype(np.int64)
             part = replace(truth, cycle_s=(cycle + 0.5).astype(np.float64) / rate_hz)
             # Eq. (2), (8) and (9)
-            charge = part.bias + K * part.scale * s
-            for i in range(3):
-                charge[:, i] += noise_sd[i] * noise[i].standard_normal(len(cycle))
+            charge = part.bias + K * part.scale * s + noise_sd * noise(len(cycle))
             counts, remainder = unit.converter(charge, remainder)
             rate, gyro = None, unit.gyro
             if gyro is not None:
-                rate = part.on_cycles(part.rate_bias) + gyro.constant(seed)
                 rate_sd = np.array(gyro.noise_density) * MILLIDEGREE * root
-                for i in range(3):
-                    rate[:, i] += rate_sd[i] * rate_noise[i].standard_normal(len(cycle))
+                rate = part.on_cycles(part.rate_bias) + gyro.constant(seed)
+                rate += rate_sd * rate_noise(len(cycle))
             until = sys.maxsize if last == n_cycles else int(stamp_ns[-1])
             (board_ns, board), (case_ns, case) = (
                 (stamps[rows] + start_ns, values[rows])
@@ -228,10 +224,7 @@ def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Boo
 
 def _walk(unit: UnitModel, grid: Floats, seed: int) -> Floats:
     """Return what the bias does of itself: a walk, counts/cycle."""
-    result = np.zeros((len(grid), 3))
-    step_h = grid[1] / 3600.0
-    for i, density in enumerate(unit.bias_walk):
-        if density:
-            steps = generator(seed, Stream.BIAS_WALK, i).standard_normal(len(grid) - 1)
-            result[1:, i] += density * math.sqrt(step_h) * np.cumsum(steps)
-    return result * unit.counts_per_micro_g
+    steps = white(seed, Stream.BIAS_WALK)(len(grid) - 1)
+    per_step = np.array(unit.bias_walk) * math.sqrt(grid[1] / 3600.0)
+    walk = np.concatenate((np.zeros((1, 3)), per_step * np.cumsum(steps, axis=0)))
+    return np.asarray(walk * unit.counts_per_micro_g)

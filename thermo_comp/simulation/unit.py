@@ -53,6 +53,12 @@ def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
 
 
+def white(seed: int, stream: Stream) -> Callable[[int], Floats]:
+    """Return what gives the next n numbers of each axis, shape (n, 3)."""
+    axes = [generator(seed, stream, axis) for axis in range(3)]
+    return lambda n: np.stack([axis.standard_normal(n) for axis in axes], axis=1)
+
+
 def first_charge(seed: int) -> Ints:
     """Return the charge on the integrators at power-on, shape (3,), in 2^-40 count."""
     phases = [generator(seed, Stream.CONVERTER_PHASE, axis).integers(_ONE) for axis in range(3)]

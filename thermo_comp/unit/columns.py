@@ -59,11 +59,7 @@ PLAY_TAU: Final = 900.0
 
 @dataclass(frozen=True)
 class Column:
-    """
-    One regressor of the thermal response; its keys are the calibration file's.
-
-    Raises ValueError if the keys contradict each other: naming the key, the rule and the value.
-    """
+    """One regressor of the thermal response; its keys are the calibration file's."""
 
     group: Annotated[
         Literal['now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'],
@@ -121,9 +117,9 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
     now = [Column('now', 'now', sensor, range=UNBOUNDED) for sensor in sensors]
     board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
     neighbour = [
-        Column('neighbour', 'neighbour', sensor, tau, range=UNBOUNDED)
+        replace(column, group='neighbour', kind='neighbour', sensor=sensor)
         for sensor in sensors
-        for tau in FINE_TAUS
+        for column in board
     ]
     coarse = [column for column in board if column.tau_s in BANK_TAUS]
     flow = [*now, *(column for column in neighbour if column.tau_s in BANK_TAUS)]
@@ -152,11 +148,7 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """
-    Find what a tracker must remember for some columns.
-
-    Raises ValueError if a column is of a sensor that is not among them.
-    """
+    """Find what a tracker must remember for some columns, ValueError if a sensor is missing."""
     lags: set[tuple[str, float]] = set()
     plays: set[tuple[float, float]] = set()
     for column in columns:

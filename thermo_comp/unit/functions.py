@@ -75,10 +75,7 @@ class Polynomial(_Family):
     """
     ``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10), with the leading constant where it belongs).
 
-    coefficients: by rising power; the first is the value at the reference: 0 for a bias function,
-        1 for a scale function. Unit of the function per K^power
-
-    Raises ValueError if there are no coefficients.
+    The first is the value at the reference: 0 for a bias function, 1 for a scale function.
     """
 
     coefficients: tuple[float, ...]
@@ -113,15 +110,8 @@ class Polynomial(_Family):
 @dataclass(frozen=True)
 class CubicSpline(_Family):
     """
-    Natural cubic spline through values at knots, one of which is the reference (0 K).
-
-    Outside the outermost knots the end value is held.
-
-    knots_k: rising deviations from the reference temperature [K]; 0 is one of them
-    values: the function at the knots; at knot 0 it is 0 (bias) or 1 (scale)
-
-    Raises ValueError if there are fewer than three knots, they do not rise, 0 is missing, or the
-    lengths differ.
+    Natural cubic spline through values at rising knots [K from the reference], one of them 0,
+    where the value is 0 (bias) or 1 (scale). Beyond the knots the end value is held.
     """
 
     knots_k: tuple[float, ...]
@@ -183,14 +173,8 @@ class CubicSpline(_Family):
 @dataclass(frozen=True)
 class Exponential(_Family):
     """
-    ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``.
-
-    constant: together with the amplitudes it makes the value at the reference 0 (bias) or 1
-        (scale)
-    amplitudes: in the unit of the function
-    e_fold_k: the temperature change that multiplies a term by e [K]; any sign, not 0
-
-    Raises ValueError if there is no term, the lengths differ, or an e-fold is below 1 K.
+    ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``, which at the reference is 0 (bias) or
+    1 (scale); an e-fold is the change that multiplies a term by e [K], of any sign.
     """
 
     constant: float

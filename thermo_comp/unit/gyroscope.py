@@ -58,8 +58,8 @@ class Gyroscope:
     """
     What temperature does to the angular rate.
 
-    Raises ValueError if the posterior has not one variance per parameter: axis by axis the level
-    and the free coefficients of the static set, those of the dynamic one, and the weights.
+    The parameters of the posterior are axis by axis the level and the free coefficients of the
+    static set, those of the dynamic one, and the weights.
     """
 
     bias_rad_s: Annotated[Vector, 'At the reference temperature, in the mean over positions.']

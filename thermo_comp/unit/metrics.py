@@ -14,27 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..typing import Bools, Floats
-from .gravity import MICRO_G
 
 
 @dataclass(frozen=True)
 class ResidualStatistics:
-    """
-    What is said of a set of residuals: how many were finite and, of these, mean, root of the mean
-    square and largest magnitude in their unit, NaN when there are none.
-    """
+    """What is said of residuals that are finite: NaN when there are none."""
 
     n: int
     mean: float
     rms: float
     peak: float
-
-    @property
-    def micro_g(self) -> ResidualStatistics:
-        """The statistics of residuals in m/s^2, expressed in micro-g."""
-        return ResidualStatistics(
-            self.n, self.mean / MICRO_G, self.rms / MICRO_G, self.peak / MICRO_G
-        )
 
 
 def residual_statistics(residual: Floats) -> ResidualStatistics:

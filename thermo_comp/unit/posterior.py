@@ -34,9 +34,6 @@ class Posterior:
     What is uncertain about the parameters, all at once: factor @ factor.T + diag(rest).
 
     The order of the parameters is that of `ParameterLayout`.
-
-    Raises ValueError if a text is not base64 of float32 numbers, the sizes differ, a number is not
-    finite, or a variance is negative.
     """
 
     rank: Annotated[int, Bounds(at_least=0), 'Number of columns of the factor.']
@@ -92,10 +89,8 @@ class Posterior:
 
 class Block(NamedTuple):
     """
-    Where the parameters of the bias, or of the scale, of one axis stand among all.
-
-    Each index is that of the first: the level of a set is followed by its function's free
-    coefficients, the weights of the response stand from `response` to before `end`.
+    Where the parameters of the bias, or of the scale, of one axis stand among all: from the level
+    of each set on its function's, from `response` to before `end` the weights of the response.
     """
 
     static: int
@@ -119,10 +114,8 @@ def lay_out(
 
 class ParameterLayout(NamedTuple):
     """
-    The order of a calibration's parameters in its posterior.
-
-    For each axis the bias [input units], then the scale [relative]; then M[1][0], M[2][0],
-    M[2][1] from `misalignment` on.
+    The order of a calibration's parameters in its posterior: axis by axis the bias [input units],
+    then the scale [relative]; M[1][0], M[2][0], M[2][1] from `misalignment` on.
     """
 
     bias: list[Block]
@@ -132,11 +125,7 @@ class ParameterLayout(NamedTuple):
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """
-    Find the smallest factor that holds a covariance matrix.
-
-    Raises ValueError if `covariance` has a negative variance or is not positive semidefinite.
-    """
+    """Find the smallest factor that holds a covariance matrix; ValueError if it is none."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')

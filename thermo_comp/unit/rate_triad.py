@@ -32,11 +32,7 @@ _NIL = (0.0, 0.0, 0.0)
 
 
 def rate_triad(calibration: Calibration) -> Calibration:
-    """
-    Return the gyroscope of a unit as a triad.
-
-    Raises ValueError if there is none.
-    """
+    """Return the gyroscope of a unit, which must have one, as a triad."""
     own = calibration.gyroscope
     if own is None:
         raise ValueError('`calibration` must have a gyroscope')
