@@ -20,7 +20,7 @@ from simulation_helpers import ideal_regime
 from thermo_comp import __version__
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.fitting.reduction import Readings
-from thermo_comp.judging import open_bag
+from thermo_comp.judging import open_bags
 from thermo_comp.recording import BagWriter
 from thermo_comp.report import (
     Evidence,
@@ -157,16 +157,16 @@ def test_page_has_each_id_once_and_refers_to_ids_it_has(page):
 def test_bag_says_whether_its_fit_has_seen_it(bag):
     calibration = fitted().calibration
     assert 'positions in bags of its own fit' in Page(certificate()).text
-    unseen = evidence_of_bags([open_bag(bag)], calibration)
+    unseen = evidence_of_bags(open_bags([bag]), calibration)
     assert '1 position in bags that the fit has not seen' in words_of(unseen).text
     sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].source.sha256),)
     provenance = replace(calibration.provenance, sources=sources)
-    seen = evidence_of_bags([open_bag(bag)], replace(calibration, provenance=provenance))
+    seen = evidence_of_bags(open_bags([bag]), replace(calibration, provenance=provenance))
     assert '1 position in bags of its own fit' in words_of(seen).text
 
 
 def test_bag_alone_shows_temperatures_derivatives_and_flag(bag, tmp_path):
-    found = evidence_of_bags([open_bag(bag)])
+    found = evidence_of_bags(open_bags([bag]))
     shown = found.shown
     truth = run(0).truth
     # In the middle of the first ramp the case heats at the chamber's 1.5 K/min or a little less.
@@ -214,7 +214,7 @@ def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
     calibration = replace(
         calibration, unit=replace(calibration.unit, serial=evil), provenance=provenance
     )
-    found = evidence_of_bags([open_bag(bag)], calibration)
+    found = evidence_of_bags(open_bags([bag]), calibration)
     page = page_of(found, tmp_path)
     assert page.text.count(evil) >= 6
     assert '$\\frac{.mcap' in page.text
@@ -254,7 +254,7 @@ def test_bag_is_read_in_bounded_memory(tmp_path):
             writer.write_counts('accel/counts', one.accel_stamp_ns + step, one.counts)
     tracemalloc.start()
     try:
-        opened = open_bag(tmp_path / 'long.mcap')
+        (opened,) = open_bags([tmp_path / 'long.mcap'])
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -290,7 +290,7 @@ def test_page_is_written_atomically(tmp_path):
 def test_verdict_and_its_colour(bag):
     assert evidence().level in ('good', 'reserved')
     calibration = fitted().calibration
-    opened = [open_bag(bag)]
+    opened = open_bags([bag])
     narrow = {
         name: replace(getattr(calibration, name), temperature_range_c=(19.0, 22.0))
         for name in ('static', 'dynamic')
@@ -309,13 +309,13 @@ def test_another_units_calibration_is_refused(bag):
     calibration = fitted().calibration
     other = replace(calibration, unit=replace(calibration.unit, serial='other'))
     with pytest.raises(CalibrationError, match='other'):
-        evidence_of_bags([open_bag(bag)], other)
-    assert evidence_of_bags([open_bag(bag)], other, serial='').serial == 'other'
+        evidence_of_bags(open_bags([bag]), other)
+    assert evidence_of_bags(open_bags([bag]), other, serial='').serial == 'other'
 
 
 def test_refusals(bag, tmp_path):
     with pytest.raises(RecordingError, match='no such file'):
-        open_bag(tmp_path / 'none.mcap')
+        open_bags([tmp_path / 'none.mcap'])
 
 
 def test_command(cli, bag, tmp_path):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.errors import ThermoCompError
-from thermo_comp.judging import open_bag
+from thermo_comp.judging import open_bags
 from thermo_comp.report import (
     CertificateInfo,
     evidence_of_bags,
@@ -207,7 +207,7 @@ def test_rule_of_conformity_names_the_limit():
 
 def test_simulated_bags_mark_every_page(tmp_path):
     calibration = fitted().calibration
-    simulated = evidence_of_bags([open_bag(write_bag(tmp_path / 'sim.mcap'))], calibration)
+    simulated = evidence_of_bags(open_bags([write_bag(tmp_path / 'sim.mcap')]), calibration)
     assert 'class="simulated"' in render_report(simulated, figures=[])
     assert 'class="simulated"' not in render_report(evidence_of_bags([], calibration), figures=[])
 

@@ -162,9 +162,8 @@ def report(
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
     """
-    from ..judging import open_bag
+    from ..judging import open_bags
     from ..judging.history import drifts_of
-    from ..replay import needed_roles
     from ..report import evidence_of_bags, load_certificate_info, write_report
     from ..unit.calibration_file import load_calibration
 
@@ -177,19 +176,9 @@ def report(
     info = None
     if certificate_info is not None:
         info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
-    opened: list[Any] = []
-    with out.progress('reading', total=max(len(paths), 1)) as done:
-        for path in paths:
-            opened.append(
-                open_bag(
-                    path,
-                    **reading,
-                    window_s=judging['window_s'],
-                    calibration=loaded,
-                    require=('board',) if loaded is None else needed_roles(loaded),
-                    progress=lambda part: done(len(opened) + part),
-                )
-            )
+    with out.progress('reading') as done:
+        window_s = judging['window_s']
+        opened = open_bags(paths, known[:1], **reading, window_s=window_s, progress=done)
     with options.usage_of():
         evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in opened)
@@ -236,7 +225,7 @@ def view(
     live = LiveReport(
         calibration,
         bags or [],
-        **reading,
+        reading=reading,
         read=lambda info: out.told([(info.path, info.chosen, info.truncated)]),
         gravity=gravity,
         serial=serial,

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the judgement of a calibration against recordings: one judge, for every command."""
 
-from .evaluation import Evaluation, evaluate, judge_bags, open_bag
+from .evaluation import Evaluation, evaluate, judge_bags, open_bags
 from .judgement import Judgement, judge
 from .verdicts import SECTIONS, Verdict
 from .windows import WINDOW_S, Windows, corrected_windows
@@ -18,5 +18,5 @@ __all__ = [
     'evaluate',
     'judge',
     'judge_bags',
-    'open_bag',
+    'open_bags',
 ]

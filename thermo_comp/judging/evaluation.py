@@ -1,17 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the way from recordings to a judgement: each is read once, in bounded memory.
-
-Reading and judging are apart: whoever looks at a bag under several calibrations, or again when
-the calibration has changed, reads it once.
-"""
+"""Owns the way from recordings to a judgement: each is read once, in bounded memory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +25,10 @@ from .windows import WINDOW_S, corrected_windows, sum_length
 
 # A unit at rest scatters by no more than this many times what its calibration says of its noise.
 _NOISES = 4.0
-_BOARD: tuple[Role, ...] = ('board',)
-Progress = Callable[[float], None]
+
+
+def _silent(_part: float) -> None:
+    pass
 
 
 @dataclass(frozen=True)
@@ -42,40 +40,44 @@ class Evaluation:
     notes: tuple[str, ...]
 
 
-def open_bag(
-    path: str | Path,
+def open_bags(
+    paths: Sequence[str | Path],
+    calibrations: Sequence[Calibration] = (),
+    *,
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
-    *,
     window_s: float = WINDOW_S,
-    calibration: Calibration | None = None,
-    require: Collection[Role] = _BOARD,
-    progress: Progress | None = None,
-) -> ReducedBag:
+    progress: Callable[[float], None] = _silent,
+) -> list[ReducedBag]:
     """
-    Read one bag, in bounded memory, for windows of `window_s` seconds.
+    Read bags, in bounded memory, for windows of `window_s` seconds.
 
-    What is read, what is saturated and what a rest scatters by is as the `calibration` says, else
-    the usual. Raises RecordingError if it cannot be read or has no board temperature.
+    What is read, what is saturated and what a rest scatters by is as the first calibration says,
+    else the usual. Raises RecordingError if one cannot be read, or has no board temperature where
+    a calibration, or none, asks for one.
     """
-    if calibration is not None:
-        input = input_for(calibration, input)  # noqa: A001 - as above
-    source, info = recording_source(path, topics, input, require=require, progress=progress)
-    full_scale = COUNTS_FULL_SCALE if info.input != 'imu' else None
-    still_sd = STILL_SD
-    if calibration is not None:
-        full_scale = calibration.unit.full_scale
-        density = max(calibration.noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
-        still_sd = max(still_sd, _NOISES / np.sqrt(calibration.unit.cycle_time_s) * density)
-    bag = reduce_source(
-        replace(source, sha256=digest(Path(path))),
-        window_s=sum_length(window_s),
-        still_sd=still_sd,
-        full_scale=full_scale,
-    )
-    if 'board' in require and not len(bag.board.value):
-        raise RecordingError('no board temperature in it', path=str(path))
-    return bag
+    require: tuple[Role, ...] = ('board',)
+    known: dict[str, Any] = {}
+    if calibrations:
+        unit, require = calibrations[0].unit, needed_roles(*calibrations)
+        input = input_for(calibrations[0], input)  # noqa: A001 - as above
+        density = max(calibrations[0].noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
+        noise = _NOISES / np.sqrt(unit.cycle_time_s) * density
+        known = {'full_scale': unit.full_scale, 'still_sd': max(STILL_SD, noise)}
+    found: list[ReducedBag] = []
+    for path in paths:
+
+        def told(part: float) -> None:
+            progress((len(found) + part) / len(paths))
+
+        source, info = recording_source(path, topics, input, require=require, progress=told)
+        usual = {'full_scale': None if info.input == 'imu' else COUNTS_FULL_SCALE}
+        source = replace(source, sha256=digest(Path(path)))
+        bag = reduce_source(source, window_s=sum_length(window_s), **(usual | known))
+        if 'board' in require and not len(bag.board.value):
+            raise RecordingError('no board temperature in it', path=str(path))
+        found.append(bag)
+    return found
 
 
 def judge_bags(
@@ -103,7 +105,7 @@ def evaluate(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     serial: str | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] = _silent,
 ) -> Evaluation:
     """
     Judge one or more calibrations of a unit, given with their names, on its recordings.
@@ -116,22 +118,14 @@ def evaluate(
     """
     if not paths or not calibrations:
         raise ValueError('`paths` and `calibrations` must hold at least one each')
-    _, first = calibrations[0]
-    gravity = first.gravity_m_s2 if gravity is None else gravity
-    bags = []
-    for number, path in enumerate(paths):
-        bag = open_bag(
-            path,
-            topics,
-            input,
-            window_s=window_s,
-            calibration=first,
-            require=needed_roles(*(one for _, one in calibrations)),
-            progress=progress and _part_of(progress, number, len(paths)),
-        )
-        for _, calibration in calibrations:
-            check_unit(calibration, bag.info, serial)
-        bags.append(bag)
+    models = [one for _, one in calibrations]
+    gravity = models[0].gravity_m_s2 if gravity is None else gravity
+    bags = open_bags(
+        paths, models, topics=topics, input=input, window_s=window_s, progress=progress
+    )
+    for bag in bags:
+        for one in models:
+            check_unit(one, bag.info, serial)
     judgements = {}
     for name, calibration in calibrations:
         judgement = judge_bags(
@@ -150,7 +144,3 @@ def evaluate(
         if number not in judged
     )
     return Evaluation(tuple(bags), judgements, notes)
-
-
-def _part_of(tell: Progress, before: int, total: int) -> Progress:
-    return lambda part: tell((before + part) / total)

@@ -255,7 +255,7 @@ def evidence_of_fit(result: FitResult) -> Evidence:
     return replace(
         judged,
         steps=result.residuals,
-        left_out={k: left_out[one] for k, one in enumerate(found) if one in left_out},
+        left_out={k: left_out[one] for k, one in enumerate(found) if left_out.get(one, 0.0) > 0.0},
         findings=tuple(dict.fromkeys((*judged.findings, *against))),
         checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
         is_fit=True,

@@ -15,7 +15,7 @@ import hashlib
 import secrets
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -23,8 +23,8 @@ from typing import Any
 
 from ..errors import ThermoCompError
 from ..fitting import ReducedBag
-from ..judging import open_bag
-from ..recording import Input, RecordingInfo, Topics
+from ..judging import open_bags
+from ..recording import RecordingInfo
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence, evidence_of_bags
 from .figures import ReportFigure, drawn_figures, figures_of
@@ -56,14 +56,13 @@ class LiveReport:
         self,
         calibration: Path,
         bags: Sequence[Path] = (),
-        topics: Topics | None = None,
-        input: Input = 'auto',  # noqa: A002 - as everywhere
-        read: Callable[[RecordingInfo], None] | None = None,
+        read: Callable[[RecordingInfo], None] = lambda _: None,
+        reading: Mapping[str, Any] | None = None,
         **judging: Any,
     ) -> None:
         self._calibration, self._bags = calibration, list(bags)
-        self._topics, self._input, self._read = topics, input, read
-        self._judging = judging  # of `evidence_of_bags`
+        # For `open_bags` and `evidence_of_bags`.
+        self._read, self._reading, self._judging = read, reading or {}, judging
         self._opened: dict[Path, tuple[str, ReducedBag]] = {}
         self._lock = threading.Lock()
         self._version = self._notice = ''
@@ -102,10 +101,9 @@ class LiveReport:
         for path in self._bags:
             signature = _signature(path)
             if self._opened.get(path, ('',))[0] != signature:
-                bag = open_bag(path, self._topics, self._input, calibration=calibration)
+                (bag,) = open_bags([path], [calibration], **self._reading)
                 self._opened[path] = (signature, bag)
-                if self._read is not None:
-                    self._read(bag.info)
+                self._read(bag.info)
         bags = [self._opened[path][1] for path in self._bags]
         return evidence_of_bags(bags, calibration, **self._judging)
 
