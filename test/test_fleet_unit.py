@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from conftest import Cli
 from fleet_helpers import OPTIONS, damage, write_unit
 
 from thermo_comp.fitting import fit
@@ -52,6 +53,24 @@ def test_the_fit_is_that_of_thermo_comp_fit(fleet: Path, brief: UnitOutcome) -> 
     assert ours.provenance.sources == theirs.provenance.sources
     # The date of the fit is all that differs.
     assert ours == replace(theirs, provenance=ours.provenance)
+
+
+def test_the_verdict_is_that_of_evaluate(
+    fleet: Path, brief: UnitOutcome, cli: Cli, tmp_path: Path
+) -> None:
+    row, bags = brief.row, sorted((fleet / 'lot-A' / 'unit1').iterdir())
+    calibration = tmp_path / 'unit.yaml'
+    calibration.write_text(brief.calibration)
+    found = json.loads(cli('evaluate', *bags, '-c', calibration, '--json', code=None).stdout)
+    assert row['verdict'] == found['verdict']
+    assert row['reason'] == found['reason']
+    assert row['window_s'] == found['window_s']
+    micro_g = 9.80665e-6
+    sections = found['sections_m_s2']
+    for section in ('static', 'dynamic', 'all'):
+        assert row[f'{section}_ug'] == pytest.approx(sections[section]['rms'] / micro_g)
+    for cell, name in (('raw_ug', 'raw_rms'), ('peak_ug', 'peak'), ('claimed_ug', 'claimed_rms')):
+        assert row[cell] == pytest.approx(sections['all'][name] / micro_g)
 
 
 class TestRow:

@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 
 import pytest
-from fleet_helpers import OPTIONS, write_unit
 from report_helpers import fitted, write_bag
 
 from thermo_comp.report.html import number
@@ -48,27 +47,3 @@ def test_evaluate_and_report_agree(cli, folder: Path, options: tuple[str, ...]) 
         if section['n']:
             for name in ('raw_rms', 'rms', 'peak', 'claimed_rms'):
                 assert f'>{number(section[name] / 9.80665e-6)}<' in text
-
-
-def test_fleet_and_evaluate_agree(cli, tmp_path: Path) -> None:
-    pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
-    from thermo_comp.fleet.units import Storage, find_units
-    from thermo_comp.fleet.work import process_unit
-
-    bags = write_unit(tmp_path / 'fleet' / 'unit1', 1)
-    (unit,) = find_units(Storage(str(tmp_path / 'fleet')))
-    outcome = process_unit(unit, str(tmp_path / 'fleet'), OPTIONS)
-    assert outcome is not None
-    row = outcome.row
-    calibration = tmp_path / 'unit.yaml'
-    calibration.write_text(outcome.calibration)
-    found = json.loads(cli('evaluate', *bags, '-c', calibration, '--json', code=None).stdout)
-    assert row['verdict'] == found['verdict']
-    assert row['reason'] == found['reason']
-    assert row['window_s'] == found['window_s']
-    micro_g = 9.80665e-6
-    sections = found['sections_m_s2']
-    for section in ('static', 'dynamic', 'all'):
-        assert row[f'{section}_ug'] == pytest.approx(sections[section]['rms'] / micro_g)
-    for cell, name in (('raw_ug', 'raw_rms'), ('peak_ug', 'peak'), ('claimed_ug', 'claimed_rms')):
-        assert row[cell] == pytest.approx(sections['all'][name] / micro_g)
