@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration
-from conftest import ROOT, Cli
+from conftest import ROOT, Cli, parsed
 
 from thermo_comp.recording import BagWriter, Topics
 from thermo_comp.unit.calibration import Axes, AxisReference
@@ -316,11 +316,14 @@ def test_a_torn_bag_is_worked_through_and_the_exit_code_tells(
         ('info', torn),
         ('replay', torn, '-c', unit, '-o', output),
         ('evaluate', torn, '-c', unit),
-        ('report', torn, '-c', unit, '-o', tmp_path / 'page.html'),
+        ('report', torn, '-c', unit, '-o', tmp_path / 'page.html', '--json'),
     ):
         finished = cli(*arguments, code=1)
         said = finished.stdout + finished.stderr
         assert 'the file is cut off at byte ' in said, said
         assert 'error' not in finished.stderr
     assert output.is_file()
-    assert (tmp_path / 'page.html').is_file()
+    data = parsed(finished.stdout)
+    assert data['headline'] == f'{data["verdict"]}: {data["reason"]}'
+    assert (tmp_path / 'page.html').read_text().startswith('<!DOCTYPE html>')
+    assert 'exists already' in cli(*arguments, code=1).stderr

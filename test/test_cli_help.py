@@ -42,7 +42,7 @@ OF_ITS_OWN = {
     if name != 'demo'
 }
 # Of each command that prints figures and ends by itself: what serves a page or listens does not;
-# play, report and fit have theirs in test_cli and test_docs.
+# play, report and fit have theirs in test_cli, test_cli_errors and test_docs.
 WITH_JSON = list(
     {
         one.split()[1]: one

@@ -9,6 +9,7 @@ lines that looked like the program's own; a Cyrillic serial ended a command on a
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -136,16 +137,25 @@ def test_a_recording_forges_no_line(
 
 
 @pytest.mark.parametrize('encoding', ['latin-1', 'ascii', 'utf-8'])
-def test_any_terminal_can_show_it(tmp_path: Path, cli: Cli, encoding: str) -> None:
+def test_any_terminal_can_show_it(
+    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch, encoding: str
+) -> None:
     calibration = rich_calibration()
     unit = replace(calibration.unit, serial='Блок')
     save_calibration(replace(calibration, unit=unit), tmp_path / 'unit.yaml')
     name = tmp_path / os.fsdecode(b'not \xff utf-8.yaml')
     (tmp_path / 'unit.yaml').rename(name)
     for more in ((), ('--json',)):
-        said = cli('info', name, *more, PYTHONIOENCODING=encoding).stdout
+        terminal = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        with monkeypatch.context() as patch:
+            patch.setattr('sys.stdout', terminal)
+            assert run(['info', str(name), *more]) == 0
+        terminal.seek(0)
+        said = terminal.read()
         assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in said
         assert r'not \udcff utf-8.yaml' in said
+    if encoding == 'latin-1':  # one of them as a user has it
+        assert r'\u0411' in cli('info', name, PYTHONIOENCODING=encoding).stdout
     absent = cli('info', tmp_path / os.fsdecode(b'no\xff.mcap'), code=1)
     assert r'no\udcff.mcap: ' in absent.stderr
 
