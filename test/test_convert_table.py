@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from thermo_comp.convert.log import NO_STAMP
-from thermo_comp.convert.table import exact_ns, layout, read_parquet, read_text
+from thermo_comp.convert.table import Format, Stamp, exact_ns, layout, read_parquet, read_text
 from thermo_comp.errors import RecordingError
 
+ROWS_ALONE = Stamp(rate_hz=1.0)
 ROWS = [(1000, 0.5, -1.25), (1001, 0.25, 2e-3), (1003, -7.0, 1.5)]
 
 
@@ -40,7 +41,7 @@ def test_every_layout_reads_alike(
     lines = [delimiter.join(('t', 'a', 'b'))]
     lines += [delimiter.join(map(str, row)) for row in ROWS]
     path = write(tmp_path / 'log.txt', prefix + newline.join(lines) + newline)
-    table = read_text(path, ['b', 'a'], stamp='t', stamp_exponent=6)
+    table = read_text(path, ['b', 'a'], Stamp('t', 'ms'))
     assert table.stamp_ns is not None
     assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
     assert table.values['a'].tolist() == [row[1] for row in ROWS]
@@ -50,10 +51,10 @@ def test_every_layout_reads_alike(
 
 def test_headings_are_optional(tmp_path: Path) -> None:
     path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
-    assert read_text(path, [2]).values[2].tolist() == [3.0, 6.0]
+    assert read_text(path, [2], ROWS_ALONE).values[2].tolist() == [3.0, 6.0]
     # A table whose first line is all words has headings, unless the user says otherwise.
     path = write(tmp_path / 'words.txt', 'nan inf\n1 2\n')
-    assert read_text(path, [0], has_header=True).values[0].tolist() == [1.0]
+    assert read_text(path, [0], ROWS_ALONE, Format(header=True)).values[0].tolist() == [1.0]
 
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
@@ -63,7 +64,7 @@ def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path: Path, separ
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
     text = '\n'.join([*head, *(row.replace('|', separator) for row in rows)])
-    table = read_text(write(tmp_path / 'log.csv', text), ['t', 'az'])
+    table = read_text(write(tmp_path / 'log.csv', text), ['t', 'az'], ROWS_ALONE)
     assert np.isnan(table.values['t'][0])
     np.testing.assert_array_equal(table.values['az'][1:], np.arange(60.0))
     assert table.line[1] == 9
@@ -72,7 +73,7 @@ def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path: Path, separ
 
 def test_line_numbers_are_those_of_an_editor(tmp_path: Path) -> None:
     path = write(tmp_path / 'log.csv', '# made by hand\na,b\n\n1,2\nx,3\n4\n5,6\n')
-    table = read_text(path, ['a', 'b'])
+    table = read_text(path, ['a', 'b'], ROWS_ALONE)
     assert table.line.tolist() == [4, 5, 7]
     np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
     # The row with one cell is not silently shifted: it is counted and left out.
@@ -82,9 +83,9 @@ def test_line_numbers_are_those_of_an_editor(tmp_path: Path) -> None:
 def test_chunks_make_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = '\n'.join(f'{i},{i * i}' for i in range(1000))
     path = write(tmp_path / 'log.csv', 'a,b\n' + rows + '\n')
-    whole = read_text(path, ['b'], stamp='a')
+    whole = read_text(path, ['b'], Stamp('a', 'ns'))
     monkeypatch.setattr('thermo_comp.convert.table._CHUNK_ROWS', 7)
-    parts = read_text(path, ['b'], stamp='a')
+    parts = read_text(path, ['b'], Stamp('a', 'ns'))
     assert whole.values['b'].tolist() == parts.values['b'].tolist()
     assert whole.line.tolist() == parts.line.tolist()
 
@@ -92,10 +93,15 @@ def test_chunks_make_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_stamps_are_exact() -> None:
     # A float64 of nanoseconds since 1970 has steps of 256 ns.
     cells = ['1767225600.123456789', '1767225600123456789e-9', ' +2 ', '1.5e-9']
-    assert exact_ns(cells, 9).tolist() == [1767225600123456789, 1767225600123456789, 2 * 10**9, 2]
-    assert exact_ns(['1767225600123456789'], 0).tolist() == [1767225600123456789]
+    assert exact_ns(cells, 's').tolist() == [
+        1767225600123456789,
+        1767225600123456789,
+        2 * 10**9,
+        2,
+    ]
+    assert exact_ns(['1767225600123456789'], 'ns').tolist() == [1767225600123456789]
     bad = ['', 'soon', 'nan', 'inf', '1e40', '99999999999999999999']
-    assert exact_ns(bad, 0).tolist() == [NO_STAMP] * len(bad)
+    assert exact_ns(bad, 'ns').tolist() == [NO_STAMP] * len(bad)
 
 
 def test_layout_prefers_the_delimiter_that_splits_all_lines_alike() -> None:
@@ -124,13 +130,13 @@ def test_bad_tables_are_refused(
 ) -> None:
     path = write(tmp_path / 'log.csv', text)
     with pytest.raises(RecordingError, match=message) as caught:
-        read_text(path, [column])
+        read_text(path, [column], ROWS_ALONE)
     assert str(path) in str(caught.value)
 
 
 def test_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='No such file'):
-        read_text(tmp_path / 'absent.csv', ['a'])
+        read_text(tmp_path / 'absent.csv', ['a'], ROWS_ALONE)
 
 
 class TestParquet:
@@ -149,7 +155,7 @@ class TestParquet:
         path = self.table(
             tmp_path, t=[row[0] for row in ROWS], a=[row[1] for row in ROWS], b=[1, None, 3]
         )
-        table = read_parquet(path, ['a', 'b'], 't', 6)
+        table = read_parquet(path, ['a', 'b'], Stamp('t', 'ms'))
         assert table.stamp_ns is not None
         assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
         assert table.values['a'].tolist() == [row[1] for row in ROWS]
@@ -159,24 +165,24 @@ class TestParquet:
         path = self.table(
             tmp_path, t=np.array([1767225600123, 0], dtype='datetime64[ms]'), a=[1.0, 2.0]
         )
-        table = read_parquet(path, ['a'], 't', 9)
+        table = read_parquet(path, ['a'], Stamp('t', 's'))
         assert table.stamp_ns is not None
         assert table.stamp_ns.tolist() == [1767225600123 * 10**6, 0]
 
     def test_floats_of_seconds(self, tmp_path: Path) -> None:
         path = self.table(tmp_path, t=[0.5, float('nan')], a=[1.0, 2.0])
-        table = read_parquet(path, ['a'], 't', 9)
+        table = read_parquet(path, ['a'], Stamp('t', 's'))
         assert table.stamp_ns is not None
         assert table.stamp_ns.tolist() == [500_000_000, NO_STAMP]
 
     def test_refusals(self, tmp_path: Path) -> None:
         path = self.table(tmp_path, a=['one', 'two'])
         with pytest.raises(RecordingError, match="column 'a' holds string"):
-            read_parquet(path, ['a'], None, 0)
+            read_parquet(path, ['a'], ROWS_ALONE)
         with pytest.raises(RecordingError, match="no column 'b'"):
-            read_parquet(path, ['b'], None, 0)
+            read_parquet(path, ['b'], ROWS_ALONE)
         with pytest.raises(RecordingError, match='the table is empty'):
-            read_parquet(self.table(tmp_path, a=np.array([], dtype=float)), ['a'], None, 0)
+            read_parquet(self.table(tmp_path, a=np.array([], dtype=float)), ['a'], ROWS_ALONE)
         path.write_text('a,b\n')
         with pytest.raises(RecordingError, match='not a readable Parquet file'):
-            read_parquet(path, ['a'], None, 0)
+            read_parquet(path, ['a'], ROWS_ALONE)

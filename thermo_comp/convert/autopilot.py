@@ -30,7 +30,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,8 @@ from ..typing import Floats, Ints
 from .log import NO_STAMP, SLOW_HZ, ForeignLog, Readings, find_stillness, library, thin
 
 T = TypeVar('T')
+#: What a log holds by instance: IMUs, barometers, and why an IMU's thermal drift is gone.
+_Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, str]]
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
@@ -59,14 +61,6 @@ _HEADER_BYTES = 3
 _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
 
-class _Held(NamedTuple):
-    """What a log holds by instance; `compensated` says why an IMU's thermal drift is gone."""
-
-    imus: Mapping[int, ForeignLog]
-    baros: Mapping[int, Readings]
-    compensated: Mapping[int, str]
-
-
 def read_autopilot(
     path: str | Path,
     imu: int | None = None,
@@ -78,11 +72,12 @@ def read_autopilot(
     instance by default; ArduPilot's are counted from 0: the old type ``IMU2`` is 1.
     """
     path = Path(path)
-    held = _ulog(path) if path.suffix.lower() == '.ulg' else _dataflash(path)
-    why = held.compensated.get(min(held.imus, default=0) if imu is None else imu)
+    read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
+    imus, baros, compensated = read(path)
+    why = compensated.get(min(imus, default=0) if imu is None else imu)
     if why and not allow_compensated:
         raise RecordingError(why, path=path)
-    rows = _instance(held.imus, imu, 'IMU', path)
+    rows = _instance(imus, imu, 'IMU', path)
     stamped = rows.stamp_ns != NO_STAMP
     rest = find_stillness(rows.stamp_ns[stamped], rows.accel[stamped])
     if rest.noise <= _NO_NOISE * rest.magnitude:
@@ -91,7 +86,7 @@ def read_autopilot(
             'from which no calibration of a real sensor can come',
             path=path,
         )
-    heard = {number: _reported(readings) for number, readings in held.baros.items()}
+    heard = {number: _reported(readings) for number, readings in baros.items()}
     if baro is None:
         heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
     found = [_reported(one) for one in rows.temperatures.values()]
@@ -154,7 +149,7 @@ def _ulog(path: Path) -> _Held:
             metadata=metadata,
             hint=hint or (_PROFILE if is_slow else ''),
         )
-    return _Held(imus, baros, compensated)
+    return imus, baros, compensated
 
 
 def _combined(columns: _Columns) -> list[_Columns]:
@@ -245,7 +240,7 @@ def _dataflash(path: Path) -> _Held:
         for number in imus
         if reader.params.get(name := f'INS_TCAL{number + 1}_ENABLE') == 1.0
     }
-    return _Held(imus, baros, compensated)
+    return imus, baros, compensated
 
 
 def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:

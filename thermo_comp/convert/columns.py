@@ -22,13 +22,12 @@ from ..files import read_bounded
 from ..plain_yaml import load_plain_yaml
 from ..recording.topics import is_thermometer
 from ..typing import Floats
-from ..unit.schema import Bounds, NotNegative, Positive, SchemaError, build
+from ..unit.schema import Bounds, Positive, SchemaError, build
 from .log import NO_STAMP, ForeignLog, Readings, Unit, believed_unit, find_stillness, thin
-from .table import STAMP_EXPONENTS, Column, TimeUnit, read_parquet, read_text
+from .table import STAMP_EXPONENTS, Column, Format, Stamp, read_parquet, read_text
 
 Triple = tuple[Column, Column, Column]
 
-_DELIMITERS = {'tab': '\t', 'blank': ' '}
 #: Slope and offset from a table's reading to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Between two samples lies more than the first [s], and less than the second: so times are told.
@@ -38,34 +37,6 @@ _FASTEST_RAD_S = 20.0
 _GIVE_MAP = 'give a column map: --columns MAP'
 #: A map takes some kB.
 _SIZE_LIMIT = 1 << 20
-
-
-@dataclass(frozen=True)
-class Format:
-    """How the text is laid out; found out where it is not said."""
-
-    delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
-    header: bool | None = None
-
-
-@dataclass(frozen=True)
-class Stamp:
-    """
-    A column of time stamps, or a fixed rate.
-
-    The start is not 0 by default, because ROS takes a zero stamp for "no time yet".
-    """
-
-    column: Column | None = None
-    unit: TimeUnit | None = None
-    rate_hz: Positive | None = None
-    start_s: NotNegative = 1.0
-
-    def __post_init__(self) -> None:
-        if (self.column is None) == (self.rate_hz is None):
-            raise ValueError('give either `column` and `unit`, or `rate_hz`')
-        if self.column is not None and self.unit is None:
-            raise ValueError('`unit` must be s, ms, us or ns where there is a column')
 
 
 @dataclass(frozen=True)
@@ -147,7 +118,7 @@ class ColumnMap:
     case: Thermometer | None = None
     further: tuple[Further, ...] = ()
     gyro: Gyro | None = None
-    format: Format = Format()
+    format: Format | None = None
     frame_id: str = 'imu_link'
     serial: Annotated[str, Bounds(shortest=1)] | None = None
 
@@ -177,22 +148,14 @@ def load_column_map(path: str | Path) -> ColumnMap:
 def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
     """Read all rows of a table as its column map says, with the temperatures thinned."""
     path = Path(path)
-    accel, gyro, stamp, style = columns.accel, columns.gyro, columns.stamp, columns.format
+    accel, gyro = columns.accel, columns.gyro
     thermometers = {'board': columns.board, 'case': columns.case}
     thermometers |= {one.name: one for one in columns.further}
     said = {name: one for name, one in thermometers.items() if one is not None}
     wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in said.values())]
-    wanted, exponent = list(dict.fromkeys(wanted)), STAMP_EXPONENTS[stamp.unit or 'ns']
-    if path.suffix.lower() in ('.parquet', '.pq'):
-        table = read_parquet(path, wanted, stamp.column, exponent)
-    else:
-        delimiter = _DELIMITERS.get(style.delimiter or '', style.delimiter)
-        table = read_text(path, wanted, stamp.column, exponent, delimiter, style.header)
+    read = read_parquet if path.suffix.lower() in ('.parquet', '.pq') else read_text
+    table = read(path, list(dict.fromkeys(wanted)), columns.stamp, columns.format)
     stamp_ns = table.stamp_ns
-    if stamp_ns is None:
-        # Each stamp from its own number, so that no rounding adds up.
-        steps = np.rint(np.arange(len(table.line)) * (1e9 / (stamp.rate_hz or 1.0)))
-        stamp_ns = round(stamp.start_s * 1e9) + steps.astype(np.int64)
     known = stamp_ns != NO_STAMP
     temperatures = {}
     for name, one in said.items():
@@ -227,7 +190,7 @@ def guess_columns(path: str | Path, rate_hz: float | None = None) -> ColumnMap:
     RecordingError where they do not say what they are.
     """
     path = Path(path)
-    table = read_text(path)
+    table = read_text(path, None, Stamp(rate_hz=1.0))
     width = len(table.values)
     if table.has_headings or width not in (3, 4, 6, 7):
         raise RecordingError(

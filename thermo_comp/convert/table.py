@@ -25,6 +25,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Floats, Ints
+from ..unit.schema import NotNegative, Positive
 from .log import NO_STAMP, library
 
 Column = str | int
@@ -40,8 +41,43 @@ _MOST_ROWS_PER_BYTE = 4
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
+_DELIMITERS = {'tab': '\t', 'blank': ' '}
+
 #: Line number and cells of each row.
 _Rows = Iterator[tuple[int, list[str]]]
+
+
+@dataclass(frozen=True)
+class Format:
+    """How the text is laid out; found out where it is not said."""
+
+    delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
+    header: bool | None = None
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """
+    A column of time stamps, or a fixed rate.
+
+    The start is not 0 by default, because ROS takes a zero stamp for "no time yet".
+    """
+
+    column: Column | None = None
+    unit: TimeUnit | None = None
+    rate_hz: Positive | None = None
+    start_s: NotNegative = 1.0
+
+    def __post_init__(self) -> None:
+        if (self.column is None) == (self.rate_hz is None):
+            raise ValueError('give either `column` and `unit`, or `rate_hz`')
+        if self.column is not None and self.unit is None:
+            raise ValueError('`unit` must be s, ms, us or ns where there is a column')
+
+    def ticks(self, n: int) -> Ints:
+        """Give the stamps of rows at the fixed rate, shape (n,); no rounding adds up."""
+        steps: Ints = np.rint(np.arange(n) * (1e9 / (self.rate_hz or 1.0))).astype(np.int64)
+        return steps + round(self.start_s * 1e9)
 
 
 @dataclass(frozen=True)
@@ -51,32 +87,24 @@ class Table:
 
     line: line of each row in the file, counted from 1 (the row number for Parquet), shape (n,)
     values: the columns asked for; NaN where a cell is no number, shape (n,)
-    stamp_ns: the stamp column; `NO_STAMP` where a cell is no number, shape (n,)
+    stamp_ns: their stamps; `NO_STAMP` where a cell is no number, shape (n,)
     n_short: rows with too few cells (the last line of a log that was cut off), left out
     has_headings: whether its columns have names
     """
 
     line: Ints
     values: dict[Column, Floats]
-    stamp_ns: Ints | None
+    stamp_ns: Ints
     n_short: int = 0
     has_headings: bool = True
 
 
 def read_text(
-    path: Path,
-    columns: Sequence[Column] | None = None,
-    stamp: Column | None = None,
-    stamp_exponent: int = 0,
-    delimiter: str | None = None,
-    has_header: bool | None = None,
+    path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
 ) -> Table:
     """
     Read some columns of a table of text, by their headings or numbers counted from 0; None reads
     all, by their numbers.
-
-    `stamp_exponent` is the power of ten from the stamp's unit to nanoseconds. The delimiter and
-    whether there are headings are found out where they are not said.
     """
     try:
         with TextIOWrapper(
@@ -88,9 +116,11 @@ def read_text(
             if '\0' in head:
                 raise RecordingError('not a table of text: it holds zero bytes', path=path)
             file.seek(0)
-            delimiter, width = layout(head, delimiter)
-            headings, rows = _begin(_rows(file, delimiter), width, has_header)
-            return _collect(path, headings, rows, columns, stamp, stamp_exponent)
+            style = style or Format()
+            given = _DELIMITERS.get(style.delimiter or '', style.delimiter)
+            delimiter, width = layout(head, given)
+            headings, rows = _begin(_rows(file, delimiter), width, style.header)
+            return _collect(path, headings, rows, columns, stamp)
     except (UnicodeError, csv.Error) as failure:
         raise RecordingError(f'not a table of text ({failure})', path=path) from failure
     except OSError as failure:
@@ -166,12 +196,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _collect(
-    path: Path,
-    headings: list[str],
-    rows: _Rows,
-    columns: Sequence[Column] | None,
-    stamp: Column | None,
-    stamp_exponent: int,
+    path: Path, headings: list[str], rows: _Rows, columns: Sequence[Column] | None, stamp: Stamp
 ) -> Table:
     first = next(rows, None)
     if first is None:
@@ -180,7 +205,7 @@ def _collect(
     width = len(first[1])
     wanted = range(width) if columns is None else columns
     places = {name: _place(path, name, headings, width) for name in wanted}
-    at = None if stamp is None else _place(path, stamp, headings, width)
+    at = None if stamp.column is None else _place(path, stamp.column, headings, width)
     needed = 1 + max([*places.values(), -1 if at is None else at])
 
     lines: list[Ints] = []
@@ -195,11 +220,12 @@ def _collect(
         block = [_floats([row[i] for _, row in whole]) for i in places.values()]
         blocks.append(np.reshape(block, (len(places), len(whole))))
         if at is not None:
-            stamps.append(exact_ns([row[at] for _, row in whole], stamp_exponent))
+            stamps.append(exact_ns([row[at] for _, row in whole], stamp.unit))
+    line = np.concatenate(lines)
     return Table(
-        line=np.concatenate(lines),
+        line=line,
         values=dict(zip(places, np.concatenate(blocks, axis=1), strict=True)),
-        stamp_ns=np.concatenate(stamps) if stamps else None,
+        stamp_ns=np.concatenate(stamps) if stamps else stamp.ticks(len(line)),
         n_short=n_short,
         has_headings=bool(headings),
     )
@@ -229,24 +255,25 @@ def _floats(cells: Sequence[str]) -> Floats:
         return np.array([float(cell) if _is_number(cell) else np.nan for cell in cells])
 
 
-def exact_ns(cells: Sequence[str], exponent: int) -> Ints:
+def exact_ns(cells: Iterable[object], unit: TimeUnit | None) -> Ints:
     """
-    Return stamps in nanoseconds, exact to the last digit, of decimal numbers in 10^`exponent` ns;
-    `NO_STAMP` where a cell is no finite number or out of range.
+    Return stamps in nanoseconds, exact to the last digit, of decimal numbers; `NO_STAMP` where a
+    cell is no finite number or out of range.
     """
-    stamps = np.full(len(cells), NO_STAMP, dtype=np.int64)
-    for i, cell in enumerate(cells):
+    stamps = []
+    for cell in cells:
+        stamps.append(NO_STAMP)
         try:
-            number = Decimal(cell.strip()) * 10**exponent
+            number = Decimal(str(cell).strip()) * 10 ** STAMP_EXPONENTS[unit or 'ns']
             if abs(number) < 2**63 - 1:
-                stamps[i] = round(number)
-        except ArithmeticError:  # noqa: PERF203 - no cell stops the others
+                stamps[-1] = round(number)
+        except ArithmeticError:
             continue
-    return stamps
+    return np.array(stamps, dtype=np.int64)
 
 
 def read_parquet(
-    path: Path, columns: Sequence[Column], stamp: Column | None, stamp_exponent: int
+    path: Path, columns: Sequence[Column], stamp: Stamp, _style: Format | None = None
 ) -> Table:
     """
     Read some columns of a Parquet file, as `read_text` does of text; a stamp column of Parquet's
@@ -261,7 +288,7 @@ def read_parquet(
             if found.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
                 raise RecordingError(f'it claims {found.metadata.num_rows} rows', path=path)
             headings = list(found.schema_arrow.names)
-            names: list[Column] = [*columns] if stamp is None else [*columns, stamp]
+            names = [*columns] if stamp.column is None else [*columns, stamp.column]
             places = {name: _place(path, name, headings, len(headings)) for name in names}
             table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
     except RecordingError:
@@ -280,12 +307,11 @@ def read_parquet(
             said = f'column {name!r} holds {cells[name].type}'
             raise RecordingError(said, path=path) from failure
         values[name] = np.asarray(column, dtype=np.float64)
-    stamp_ns = None
-    if stamp is not None:
-        stamps = cells[stamp]
+    stamp_ns = stamp.ticks(table.num_rows)
+    if stamp.column is not None:
+        stamps, unit = cells[stamp.column], stamp.unit
         if pa.types.is_timestamp(stamps.type):
-            stamp_exponent = STAMP_EXPONENTS[stamps.type.unit]
-            stamps = stamps.cast(pa.int64())
-        stamp_ns = exact_ns([str(cell) for cell in stamps.to_pylist()], stamp_exponent)
+            unit, stamps = stamps.type.unit, stamps.cast(pa.int64())
+        stamp_ns = exact_ns(stamps.to_pylist(), unit)
     line = np.arange(1, table.num_rows + 1, dtype=np.int64)
     return Table(line, values, stamp_ns)
