@@ -196,10 +196,11 @@ def drawn(unit, layout, d):
                     one,
                     delta=one.delta + d[bias],
                     bias_function=fs.with_free(
-                        tuple(c + d[bias + 1 + k] for k, c in enumerate(fs.free_coefficients))
+                        tuple(c + d[bias + 1 + k] for k, c in enumerate(fs.free_coefficients)), 0.0
                     ),
                     scale_function=fc.with_free(
-                        tuple(c + d[scale + 1 + k] for k, c in enumerate(fc.free_coefficients))
+                        tuple(c + d[scale + 1 + k] for k, c in enumerate(fc.free_coefficients)),
+                        1.0,
                     ),
                 )
             )

@@ -21,10 +21,14 @@ from thermo_comp.fitting.verdict import (
     judge_result,
     judge_windows,
 )
-from thermo_comp.fitting.windows import ThermalWindows
+from thermo_comp.fitting.windows import Model, Sets, ThermalWindows
 from thermo_comp.simulation import positions
+from thermo_comp.thermal.settings import DetectorSettings
+from thermo_comp.unit.functions import Polynomial
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.metrics import residual_statistics
+
+LINE = Polynomial((0.0, 1.0))
 
 
 def findings_of(
@@ -43,8 +47,10 @@ def good(rng: np.random.Generator) -> tuple[ThermalWindows, np.ndarray]:
     )
     gradient = 600.0 * rate
     windows = ThermalWindows(
+        model=Model(
+            '', Sets(Polynomial((0.0, 1.0)), Polynomial((0.0,))), (), (), DetectorSettings(), 20.0
+        ),
         data=data,
-        names=tuple(f'bag{k}' for k in range(18)),
         temperature=case - gradient,
         rate=rate,
         weight=(rate != 0.0).astype(float),

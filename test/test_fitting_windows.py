@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from builders import ArrayBlock
 
-from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit, reduce_bag
+from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit_bags, reduce_bag
 from thermo_comp.fitting.options import sets_of
 from thermo_comp.fitting.reduction import ReducedBag
-from thermo_comp.fitting.windows import ThermalWindows, thermal_windows
+from thermo_comp.fitting.windows import Model, ThermalWindows, thermal_windows
 from thermo_comp.simulation import (
     STANDARD_GRAVITY,
     Position,
@@ -49,13 +49,19 @@ def sources(n: int, seed: int = 1) -> list[FitSource]:
 
 
 @pytest.fixture(scope='module')
-def bags() -> list[ReducedBag]:
-    return [reduce_bag(source, OPTIONS) for source in sources(2)]
+def all_bags() -> list[ReducedBag]:
+    return [reduce_bag(source, OPTIONS) for source in sources(9)]
+
+
+@pytest.fixture(scope='module')
+def bags(all_bags: list[ReducedBag]) -> list[ReducedBag]:
+    return all_bags[:2]
 
 
 def windows_of(bags: list[ReducedBag], columns: tuple[Column, ...] = bank()) -> ThermalWindows:
+    sets = sets_of(OPTIONS, bags)
     return thermal_windows(
-        bags, columns, sets_of(OPTIONS, bags), DetectorSettings(), ThermalConfig(), 20.0, 60.0
+        bags, Model('response', sets, columns, ('case',), DetectorSettings(), 20.0)
     )
 
 
@@ -201,12 +207,12 @@ def test_curves(bags, options, static, dynamic, is_shared) -> None:  # type: ign
     assert all(column[0] == 0.0 for column in columns[found.static.n_free :])
 
 
-@pytest.fixture(scope='module', params=['golovach', 'exponential'])
-def result(request: pytest.FixtureRequest) -> FitResult:
+@pytest.fixture(scope='module', params=['golovach', 'linear', 'exponential', 'spline'])
+def result(request: pytest.FixtureRequest, all_bags: list[ReducedBag]) -> FitResult:
     if request.param == 'golovach':
-        return fit(sources(9), replace(OPTIONS, model='golovach'))
-    groups = ('curve', 'set', 'board')
-    return fit(sources(9), replace(OPTIONS, static_curve=request.param, groups=groups))
+        return fit_bags(all_bags, replace(OPTIONS, model='golovach'))
+    groups = ('curve', 'set', *(['board'] if request.param == 'exponential' else []))
+    return fit_bags(all_bags, replace(OPTIONS, static_curve=request.param, groups=groups))
 
 
 def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:

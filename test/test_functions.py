@@ -72,7 +72,8 @@ def test_slope_is_the_derivative(function, t):
 def test_value_is_linear_in_the_free_coefficients(function, t, data):
     change = data.draw(st.tuples(*[st.floats(-1.0, 1.0)] * function.n_free))
     other = function.with_free(
-        tuple(a + b for a, b in zip(function.free_coefficients, change, strict=True))
+        tuple(a + b for a, b in zip(function.free_coefficients, change, strict=True)),
+        float(function.value(0.0)),
     )
     expected = function.value(t) + sum(
         b * d for b, d in zip(function.basis(t), change, strict=True)

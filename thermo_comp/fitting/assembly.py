@@ -6,15 +6,13 @@ Owns the way from a posterior to the Calibration that the compensator applies, a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
 
 from .. import __version__
-from ..thermal.settings import DetectorSettings
 from ..typing import Floats
 from ..unit.calibration import (
     FORMAT_VERSION,
@@ -28,9 +26,10 @@ from ..unit.calibration import (
     ResponseTerm,
     Source,
     Unit,
+    parameter_layout,
 )
 from ..unit.columns import Column
-from ..unit.functions import CubicSpline, Polynomial, TemperatureFunction
+from ..unit.functions import TemperatureFunction
 from ..unit.posterior import posterior_of
 from .evidence import ResidualRow
 from .learning import Learnt
@@ -50,111 +49,64 @@ _LINEAR_REACH = 2.0
 _MARGIN_C, _RATE_MARGIN = 0.5, 0.01
 # Without any thermometer the curve is flat, and what it leaves open grows from the reference on.
 _UNSEEN_MARGIN_C, _UNSEEN_RATE = 50.0, 3.0
-
-
-@dataclass(frozen=True)
-class UnitFacts:
-    """
-    What the calibration says of the unit besides the fit.
-
-    unit: serial, input, full scale, cycle
-    detector: settings under which the regimes were told apart
-    board_lag: time constant of the board behind the case [s]
-    reference_temperature: T_ref [degC]
-    model: name of the model, for the provenance
-    sensors: thermometers beside the board; the first leads, the others stay where they are of use
-    """
-
-    unit: Unit
-    detector: DetectorSettings
-    board_lag: float
-    reference_temperature: float
-    model: str
-    sensors: tuple[str, ...] = ('case',)
+# Stands in where the bags do not tell how far the board lags behind the case.
+_USUAL_BOARD_LAG_S = 900.0
+_NIL = (0.0, 0.0, 0.0)
 
 
 def build_calibration(
     windows: ThermalWindows,
     regression: Regression,
     learnt: Learnt,
-    columns: Sequence[Column],
-    sets: Sets,
-    nominal: Floats,
     bags: Sequence[ReducedBag],
-    facts: UnitFacts,
+    unit: Unit,
     residuals: Sequence[ResidualRow] = (),
     findings: Sequence[Finding] = (),
 ) -> Calibration:
-    """
-    Write a posterior as a calibration.
-
-    `nominal`: K0 [input units per m/s^2], shape (3,).
-    """
-    state, prior, layout = learnt.posterior.state, learnt.prior, learnt.claim.layout
-    # Of bias in input units, of scale relative, per unit of the column.
-    weights = state.weights / regression.rms
-    weights[0] *= nominal[:, None]
-    n_sets = len(sets.levels())
-    used = [k for k in range(len(columns)) if (layout.weights[:, 0, n_sets + k] >= 0).any()]
-    terms = tuple(
-        ResponseTerm(
-            **{field.name: getattr(columns[k], field.name) for field in fields(Column)}
-            | {'range': _column_range(columns[k], windows.raw[:, k])},
-            bias=_triple(weights[0, :, n_sets + k]),
-            scale=_triple(weights[1, :, n_sets + k]),
-        )
-        for k in used
-    )
-    slow = _slow_error(windows, learnt)
+    """Write a posterior as a calibration."""
+    model, prior, state = windows.model, learnt.prior, learnt.posterior.state
+    layout = learnt.claim.layout
+    taken = (layout.weights[:, 0, len(model.sets.levels()) :] >= 0).any(axis=0)
+    used = np.flatnonzero(taken).tolist()
+    to_file = file_parameters(regression, layout, state, model.sets, used)
+    values = to_file @ regression.vector(state, layout)[: layout.n_unit]
+    values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     is_seen = windows.was_measured
-    regimes = {
-        name: RegimeSet(
-            _range(windows.temperature, _MARGIN_C if is_seen else _UNSEEN_MARGIN_C),
-            _widened(
-                windows.rate * 60.0, _LINEAR_REACH, _RATE_MARGIN if is_seen else _UNSEEN_RATE
-            ),
-            *(
-                _axis_set(sets, weights[:, axis], is_dynamic, float(slow[axis]))
-                for axis in range(3)
-            ),
-        )
-        for name, is_dynamic in (('static', False), ('dynamic', True))
-    }
-    matrix = np.linalg.inv(state.inverse)
-    K = state.kappa * nominal
-    to_file = file_parameters(regression, layout, state, sets, nominal, used)
-    covariance = to_file @ learnt.claim.covariance @ to_file.T
+    temperatures = _range(windows.temperature, _MARGIN_C if is_seen else _UNSEEN_MARGIN_C)
+    rate_margin = _RATE_MARGIN if is_seen else _UNSEEN_RATE
+    rates = _widened(windows.rate * 60.0, _LINEAR_REACH, rate_margin)
+    slow = _slow_error(windows, learnt).tolist()
+    static, dynamic = (
+        RegimeSet(temperatures, rates, *(_blank(family, sd) for sd in slow))
+        for family in model.sets.families
+    )
+    columns = [
+        replace(model.columns[k], range=_column_range(model.columns[k], windows.raw[:, k]))
+        for k in used
+    ]
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
-    walk = prior.sigma * np.sqrt(prior.rho * 3600.0)
-    return Calibration(
+    blank = Calibration(
         format_version=FORMAT_VERSION,
-        unit=facts.unit,
-        reference_temperature_c=facts.reference_temperature,
+        unit=unit,
+        reference_temperature_c=model.reference_temperature,
         gravity_m_s2=regression.gravity,
-        axes=Axes(
-            *(
-                AxisReference(float(K[axis]), float(state.bias[axis] * nominal[axis]))
-                for axis in range(3)
-            )
-        ),
-        static=regimes['static'],
-        dynamic=regimes['dynamic'],
+        axes=Axes(*[AxisReference(1.0, 0.0)] * 3),
+        static=static,
+        dynamic=dynamic,
         noise_density_m_s2_sqrt_hz=_triple(np.maximum(prior.sigma * np.sqrt(window_s), 1e-9)),
-        slow_noise_m_s2_sqrt_h=_triple(walk),
-        misalignment=(_triple(matrix[0]), _triple(matrix[1]), _triple(matrix[2])),
-        misalignment_sd=_triple(np.sqrt(np.diag(covariance)[-3:])),
+        slow_noise_m_s2_sqrt_h=_triple(prior.sigma * np.sqrt(prior.rho * 3600.0)),
         sensors=tuple(
             name
-            for k, name in enumerate(facts.sensors)
-            if not k or any(name == column.sensor for column in terms)
+            for k, name in enumerate(model.sensors)
+            if not k or any(name == column.sensor for column in columns)
         ),
-        response=terms,
-        board_lag_s=facts.board_lag,
-        detector=facts.detector,
+        response=blank_terms(columns),
+        board_lag_s=_board_lag(windows),
+        detector=model.detector,
         provenance=Provenance(
             created=datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ'),
             tool_version=__version__,
-            model=facts.model,
+            model=model.name,
             sources=tuple(
                 Source(bag.source.name, bag.source.sha256 or '', bag.n_samples) for bag in bags
             ),
@@ -177,96 +129,122 @@ def build_calibration(
             ),
         ),
         evidence=learnt.worth if is_seen else (),
+    )
+    covariance = to_file @ learnt.claim.covariance @ to_file.T
+    return with_parameters(blank, state.kappa * regression.nominal_scale, values, covariance)
+
+
+def _blank(family: TemperatureFunction, slow: float) -> AxisSet:
+    """Make the curves of one axis in one regime, of no temperature effect."""
+    nothing = (0.0,) * family.n_free
+    bias, scale = (family.with_free(nothing, reference) for reference in (0.0, 1.0))
+    return AxisSet(bias, scale, residual_sd_m_s2=slow)
+
+
+def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
+    """Make a response of no weights."""
+    return tuple(ResponseTerm(**vars(one), bias=_NIL, scale=_NIL) for one in columns)
+
+
+def parameters_of(calibration: Calibration) -> Floats:
+    """
+    Return the parameters of a calibration in the order of its posterior.
+
+    Levels of the scale, relative to the scale factor, are 0.
+    """
+    values: list[float] = []
+    pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
+    for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
+        for one in sets:
+            values += [reference.bias + one.delta, *one.bias_function.free_coefficients]
+        values += [term.bias[axis] for term in calibration.response]
+        for one in sets:
+            values += [0.0, *one.scale_function.free_coefficients]
+        values += [term.scale[axis] for term in calibration.response]
+    M = calibration.misalignment
+    return np.array([*values, M[1][0], M[2][0], M[2][1]])
+
+
+def with_parameters(
+    calibration: Calibration, scale_factor: Floats, values: Floats, covariance: Floats
+) -> Calibration:
+    """
+    Give a calibration other parameters, in the order of its posterior, and their covariance.
+
+    `scale_factor`: K [input units per m/s^2], shape (3,); levels of the scale are not looked at.
+    """
+    layout = parameter_layout(calibration)
+    regimes = []
+    for k, regime in enumerate(calibration.regime_sets()):
+        x, y, z = (
+            replace(
+                own,
+                bias_function=own.bias_function.with_free(
+                    _numbers(values[bias[k] + 1 : bias[k + 1]]), 0.0
+                ),
+                scale_function=own.scale_function.with_free(
+                    _numbers(values[scale[k] + 1 : scale[k + 1]]), 1.0
+                ),
+                delta=float(values[bias[k]] - values[bias.static]),
+            )
+            for own, bias, scale in zip(regime.axes(), layout.bias, layout.scale, strict=True)
+        )
+        regimes.append(replace(regime, x=x, y=y, z=z))
+    a, b, c = _triple(values[-3:])
+    biases, scales = (np.array([one.response for one in part]) for part in layout[:2])
+    return replace(
+        calibration,
+        axes=Axes(
+            *(
+                AxisReference(float(K), float(values[bias.static]))
+                for K, bias in zip(scale_factor, layout.bias, strict=True)
+            )
+        ),
+        static=regimes[0],
+        dynamic=regimes[1],
+        misalignment=((1.0, 0.0, 0.0), (a, 1.0, 0.0), (b, c, 1.0)),
+        misalignment_sd=_triple(np.sqrt(np.diag(covariance)[-3:])),
+        response=tuple(
+            replace(term, bias=_triple(values[biases + k]), scale=_triple(values[scales + k]))
+            for k, term in enumerate(calibration.response)
+        ),
         posterior=posterior_of(covariance),
     )
 
 
-def _axis_set(sets: Sets, weights: Floats, is_dynamic: bool, slow: float) -> AxisSet:
-    """Make the curves of one axis in one regime."""
-    n = sets.static.n_free
-    bias, scale = weights
-    family = sets.dynamic if is_dynamic else sets.static
-    delta = 0.0
-    of_bias, of_scale = bias[:n], scale[:n]
-    if is_dynamic:
-        delta = float(bias[n])
-        m = sets.dynamic.n_free
-        of_bias, of_scale = bias[n + 1 : n + 1 + m], scale[n + 1 : n + 1 + m]
-        if sets.is_shared:
-            # A difference is of lower order: what it lacks is the static curve's own.
-            family = sets.static
-            of_bias = bias[:n] + np.pad(of_bias, (0, n - m))
-            of_scale = scale[:n] + np.pad(of_scale, (0, n - m))
-    return AxisSet(
-        bias_function=_shaped(family, 0.0, _numbers(of_bias)),
-        scale_function=_shaped(family, 1.0, _numbers(of_scale)),
-        delta=delta,
-        residual_sd_m_s2=slow,
-    )
-
-
-def _shaped(
-    family: TemperatureFunction, reference: float, values: tuple[float, ...]
-) -> TemperatureFunction:
-    """Make a function of a family with its value at the reference and its free coefficients."""
-    if isinstance(family, Polynomial):
-        return Polynomial((reference, *values))
-    if isinstance(family, CubicSpline):
-        anchored = tuple(reference if knot == 0.0 else 0.0 for knot in family.knots_k)
-        return CubicSpline(family.knots_k, anchored).with_free(values)
-    return replace(family, constant=reference - math.fsum(values), amplitudes=values)
-
-
 def file_parameters(
-    regression: Regression,
-    layout: Layout,
-    state: State,
-    sets: Sets,
-    nominal: Floats,
-    used: Iterable[int],
+    regression: Regression, layout: Layout, state: State, sets: Sets, used: Sequence[int]
 ) -> Floats:
-    """
-    Differentiate the file's parameters, in its order, by the regression's.
-
-    `nominal`: K0 [input units per m/s^2], shape (3,).
-    """
-    used = list(used)
-    n_sets = len(sets.levels())
+    """Differentiate the file's parameters, in its order, by the regression's."""
     n, m = sets.static.n_free, sets.dynamic.n_free
+    # Place -1 is that of nothing.
+    unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
-
-    def row(*terms: tuple[int, float]) -> None:
-        made = np.zeros(layout.n_unit)
-        for place, value in terms:
-            if place >= 0:
-                made[place] += value
-        rows.append(made)
-
-    for axis in range(3):
-        for places, level, unit in (
-            (layout.weights[0, axis], (int(layout.bias[axis]), nominal[axis]), nominal[axis]),
-            (layout.weights[1, axis], (int(layout.kappa[axis]), 1.0 / state.kappa[axis]), 1.0),
+    for axis, K in enumerate(regression.nominal_scale):
+        for places, unit, level in (
+            (layout.weights[0, axis], K, K * unknown[layout.bias[axis]]),
+            (layout.weights[1, axis], 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
         ):
-            each = [(int(p), unit / r) for p, r in zip(places, regression.rms, strict=True)]
-            row(level)
-            for k in range(n):
-                row(each[k])
-            row(level, each[n])
+            each = unknown[places] * (unit / regression.rms)[:, None]
+            static, (delta,), dynamic, response = np.split(each, [n, n + 1, n + 1 + m])
             if sets.is_shared:
-                for k in range(n):
-                    row(each[k], *([each[n + 1 + k]] if k < m else []))
-            else:
-                for k in range(m):
-                    row(each[n + 1 + k])
-            for k in used:
-                row(each[n_sets + k])
+                both = np.zeros((max(n, m), layout.n_unit))
+                both[:n] += static
+                both[:m] += dynamic
+                dynamic = both
+            rows += [level, *static, level + delta, *dynamic, *response[used]]
     a, _, c = state.skew
     # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the skew (a, b, c) of its inverse.
-    s = [int(place) for place in layout.skew]
-    row((s[0], -1.0))
-    row((s[0], c), (s[1], -1.0), (s[2], a))
-    row((s[2], -1.0))
-    return np.array(rows)
+    of_a, of_b, of_c = unknown[layout.skew]
+    return np.array([*rows, -of_a, c * of_a - of_b + a * of_c, -of_c])
+
+
+def _board_lag(windows: ThermalWindows) -> float:
+    """Time constant of the board behind the case: slope of the gradient over its rate [s]."""
+    rate = windows.rate - np.mean(windows.rate)
+    power = float(rate @ rate)
+    lag = float(rate @ windows.gradient) / power if power > 0.0 else np.nan
+    return lag if 1.0 <= lag <= 1e5 else _USUAL_BOARD_LAG_S
 
 
 def _slow_error(windows: ThermalWindows, learnt: Learnt) -> Floats:

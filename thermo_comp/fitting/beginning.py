@@ -21,7 +21,7 @@ from .priors import known_of, state_of
 from .start import ConstantCalibration, constant_calibration, position_means
 from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD, Prior, initial_state
 from .verdict import POSITIONS_NEEDED
-from .windows import CURVE, SET, Sets, ThermalWindows
+from .windows import CURVE, SET, ThermalWindows
 
 # Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
 _COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
@@ -35,7 +35,6 @@ def regress(
     windows: ThermalWindows,
     start: ConstantCalibration,
     up: Floats,
-    sets: Sets,
     options: FitOptions,
     tell: Callable[[float], None],
 ) -> tuple[Regression, Learnt]:
@@ -54,7 +53,7 @@ def regress(
     prior, knowns = _wide_prior(windows, start, up, options), []
     if known is not None:
         state = state_of(known, regression, up)
-        knowns = known_of(known, regression, state, sets, options)
+        knowns = known_of(known, regression, state, windows.model.sets, options)
         prior = replace(prior, widths=windows.data.parts.astype(np.float64), known=knowns[-1])
     forced = [
         options.model == 'golovach' or group == CURVE or group in options.forced

@@ -42,6 +42,7 @@ class Design:
     def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:
         self.windows = windows
         self.gravity = gravity
+        self.nominal_scale = nominal_scale
         self.measured = windows.mean / nominal_scale
         self.rms = np.sqrt(np.mean(windows.columns**2, axis=0))
         self.rms[self.rms == 0.0] = 1.0

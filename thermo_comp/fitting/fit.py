@@ -17,13 +17,12 @@ import numpy as np
 
 from ..errors import FitError
 from ..text import valid_serial
-from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
 from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
 from . import verdict
-from .assembly import UnitFacts, build_calibration
+from .assembly import build_calibration
 from .beginning import first_guess, regress
 from .coverage import LeastKnown, least_known, rough_centre
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
@@ -37,18 +36,14 @@ from .sensors import learn_detector
 from .sources import FitSource
 from .start import position_means
 from .verdict import Finding, enforce
-from .windows import FEWEST_WINDOWS, SET, ThermalWindows, thermal_windows
+from .windows import FEWEST_WINDOWS, SET, Model, ThermalWindows, thermal_windows
 
 Progress = Callable[[float], None]
 
-# Neighbouring windows of a position are merged up to this length for the regression [s].
-_WINDOW_S = 60.0
 # Usual full scales of units that report m/s^2.
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 # The board has its say in when the regime closes, unless the log evidence gains this without.
 _CLOSING_EARNED = 10.0
-# Stands in where the bags do not tell how far the board lags behind the case.
-_USUAL_BOARD_LAG_S = 900.0
 # A bias beyond this part of 1 g is a word of no force.
 _LARGEST_BIAS = 0.5
 
@@ -153,14 +148,14 @@ def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 def about(calibration: Calibration, offset: Floats) -> Calibration:
     """Make a calibration of words above those of no force one of the words themselves."""
-    axes, unit = calibration.axes, calibration.unit
+    unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
         # Words of 16 bits without a sign, of which nobody said how long they are.
         full_scale = 2.0 * COUNTS_FULL_SCALE + 1.0
     moved = (
         AxisReference(axis.scale_factor, axis.bias + by)
-        for axis, by in zip((axes.x, axes.y, axes.z), offset.tolist(), strict=True)
+        for axis, by in zip(calibration.axes, offset.tolist(), strict=True)
     )
     return replace(calibration, unit=replace(unit, full_scale=full_scale), axes=Axes(*moved))
 
@@ -187,62 +182,39 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     else:
         sets = sets_of(options, bags)
         columns = () if options.model == 'golovach' else bank(sensors)
-
-    def table(detector: DetectorSettings) -> ThermalWindows:
-        return thermal_windows(
-            bags,
-            columns,
-            sets,
-            detector,
-            ThermalConfig(),
-            options.reference_temperature,
-            _WINDOW_S,
-            sensors,
-        )
-
-    windows = table(detector)
+    reference = options.reference_temperature
+    model = Model(options.model, sets, columns, sensors, detector, reference)
+    windows = thermal_windows(bags, model)
     start = first_guess(windows, options) if known is None else constants_of(known)
     up = start.force(position_means(windows.data))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(verdict.judge_windows(windows, up, has_case), options)
     tell(0.7)
-    nominal = start.scale
-    regression, learnt = regress(windows, start, up, sets, options, tell)
+    regression, learnt = regress(windows, start, up, options, tell)
     if has_case and known is None and options.detector is None and learnt.has(SET):
         # Only the sets feel when the regime closes: with the case, or with the board too.
-        earlier = replace(detector, closes='case')
-        others = table(earlier)
-        again = Regression(others.data, options.gravity, nominal)
+        others = thermal_windows(bags, replace(model, detector=replace(detector, closes='case')))
+        again = Regression(others.data, options.gravity, start.scale)
         again.reweight(regression.weight)
         evidence = learnt.posterior.log_evidence
         if again.solve(learnt.posterior.state, learnt.prior).log_evidence > evidence:
-            again, found = regress(others, start, up, sets, options, tell)
+            again, found = regress(others, start, up, options, tell)
             if found.posterior.log_evidence > evidence + _CLOSING_EARNED:
-                detector, windows, regression, learnt = earlier, others, again, found
+                windows, regression, learnt = others, again, found
     residuals, left_out = residual_rows(windows, regression, learnt)
     findings += verdict.judge_result(
-        learnt.posterior.state.kappa * nominal,
+        learnt.posterior.state.kappa * start.scale,
         residuals,
         learnt.prior.offset_sd,
         options,
         windows.has_temperature,
     )
-    facts = UnitFacts(
-        _unit(bags, options),
-        detector,
-        board_lag(windows),
-        options.reference_temperature,
-        options.model,
-        sensors,
-    )
     try:
         calibration = build_calibration(
-            windows, regression, learnt, columns, sets, nominal, bags, facts, residuals, findings
+            windows, regression, learnt, bags, _unit(bags, options), residuals, findings
         )
-        calibration, rates = add_gyroscope(
-            calibration, windows, columns, sets, bags, facts, options
-        )
+        calibration, rates = add_gyroscope(calibration, windows, bags, options)
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     least = least_known(calibration, learnt.posterior.state.up)
@@ -266,14 +238,6 @@ def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
     """Name the thermometers beside the board that every bag has; the case leads, seen or not."""
     seen = ({name for name, one in bag.temperatures.items() if len(one.value)} for bag in bags)
     return 'case', *sorted(set.intersection(*seen) - {'board', 'case'})
-
-
-def board_lag(windows: ThermalWindows) -> float:
-    """Time constant of the board behind the case: slope of the gradient over its rate [s]."""
-    rate = windows.rate - np.mean(windows.rate)
-    power = float(rate @ rate)
-    lag = float(rate @ windows.gradient) / power if power > 0.0 else np.nan
-    return lag if 1.0 <= lag <= 1e5 else _USUAL_BOARD_LAG_S
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:

@@ -19,11 +19,10 @@ import numpy as np
 
 from ..typing import Floats, Ints
 from ..unit.calibration import Calibration
-from ..unit.columns import Column
 from ..unit.gravity import EARTH_RATE
 from ..unit.metrics import ResidualStatistics, statistics_by_regime
 from ..unit.rate_triad import gyroscope_of
-from .assembly import UnitFacts, build_calibration
+from .assembly import build_calibration
 from .evidence import left_out_force
 from .learning import Learnt, learn
 from .options import FitOptions
@@ -31,7 +30,7 @@ from .posterior import Regression
 from .reduction import ReducedBag
 from .start import position_means
 from .unknowns import Prior, initial_state
-from .windows import CURVE, Sets, ThermalWindows
+from .windows import CURVE, ThermalWindows
 
 # What it is on one axis, of an attitude that nobody knows.
 _EARTH_SD = EARTH_RATE / math.sqrt(3.0)
@@ -54,16 +53,13 @@ class RateRow:
 def add_gyroscope(
     calibration: Calibration,
     windows: ThermalWindows,
-    columns: Sequence[Column],
-    sets: Sets,
     bags: Sequence[ReducedBag],
-    facts: UnitFacts,
     options: FitOptions,
 ) -> tuple[Calibration, tuple[RateRow, ...]]:
     """Give a calibration the gyroscope of its prior, else of bags with rates and temperature."""
     if options.prior is not None:
         known = options.prior.gyroscope
-        sensors = calibration.sensors if known is None else facts.sensors
+        sensors = calibration.sensors if known is None else windows.model.sensors
         return replace(calibration, gyroscope=known, sensors=sensors), ()
     if not windows.angular_rate.shape[1] or not windows.has_temperature:
         return calibration, ()
@@ -93,14 +89,14 @@ def add_gyroscope(
         rho=np.zeros(3),
         least_offset_sd=_EARTH_SD,
     )
-    learnt = learn(regression, state, prior, is_curve, walks=bool(columns))
+    learnt = learn(regression, state, prior, is_curve, walks=bool(windows.model.columns))
     residuals = _rows(windows, regression, learnt)
     # Of the offsets the Earth's rate is no error of the gyroscope.
     turn_on = math.sqrt(max(learnt.prior.offset_sd**2 - _EARTH_SD**2, 0.0))
     told = replace(learnt, prior=replace(learnt.prior, offset_sd=turn_on))
-    triad = build_calibration(windows, regression, told, columns, sets, one, bags, facts)
+    triad = build_calibration(windows, regression, told, bags, calibration.unit)
     needed = {*calibration.sensors, *triad.sensors}
-    sensors = tuple(name for name in facts.sensors if name in needed)
+    sensors = tuple(name for name in windows.model.sensors if name in needed)
     return replace(calibration, gyroscope=gyroscope_of(triad), sensors=sensors), residuals
 
 

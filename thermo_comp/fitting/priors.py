@@ -19,19 +19,9 @@ import numpy as np
 from .. import __version__
 from ..errors import FitError
 from ..typing import Floats
-from ..unit.calibration import (
-    Axes,
-    AxisReference,
-    AxisSet,
-    Calibration,
-    Provenance,
-    ResponseTerm,
-    Source,
-    parameter_layout,
-)
+from ..unit.calibration import Calibration, Provenance, RegimeSet, Source, parameter_layout
 from ..unit.columns import Column
-from ..unit.posterior import posterior_of
-from .assembly import file_parameters
+from .assembly import blank_terms, file_parameters, parameters_of, with_parameters
 from .options import FitOptions
 from .posterior import Regression
 from .start import ConstantCalibration
@@ -60,9 +50,9 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
                 f'the prior has a response of the {term.during} regime alone: only columns of '
                 'both regimes can serve as a prior'
             )
+    names = [field.name for field in fields(Column)]
     return tuple(
-        Column(**{field.name: getattr(term, field.name) for field in fields(Column)})
-        for term in calibration.response
+        Column(**{name: getattr(term, name) for name in names}) for term in calibration.response
     )
 
 
@@ -75,47 +65,29 @@ def prior_sets(calibration: Calibration) -> Sets:
 
 def constants_of(calibration: Calibration) -> ConstantCalibration:
     """Return the nine constants of a calibration at its reference temperature."""
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     return ConstantCalibration(
-        np.array([axis.bias for axis in axes]),
-        np.array([axis.scale_factor for axis in axes]),
+        np.array([axis.bias for axis in calibration.axes]),
+        np.array([axis.scale_factor for axis in calibration.axes]),
         np.array(calibration.misalignment),
     )
 
 
 def state_of(calibration: Calibration, regression: Regression, up: Floats) -> State:
     """Return the regression's unknowns as a calibration has them, whose scale is nominal."""
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    K = np.array([axis.scale_factor for axis in axes])
-    bias = np.array([axis.bias for axis in axes])
-    on_bias, on_scale = [], []
-    pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
-    for axis, (static, dynamic) in enumerate(pairs):
-        on_bias.append(
-            [
-                *static.bias_function.free_coefficients,
-                dynamic.delta - static.delta,
-                *dynamic.bias_function.free_coefficients,
-                *(term.bias[axis] for term in calibration.response),
-            ]
-        )
-        on_scale.append(
-            [
-                *static.scale_function.free_coefficients,
-                0.0,
-                *dynamic.scale_function.free_coefficients,
-                *(term.scale[axis] for term in calibration.response),
-            ]
-        )
-        bias[axis] += static.delta
-    if len({len(row) for row in (*on_bias, *on_scale)}) > 1:
+    layout, values = parameter_layout(calibration), parameters_of(calibration)
+    if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
+    # Of each axis the level of the static set, and behind it what else there is beside that.
+    both = np.array([[values[one.static : one.end] for one in part] for part in layout[:2]])
+    both[..., layout.bias[0].dynamic] -= both[..., 0]
+    K = constants_of(calibration).scale
+    both[0] /= K[:, None]
     inverse = np.linalg.inv(np.array(calibration.misalignment))
     n_lags = len(regression.windows.start_covariance)
     return State(
         kappa=np.ones(3),
-        bias=bias / K,
-        weights=np.stack((np.array(on_bias) / K[:, None], on_scale)) * regression.rms,
+        bias=both[0, :, 0],
+        weights=both[..., 1:] * regression.rms,
         skew=np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
         up=up,
         offset=np.zeros((len(up), 3)),
@@ -134,9 +106,7 @@ def known_of(
     """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an import makes no claim to build on')
-    K = np.array(
-        [a.scale_factor for a in (calibration.axes.x, calibration.axes.y, calibration.axes.z)]
-    )
+    K = constants_of(calibration).scale
     covariance = calibration.posterior.covariance()
     places = parameter_layout(calibration)
     for axis in range(3):
@@ -149,7 +119,7 @@ def known_of(
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
     layout = regression.layout(regression.windows.parts)
-    to_file = file_parameters(regression, layout, state, sets, K, range(len(calibration.response)))
+    to_file = file_parameters(regression, layout, state, sets, range(len(calibration.response)))
     root = np.sqrt(floor)
     scaled, correlation = to_file / root[:, None], covariance / np.outer(root, root)
     mean = regression.vector(state, layout)[: layout.n_unit]
@@ -193,7 +163,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
         replace(key, range=(min(r[0] for r in ranges), max(r[1] for r in ranges)))
         for key, ranges in keys.items()
     ]
-    K = np.array([[a.scale_factor for a in (c.axes.x, c.axes.y, c.axes.z)] for c in calibrations])
+    K = np.array([constants_of(one).scale for one in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
     told = [_told(one, columns, mean_K) for one in calibrations]
     vectors = np.array([vector for vector, _ in told])
@@ -205,7 +175,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     scatter *= 1.0 + 1.0 / len(vectors)
     # What none of the units told is as alike in all as their prior was: it stays as unknown.
     scatter += np.mean([covariance for _, covariance in told], axis=0)
-    return _calibration(calibrations, columns, mean_K, mean, scatter)
+    return with_parameters(_like(calibrations, columns), mean_K, mean, scatter)
 
 
 def _unranged(columns: Sequence[Column]) -> list[Column]:
@@ -228,33 +198,21 @@ def _told(
         )
     everything = _unranged(columns)
     terms = [everything.index(column) for column in _unranged(prior_columns(calibration))]
-    values: list[float] = []
-    factor: list[float] = []
+    scale = constants_of(calibration).scale
+    values, factor = parameters_of(calibration), np.ones(calibration.posterior.n_parameters)
+    layout = parameter_layout(calibration)
+    for axis, (bias, relative) in enumerate(zip(layout.bias, layout.scale, strict=True)):
+        factor[bias.static : bias.end] = mean_K[axis] / scale[axis]
+        values[[relative.static, relative.dynamic]] = np.log(scale[axis] / mean_K[axis])
     places: list[int] = []
-    at = 0
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
-    for axis, sets in enumerate(pairs):
-        K = axes[axis].scale_factor
-        scale = float(np.log(K / mean_K[axis]))
-        for part, relative, levels in (
-            ('bias', mean_K[axis] / K, [axes[axis].bias + one.delta for one in sets]),
-            ('scale', 1.0, [scale, scale]),
-        ):
-            own: list[float] = []
-            for level, one in zip(levels, sets, strict=True):
-                own += [level, *getattr(one, f'{part}_function').free_coefficients]
-            places += [*range(at, at + len(own)), *(at + len(own) + k for k in terms)]
-            at += len(own) + len(columns)
-            own += [getattr(term, part)[axis] for term in calibration.response]
-            values += own
-            factor += [relative] * len(own)
-    M = calibration.misalignment
-    values += [M[1][0], M[2][0], M[2][1]]
-    factor += [1.0] * 3
-    places += range(at, at + 3)
-    vector, covariance = np.zeros(at + 3), np.zeros((at + 3, at + 3))
-    vector[places] = np.multiply(values, factor)
+    n = 0
+    for block in (block for pair in zip(*layout[:2], strict=True) for block in pair):
+        n_curves = block.response - block.static
+        places += [*range(n, n + n_curves), *(n + n_curves + k for k in terms)]
+        n += n_curves + len(columns)
+    places += range(n, n + 3)
+    vector, covariance = np.zeros(n + 3), np.zeros((n + 3, n + 3))
+    vector[places] = values * factor
     covariance[np.ix_(places, places)] = calibration.posterior.covariance() * np.outer(
         factor, factor
     )
@@ -270,82 +228,32 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
     ]
 
 
-def _calibration(
-    calibrations: Sequence[Calibration],
-    columns: Sequence[Column],
-    mean_K: Floats,
-    mean: Floats,
-    scatter: Floats,
-) -> Calibration:
-    """Write a mean and a scatter as a calibration like the first one."""
+def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
+    """Make a calibration like some, of these columns, which its parameters wait for."""
     first = calibrations[0]
-    static: list[AxisSet] = []
-    dynamic: list[AxisSet] = []
-    weights: list[tuple[Floats, Floats]] = []
-    references = []
-    at = 0
-    pairs = zip(first.static.axes(), first.dynamic.axes(), strict=True)
-    for axis, sets in enumerate(pairs):
-        parts = []
-        for name in ('bias_function', 'scale_function'):
-            n, m = (getattr(one, name).n_free for one in sets)
-            size = 2 + n + m + len(columns)
-            parts.append(np.split(mean[at : at + size], [1, 1 + n, 2 + n, 2 + n + m]))
-            at += size
-        (level,), of_static, (moved,), of_dynamic, on_bias = parts[0]
-        references.append(AxisReference(float(mean_K[axis]), float(level)))
-        for made, one, bias, scale, delta in (
-            (static, sets[0], of_static, parts[1][1], 0.0),
-            (dynamic, sets[1], of_dynamic, parts[1][3], float(moved - level)),
-        ):
-            made.append(
-                replace(
-                    one,
-                    bias_function=one.bias_function.with_free(tuple(bias.tolist())),
-                    scale_function=one.scale_function.with_free(tuple(scale.tolist())),
-                    delta=delta,
-                    residual_sd_m_s2=_median(calibrations, axis),
-                )
-            )
-        weights.append((on_bias, parts[1][4]))
-    a, b, c = mean[-3:].tolist()
     regimes = []
-    for name, made in (('static', static), ('dynamic', dynamic)):
-        ranges = [getattr(one, name) for one in calibrations]
-        regimes.append(
-            replace(
-                ranges[0],
-                temperature_range_c=_union([r.temperature_range_c for r in ranges]),
-                rate_range_k_min=_union([r.rate_range_k_min for r in ranges]),
-                x=made[0],
-                y=made[1],
-                z=made[2],
-            )
+    for k, regime in enumerate(first.regime_sets()):
+        each = [one.regime_sets()[k] for one in calibrations]
+        x, y, z = (
+            replace(own, residual_sd_m_s2=_median(calibrations, axis))
+            for axis, own in enumerate(regime.axes())
         )
-    sd = np.sqrt(np.diag(scatter)[-3:]).tolist()
+        temperatures = _union([one.temperature_range_c for one in each])
+        rates = _union([one.rate_range_k_min for one in each])
+        regimes.append(RegimeSet(temperatures, rates, x, y, z))
     return replace(
         first,
         unit=replace(first.unit, serial='population'),
-        axes=Axes(*references),
         static=regimes[0],
         dynamic=regimes[1],
-        misalignment=((1.0, 0.0, 0.0), (a, 1.0, 0.0), (b, c, 1.0)),
-        misalignment_sd=(sd[0], sd[1], sd[2]),
-        response=tuple(
-            ResponseTerm(
-                **{field.name: getattr(column, field.name) for field in fields(Column)},
-                bias=(float(weights[0][0][k]), float(weights[1][0][k]), float(weights[2][0][k])),
-                scale=(float(weights[0][1][k]), float(weights[1][1][k]), float(weights[2][1][k])),
-            )
-            for k, column in enumerate(columns)
-        ),
+        response=blank_terms(columns),
         provenance=Provenance(
             tool_version=__version__,
             model='population',
             sources=tuple(Source(one.unit.serial) for one in calibrations),
         ),
         evidence=(),
-        posterior=posterior_of(scatter),
+        posterior=None,
         gyroscope=None,
     )
 

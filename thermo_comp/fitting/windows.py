@@ -25,6 +25,8 @@ from .reduction import ReducedBag
 from .sensors import thermal_states
 from .unknowns import Windows
 
+# Neighbouring windows of a position are merged up to this length [s].
+_WINDOW_S = 60.0
 #: Groups of the sets themselves, beside those of the response.
 CURVE, SET = 'curve', 'set'
 #: A short rest still has so many windows: from less, no noise is learnt.
@@ -52,6 +54,12 @@ class Sets:
         switched = [weight, *(weight * value for value in dynamic)]
         return [*static, *switched], [group for group, _ in self.levels()]
 
+    @property
+    def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
+        """Return the families of the two sets: a sum is of the higher order."""
+        is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
+        return self.static, self.static if is_higher else self.dynamic
+
     def levels(self) -> list[tuple[str, bool]]:
         """Group of each column, and whether it is a level."""
         curve = [(CURVE, False)] * self.static.n_free
@@ -59,12 +67,29 @@ class Sets:
 
 
 @dataclass(frozen=True)
+class Model:
+    """
+    What is fitted: curves and columns, and how the states are told that they follow.
+
+    name: for the provenance
+    sensors: thermometers beside the board; the first leads, the others stay where they are of use
+    """
+
+    name: str
+    sets: Sets
+    columns: tuple[Column, ...]
+    sensors: tuple[str, ...]
+    detector: DetectorSettings
+    reference_temperature: float
+
+
+@dataclass(frozen=True)
 class ThermalWindows:
     """
     The regression's windows, and what the calibration says of the states they were taken in.
 
+    model: what the columns are of
     data: samples and columns, for the regression
-    names: source of each bag
     temperature, rate, weight: board temperature, its rate, weight of the dynamic set, shape (n,)
     gradient: T - T_board of the sensor that leads, shape (n,)
     raw: the response's columns before powers of t and ranges, shape (n, k)
@@ -72,8 +97,8 @@ class ThermalWindows:
     typical_count: samples in a typical window
     """
 
+    model: Model
     data: Windows
-    names: tuple[str, ...]
     temperature: Floats
     rate: Floats
     weight: Floats
@@ -93,41 +118,28 @@ class ThermalWindows:
         return bool(np.ptp(self.temperature) > 0.0)
 
 
-def thermal_windows(
-    bags: Sequence[ReducedBag],
-    columns: Sequence[Column],
-    sets: Sets,
-    detector: DetectorSettings,
-    config: ThermalConfig,
-    reference_temperature: float,
-    window_s: float,
-    sensors: Sequence[str] = ('case',),
-) -> ThermalWindows:
+def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     """
     Join the windows of all bags with the columns of their thermal state.
 
     Windows before the board's first reading, or while its estimate is still settling, are left
     out. A bag without any temperature stands at the reference, where no column says anything.
-
-    `reference_temperature`: T_ref [degC]. `window_s`: neighbouring windows of a position are
-    merged up to this length [s].
     """
-    spec = memory_of(columns, sensors)
-    table = ColumnTable(columns, spec, reference_temperature)
+    sets, columns, reference = model.sets, model.columns, model.reference_temperature
+    spec = memory_of(columns, model.sensors)
+    table = ColumnTable(columns, spec, reference)
     parts: list[tuple[Floats, ...]] = []
     numbers: list[tuple[Ints, Ints]] = []
     groups: list[str] = []
     n_positions = 0
     has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
     for bag, reduced in enumerate(bags):
-        begin, grid, states, shares = _states(
-            reduced, spec, detector, config, reference_temperature
-        )
+        begin, grid, states, shares = _states(reduced, spec, model)
         raw = table.raw(states.T)
-        curves, groups = sets.columns(states[:, BOARD] - reference_temperature, states[:, WEIGHT])
+        curves, groups = sets.columns(states[:, BOARD] - reference, states[:, WEIGHT])
         factors, _ = table.factors(states[:, BOARD], states[:, WEIGHT])
         values = [*curves, *(raw * factors)]
-        moved = _moved(columns, spec, states, shares, reference_temperature)
+        moved = _moved(columns, spec, states, shares, reference)
         whole = np.column_stack((states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved))
         for interval in reduced.intervals:
             use = interval.time >= begin
@@ -137,7 +149,7 @@ def thermal_windows(
             rows = np.column_stack([np.interp(time, grid, column) for column in whole.T])
             if has_rate and interval.angular_rate is not None:
                 rows = np.hstack((rows, interval.angular_rate[use]))
-            merged = _merged(time, count, interval.mean[use], rows, window_s)
+            merged = _merged(time, count, interval.mean[use], rows)
             n = len(merged[0])
             parts.append(merged)
             numbers.append((np.full(n, n_positions), np.full(n, bag)))
@@ -173,8 +185,8 @@ def thermal_windows(
         ),
     )
     return ThermalWindows(
+        model,
         data,
-        tuple(bag.source.name for bag in bags),
         temperature=rows[:, 0],
         rate=rows[:, 1],
         weight=rows[:, 2],
@@ -186,11 +198,7 @@ def thermal_windows(
 
 
 def _states(
-    bag: ReducedBag,
-    spec: MemorySpec,
-    detector: DetectorSettings,
-    config: ThermalConfig,
-    reference_temperature: float,
+    bag: ReducedBag, spec: MemorySpec, model: Model
 ) -> tuple[float, Floats, Floats, Floats]:
     """
     Run the tracker: where its estimate has settled, grid, states, shares of the start states.
@@ -199,10 +207,10 @@ def _states(
         # Nothing is known: a unit that stays at the reference.
         width = Layout(spec).width
         still = np.zeros((2, width))
-        still[:, BOARD] = reference_temperature
+        still[:, BOARD] = model.reference_temperature
         ends: Floats = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
         return -1.0, ends, still, np.zeros((2, len(spec.lags)))
-    tracker = ThermalTracker(detector, MemorySpec(spec.sensors), config)
+    tracker = ThermalTracker(model.detector, MemorySpec(spec.sensors), ThermalConfig())
     shortest = min(
         (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
     )
@@ -221,14 +229,10 @@ def _states(
 
 
 def _moved(
-    columns: Sequence[Column],
-    spec: MemorySpec,
-    states: Floats,
-    shares: Floats,
-    reference_temperature: float,
+    columns: Sequence[Column], spec: MemorySpec, states: Floats, shares: Floats, reference: float
 ) -> Floats:
     """Differentiate each column by the start state of its lag, shape (n, k)."""
-    t = states[:, BOARD] - reference_temperature
+    t = states[:, BOARD] - reference
     result = np.zeros((len(states), len(columns)))
     places = Layout(spec).lags
     for k, column in enumerate(columns):
@@ -242,12 +246,12 @@ def _moved(
 
 
 def _merged(
-    time: Floats, count: Floats, mean: Floats, rows: Floats, window_s: float
+    time: Floats, count: Floats, mean: Floats, rows: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Count-weighted means of neighbouring windows up to a length, or to a part of a short rest.
     """
-    window_s = min(window_s, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or window_s)
+    window_s = min(_WINDOW_S, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or _WINDOW_S)
     slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))
     first = np.flatnonzero(np.r_[True, np.diff(slot) != 0])
     total = np.add.reduceat(count, first)

@@ -90,9 +90,9 @@ class Polynomial(_Family):
         """All but the value at the reference."""
         return self.coefficients[1:]
 
-    def with_free(self, values: tuple[float, ...]) -> Polynomial:
-        """Return the same function with other free coefficients."""
-        return replace(self, coefficients=(self.coefficients[0], *values))
+    def with_free(self, values: tuple[float, ...], at_reference: float) -> Polynomial:
+        """Return the same shape with other coefficients."""
+        return replace(self, coefficients=(at_reference, *values))
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
         return _horner(self.slopes if is_slope else self.coefficients, t)
@@ -135,14 +135,15 @@ class CubicSpline(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The values at all knots but the reference."""
+        """The values at all knots but the reference, less the value there."""
         at = self.knots_k.index(0.0)
-        return self.values[:at] + self.values[at + 1 :]
+        return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
-    def with_free(self, values: tuple[float, ...]) -> CubicSpline:
-        """Return the same knots with other free values."""
+    def with_free(self, values: tuple[float, ...], at_reference: float) -> CubicSpline:
+        """Return the same knots with other values."""
         at = self.knots_k.index(0.0)
-        return replace(self, values=(*values[:at], self.values[at], *values[at:]))
+        moved = (*values[:at], 0.0, *values[at:])
+        return replace(self, values=tuple(at_reference + v for v in moved))
 
     @cached_property
     def _pieces(self) -> Floats:
@@ -199,9 +200,8 @@ class Exponential(_Family):
         """The amplitudes (the e-folds give the shape)."""
         return self.amplitudes
 
-    def with_free(self, values: tuple[float, ...]) -> Exponential:
-        """Return the same shape with other amplitudes and the same value at the reference."""
-        at_reference = self.constant + math.fsum(self.amplitudes)
+    def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
+        """Return the same shape with other amplitudes."""
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
