@@ -33,6 +33,7 @@ from thermo_comp.unit.rate_triad import gyroscope_of, rate_triad
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
 START_NS = 1_767_225_600_000_000_000
 #: White noise of a mean over 60 s of the simulated gyroscope.
+RATE_HZ, MINUTE = 2.0, 120
 FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 
 
@@ -62,19 +63,20 @@ def rms(values):
 
 @pytest.fixture(scope='module')
 def unit():
-    return unit_preset('mems', 2)
+    # Its parts take minutes; a reading every other second is enough, and half the work.
+    return unit_preset('mems', 2).with_thermometers(rate_hz=0.5)
 
 
 @pytest.fixture(scope='module')
 def fitted(unit):
     """Fit a MEMS unit, whose gyroscope drifts with parts that no column is, to nine positions."""
-    records = arrays(unit, plan('chamber-9', 2), 2)
+    records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
     return fit([source_of(one, unit.scale_factor) for one in records], OPTIONS)
 
 
 @pytest.fixture(scope='module')
 def held_out(unit):
-    return arrays(unit, plan('held-out', 2)[:2], 99)
+    return arrays(unit, plan('held-out', 2)[:2], 99, rate_hz=RATE_HZ)
 
 
 def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
@@ -83,9 +85,9 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
     for record in held_out:
         block = block_of(record, unit.scale_factor)
         out = process_block(Compensator(calibration), block, block.imu.angular_velocity)
-        n = len(out.index) // 240
+        n = len(out.index) // MINUTE
         means, raw = (
-            rate[: 240 * n].reshape(n, 240, 3).mean(axis=1)
+            rate[: MINUTE * n].reshape(n, MINUTE, 3).mean(axis=1)
             for rate in (out.angular_rate, block.imu.angular_velocity[out.index])
         )
         changes = means - means.mean(axis=0)
@@ -110,7 +112,7 @@ def test_the_fit_tells_what_other_positions_see(fitted):
 
 
 def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
-    records = arrays(unit, plan('chamber-9', 2)[:2], 2)
+    records = arrays(unit, plan('chamber-9', 2)[:2], 2, rate_hz=RATE_HZ)
     options = replace(OPTIONS, groups=('curve', 'set', 'now', 'board'))
     with_rate = fit([source_of(one, unit.scale_factor) for one in records], options)
     silent = [np.zeros((len(one.counts), 3)) for one in records]
@@ -227,7 +229,7 @@ def test_the_rate_is_corrected_by_hand_numbers():
 
 
 def test_with_a_prior_the_gyroscope_is_the_priors(unit, fitted):
-    record = arrays(unit, plan('tumble', 2)[:1], 5)[0]
+    record = arrays(unit, plan('tumble', 2)[:1], 5, rate_hz=RATE_HZ)[0]
     again = fit([source_of(record, unit.scale_factor)], replace(OPTIONS, prior=fitted.calibration))
     assert again.calibration.gyroscope == fitted.calibration.gyroscope
     assert again.rates == ()
@@ -272,7 +274,7 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
 
 
 def test_where_no_temperature_changes_nothing_is_wrong(unit, fitted):
-    bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3))
+    bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3, rate_hz=RATE_HZ))
     rate = judge_bags(bags, fitted.calibration).rate
     section = rate.sections['all']
     assert section.rms < section.raw_rms < 1.3 * section.rms
