@@ -10,7 +10,6 @@ unit without it has not been done, whatever else lies there. What was fitted wit
 
 from __future__ import annotations
 
-import datetime as dt
 import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -23,7 +22,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from .. import __version__, files
+from .. import files
 from ..errors import FitError, FleetError
 from ..fitting.priors import UNITS_NEEDED, population
 from ..unit.calibration import Calibration
@@ -203,8 +202,6 @@ def render_fleet(
         can_tell=can_tell,
         figures=drawn_figures([shares] * bool(fitted) + [distances] * bool(can_tell)),
         links={row['name']: quote(certificate_of(row)) for row in fitted},
-        now=f'{dt.datetime.now(dt.timezone.utc):%Y-%m-%d %H:%M}',
-        version=__version__,
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import datetime as dt
 import math
 import re
+import secrets
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from .. import __version__
 from ..text import counted
 from ..unit.gravity import MICRO_G
 
@@ -25,21 +27,19 @@ _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-
 _LONGEST_MARGIN = 90
 
 
-def render(template: str, *, script: str = '', nonce: str = '', **context: Any) -> str:
+def render(template: str, *, script: str = '', **context: Any) -> str:
     """
     Fill a template that extends ``page.html``; `title` at least.
 
-    A viewer's page has a script, and a nonce by which the policy lets this one run.
+    A viewer's page has a script, which runs by a nonce of this page alone.
     """
-    policy = _POLICY
+    nonce, policy = secrets.token_urlsafe(16), _POLICY
     if script:
         policy += f"; script-src 'nonce-{nonce}'; connect-src 'self'"
+    now = f'{dt.datetime.now(dt.timezone.utc):%Y-%m-%d %H:%M}'
+    known = {'margin': '', 'is_simulated': False, 'now': now, 'version': __version__, **context}
     found = _templates().get_template(template)
-    return found.render(
-        {'margin': '', 'is_simulated': False}
-        | context
-        | {'policy': Markup(policy), 'script': Markup(script), 'nonce': nonce}  # noqa: S704 - our own
-    )
+    return found.render(known, policy=policy, script=script, nonce=nonce)
 
 
 @cache

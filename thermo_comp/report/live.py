@@ -12,7 +12,6 @@ reach it through the browser.
 from __future__ import annotations
 
 import hashlib
-import secrets
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -91,7 +90,6 @@ class LiveReport:
                 self._evidence,
                 figures=self._figures,
                 script=_SCRIPT % version,
-                nonce=secrets.token_urlsafe(16),
                 notice=self._notice,
             )
 

@@ -4,13 +4,11 @@
 
 from __future__ import annotations
 
-import datetime as dt
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from .. import __version__
 from ..files import PAGE, PICTURE, write_atomically
 from ..fitting.reduction import ReducedBag
 from ..judging.history import drifts_of
@@ -20,7 +18,7 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .certificate import CertificateInfo, budget, combined, conformity_rule, results
 from .evidence import LEFT_OUT, Evidence
 from .figures import ReportFigure, drawn_figures, figures_of
-from .html import render, spelt, utc
+from .html import render, utc
 from .style import drawing, png
 from .trace import span_of
 
@@ -57,13 +55,12 @@ def render_report(
     *,
     figures: Sequence[tuple[ReportFigure, str]] | None = None,
     script: str = '',
-    nonce: str = '',
     notice: str = '',
 ) -> str:
     """
     Make the page, with figures that are drawn already if there are some.
 
-    `script` and `nonce` are a viewer's (see `html.render`), as is `notice`.
+    `script` and `notice` are a viewer's.
     """
     if figures is None:
         figures = drawn_figures(figures_of(evidence))
@@ -75,7 +72,6 @@ def render_report(
     return render(
         'certificate.html',
         script=script,
-        nonce=nonce,
         title=f'{evidence.serial}: {title}',
         heading=title,
         margin=f'{title} {info.number}, unit {evidence.serial}'.replace(' ,', ','),
@@ -84,9 +80,8 @@ def render_report(
         info=info,
         evidence=evidence,
         bags=[(one, *span_of(one), remarks_of(one)) for one in evidence.bags],
-        verdict=_verdict(evidence),
         seen=_seen(evidence),
-        dates=_dates(evidence, info),
+        tested=info.dates.test or _test_dates(evidence),
         results=results(evidence, info, contributions),
         budget=contributions,
         combined=combined(contributions),
@@ -97,8 +92,6 @@ def render_report(
         drifts=drifts_of(evidence.history),
         rungs=rungs,
         rung_headings=[f'{rung}, µg RMS' for rung in rungs],
-        now=f'{dt.datetime.now(dt.timezone.utc):%Y-%m-%d %H:%M}',
-        version=__version__,
     )
 
 
@@ -130,14 +123,6 @@ def remarks_of(bag: ReducedBag) -> list[str]:
     ]
 
 
-def _verdict(evidence: Evidence) -> tuple[str, str]:
-    """Give the verdict and its numbers, spelt for readers."""
-    words, _, numbers = evidence.headline.partition(': ')
-    if evidence.judgement is not None:
-        words, numbers = evidence.judgement.verdict, evidence.judgement.reason
-    return spelt(words), spelt(numbers)
-
-
 def _seen(evidence: Evidence) -> list[str]:
     """Say which bags the verdict rests on, and what the flag marked in the one that is shown."""
     said = []
@@ -163,17 +148,9 @@ def _seen(evidence: Evidence) -> list[str]:
     return said
 
 
-def _dates(evidence: Evidence, info: CertificateInfo) -> list[tuple[str, str]]:
-    """Give the dates; that of the test is the bags' own unless somebody knows better."""
-    test = info.dates.test
-    if not test and evidence.bags and evidence.is_seen:
-        days = sorted(f'{utc(span_of(bag)[0]):%Y-%m-%d}' for bag in evidence.bags)
-        test = days[0] if days[0] == days[-1] else f'{days[0]} to {days[-1]}'
-    calibration = evidence.calibration
-    fit = '' if calibration is None else calibration.provenance.created
-    return [
-        ('Date of test', test),
-        ('Date of fit', fit),
-        ('Date of issue', info.dates.issue),
-        ('Due for recalibration', info.dates.due),
-    ]
+def _test_dates(evidence: Evidence) -> str:
+    """Give the days on which the bags of the calibration's fit began, if it was fitted on some."""
+    if not evidence.bags or not evidence.is_seen:
+        return ''
+    days = sorted(f'{utc(span_of(bag)[0]):%Y-%m-%d}' for bag in evidence.bags)
+    return days[0] if days[0] == days[-1] else f'{days[0]} to {days[-1]}'
