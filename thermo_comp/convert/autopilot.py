@@ -278,10 +278,7 @@ def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments:
 
 
 def _stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
-    """
-    Turn microseconds since the autopilot's start into stamps; `NO_STAMP` where the number is no
-    time: beyond a century, from a damaged file.
-    """
+    """Turn microseconds since the start into stamps; `NO_STAMP` beyond a century: damage."""
     whole = np.asarray(microseconds)
     size = whole.astype(np.float64)
     is_time = (size >= 0.0) & (size < _CENTURY_US)

@@ -32,11 +32,7 @@ def bag_log(
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
-    """
-    Read a bag with an Imu topic and its thermometers, whatever they are called.
-
-    Topics that are None are found by type and neighbourhood; `unit` is what the driver publishes.
-    """
+    """Read a bag, with the topics that are None found; `unit` is what the driver publishes."""
     path = Path(path)
     given = {'imu': imu, 'board': board, 'case': case}
     found = find_topics(path, inspect_recording(path).topics, imu, board, case)
@@ -78,10 +74,7 @@ def bag_log(
 def find_topics(
     path: Path, present: Present, imu: str | None, board: str | None, case: str | None
 ) -> dict[str, str | None]:
-    """
-    Tell ``imu``, ``board`` and ``case`` among a bag's topics, None where there is no such
-    thermometer; RecordingError if there is no Imu, or more than neighbourhood can tell apart.
-    """
+    """Tell ``imu``, ``board`` and ``case`` apart, None for a thermometer that is not there."""
     imu = imu or _most(path, _of_type(present, IMU), 'Imu')
     if imu is None:
         raise RecordingError('the bag holds no Imu messages', path=path)

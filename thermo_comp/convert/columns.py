@@ -76,12 +76,7 @@ class Gyro:
 
 @dataclass(frozen=True)
 class Thermometer:
-    """
-    One temperature column; unit raw: ``degC = reading * degc_per_count + degc_at_zero``.
-
-    Slow sensors hold their last value between readings of their own: a row becomes a message where
-    the value differs from the last one, or after ten seconds.
-    """
+    """One temperature column; unit raw: ``degC = reading * degc_per_count + degc_at_zero``."""
 
     column: Column
     unit: Literal['degC', 'K', 'degF', 'raw'] = 'degC'
@@ -185,10 +180,7 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
 
 
 def guess_columns(path: str | Path, rate_hz: float | None = None) -> ColumnMap:
-    """
-    Tell the columns of a table without headings; `rate_hz` is for one without times. Raises
-    RecordingError where they do not say what they are.
-    """
+    """Tell the columns of a table without headings; `rate_hz` is for one without times."""
     path = Path(path)
     table = read_text(path, None, Stamp(rate_hz=1.0))
     width = len(table.values)

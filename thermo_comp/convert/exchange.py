@@ -61,9 +61,8 @@ def export_calibration(
     """
     Write a calibration's static set as the file of one of `TOOLS`.
 
-    `number`: which set or IMU, where the file numbers them; `device_id`: PX4's id of the sensor,
-    by which it matches the set. At the attitude `up`, a unit vector, the drift of the scale is
-    folded into the offset.
+    `number`: which set or IMU, where the file numbers them; `device_id`: by which PX4 matches it.
+    At the attitude `up`, a unit vector, the drift of the scale is folded into the offset.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
@@ -177,10 +176,9 @@ def import_calibration(
     noise_density: float = 200.0 * MICRO_G,
 ) -> Calibration:
     """
-    Read the file of one of `TOOLS`, told by what it holds, as a calibration of a unit.
+    Read the file of one of `TOOLS`, told by what it holds, with the same set in both regimes.
 
-    `number` chooses a set, IMU or instance; None takes the only one there is. `full_scale` is in
-    m/s^2. The result has the same set in both regimes.
+    `number` chooses a set or IMU; None takes the only one there is. `full_scale` is in m/s^2.
     """
     read = (tool.read(text, number) for tool in TOOLS.values())
     content = next((one for one in read if one is not None), None)

@@ -69,40 +69,25 @@ class Readings(NamedTuple):
 
 @dataclass(frozen=True)
 class ForeignLog:
-    """
-    What a log of any format holds, in file order.
-
-    path: the log
-    stamp_ns: stamps of the rows; `NO_STAMP` where there is none, shape (n,)
-    accel: readings in the stated unit; NaN where a cell is no number, shape (n, 3)
-    gyro: angular rate [rad/s], shape (n, 3)
-    temperatures: readings by the name of the thermometer
-    line: where each row stands in the file, shape (n,); None counts the rows
-    input, unit: what the accelerometer's messages become, and the unit that the log states
-    counts_per_g, clip: the stated sensitivity; readings at and beyond which the sensor saturates
-    n_short: rows that were left out because they are too short
-    missing: what of the log could not be read
-    chosen: which topics were taken without being named
-    hint: how its recorder would have logged more
-    """
+    """What a log of any format holds, in file order."""
 
     path: str
-    stamp_ns: Ints
-    accel: Floats
-    gyro: Floats | None = None
+    stamp_ns: Ints  # `NO_STAMP` where there is none, shape (n,)
+    accel: Floats  # in the stated unit; NaN where a cell is no number, shape (n, 3)
+    gyro: Floats | None = None  # [rad/s], shape (n, 3)
     temperatures: Mapping[str, Readings] = field(default_factory=dict)
-    line: Ints | None = None
-    input: Literal['counts', 'imu'] = 'imu'
+    line: Ints | None = None  # where each row stands in the file, shape (n,); None counts them
+    input: Literal['counts', 'imu'] = 'imu'  # what the accelerometer's messages become
     unit: Unit = 'm/s^2'
     counts_per_g: float | None = None
-    clip: tuple[float, float] | None = None
+    clip: tuple[float, float] | None = None  # at and beyond which the sensor saturates
     frame_id: str = 'imu_link'
     serial: str = ''
-    n_short: int = 0
+    n_short: int = 0  # rows that were left out
     metadata: Mapping[str, str] = field(default_factory=dict)
-    missing: str | None = None
-    chosen: str | None = None
-    hint: str = ''
+    missing: str | None = None  # what of it could not be read
+    chosen: str | None = None  # topics that were taken without being named
+    hint: str = ''  # how its recorder would have logged more
 
     @property
     def factor(self) -> float:
@@ -113,17 +98,12 @@ class ForeignLog:
 
 @dataclass(frozen=True)
 class Stillness:
-    """
-    Where a recording rests, and what it reads there.
+    """Where a recording rests, and what it reads there, in its unit; NaN where it never does."""
 
-    Median |a| over the quiet cells, NaN where there are none, and their median sd per axis, in
-    the input's unit; how long it rests in all; begin and end of each part in which it is moved.
-    """
-
-    magnitude: float
-    noise: float
+    magnitude: float  # median |a| of the quiet cells
+    noise: float  # their median sd per axis
     still_s: float
-    moving_ns: tuple[tuple[int, int], ...]
+    moving_ns: tuple[tuple[int, int], ...]  # where it is moved, from and to
 
 
 @dataclass(frozen=True)
@@ -136,22 +116,16 @@ class Finding:
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """
-    What came in, what went out, and what was seen on the way.
+    """What came in, what went out, and what was seen on the way."""
 
-    `log` is what was written: without the rows that are short, hold no numbers, or a stamp that
-    ROS has not; those of the other `findings` are kept. `messages` counts by the name of the
-    input, `believed` is what the readings at rest speak for.
-    """
-
-    log: ForeignLog
+    log: ForeignLog  # what was written of it
     output: str
     rows: int
-    messages: Mapping[str, int]
+    messages: Mapping[str, int]  # by the name of the input
     rate_hz: float
     duration_s: float
     findings: dict[str, Finding]
-    believed: str
+    believed: str  # which unit the readings at rest speak for
     stillness: Stillness
 
 
@@ -310,10 +284,7 @@ def _write(
 
 
 def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
-    """
-    Find where a recording rests, from its noise alone, whatever its unit, and however shortly;
-    readings (n, 3).
-    """
+    """Find where a recording (n, 3) rests, from its noise alone, however shortly."""
     reduced = CellAccumulator(_CELL_S, None)
     for first in range(0, len(accel), _RUN_ROWS):
         run = slice(first, first + _RUN_ROWS)

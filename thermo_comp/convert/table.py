@@ -57,16 +57,12 @@ class Format:
 
 @dataclass(frozen=True)
 class Stamp:
-    """
-    A column of time stamps, or a fixed rate.
-
-    The start is not 0 by default, because ROS takes a zero stamp for "no time yet".
-    """
+    """A column of time stamps, or a fixed rate."""
 
     column: Column | None = None
     unit: TimeUnit | None = None
     rate_hz: Positive | None = None
-    start_s: NotNegative = 1.0
+    start_s: NotNegative = 1.0  # ROS takes a zero stamp for "no time yet"
 
     def __post_init__(self) -> None:
         if (self.column is None) == (self.rate_hz is None):
@@ -82,30 +78,19 @@ class Stamp:
 
 @dataclass(frozen=True)
 class Table:
-    """
-    Columns of one table, in file order.
+    """Columns of one table, in file order, shape (n,)."""
 
-    line: line of each row in the file, counted from 1 (the row number for Parquet), shape (n,)
-    values: the columns asked for; NaN where a cell is no number, shape (n,)
-    stamp_ns: their stamps; `NO_STAMP` where a cell is no number, shape (n,)
-    n_short: rows with too few cells (the last line of a log that was cut off), left out
-    has_headings: whether its columns have names
-    """
-
-    line: Ints
-    values: dict[Column, Floats]
-    stamp_ns: Ints
-    n_short: int = 0
+    line: Ints  # where each row stands in the file, from 1; of Parquet its number
+    values: dict[Column, Floats]  # NaN where a cell is no number
+    stamp_ns: Ints  # `NO_STAMP` where a cell is no number
+    n_short: int = 0  # rows with too few cells, as where a log was cut off: left out
     has_headings: bool = True
 
 
 def read_text(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
 ) -> Table:
-    """
-    Read some columns of a table of text, by their headings or numbers counted from 0; None reads
-    all, by their numbers.
-    """
+    """Read columns of a table of text, by headings or numbers from 0; None reads all of them."""
     try:
         with TextIOWrapper(
             open_regular(path), encoding='utf-8-sig', errors='replace', newline=''
@@ -256,10 +241,7 @@ def _floats(cells: Sequence[str]) -> Floats:
 
 
 def exact_ns(cells: Iterable[object], unit: TimeUnit | None) -> Ints:
-    """
-    Return stamps in nanoseconds, exact to the last digit, of decimal numbers; `NO_STAMP` where a
-    cell is no finite number or out of range.
-    """
+    """Return stamps of decimal numbers, exact to the last digit; else `NO_STAMP`."""
     stamps = []
     for cell in cells:
         stamps.append(NO_STAMP)
@@ -275,10 +257,7 @@ def exact_ns(cells: Iterable[object], unit: TimeUnit | None) -> Ints:
 def read_parquet(
     path: Path, columns: Sequence[Column], stamp: Stamp, _style: Format | None = None
 ) -> Table:
-    """
-    Read some columns of a Parquet file, as `read_text` does of text; a stamp column of Parquet's
-    own timestamp type states its unit itself.
-    """
+    """Read columns of a Parquet file as of text; its own timestamps state their unit."""
     pq = library('pyarrow.parquet', 'parquet', 'a Parquet file', path)
     import pyarrow as pa
 

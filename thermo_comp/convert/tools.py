@@ -53,26 +53,17 @@ _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
 
 @dataclass(frozen=True)
 class Content:
-    """
-    What a file says: ``a = matrix (N - bias)``, the bias a cubic of temperature.
+    """What a file says: ``a = matrix (N - bias)``, the bias a cubic of temperature."""
 
-    matrix: shape (3, 3); of an autopilot's file the identity
-    bias: coefficients of each axis, in units of N, shape (3, 4)
-    reference_c, range_c: the temperature that the cubics count from, and where they hold
-    notes: what is lost, or lacks
-    source: the tool and the set that was read
-    noise: white [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second, on the way out
-    rate_bias: as `bias`, of the angular rate [rad/s], where it is known and can be said
-    """
-
-    matrix: Floats
-    bias: Floats
-    reference_c: float
+    matrix: Floats  # shape (3, 3); of an autopilot's file the identity
+    bias: Floats  # coefficients of each axis, in units of N, shape (3, 4)
+    reference_c: float  # that the cubics count from
     range_c: tuple[float, float]
-    notes: list[str]
-    source: str = ''
+    notes: list[str]  # what is lost, or lacks
+    source: str = ''  # the tool and the set that was read
+    # White [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second, on the way out.
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rate_bias: Floats | None = None
+    rate_bias: Floats | None = None  # as `bias`, of the angular rate [rad/s]
 
 
 def _write_px4(content: Content, number: int | None, device_id: int) -> str:
@@ -346,17 +337,12 @@ def _array(value: object, key: str, size: int) -> Floats:
 
 @dataclass(frozen=True)
 class Tool:
-    """
-    One tool's file: how it is written, and read; None of a text that is no such file.
-
-    `is_thermal`: whether it keeps a bias over temperature, about `reference_c` where that is
-    fixed; the others keep scale and misalignment.
-    """
+    """One tool's file: a bias over temperature, or scale and misalignment."""
 
     write: Callable[[Content, int | None, int], str]
-    read: Callable[[str, int | None], Content | None]
+    read: Callable[[str, int | None], Content | None]  # None of a text that is no such file
     is_thermal: bool = False
-    reference_c: float | None = None
+    reference_c: float | None = None  # where it is fixed
 
 
 TOOLS = {

@@ -42,20 +42,16 @@ CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'resu
 
 @dataclass(frozen=True)
 class FleetResult:
-    """
-    A fleet, done: its rows by name, what they tell, the files.
-
-    `n_done` counts the fits of this run; `no_prior` says why there is no `prior`.
-    """
+    """A fleet, done: its rows by name, what they tell, the files."""
 
     rows: tuple[Row, ...]
     summary: Summary
-    n_done: int
+    n_done: int  # fits of this run
     parquet: Path
     csv: Path
     page: Path
     prior: Path | None
-    no_prior: str
+    no_prior: str  # why there is none
 
     @property
     def n_fitted(self) -> int:
@@ -80,12 +76,7 @@ def fit_fleet(
     earlier: Sequence[Row] = (),
     tell: Callable[[int, int, Row], None] | None = None,
 ) -> FleetResult:
-    """
-    Fit all units whose results are not there yet.
-
-    Raises FleetError without a library, bags or a scheduler; OutputError where nothing can be
-    written.
-    """
+    """Fit all units whose results are not there yet; FleetError, OutputError if it cannot."""
     for name in ('distributed', 'fsspec', 'pyarrow'):
         if find_spec(name) is None:
             raise FleetError(
@@ -243,11 +234,7 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """
-        Write what came out of a unit, and return its row.
-
-        A failure takes no earlier calibration away. Raises OutputError if it cannot be written.
-        """
+        """Write what came out, and return its row; a failure takes no calibration away."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):

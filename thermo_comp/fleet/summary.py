@@ -34,17 +34,13 @@ QUANTITIES = tuple(one for one in COLUMNS if one.label)
 
 
 class Spread(NamedTuple):
-    """
-    How a quantity is spread: `z`, shape (n,), is the distance from the median `middle` in `sd`.
-
-    `sd` is 1.4826 times the median absolute deviation; of a size, of its logarithm.
-    """
+    """How a quantity is spread about its median, and each unit's distance in robust sd."""
 
     quantity: Column
     names: tuple[str, ...]
     values: Floats
     middle: float
-    sd: float
+    sd: float  # 1.4826 times the median absolute deviation; of a size, of its logarithm
     z: Floats
 
 
@@ -80,15 +76,11 @@ class Retest:
 
 @dataclass(frozen=True)
 class Summary:
-    """
-    What a fleet table tells: units by verdict, spreads, outliers and drifts, the surest first.
-
-    Beyond `limit` standard deviations a unit stands out; infinite where too few units tell.
-    """
+    """What a fleet table tells: units by verdict; outliers and drifts, the surest first."""
 
     verdicts: dict[str, int]
     spreads: tuple[Spread, ...]
-    limit: float
+    limit: float  # in standard deviations; infinite where too few units tell
     outliers: tuple[Outlier, ...]
     drifts: tuple[Retest, ...]
 

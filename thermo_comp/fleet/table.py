@@ -41,20 +41,15 @@ _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
 class Column(NamedTuple):
-    """
-    One column: its heading with the unit of measurement, what stands in it, and its meaning.
-
-    Units are compared in what has a `label`, see `_COMPARED`; `sd` is the column with its
-    standard deviation.
-    """
+    """One column: its heading with the unit of measurement, what stands in it, its meaning."""
 
     name: str
     kind: str  # text, whole, number
     meaning: str
-    label: str = ''
+    label: str = ''  # of what units are compared in, see `_COMPARED`
     unit: str = ''
     by: str = 'value'
-    sd: str = ''
+    sd: str = ''  # the column with its standard deviation
 
 
 _BELOW = ((1, 0), (2, 0), (2, 1))
@@ -223,10 +218,7 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
 
 
 def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
-    """
-    Write the table as fleet.parquet, with the columns' meaning in its metadata, and as fleet.csv,
-    with all digits; each is replaced as a whole.
-    """
+    """Write the table, as Parquet with the columns' meaning, and as CSV with all digits."""
     import pyarrow as pa
     from pyarrow import parquet
 

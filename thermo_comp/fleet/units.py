@@ -59,11 +59,7 @@ class FoundUnit:
 
 
 class Storage:
-    """
-    A folder here or at a URL like ``s3://bucket/bags``; FleetError for a strange protocol.
-
-    `address` is what another process must be told to find it, wherever that was started.
-    """
+    """A folder here or at a URL like ``s3://bucket/bags``; FleetError for a strange protocol."""
 
     def __init__(self, url: str) -> None:
         import fsspec
@@ -75,6 +71,7 @@ class Storage:
             raise FleetError(f'{url}: {words(error)}') from error
         self._root = str(root).rstrip('/')
         self._is_local = 'file' in self._fs.protocol
+        # What another process must be told to find it, wherever that was started.
         self.address = self._root if self._is_local else url
         self.name = self._root.rpartition('/')[2]
 

@@ -60,15 +60,11 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class UnitOutcome:
-    """
-    What came out of one unit, small enough to travel: its row, the hashes of its bags, its files.
-
-    `is_final`: the same bags would give the same again; a failed file system may not.
-    """
+    """What came out of one unit, small enough to travel."""
 
     row: dict[str, Cell]
-    hashes: dict[str, str]
-    is_final: bool
+    hashes: dict[str, str]  # of its bags
+    is_final: bool  # the same bags would give the same again; a failed file system may not
     calibration: str = ''
     certificate: str = ''
 
@@ -178,11 +174,7 @@ def dask_setup(_worker: object) -> None:
 def connected(
     scheduler: str | None = None, n_workers: int | None = None, most: int = 1 << 30
 ) -> Iterator[Any]:
-    """
-    Give a client of a cluster with at least one worker: of one that runs, or of one of its own.
-
-    Raises FleetError if nobody answers, there is no worker, or they run another version.
-    """
+    """Give a client of a cluster: of one that runs, with workers of this version, or its own."""
     import dask
     from distributed import Client, LocalCluster
 
