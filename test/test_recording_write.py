@@ -358,8 +358,6 @@ def test_a_killed_writer_leaves_the_old_output_and_a_readable_rest(
 
 
 def test_arguments_that_do_not_fit(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="`compression` must be zstd, lz4 or none, got 'gzip'"):
-        BagWriter(tmp_path / 'bag', compression='gzip')  # type: ignore[arg-type]
     with BagWriter(tmp_path / 'bag') as bag:
         with pytest.raises(ValueError, match=r'`xyz` must have shape \(2, 3\), got \(2, 2\)'):
             bag.write_counts('a', [1, 2], [[1, 2], [3, 4]])
@@ -373,13 +371,13 @@ def test_arguments_that_do_not_fit(tmp_path: Path) -> None:
             bag.write_counts('a', [2**31 * 10**9], [[1, 2, 3]])
         with pytest.raises(ValueError, match='`log_ns` must have 1 values, got 2'):
             bag.write_counts('a', [1], [[1, 2, 3]], log_ns=[1, 2])
-        with pytest.raises(ValueError, match=r'`celsius` must have 1 values, got \(2,\)'):
+        with pytest.raises(ValueError, match=r'`celsius` must have shape \(1, 1\), got \(2, 1\)'):
             bag.write_temperature('a', [1], [1.0, 2.0])
         with pytest.raises(ValueError, match='`linear_acceleration` must have shape'):
             bag.write_imu('a', [1], [[1.0, 2.0]], np.zeros(9))
         with pytest.raises(ValueError, match='`linear_acceleration_covariance` must have shape'):
             bag.write_imu('a', [1], [[1.0, 2.0, 3.0]], np.zeros((1, 3)))
-        with pytest.raises(ValueError, match=r'`values` must have 1 values, got \(2,\)'):
+        with pytest.raises(ValueError, match=r'could not broadcast .* shape \(2,\)'):
             bag.write_bool('a', [1], [True, False])
         with pytest.raises(ValueError, match='`log_ns` must have 1 values, got 2'):
             bag.write_raw('a', 'std_msgs/msg/Bool', [1, 2], [b''])

@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -30,6 +31,8 @@ from .mcap_file import MAGIC, METADATA_NAME
 from .messages import Messages, join_messages, scatter
 from .rosbag2_metadata import Definition, dump_yaml, information, offered_qos
 
+Compression = Literal['none', 'lz4', 'zstd']
+
 #: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
 _ZSTD_LEVEL = -1
 # Versions of mcap differ in which of its methods are typed.
@@ -40,36 +43,27 @@ _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 
 class McapOutput:
-    """
-    One new MCAP file from its first byte to its footer.
-
-    `metadata` is written at the front, so that even a torn file has it; `name` is what the
-    finished file will be called.
-    """
+    """One new MCAP file, its metadata at the front, so that even a torn one has them."""
 
     def __init__(
         self,
         path: Path,
-        compression: Literal['none', 'lz4', 'zstd'],
+        compression: Compression,
         level: int | None,
         chunk_bytes: int,
         metadata: Mapping[str, str],
         name: str,
     ) -> None:
-        self._name = name
-        self._metadata = metadata
+        self._name, self._metadata, self._chunk_bytes = name, metadata, chunk_bytes
         self._compression = '' if compression == 'none' else compression
         self._compress = _compressor(compression, level)
-        self._chunk_bytes = chunk_bytes
         self._schemas: dict[str, records.Schema] = {}
-        self._channels: dict[str, records.Channel] = {}
-        self._types: dict[str, tuple[str, str]] = {}
-        self._counts: dict[int, int] = {}
+        #: By topic, with the type and its hash.
+        self._channels: dict[str, tuple[records.Channel, str, str]] = {}
+        self._counts: Counter[int] = Counter()
         self._chunks: list[records.ChunkIndex] = []
         self._metadata_index: list[records.MetadataIndex] = []
         self._tail: list[Messages] = []
-        self._start_ns: int | None = None
-        self._end_ns = 0
         self._at = 0
         self._stream = path.open('xb', buffering=0)
         self._put(MAGIC)
@@ -80,9 +74,10 @@ class McapOutput:
     def channel(self, topic: str, kind: str, definition: Definition) -> int:
         """Give the number of a topic's channel, made where it is new."""
         if topic in self._channels:
-            if self._types[topic][0] != kind:
+            known, known_kind, _ = self._channels[topic]
+            if known_kind != kind:
                 raise RecordingError(f'already written with another type than {kind}')
-            return self._channels[topic].id
+            return known.id
         if kind not in self._schemas:
             number, text = len(self._schemas) + 1, definition.text.encode()
             self._schemas[kind] = records.Schema(number, text, definition.encoding, kind)
@@ -97,9 +92,7 @@ class McapOutput:
                 'topic_type_hash': definition.type_hash,
             },
         )
-        self._channels[topic] = channel
-        self._types[topic] = (kind, definition.type_hash)
-        self._counts[channel.id] = 0
+        self._channels[topic] = channel, kind, definition.type_hash
         self._put_record(channel)
         return channel.id
 
@@ -123,11 +116,10 @@ class McapOutput:
             if len(messages):
                 self._put_chunk(messages)
         topics = (
-            (topic, *self._types[topic], self._counts[channel.id])
-            for topic, channel in self._channels.items()
+            (topic, kind, type_hash, self._counts[channel.id])
+            for topic, (channel, kind, type_hash) in self._channels.items()
         )
-        times = self._start_ns or 0, self._end_ns
-        found = information(self._name, *times, topics, self._metadata)
+        found = information(self._name, *self._times(), topics, self._metadata)
         self._put_metadata('rosbag2', {'serialized_metadata': dump_yaml(found).strip()})
         self._put_record(records.DataEnd(data_section_crc=0))
         self._put_summary()
@@ -138,6 +130,11 @@ class McapOutput:
     def close(self) -> None:
         """Close the file as it is."""
         self._stream.close()
+
+    def _times(self) -> tuple[int, int]:
+        """Give the log times of the first and the last message."""
+        start = min((one.message_start_time for one in self._chunks), default=0)
+        return start, max((one.message_end_time for one in self._chunks), default=0)
 
     def _put(self, data: Any) -> None:
         view = memoryview(data)
@@ -169,8 +166,6 @@ class McapOutput:
         scatter(data, at, heads.view(np.dtype((np.void, MESSAGE_HEAD_BYTES))))
         packed, checksum = self._compress(data.data), zlib.crc32(data.data)
         start, end = int(np.min(log_ns)), int(np.max(log_ns))
-        self._start_ns = start if self._start_ns is None else min(self._start_ns, start)
-        self._end_ns = max(self._end_ns, end)
         name = self._compression.encode()
         begin, n_bytes = self._at, len(data)
         head = (Opcode.CHUNK, 40 + len(name) + len(packed), start, end, n_bytes, checksum)
@@ -201,28 +196,26 @@ class McapOutput:
         )
 
     def _put_summary(self) -> None:
-        begin = self._at
+        begin, (start, end) = self._at, self._times()
         statistics = records.Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
             chunk_count=len(self._chunks),
-            message_count=sum(self._counts.values()),
-            message_end_time=self._end_ns,
-            message_start_time=self._start_ns or 0,
+            message_count=self._counts.total(),
+            message_end_time=end,
+            message_start_time=start,
             metadata_count=len(self._metadata_index),
             schema_count=len(self._schemas),
         )
-        kinds, topics = self._schemas.values(), self._channels.values()
-        body = self._put_record(*kinds, *topics, statistics, *self._chunks, *self._metadata_index)
+        declared = *self._schemas.values(), *(one for one, *_ in self._channels.values())
+        body = self._put_record(*declared, statistics, *self._chunks, *self._metadata_index)
         footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 20, begin, 0)
         self._put_record(records.Footer(begin, 0, zlib.crc32(footer_head, zlib.crc32(body))))
         self._put(MAGIC)
 
 
-def _compressor(
-    compression: Literal['none', 'lz4', 'zstd'], level: int | None
-) -> Callable[[Any], Any]:
+def _compressor(compression: Compression, level: int | None) -> Callable[[Any], Any]:
     if compression == 'zstd':
         return zstandard.ZstdCompressor(level=_ZSTD_LEVEL if level is None else level).compress
     if compression == 'lz4':

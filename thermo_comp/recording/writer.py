@@ -14,7 +14,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,13 +22,11 @@ from ..errors import OutputError, RecordingError
 from ..files import Draft, bag_kind
 from ..typing import Bytes, Ints
 from .columns import ImuColumns
-from .mcap_out import McapOutput
+from .mcap_out import Compression, McapOutput
 from .messages import Messages
 from .rosbag2_metadata import Definition, dump_yaml, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
 from .wire import N_NUMBERS, encode_stamped
-
-Compression = Literal['none', 'lz4', 'zstd']
 
 #: The first stamp that no ROS message can hold; none is before 0 [ns].
 STAMP_END_NS = 2**31 * 10**9
@@ -40,22 +37,14 @@ _Column = tuple[int, str, ArrayLike, int]
 
 class BagWriter:
     """
-    Write a bag; use it as a context manager.
+    Write a bag, ``*.mcap`` or a rosbag2 directory; use it as a context manager.
 
-    ``*.mcap`` makes a bare file, anything else a rosbag2 directory. `level` is that of the
-    compression (``zstd``, ``lz4`` or ``none``), by default a fast one; `chunk_bytes` counts before
-    it. `RecordingInfo.metadata` gives the metadata back. What `is_precious` is not dropped where
-    it cannot be finished. Raises OutputError where the output exists and is not to be overwritten,
-    is no bag that may be replaced, or cannot be created.
-
-    Messages are buffered until `flush`, which merges all topics in log-time order; 64 MiB of them
-    are flushed unasked. So one group of calls whose time spans overlap and a `flush` make a file
-    in log-time order, whatever order the calls had. A process that is killed loses what is
-    buffered and the chunk being filled; the rest stands in a hidden file beside the target and can
-    be read as a torn bag.
-
-    The writing methods raise ValueError for shapes that do not fit and times that no ROS stamp can
-    hold, OutputError where the disk is full or the like. Log times are the stamps, if not given.
+    Without a `level` the compression is a fast one; `chunk_bytes` counts before it. What
+    `is_precious` is not dropped where it cannot be finished. Messages are buffered until `flush`,
+    which merges all topics in log-time order; 64 MiB of them are flushed unasked. A process that
+    is killed leaves what is written in a hidden file beside the target, a torn bag. Raises
+    OutputError for what may not or cannot be written; the methods also ValueError for shapes that
+    do not fit and times that no ROS stamp can hold. Log times are the stamps, if not given.
     """
 
     def __init__(
@@ -69,8 +58,6 @@ class BagWriter:
         chunk_bytes: int = 1 << 20,
         is_precious: bool = False,
     ) -> None:
-        if compression not in {'zstd', 'lz4', 'none'}:
-            raise ValueError(f'`compression` must be zstd, lz4 or none, got {compression!r}')
         self._path = Path(path)
         self._is_precious = is_precious
         self._batches: list[Messages] = []
@@ -80,14 +67,8 @@ class BagWriter:
         self._draft = Draft(path, kind, overwrite=overwrite)
         with self._translated():
             name = self._path.name if self._is_file else f'{self._path.name}_0.mcap'
-            self._file = McapOutput(
-                self._draft.partial if self._is_file else self._draft.partial / name,
-                compression,
-                level,
-                chunk_bytes,
-                dict(metadata or {}),
-                name,
-            )
+            path = self._draft.partial if self._is_file else self._draft.partial / name
+            self._file = McapOutput(path, compression, level, chunk_bytes, metadata or {}, name)
 
     def write_counts(
         self,
@@ -110,11 +91,7 @@ class BagWriter:
         frame_id: str = '',
     ) -> None:
         """Write sensor_msgs/Temperature: degC, shape (n,), of unknown variance."""
-        column = np.asarray(celsius, np.float64)
-        if column.shape != np.shape(stamp_ns):
-            n = np.size(stamp_ns)
-            raise ValueError(f'`celsius` must have {n} values, got {column.shape}')
-        columns = [(0, 'celsius', column.reshape(-1, 1), 1)]
+        columns = [(0, 'celsius', np.reshape(celsius, (-1, 1)), 1)]
         self._write_stamped(topic, TEMPERATURE, stamp_ns, log_ns, frame_id, columns)
 
     def write_imu(
@@ -130,8 +107,7 @@ class BagWriter:
         """
         Write sensor_msgs/Imu: m/s^2, shape (n, 3), with the covariance (n, 9) or (9,).
 
-        Without `imu` neither orientation nor angular velocity is claimed: identity, zero rate, and
-        -1 as first element of each covariance.
+        Without `imu` neither orientation nor rate is claimed: -1 begins their covariances.
         """
         columns: list[_Column] = [
             (25, 'linear_acceleration', linear_acceleration, 3),
@@ -149,11 +125,8 @@ class BagWriter:
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
         """Write std_msgs/Bool."""
         times = _as_times('log_ns', log_ns)
-        flags = np.atleast_1d(np.asarray(values, np.bool_))
-        if flags.shape != times.shape:
-            raise ValueError(f'`values` must have {len(times)} values, got {flags.shape}')
         rows = np.zeros((len(times), 5), np.uint8)
-        rows[:, 1], rows[:, 4] = 1, flags
+        rows[:, 1], rows[:, 4] = 1, np.asarray(values, np.bool_)
         self._add(topic, BOOL, _of_rows(rows, times))
 
     def write_raw(
@@ -164,12 +137,7 @@ class BagWriter:
         messages: Sequence[bytes] | Messages,
         definition: tuple[str, str] | None = None,
     ) -> None:
-        """
-        Write messages that are serialized (CDR) already.
-
-        `definition` is encoding and text of the type's, as `RecordingReader.definitions` gives it;
-        by default that of ROS 2 Jazzy, RecordingError where that has none.
-        """
+        """Write what is serialized (CDR) already; without a `definition` Jazzy must have one."""
         times = _as_times('log_ns', log_ns, len(messages))
         if not isinstance(messages, Messages):
             messages = Messages.of(messages, np.zeros(len(messages)), times)
@@ -197,10 +165,10 @@ class BagWriter:
                         file.flush()
                         os.fsync(file.fileno())
             self._draft.publish()
+            self._file = None
         except BaseException:
             self.abort()
             raise
-        self._file = None
 
     def abort(self) -> None:
         """Drop the unfinished output; what stood under its name before stays."""
@@ -257,7 +225,7 @@ class BagWriter:
         except RecordingError as error:
             raise RecordingError(error.message, self._path, name) from error
         if len(messages):
-            channel = np.full(len(messages), number, np.uint16)
+            channel = np.full_like(messages.channel, number)
             self._batches.append(replace(messages, channel=channel))
             if sum(len(one.data) for one in self._batches) > _AUTO_FLUSH_BYTES:
                 self.flush()
