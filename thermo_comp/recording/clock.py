@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from math import inf
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import RecordingError
-from ..typing import Bools, Ints
+from ..typing import Ints
 from .columns import Block
 from .topics import Part
 
@@ -30,7 +29,7 @@ _MOST_JUMPS = 100
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
-def without_jumps(blocks: Iterable[Block]) -> Iterator[Block]:
+def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """Move stamps behind a jump, all by the same; RecordingError for stamps that are no clock."""
     last_ns: int | None = None
     offset = 0
@@ -54,12 +53,13 @@ def without_jumps(blocks: Iterable[Block]) -> Iterator[Block]:
         span_ns += int(np.sum(np.where(is_jump, LONGEST_PAUSE_NS, np.maximum(steps, 0))))
         if n_jumps > _MOST_JUMPS:
             raise RecordingError(
-                f'its stamps jump by more than an hour more than {_MOST_JUMPS} times'
+                f'its stamps jump by more than an hour more than {_MOST_JUMPS} times', path
             )
         if span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
             raise RecordingError(
                 f'{n_messages} messages stamped over {span_ns * 1e-9 / 86400:.0f} days: '
-                'no recording of a thermal test'
+                'no recording of a thermal test',
+                path,
             )
         if not moved.any():
             yield block
@@ -81,45 +81,32 @@ class Cut:
     """Leaves out of blocks what is outside a part; `since_s` is where it begins in the bag."""
 
     def __init__(self, path: Path, part: Part) -> None:
-        self._path = path
-        self._part = part
-        self._first_ns: int | None = None
+        self._path, self._part = path, part
         self.since_s = 0.0
 
     def blocks(self, blocks: Iterable[Block]) -> Iterator[Block]:
         """Cut blocks; RecordingError where no sample is left."""
-        n_kept, last_ns = 0, 0
-        self._first_ns = None
+        if self._part.is_whole:
+            yield from blocks
+            return
+        first_ns: int | None = None
+        last_ns = n_kept = 0
         for block in blocks:
             if len(block):
                 last_ns = int(block.accel_stamp_ns[-1])
-                if self._first_ns is None:
-                    self._first_ns = int(block.accel_stamp_ns[0])
-            left = self._cut(block)
+                first_ns = int(block.accel_stamp_ns[0]) if first_ns is None else first_ns
+            stamps = {name: one.stamp_ns for name, one in block.temperatures.items()}
+            stamps['accel'] = block.accel_stamp_ns
+            begin, end = self._part.limits_ns(first_ns)
+            left = block.take({k: (own >= begin) & (own < end) for k, own in stamps.items()})
             if len(left) and not n_kept:
-                self.since_s = (int(left.accel_stamp_ns[0]) - (self._first_ns or 0)) * 1e-9
+                self.since_s = (int(left.accel_stamp_ns[0]) - (first_ns or 0)) * 1e-9
             n_kept += len(left)
             if left.n_messages:
                 yield left
-        if not n_kept and self._first_ns is not None:
+        if not n_kept and first_ns is not None:
             raise RecordingError(
-                f'no sample is in {self._part}: they are stamped from {self._first_ns * 1e-9:.3f} '
-                f'to {last_ns * 1e-9:.3f}, which is {(last_ns - self._first_ns) * 1e-9:.1f} s',
+                f'no sample is in {self._part}: they are stamped from {first_ns * 1e-9:.3f} '
+                f'to {last_ns * 1e-9:.3f}, which is {(last_ns - first_ns) * 1e-9:.1f} s',
                 self._path,
             )
-
-    def _cut(self, block: Block) -> Block:
-        inside = {name: self._is_inside(one.stamp_ns) for name, one in block.temperatures.items()}
-        inside['accel'] = self._is_inside(block.accel_stamp_ns)
-        return block if all(own.all() for own in inside.values()) else block.take(inside)
-
-    def _is_inside(self, stamp_ns: Ints) -> Bools:
-        if self._first_ns is None and not self._part.is_stamped:
-            # Before the first sample.
-            return np.full(len(stamp_ns), self._part.begin is None)
-        origin_ns = 0 if self._part.is_stamped else self._first_ns or 0
-        begin, end = (
-            default if limit is None else origin_ns + round(limit * 1e9)
-            for limit, default in ((self._part.begin, -inf), (self._part.end, inf))
-        )
-        return (stamp_ns >= begin) & (stamp_ns < end)

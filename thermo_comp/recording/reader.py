@@ -10,7 +10,9 @@ Reading order
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import re
+from collections import ChainMap
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -33,7 +35,7 @@ from .columns import (
 )
 from .foreign import ForeignFile
 from .mcap_file import McapFile
-from .messages import BagFile, Messages, Topic
+from .messages import BagFile, Done, Messages, Topic
 from .rosbag2_metadata import Description, read_metadata
 from .topics import Topics, select_topics, shown
 from .unpack import expand, translated
@@ -64,18 +66,17 @@ class RecordingReader:
             self.info = self._open(path)
             self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
             with translated(path):
-                selection = select_topics(self.info.topics, topics, input, require)
+                found = select_topics(self.info.topics, topics, input, require)
+            self.topics: Mapping[Role, str] = found[0]
+            self.info = replace(self.info, input=found[1], chosen=found[2])
         except OSError as error:
             self.close()
             raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
         except BaseException:
             self.close()
             raise
-        self._names = selection.thermometers
-        self.topics: Mapping[Role, str] = dict(selection.topics)
         self._part = topics.part
         self._cut = Cut(path, topics.part)
-        self.info = replace(self.info, input=selection.input, chosen=selection.chosen)
 
     def _open(self, path: Path) -> RecordingInfo:
         """Open the files; those that rosbag2 has compressed as a whole are expanded beside."""
@@ -83,10 +84,7 @@ class RecordingReader:
         folder = ''
         if found.compression == 'file':
             folder = self._stack.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
-        self._stack.callback(self._close_files)
-        # Ends before the files that its threads read.
         pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
-        self._stack.callback(pool.shutdown, wait=True, cancel_futures=True)
         notes = [note]
         for name in found.files:
             file = name
@@ -95,20 +93,21 @@ class RecordingReader:
                 with translated(name):
                     notes.append(expand(name, file))
             is_packed = found.compression == 'message'
+            one: BagFile
             if found.storage == 'mcap' and not is_packed:
-                self._files.append(McapFile(file, name, pool))
+                one = McapFile(file, name, pool)
             else:
-                self._files.append(ForeignFile(file, name, is_packed=is_packed))
-        for one in self._files:
+                one = ForeignFile(file, name, is_packed=is_packed)
+            self._stack.callback(one.close)
+            self._files.append(one)
             if one.truncated is not None:
-                front = f'{one.path.name}: ' if len(self._files) > 1 else ''
+                front = f'{name.name}: ' if len(found.files) > 1 else ''
                 notes.append(front + one.truncated)
+        # Ended before the files that its threads read.
+        self._stack.callback(pool.shutdown, wait=True, cancel_futures=True)
         topics = count_topics(topic for one in self._files for topic in one.topics.values())
         for topic, n_promised in found.counts.items():
             notes.append(_loss(topic, topics.get(topic, ('', 0))[1], n_promised))
-        metadata = dict(found.custom)
-        for one in self._files:
-            metadata |= one.metadata
         return RecordingInfo(
             path,
             self._files[0].storage,
@@ -116,7 +115,7 @@ class RecordingReader:
             min((f.start_ns for f in self._files if f.start_ns is not None), default=0),
             max((f.end_ns for f in self._files if f.end_ns is not None), default=0),
             '; '.join(filter(None, notes)) or None,
-            metadata,
+            dict(ChainMap(*(f.metadata for f in self._files[::-1]), found.custom)),
         )
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
@@ -126,8 +125,7 @@ class RecordingReader:
         `raw` keeps the serialized messages in `Block.raw`; `n_messages` is about how many make a
         block, 0 for as few as are read at good speed.
         """
-        blocks = self._blocks(raw, n_messages)
-        yield from blocks if self._part.is_whole else self._cut.blocks(blocks)
+        return self._cut.blocks(self._blocks(raw, n_messages))
 
     def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         n_read = dict.fromkeys(self.topics, 0)
@@ -145,61 +143,51 @@ class RecordingReader:
     def _decoded(self, raw: bool) -> Iterator[Block]:
         """Decode the topic of each role, in reading order."""
         roles = {topic: role for role, topic in self.topics.items()}
-        for file in self._opened():
-            feeds: dict[int, tuple[Role, Topic]] = {}
-            for number, topic in file.topics.items():
-                if topic.name in roles:
-                    if topic.encoding not in {'cdr', 'ros1'}:
-                        raise _no_cdr(topic, file)
-                    feeds[number] = roles[topic.name], topic
-            for role, topic in feeds.values():
-                if topic[:3] != dict(feeds.values())[role][:3]:
-                    reason = 'its messages have several encodings'
+
+        def decoded(topics: Mapping[int, Topic], messages: Messages) -> list[Block]:
+            feeds = {number: (roles[topic.name], topic) for number, topic in topics.items()}
+            return decode_blocks(messages, feeds, self.topics, keep_raw=raw)
+
+        return self._read(roles, {'cdr', 'ros1'}, decoded)
+
+    def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
+        """Read topics, by the bag's own names, as they are, about in order of log time."""
+        return self._read(topics, {'cdr'}, _by_topic)
+
+    def _read(
+        self,
+        names: Collection[str],
+        encodings: Collection[str],
+        work: Callable[[Mapping[int, Topic], Messages], list[Done]],
+    ) -> Iterator[Done]:
+        """Do some work on the messages of topics, file by file."""
+        if not self._files:
+            raise RecordingError('the recording is closed', self.info.path)
+        for file in self._files:
+            own = {number: one for number, one in file.topics.items() if one.name in names}
+            for topic in own.values():
+                if topic.encoding not in encodings:
+                    reason = f'its messages are encoded as {shown(topic.encoding)!r}, expected cdr'
                     raise RecordingError(reason, file.path, shown(topic.name))
-            if feeds:
-                work = partial(decode_blocks, feeds=feeds, names=self._names, keep_raw=raw)
-                with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
-                    for blocks in file.read(feeds, work):
-                        yield from blocks
+            with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
+                for found in file.read(own, partial(work, own)) if own else ():
+                    yield from found
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
         """Read the bag for whoever walks its time: without the jumps of its clock."""
-        try:
-            if self._part.is_whole or self._part.is_stamped:
-                yield from without_jumps(self.blocks())
-            else:
-                yield from self._cut.blocks(without_jumps(self._blocks()))
-        except RecordingError as error:
-            raise RecordingError(error.message, error.path or self.info.path, error.key) from error
+        if self._part.is_stamped:
+            return without_jumps(self.blocks(), self.info.path)
+        return self._cut.blocks(without_jumps(self._blocks(), self.info.path))
 
     @property
     def since_s(self) -> float:
         """Where the part that is read begins, since the bag's first sample [s]; known then."""
         return self._cut.since_s
 
-    def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
-        """Read topics, by the bag's own names, as they are, about in order of log time."""
-        for file in self._opened():
-            own = {n: one for n, one in file.topics.items() if one.name in topics}
-            for topic in own.values():
-                if topic.encoding != 'cdr':
-                    raise _no_cdr(topic, file)
-            with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
-                for found in file.read(own, partial(_raw, topics=own)) if own else ():
-                    yield from found
-
     def close(self) -> None:
         """Close the files and remove what was expanded."""
         self._stack.close()
-
-    def _close_files(self) -> None:
-        while self._files:
-            self._files.pop().close()
-
-    def _opened(self) -> Sequence[BagFile]:
-        if not self._files:
-            raise RecordingError('the recording is closed', self.info.path)
-        return self._files
+        self._files.clear()
 
     def __enter__(self) -> RecordingReader:
         """Give the open reader."""
@@ -238,7 +226,7 @@ def read_recording(
     with open_recording(path, topics, input, require=require) as reader:
         blocks = list(reader.blocks())
         nothing = Messages.of([], [], [])
-        return Recording(reader.info, joined(blocks or decode_blocks(nothing, {}, ROLES[1:])))
+        return Recording(reader.info, joined(blocks or decode_blocks(nothing, {}, ROLES)))
 
 
 def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
@@ -259,7 +247,7 @@ def _described(path: Path) -> tuple[Description, str | None]:
             files = [one for one in path.iterdir() if one.suffix == suffix and one.is_file()]
             if files:
                 note = 'metadata.yaml is missing, the recording was not finished'
-                return Description(suffix[1:], tuple(_in_split_order(files))), note
+                return Description(suffix[1:], tuple(sorted(files, key=_place_of))), note
         raise RecordingError('not a bag: the directory has no metadata.yaml', path)
     if not path.is_file():
         raise RecordingError('not a bag: neither a file nor a directory', path)
@@ -268,17 +256,13 @@ def _described(path: Path) -> tuple[Description, str | None]:
     return Description(path.suffix[1:], (path,)), None
 
 
-def _in_split_order(files: Iterable[Path]) -> list[Path]:
-    """Sort the files of a split bag by the number at the end of their names."""
-
-    def number(file: Path) -> tuple[int, str]:
-        digits = file.stem.rpartition('_')[2]
-        return (int(digits) if digits.isascii() and digits.isdigit() else 0, file.name)
-
-    return sorted(files, key=number)
+def _place_of(file: Path) -> tuple[int, str]:
+    """Give the number at the end of a file's name, by which the files of a split bag follow."""
+    number = re.search(r'_([0-9]+)$', file.stem)
+    return (int(number[1]) if number else 0, file.name)
 
 
-def _raw(messages: Messages, topics: Mapping[int, Topic]) -> list[tuple[Topic, Messages]]:
+def _by_topic(topics: Mapping[int, Topic], messages: Messages) -> list[tuple[Topic, Messages]]:
     found = ((topic, messages.of_channels([number])) for number, topic in topics.items())
     return [(topic, one.packed()) for topic, one in found if len(one)]
 
@@ -287,8 +271,3 @@ def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
     if n_read >= n_promised:
         return None
     return f'{shown(topic)}: {n_read} of the {n_promised} messages promised are there'
-
-
-def _no_cdr(topic: Topic, file: BagFile) -> RecordingError:
-    reason = f'its messages are encoded as {shown(topic.encoding)!r}, expected cdr'
-    return RecordingError(reason, file.path, shown(topic.name))

@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from math import isfinite
-from typing import Any, Literal, NamedTuple, cast
+from math import inf, isfinite
+from typing import Any, Literal, cast
 
 from ..errors import RecordingError
 from ..text import one_line
@@ -62,6 +62,14 @@ class Part:
     def is_stamped(self) -> bool:
         """Whether the times are stamps."""
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
+
+    def limits_ns(self, first_ns: int | None) -> tuple[float, float]:
+        """Give begin and end as stamps; `first_ns` is the bag's first sample, if it has come."""
+        origin = 0 if self.is_stamped else first_ns
+        if origin is None:  # nothing is known of it but whether it may begin before
+            return (-inf, inf) if self.begin is None else (inf, inf)
+        begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
+        return begin, inf if self.end is None else origin + round(self.end * 1e9)
 
     def __str__(self) -> str:
         """Write it behind a bag's name."""
@@ -130,29 +138,16 @@ def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
     return '' if _fits(name, wanted) else f'{shown(name)}, its {among} {kind}, is taken for {key}'
 
 
-class Selection(NamedTuple):
-    """
-    Which topics of a bag feed which role, as far as they have messages.
-
-    `thermometers` are the names of all of them; `input` says what the accelerometer's topic is,
-    `chosen` what was taken for want of the usual name.
-    """
-
-    topics: Mapping[Role, str]
-    thermometers: tuple[str, ...]
-    input: Literal['counts', 'imu'] | None
-    chosen: str | None
-
-
 def select_topics(
     present: Present,
     topics: Topics,
     input: Input,  # noqa: A002 - the parameter's public name
     require: Collection[Role],
-) -> Selection:
+) -> tuple[dict[Role, str], Literal['counts', 'imu'] | None, str | None]:
     """
-    Find the topics of the accelerometer and of the thermometers.
+    Find the topics that feed the roles, as far as they have messages.
 
+    Gives these, what the accelerometer's is, and what was taken for want of the usual name. Raises
     RecordingError for an empty bag, and for a topic that is ambiguous, of another type, or missing
     or without messages where it is required.
     """
@@ -176,13 +171,8 @@ def select_topics(
             chosen.append(said_choice(name, key, getattr(topics, key)))
         elif role in require:
             raise RecordingError('the topic has no messages', key=shown(name))
-    further = _further(present, topics, found, is_read=bool(require))
-    return Selection(
-        {**found, **further},
-        ('board', 'case', *further),
-        cast(Any, taken),
-        '; '.join(filter(None, chosen)) or None,
-    )
+    found |= _further(present, topics, found, is_read=bool(require))
+    return found, cast(Any, taken), '; '.join(filter(None, chosen)) or None
 
 
 def _further(

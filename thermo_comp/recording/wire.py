@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..errors import RecordingError
 from ..typing import Bytes, Floats, Ints
-from .columns import Block, ImuColumns, Readings, Role
+from .columns import ROLES, Block, ImuColumns, Readings, Role
 from .messages import Messages, Topic, field, gather
 from .rosbag2_metadata import typestore
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, shown
@@ -52,36 +52,39 @@ class Stamped(NamedTuple):
 def decode_blocks(
     messages: Messages,
     feeds: Mapping[int, tuple[Role, Topic]],
-    names: Iterable[str],
+    roles: Iterable[Role],
     *,
     keep_raw: bool = False,
 ) -> list[Block]:
     """
     Decode messages, in their order; a block ends where the frame changes.
 
-    `feeds` are role and topic of each channel, `names` all thermometers. Raises RecordingError,
-    without a path, for a message whose bytes do not fit its type.
+    `feeds` are role and topic of each channel, `roles` those of the whole bag. Raises
+    RecordingError, without a path, for a message whose bytes do not fit its type.
     """
-    names = tuple(names)
-    roles = dict(feeds.values())
-    is_imu = 'accel' in roles and roles['accel'].type == IMU
+    roles = tuple(dict.fromkeys((*ROLES, *roles)))
+    topics = dict(feeds.values())
+    is_imu = 'accel' in topics and topics['accel'].type == IMU
     temperatures, log_ns, raw = {}, {}, {}
-    for role in ('accel', *names):
+    for role in roles:
         kind = TEMPERATURE if role != 'accel' else IMU if is_imu else VECTOR3_STAMPED
-        rank = messages.places_of([number for number, (own, _) in feeds.items() if own == role])
+        channels = {number: topic for number, (own, topic) in feeds.items() if own == role}
+        rank = messages.places_of(channels)
         own = messages.take(rank)
         try:
-            if role in roles and roles[role].encoding == 'ros1':
+            if len({topic[:3] for topic in channels.values()}) > 1:
+                raise RecordingError('its messages have several encodings')
+            if role in topics and topics[role].encoding == 'ros1':
                 own = as_cdr(own, kind)
             stamp_ns, numbers, frame = decode_stamped(own, kind)
         except RecordingError as error:
-            raise RecordingError(error.message, key=shown(roles[role].name)) from error
+            raise RecordingError(error.message, key=shown(topics[role].name)) from error
         if role == 'accel':
             changes = rank[1:][frame[1:] != frame[:-1]].tolist()
             if changes:
                 runs = (slice(*run) for run in pairwise([0, *changes, len(messages)]))
                 pieces = (messages.take(run) for run in runs)
-                return [decode_blocks(one, feeds, names, keep_raw=keep_raw)[0] for one in pieces]
+                return [decode_blocks(one, feeds, roles, keep_raw=keep_raw)[0] for one in pieces]
             accel, samples_ns, samples, frames = rank, stamp_ns, numbers, frame
         else:
             after = np.searchsorted(accel, rank).astype(np.int64)

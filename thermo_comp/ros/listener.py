@@ -30,7 +30,7 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
 from ..online.stamped_flag import STAMPED_TOPIC
-from ..recording import ROLES, BagWriter, Input, Role, Topics
+from ..recording import BagWriter, Input, Role, Topics
 from ..recording.growing import News
 from ..recording.messages import Messages, Topic
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
@@ -223,8 +223,7 @@ class LiveTopics(_Listener):
             [numbers[role] for role, messages, _ in waiting for _ in messages],
             [one for _, _, received_ns in waiting for one in received_ns],
         )
-        names = dict.fromkeys((*ROLES[1:], *(role for role in numbers if role != 'accel')))
-        yield from map(News, decode_blocks(messages.in_order(), feeds, names, keep_raw=True))
+        yield from map(News, decode_blocks(messages.in_order(), feeds, numbers, keep_raw=True))
 
     def _look(self) -> None:
         """Subscribe to what is published; say what is not."""
