@@ -13,7 +13,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import secrets
 import shutil
 import stat
 from collections.abc import Iterable, Iterator
@@ -261,7 +260,7 @@ def _told(path: str | Path) -> Iterator[None]:
 
 def _hidden_sibling(path: Path) -> Path:
     stem = path.stem[:40]
-    return path.with_name(f'.{stem}.{os.getpid()}-{secrets.token_hex(3)}.partial{path.suffix}')
+    return path.with_name(f'.{stem}.{os.getpid()}-{os.urandom(3).hex()}.partial{path.suffix}')
 
 
 def _overlaps(target: Path, other: Path) -> bool:

@@ -16,7 +16,7 @@ import typer
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import bags, convert, demo, fit, judge, output, record, simulate
+from . import bags, convert, fit, judge, output, record, simulate
 from .options import expanded, option
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
@@ -53,7 +53,7 @@ def _top(
 for _command in (
     *(record.record, fit.fit, fit.prior, judge.evaluate, bags.replay, bags.play, bags.info),
     *(judge.report, judge.view, convert.convert, convert.export, convert.import_),
-    *(simulate.simulate, demo.demo),
+    *(simulate.simulate, simulate.demo),
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))
 _fleet = typer.Typer(name='fleet', help='Fit many units, and see what they tell together.')

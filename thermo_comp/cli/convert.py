@@ -48,12 +48,10 @@ def convert(
         metavar='FILE',
     ),
     output: Path = option('Bag to write; *.mcap makes a bare file.', ..., '--output', '-o'),
-    columns: Path | None = option(
-        'Column map of a table (YAML): what is where, in which unit.', None
-    ),
+    columns: Path | None = option('Column map of a table (YAML): what is where, in which unit.'),
     rate_hz: float | None = options.TABLE_RATE,
-    imu: int | None = option('IMU of a log, counted from 0.', None),
-    baro: int | None = option('Barometer of a log, for the case temperature.', None),
+    imu: int | None = option('IMU of a log, counted from 0.'),
+    baro: int | None = option('Barometer of a log, for the case temperature.'),
     allow_compensated: bool = option('Take a log that INS_TCAL or TC_A has corrected.', False),
     names: dict[str, str] = options.names,
     unit: Literal['m/s^2', 'g', 'mg'] = option('What the Imu topic of a bag is in.', 'm/s^2'),
@@ -207,14 +205,12 @@ def export(
     number: int | None = option(
         'Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
         'Kalibr (0).',
-        None,
         min=0,
     ),
     device_id: int = option("PX4's id of the sensor (TC_An_ID), which it matches by.", 0),
     up: tuple[float, float, float] | None = option(
         'Direction of +g in the sensor frame, at which the drift of the scale is folded '
         'into the offset.',
-        None,
         metavar='X Y Z',
     ),
     force: bool = options.FORCE,
@@ -258,9 +254,7 @@ def import_(
     ),
     output: Path = options.NEW_CALIBRATION,
     serial: str = option('Serial to give the unit.', ..., callback=options.check_serial),
-    number: int | None = option(
-        'Which set, where there are several (TC_A0, INS_TCAL1, imu0).', None
-    ),
+    number: int | None = option('Which set, where there are several (TC_A0, INS_TCAL1, imu0).'),
     gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
     rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
     full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),

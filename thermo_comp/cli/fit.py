@@ -31,31 +31,27 @@ def fit(
     output: Path = options.NEW_CALIBRATION,
     settings: dict[str, Any] = options.fitting,
     static_curve: Curve | None = option(
-        "Bias and scale over temperature; else the model's own.", None, metavar='CURVE'
+        "Bias and scale over temperature; else the model's own.", metavar='CURVE'
     ),
     dynamic_curve: Curve | None = option(
-        'The same of the dynamic set, by itself.', None, metavar='CURVE'
+        'The same of the dynamic set, by itself.', metavar='CURVE'
     ),
-    groups: str | None = option('Groups that may take part, by commas.', None, metavar='A,B'),
+    groups: str | None = option('Groups that may take part, by commas.', metavar='A,B'),
     force_groups: str = option('Groups that stay whatever they earn.', '', metavar='A,B'),
     prior: Path | None = option(
-        'Calibration to begin with: of the type, or an old one.', None, metavar='YAML'
+        'Calibration to begin with: of the type, or an old one.', metavar='YAML'
     ),
     ageing_bias: str | None = option(
-        "What the biases may have changed by since the prior's: 50ug, 0.1mg.", None
+        "What the biases may have changed by since the prior's: 50ug, 0.1mg."
     ),
     ageing_scale: float = option(
         'What the scale may have changed by since, in ppm.', 0.0, metavar='PPM'
     ),
-    report: Path | None = option('Certificate to write (HTML).', None, metavar='HTML'),
+    report: Path | None = option('Certificate to write (HTML).', metavar='HTML'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
-    serial: str | None = option(
-        "Serial, instead of the bags'.", None, callback=options.check_serial
-    ),
+    serial: str | None = option("Serial, instead of the bags'.", callback=options.check_serial),
     offset: float | None = options.OFFSET,
-    columns: Path | None = option(
-        'Column map of the tables, as for convert.', None, metavar='YAML'
-    ),
+    columns: Path | None = option('Column map of the tables, as for convert.', metavar='YAML'),
     rate_hz: float | None = options.TABLE_RATE,
     reading: dict[str, Any] = options.reading_part,
     force: bool = options.FORCE,
@@ -154,15 +150,15 @@ def fleet_fit(
     output: Path = option('Folder of the results; goes on where it was.', ..., '--output', '-o'),
     settings: dict[str, Any] = options.fitting,
     scheduler: str | None = option(
-        'Dask scheduler (tcp://HOST:PORT), instead of this machine alone.', None
+        'Dask scheduler (tcp://HOST:PORT), instead of this machine alone.'
     ),
-    workers: int | None = option('Processes on this machine; all processors.', None, min=1),
+    workers: int | None = option('Processes on this machine; all processors.', min=1),
     certificates: bool = option('Write a certificate for each unit.', True),
     with_prior: bool = option(
         'Fit the units that lack data again with what the others share.', False, '--with-prior'
     ),
     earlier: list[Path] | None = option(
-        'fleet.parquet of an earlier fleet, to see drift.', None, metavar='TABLE'
+        'fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'
     ),
     reading: dict[str, Any] = options.reading,
     out: Output = options.out,

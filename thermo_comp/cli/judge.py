@@ -28,7 +28,7 @@ def evaluate(
         'Calibration; the first is judged, more are compared.', ..., '--calibration', '-c'
     ),
     judging: dict[str, Any] = options.judging,
-    csv: Path | None = option('File for the windows, one a line.', None, metavar='FILE'),
+    csv: Path | None = option('File for the windows, one a line.', metavar='FILE'),
     reading: dict[str, Any] = options.reading_part,
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -145,7 +145,7 @@ def report(
     calibration: list[Path] | None = option(
         'Calibration of the unit; more make its history (YAML).', None, '--calibration', '-c'
     ),
-    figures: Path | None = option('Folder for the figures as PNG files.', None, metavar='DIR'),
+    figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
     judging: dict[str, Any] = options.judging,
     reading: dict[str, Any] = options.reading_part,

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 usage = typer.BadParameter
 
 
-def option(text: str, default: Any, *flags: str, **rules: Any) -> Any:
+def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:
     """Describe an option: what it is for, its flags where they are not its name's, its bounds."""
     return typer.Option(default, *flags, help=text, **rules)
 
@@ -92,17 +92,13 @@ FORCE = option('Overwrite one of the same kind.', False, '--force', '-f')
 QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
 JUDGED_BAGS = argument('Bags to judge it on.', None, metavar='[BAG]...')
-CERTIFICATE_INFO = option('What the laboratory states: number, customer, ... (YAML).', None)
-TABLE_RATE = option('Samples per second of a table without times.', None, min=0.01, max=1e6)
+CERTIFICATE_INFO = option('What the laboratory states: number, customer, ... (YAML).')
+TABLE_RATE = option('Samples per second of a table without times.', min=0.01, max=1e6)
 SERIAL = option(
-    "Serial of the unit, instead of the bag's; '' accepts any calibration.",
-    None,
-    callback=check_serial,
+    "Serial of the unit, instead of the bag's; '' accepts any calibration.", callback=check_serial
 )
 OFFSET = option(
-    'What raw words read without a force, as 32768; found out by itself if it can.',
-    None,
-    metavar='WORD',
+    'What raw words read without a force, as 32768; found out by itself if it can.', metavar='WORD'
 )
 INPUT = option('What is read from the bag.', 'auto', '--input')
 Input = Literal['auto', 'counts', 'imu']
@@ -120,13 +116,9 @@ def out(
 @given
 def names(
     topic: list[str] | None = option(
-        'Where an input stands: counts, imu, board, case, temperature/NAME.',
-        None,
-        metavar='INPUT=TOPIC',
+        'Where an input stands: counts, imu, board, case, temperature/NAME.', metavar='INPUT=TOPIC'
     ),
-    topics: Path | None = option(
-        'The same from a file, INPUT: TOPIC a line.', None, metavar='YAML'
-    ),
+    topics: Path | None = option('The same from a file, INPUT: TOPIC a line.', metavar='YAML'),
 ) -> dict[str, str]:
     """Collect what `--topic` says, and what of the file it does not."""
     from ..plain_yaml import read_plain_yaml
@@ -177,9 +169,9 @@ def reading_part(input_: Input = INPUT, topics: 'Topics' = topics_part) -> dict[
 
 @given
 def place(
-    gravity: float | None = option('Local gravity in m/s^2.', None, metavar='G'),
-    latitude: float | None = option('Latitude in degrees, with --height.', None),
-    height: float | None = option('Height above the ellipsoid in m.', None),
+    gravity: float | None = option('Local gravity in m/s^2.', metavar='G'),
+    latitude: float | None = option('Latitude in degrees, with --height.'),
+    height: float | None = option('Height above the ellipsoid in m.'),
 ) -> float | None:
     """Give local gravity, None where nothing was said; latitude and height go together."""
     if gravity is not None or (latitude is None and height is None):
@@ -196,9 +188,7 @@ def place(
 def judging(
     gravity: float | None = place,
     window_s: float = option('Length of a window at rest, in s.', 60.0, '--window', metavar='S'),
-    tolerance: str | None = option(
-        'Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.', None
-    ),
+    tolerance: str | None = option('Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
     """Give keywords of what judges."""
@@ -214,7 +204,7 @@ def fitting(
     model: Literal['response', 'golovach'] = option(
         "The thermal response, or the paper's two sets alone.", 'response'
     ),
-    full_scale: float | None = option('Magnitude of a saturated sample, in input units.', None),
+    full_scale: float | None = option('Magnitude of a saturated sample, in input units.'),
     reference_temperature: float = option(
         'Reference temperature in degC.', 20.0, min=-273.15, max=1000.0
     ),
@@ -228,7 +218,7 @@ def fitting(
     still_sd: str = option(
         "Largest scatter of samples at rest: a few times the sensor's noise.", '50mg'
     ),
-    allow: list[str] | None = option('Refusal to override, as its message names it.', None),
+    allow: list[str] | None = option('Refusal to override, as its message names it.'),
 ) -> dict[str, Any]:
     """Give keywords of FitOptions; FitError where gravity is none that is found on Earth."""
     given = locals()

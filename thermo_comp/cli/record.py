@@ -39,7 +39,7 @@ def record(
     positions: int = option('Positions wanted.', 18, min=1, max=999),
     soak: str = option('Rest wanted in each: 45min, 1.5h, 30s.', '45min'),
     serial: str | None = option(
-        'Serial of the unit, for the bags.', None, callback=options.check_serial
+        'Serial of the unit, for the bags.', callback=options.check_serial
     ),
     offset: float | None = options.OFFSET,
     reading: dict[str, Any] = options.reading,
