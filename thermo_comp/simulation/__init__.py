@@ -16,10 +16,17 @@ Nothing here is built from a compensator's regressors, reads a file or a clock.
 """
 
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
-from .campaign import PLAN_NAMES, Position, arrays, plan, positions
-from .cyclogram import CYCLOGRAM_NAMES, Cyclogram, parse_cyclogram
+from .campaign import (
+    CYCLOGRAM_NAMES,
+    PLAN_NAMES,
+    Cyclogram,
+    Position,
+    parse_cyclogram,
+    plan,
+    positions,
+)
 from .presets import TRIAD_NAMES, UNIT_NAMES, unit_preset
-from .run import START_NS, SimulatedRun, simulate, simulate_blocks
+from .run import START_NS, SimulatedRun, arrays, simulate, simulate_blocks
 from .unit import UnitModel
 
 __all__ = [

@@ -156,10 +156,6 @@ class ThermalNetwork:
             air += float((temperature - cold) / (hot - cold))
         return air
 
-    def heater_power(self, air: float) -> float:
-        """Return what the thermostat spends in an endless soak, W; 0 without one."""
-        return 0.0 if self.thermostat is None else float(self.settled(air)[len(self.nodes)])
-
 
 class ThermalResponse:
     """
@@ -184,7 +180,9 @@ class ThermalResponse:
         air = np.asarray(knot_air, dtype=float)
         heat = network.thermostat
         if heat is not None:
-            watts = [network.heater_power(float(a)) for a in (air.max(), air.min())]
+            # The state behind the parts' temperatures.
+            n = len(network.nodes)
+            watts = [network.settled(float(a))[n] for a in (air.max(), air.min())]
             if watts[0] < 0.0 or watts[1] > heat.max_power:
                 raise ValueError(
                     f'air of {air.min():g}..{air.max():g} degC needs {watts[0]:.2f}..'

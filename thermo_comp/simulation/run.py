@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..typing import Bools, Floats, Ints
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.gyroscope import MILLIDEGREE
-from .cyclogram import Cyclogram
+from .campaign import Cyclogram, Position
 from .drift import PartHistory, drift_of
 from .network import AIR, ThermalResponse
 from .unit import Stream, SwitchedLoad, UnitModel, first_charge, generator, white
@@ -95,6 +95,34 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
     return next(simulate_blocks(unit, cyclogram, up, block_size=sys.maxsize, **options))
 
 
+def arrays(
+    unit: UnitModel,
+    stations: Iterable[Position],
+    seed: int = 0,
+    *,
+    rate_hz: float = 4.0,
+    gravity: float = STANDARD_GRAVITY,
+) -> list[SimulatedRun]:
+    """Run a unit through a test in memory; each position has a seed of its own, stamps from 0."""
+    solved: dict[Cyclogram, Truth] = {}
+    runs = []
+    for number, one in enumerate(stations):
+        run = simulate(
+            unit,
+            one.program,
+            one.up,
+            rate_hz=rate_hz,
+            seed=1000 * seed + number,
+            gravity=gravity,
+            start_ns=0,
+            # A load is switched by the seed.
+            like=None if unit.load else solved.get(one.program),
+        )
+        solved[one.program] = run.truth
+        runs.append(replace(run, name=one.name))
+    return runs
+
+
 def simulate_blocks(
     unit: UnitModel,
     cyclogram: Cyclogram,
@@ -117,8 +145,6 @@ def simulate_blocks(
     is random in this run, the specimen has its own. Unless `warm`, the unit is switched on at the
     start. `like` is the truth of another run of this unit through this program: its heat flow.
     """
-    if block_size < 1:
-        raise ValueError(f'`block_size` must be at least 1, got {block_size}')
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
     for name, value in positive.items():
@@ -129,15 +155,12 @@ def simulate_blocks(
     if n_cycles < 1:
         raise ValueError(f'the program of {duration} s is shorter than one cycle')
     direction = np.asarray(up, dtype=float)
-    length = np.linalg.norm(direction, axis=-1)
-    if direction.shape != (3,) or not length > 0.0:
-        raise ValueError(f'`up` must be a vector other than zero, shape (3,), got {up!r}')
     if like is None:
         like = _heat_flow(unit, cyclogram, seed, warm)
     truth = replace(
         like,
         bias_grid=like.thermal_bias + _walk(unit, like.grid_s, seed),
-        specific_force=gravity * (direction / length),
+        specific_force=gravity * (direction / np.linalg.norm(direction)),
     )
     read = unit
     if temperature_rate_hz is not None:
