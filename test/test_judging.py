@@ -90,7 +90,7 @@ def made(
         position=np.zeros(n, np.int64),
         start_ns=START_NS + rows * 60 * 10**9,
         time=rows * 60.0 + 30.0,
-        count=np.full(n, 600.0),
+        count=np.full(n, 600),
         mean=constant * K,
         board=np.full(n, 20.0),
         rate=np.zeros(n),

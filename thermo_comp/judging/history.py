@@ -24,14 +24,12 @@ class Epoch:
     """
     One calibration of a history, in a soak at the reference temperature of the first.
 
-    Bias [ug], scale [ppm of the first one], shapes (3,); an sd that nobody claims is NaN.
+    Bias of x y z [ug], scale [ppm of the first one], shape (6,); an sd that nobody claims is NaN.
     """
 
     created: str
-    bias: Floats
-    bias_sd: Floats
-    scale: Floats
-    scale_sd: Floats
+    value: Floats
+    sd: Floats
 
 
 @dataclass(frozen=True)
@@ -70,16 +68,10 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     for number, one in enumerate(ordered):
         bias, bias_sd, scale, scale_sd = in_a_soak(one, ordered[0].reference_temperature_c)
         first = first if number else scale
-        claim = 1.0 if one.has_uncertainty else np.nan
-        found.append(
-            Epoch(
-                created=one.provenance.created or f'no. {number + 1}',
-                bias=bias / MICRO_G,
-                bias_sd=claim * bias_sd / MICRO_G,
-                scale=1e6 * (scale / first - 1.0),
-                scale_sd=claim * 1e6 * scale_sd,
-            )
-        )
+        value = np.concatenate((bias / MICRO_G, 1e6 * (scale / first - 1.0)))
+        sd = np.concatenate((bias_sd / MICRO_G, 1e6 * scale_sd))
+        created = one.provenance.created or f'no. {number + 1}'
+        found.append(Epoch(created, value, sd if one.has_uncertainty else np.full(6, np.nan)))
     return tuple(found)
 
 
@@ -89,12 +81,11 @@ def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
         Drift(
             earlier=before.created,
             later=after.created,
-            constant=f'{name} {axis}',
-            unit=unit,
-            change=float(getattr(after, name)[i] - getattr(before, name)[i]),
-            sd=float(np.hypot(getattr(before, f'{name}_sd')[i], getattr(after, f'{name}_sd')[i])),
+            constant=f'{"scale" if k // 3 else "bias"} {AXES[k % 3]}',
+            unit='ppm' if k // 3 else 'ug',
+            change=float(after.value[k] - before.value[k]),
+            sd=float(np.hypot(before.sd[k], after.sd[k])),
         )
         for before, after in pairwise(history)
-        for name, unit in (('bias', 'ug'), ('scale', 'ppm'))
-        for i, axis in enumerate(AXES)
+        for k in range(6)
     ]

@@ -65,7 +65,7 @@ class Windows:
     position: Ints
     start_ns: Stamps
     time: Floats
-    count: Floats
+    count: Ints
     mean: Floats
     board: Floats
     rate: Floats
@@ -139,21 +139,15 @@ def corrected_windows(
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
         claimed_sd = np.sqrt(np.maximum(table['variance'] - noise, 0.0) + mean_white)
         noise_sd = np.sqrt(mean_white)
-    bag = table['bag'].astype(np.int64)
-    origin = np.array([one.start_ns for one in bags], dtype=np.int64)
-    same = ('time', 'count', 'mean', 'board', 'rate', 'force', 'gyro')
     return Windows(
         window_s=window_s,
         gravity=np.nan if gravity is None else gravity,
-        bag=bag,
-        position=table['position'].astype(np.int64),
-        start_ns=np.rint(table['start'] * 1e9).astype(np.int64) + origin[bag],
         is_dynamic=table['weight'] > 0.5,
         is_inside=table['excess'] <= _EDGE,
         raw=raw,
         claimed_sd=claimed_sd,
         noise_sd=noise_sd,
-        **{name: table[name] for name in same},
+        **{name: table[name] for name in (*_ONCE, 'time', 'board', 'rate', *_TRIPLES, 'gyro')},
     )
 
 
@@ -166,7 +160,7 @@ def csv_of(windows: Windows, bags: Sequence[str]) -> str:
         'start_ns': windows.start_ns,
         'time_s': windows.time,
         'window_s': np.full(len(windows), windows.window_s),
-        'samples': windows.count.astype(int),
+        'samples': windows.count,
         'board_c': windows.board,
         'board_rate_k_min': windows.rate * 60.0,
         'regime': np.where(windows.is_dynamic, 'dynamic', 'static'),
@@ -195,9 +189,10 @@ def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floa
 
 # Sums, and then windows, in rows with names.
 _Table: TypeAlias = npt.NDArray[Any]
-# What is there once for a window; all else is averaged over its sums.
-_ONCE = ('bag', 'position', 'start', 'count', 'excess')
+# What is there once for a window, all else but `excess` is averaged over its sums.
+_ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance')
+_TRIPLES = ('mean', 'force')
 
 
 def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s: float) -> _Table:
@@ -206,8 +201,10 @@ def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s
     if calibration is not None and calibration.gyroscope is not None:
         n_gyro = 9 + Layout(Correction(calibration).memory).width
     kind = np.dtype(
-        [(name, float) for name in (*_ONCE, *_AVERAGED)]
-        + [('mean', float, 3), ('force', float, 3), ('gyro', float, n_gyro)]
+        [(name, np.int64) for name in _ONCE]
+        + [(name, float) for name in (*_AVERAGED, 'excess')]
+        + [(name, float, 3) for name in _TRIPLES]
+        + [('gyro', float, n_gyro)]
     )
     parts: list[_Table] = [np.zeros(0, kind)]
     n_positions = 0
@@ -222,24 +219,27 @@ def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s
         sums: list[_Table] = [np.zeros(0, kind)]
         for one in bag.intervals:
             n = one.n_whole // per * per
-            own = np.full(n, np.nan, kind)
+            own = np.zeros(n, kind)
             own['bag'], own['position'] = number, n_positions
-            own['start'] = one.begin_s + bag.window_s * np.arange(n)
+            begin_s = one.begin_s + bag.window_s * np.arange(n)
+            own['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
             own['count'], own['time'], own['mean'] = one.count[:n], one.time[:n], one.mean[:n]
+            own['gyro'] = np.nan
             if n_gyro and one.angular_rate is not None:
                 own['gyro'][:, :3] = one.angular_rate[:n]
             sums.append(own)
             n_positions += 1
         whole = np.concatenate(sums)
-        if len(whole):
-            if calibration is None:
-                _keep(bag, whole)
-            else:
-                _correct(calibration, bag, whole)
-            # Messages were lost, or the bag ends within it.
-            usual = np.median(whole['count'])
-            whole['excess'][whole['count'] < _LEAST_FILLED * usual] = np.nan
-            parts.append(_joined(whole.reshape(-1, per)))
+        if calibration is None:
+            since = (bag.board.stamp_ns - bag.start_ns) * 1e-9
+            whole['board'] = np.interp(whole['time'], since, bag.board.value) if len(whole) else 0
+            whole['force'] = whole['mean']
+        else:
+            _correct(calibration, bag, whole)
+        # Messages were lost, or the bag ends within it.
+        few = _LEAST_FILLED * np.median(whole['count']) if len(whole) else 0.0
+        whole['excess'][whole['count'] < few] = np.nan
+        parts.append(_joined(whole.reshape(-1, per)))
     return np.concatenate(parts)
 
 
@@ -249,16 +249,9 @@ def _joined(sums: _Table) -> _Table:
     result['count'] = sums['count'].sum(axis=1)
     result['excess'] = sums['excess'].max(axis=1)
     share = sums['count'] / result['count'][:, None]
-    for name in (*_AVERAGED, 'mean', 'force', 'gyro'):
+    for name in (*_AVERAGED, *_TRIPLES, 'gyro'):
         result[name] = np.einsum('nk,nk...->n...', share, sums[name])
     return np.asarray(result[np.isfinite(result['excess'])])
-
-
-def _keep(bag: ReducedBag, sums: _Table) -> None:
-    since = (bag.board.stamp_ns - bag.start_ns) * 1e-9
-    sums['board'] = np.interp(sums['time'], since, bag.board.value)
-    sums['force'] = sums['mean']
-    sums['excess'] = sums['rate'] = sums['weight'] = 0.0
 
 
 def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
@@ -277,6 +270,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
         corrected = compensator.process(stamp_ns, *row['mean'].tolist())
         status = take_snapshot(compensator)
         if corrected is None or status.state is None:
+            row['excess'] = np.nan
             continue
         row['force'] = corrected[:3]
         row['variance'] = variance_along(corrected[:3], corrected[3:])

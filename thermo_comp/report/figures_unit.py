@@ -239,15 +239,15 @@ def draw_history(evidence: Evidence) -> Figure:
     history = evidence.history
     figure, panels = _bias_and_scale(2.6, 'change')
     places = np.arange(len(history))
-    for axes, name in zip(panels, ('bias', 'scale'), strict=True):
-        value, sd = (
-            np.array([getattr(one, key) for one in history]) for key in (name, f'{name}_sd')
-        )
-        change, half = value - value[0], BAND_SDS * np.nan_to_num(sd)
+    change = np.array([one.value - history[0].value for one in history])
+    half = BAND_SDS * np.nan_to_num([one.sd for one in history])
+    for axes, name, first in zip(panels, ('bias', 'scale'), (0, 3), strict=True):
         for i, (axis, marker) in enumerate(zip(AXES, 'os^', strict=True)):
             look: style.Line = {'marker': marker, 'markersize': 3.5, **style.AXIS_LINES[i]}
             at = places + 0.08 * (i - 1)
-            axes.errorbar(at, change[:, i], half[:, i], label=axis, capsize=2.0, **look)
+            axes.errorbar(
+                at, change[:, first + i], half[:, first + i], label=axis, capsize=2.0, **look
+            )
         axes.set_xticks(places, [label_text(one.created[:10]) for one in history])
         style.legend_above(axes, name, share=0.5)
     return figure
