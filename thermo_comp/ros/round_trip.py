@@ -3,10 +3,9 @@
 """
 Owns the round trip: bag -> player -> DDS -> node process -> DDS -> recorder -> bag, without loss.
 
-Everything on the way is what runs on a robot; only the QoS differs, through the parameters made
-for that: subscriptions reliable and without a limit of depth. And the player waits for what comes
-out of the node: a reliable reader that is full lets a sample be sent again, later than the
-temperatures behind it, and the order of arrival would no longer be that of the bag.
+Everything on the way is what runs on a robot; only the QoS differs: subscriptions reliable and
+without a limit of depth. And the player waits for the node: a reliable reader that is full lets a
+sample be sent again, later than the temperatures behind it, in another order than the bag's.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -31,22 +29,17 @@ from ..recording import ROLES
 from ..unit.calibration_file import load_calibration
 from .listener import OUTPUTS, Recorder
 from .node import NODE_NAME
-from .player import LOOK, PlayReport, opened_player
+from .player import PlayReport, opened_player
 
-#: What the node makes of samples.
-SAMPLES = 'imu/data_raw'
-#: How long node and recorder may take to find each other [s].
-DISCOVERY_S = 30.0
+#: How long node and recorder may take to find each other, or to take what comes last: a message
+#: that Fast DDS has to repeat is 3 s late, on a busy machine several times [s].
+PATIENCE_S = 30.0
 #: How long the node may take to answer [s]; then it is asked again.
 ANSWER_S = 1.0
 #: How long the node may take to end [s].
 STOPPING_S = 10.0
-#: A message that Fast DDS has to repeat is 3 s late, on a busy machine several times [s].
-COMPLETION_S = 30.0
-#: Samples that do not come out for this long were dropped by the node [s].
-DROPPED_S = 0.5
-#: Samples that the node may be behind the player.
-IN_FLIGHT = 1000
+#: Samples that the node may be behind the player; its middleware holds 5000.
+IN_FLIGHT = 2000
 
 _TOPICS = {**OUTPUTS, 'diagnostics': DiagnosticArray}
 
@@ -135,43 +128,40 @@ def round_trip(
         Recorder(output, topics=_TOPICS, ros_args=ros_args, overwrite=overwrite) as recorder,
     ):
 
+        def account() -> dict[str, str]:
+            """Return what the node has said of itself last."""
+            newest = recorder.newest('diagnostics')
+            return {one.key: one.value for one in newest.status[0].values} if newest else {}
+
         def is_connected(_: object) -> bool:
             # The node learns of the recorder's subscriptions in the order in which they were made:
             # once it is heard on the last one it sends on all of them.
-            return recorder.has_publishers and recorder.newest('diagnostics') is not None
+            return not node.is_alive or (recorder.has_publishers and bool(account()))
 
-        recorder.wait_until(lambda _: is_connected(_) or not node.is_alive, DISCOVERY_S)
-        if not is_connected(None):
+        if not recorder.wait_until(is_connected, PATIENCE_S) or not node.is_alive:
             raise ThermoCompError(' '.join(node.said.split()) or 'the node was not found')
-        n_dropped = 0
 
         def throttle(n_sent: int) -> None:
-            """Wait for the recorder; what does not come at all counts as dropped."""
-            nonlocal n_dropped
-            n_out = recorder.counts[SAMPLES]
-            while n_sent - n_dropped - n_out > IN_FLIGHT:
-                # Diagnostics go on coming, whatever becomes of the samples.
-                if not recorder.wait_until(lambda now, n=n_out: now[SAMPLES] > n, DROPPED_S):
-                    n_dropped = n_sent - n_out
-                n_out = recorder.counts[SAMPLES]
+            """Wait for the node, which tells how far it is ten times a second."""
+            recorder.wait_until(
+                lambda _: n_sent - int(account()['samples in']) <= IN_FLIGHT, ANSWER_S
+            )
 
         with opened_player(bag, rate, ros_args=ros_args) as player:
-            deadline, awaited = time.monotonic() + DISCOVERY_S, ['accel', *thermometers]
-            while player.unheard(awaited) or not _answers(player.node):
-                if time.monotonic() > deadline:
-                    break
-                time.sleep(LOOK)
+            awaited = ['accel', *thermometers]
+            recorder.wait_until(
+                lambda _: not player.unheard(awaited) and _answers(player.node), PATIENCE_S
+            )
             played = player.run(progress, throttle)
 
         def is_complete(counts: Mapping[str, int]) -> bool:
             """Tell whether the node has taken all, and the recorder all that it published."""
-            (status,) = recorder.newest('diagnostics').status
-            account = {one.key: one.value for one in status.values}
-            expected = [account[key] for key in ('samples in', 'samples out', 'flags', 'flags')]
+            said = account()
+            expected = [said[key] for key in ('samples in', 'samples out', 'flags', 'flags')]
             found = [max(played.n_messages.values()), *(counts[topic] for topic in OUTPUTS)]
-            return expected == [str(count) for count in found]
+            return not node.is_alive or expected == [str(count) for count in found]
 
-        recorder.wait_until(is_complete, COMPLETION_S)
+        recorder.wait_until(is_complete, PATIENCE_S)
         if not node.is_alive:
             raise ThermoCompError(f'the node ended: {" ".join(node.said.split())}')
         return played, recorder.counts
