@@ -257,7 +257,7 @@ def play(
         out.note(f'nobody listened to {name}')
     for name in report.lossy:
         out.note(f'{name} has a best-effort subscriber, which can lose messages')
-    out.told([(bag, report.chosen, report.missing)])
+    out.told([(bag, report.info.chosen, report.info.truncated)])
     out.table(('topic', 'messages'), sorted(report.n_messages.items()))
     out.line(f'played in {report.duration_s:.1f} s')
     out.end(messages=report.n_messages, **picked(report, 'duration_s unheard lossy'))

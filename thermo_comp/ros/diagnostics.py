@@ -59,6 +59,12 @@ _RISEN = {
     'n_unpublished': (_WARN, 'messages not accepted by DDS'),
 }
 
+_FAULTS = {
+    Fault.STILL: 'stands still to the bit, its uncertainty grows',
+    Fault.FROZEN: 'frozen: the other moves; its readings are not used',
+    Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
+}
+
 #: Level and text.
 Finding = tuple[int, str]
 
@@ -251,12 +257,8 @@ def _findings(
         if new[name]:
             yield level, f'{new[name]} {text.format(full_scale=unit.full_scale)}'
     for name, (fault, step) in status.faults.items():
-        if fault == Fault.STILL:
-            yield _WARN, f'{name} temperature stands still to the bit, its uncertainty grows'
-        elif fault == Fault.FROZEN:
-            yield _WARN, f'{name} temperature frozen: the other moves; its readings are not used'
-        elif fault == Fault.STEP:
-            yield _WARN, f'{name} temperature jumped by {step:+.2f} K; its readings are not used'
+        if fault in _FAULTS:
+            yield _WARN, f'{name} temperature {_FAULTS[fault].format(step)}'
     if status.pending_ahead_s > AHEAD_S:
         text = f'{status.pending_ahead_s:.0f} s ahead of the samples'
         yield _WARN, f'temperatures are stamped {text}'

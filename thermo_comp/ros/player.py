@@ -8,10 +8,9 @@ remappings and a namespace apply as to a sensor driver. The messages are those o
 for byte, in the bag's order; ROS 1 messages are rewritten in CDR.
 
 Flow control: after `WINDOW` messages of a topic the player waits until every reliable subscriber
-has acknowledged them, so no more than that is ever under way, which fits into the queues of the
-transport, and none is overwritten before it has arrived. Fast DDS asks for acknowledgement with
-every message only while the publisher's history is full, and otherwise every 3 s; hence the small
-histories, which transient-local durability keeps full.
+has acknowledged them, so that the queues of the transport hold what is under way. Fast DDS asks
+for acknowledgement with every message only while the publisher's history is full, and otherwise
+every 3 s; hence the small histories, which transient-local durability keeps full.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Vector3Stamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Imu, Temperature
+from sensor_msgs.msg import Temperature
 
 from ..errors import ThermoCompError
-from ..recording import Block, Input, RecordingReader, Role, Topics, open_recording
+from ..recording import Block, Input, RecordingInfo, RecordingReader, Role, Topics, open_recording
+from .relay import INPUTS
 from .waitloop import own_node
 
 NODE_NAME = 'thermo_comp_player'
@@ -53,8 +52,6 @@ SETTLING = 0.3
 #: How long a subscriber may leave a window unacknowledged [s].
 PATIENCE = 30.0
 
-_ACCEL = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
-
 
 @dataclass(frozen=True, slots=True)
 class PlayReport:
@@ -66,9 +63,8 @@ class PlayReport:
     #: Topics to which nobody listened, and those with a best-effort subscriber, which can lose.
     unheard: list[str]
     lossy: list[str]
-    #: Which topics of the bag were taken by their type, and what of it could not be read.
-    chosen: str | None
-    missing: str | None
+    #: The bag: which of its topics were taken by their type, what of it could not be read.
+    info: RecordingInfo
 
 
 def play(
@@ -119,7 +115,7 @@ class Player:
     def __init__(self, node: Node, reader: RecordingReader, rate: float) -> None:
         self.node, self._reader, self._rate = node, reader, rate
         kinds = {role: (Temperature, f'temperature/{role}') for role in reader.topics}
-        kinds['accel'] = _ACCEL[reader.info.input or 'counts']
+        kinds['accel'] = INPUTS[reader.info.input or 'counts']
         self._publishers: dict[Role, Any] = {
             role: node.create_publisher(
                 *kinds[role],
@@ -150,24 +146,19 @@ class Player:
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {one.topic_name: role for role, one in self._publishers.items()}
-        unheard, lossy = (
-            self.unheard(),
-            [
-                name
-                for name in topics
-                for end in self.node.get_subscriptions_info_by_topic(name)
-                if end.qos_profile.reliability != ReliabilityPolicy.RELIABLE
-            ],
-        )
+        unheard = self.unheard()
+        lossy = [
+            name
+            for name in topics
+            for end in self.node.get_subscriptions_info_by_topic(name)
+            if end.qos_profile.reliability != ReliabilityPolicy.RELIABLE
+        ]
         started = time.monotonic()
         start_ns: int | None = None
         for block in reader.blocks(raw=True):
             for _, log_ns, role, data in _in_order(block):
                 start_ns = log_ns if start_ns is None else start_ns
-                if self._rate:
-                    self._pace(started, start_ns, log_ns)
-                elif time.monotonic() >= self._next_clock:
-                    self._tell_time(log_ns)
+                self._pace(started, start_ns, log_ns)
                 self._publishers[role].publish(data)
                 n_sent[role] += 1
                 if n_sent[role] % WINDOW[role] == 0:
@@ -182,26 +173,23 @@ class Player:
             time.monotonic() - started,
             unheard,
             list(dict.fromkeys(lossy)),
-            reader.info.chosen,
-            reader.info.truncated,
+            reader.info,
         )
 
     def _pace(self, started: float, start_ns: int, log_ns: int) -> None:
         """Sleep until a message is due; tell the time meanwhile."""
-        due = started + (log_ns - start_ns) * 1e-9 / self._rate
+        due = started + (log_ns - start_ns) * 1e-9 / self._rate if self._rate else started
         while True:
             now = time.monotonic()
+            left_s = max(0.0, due - now)
             if now >= self._next_clock:
-                self._tell_time(start_ns + int((min(now, due) - started) * self._rate * 1e9))
-            if now >= due:
+                self._next_clock = now + CLOCK_PERIOD
+                told, message = log_ns - int(left_s * self._rate * 1e9), Clock()
+                message.clock.sec, message.clock.nanosec = divmod(told, 1_000_000_000)
+                self._clock.publish(message)
+            if not left_s:
                 return
-            time.sleep(min(due - now, CLOCK_PERIOD))
-
-    def _tell_time(self, log_ns: int) -> None:
-        self._next_clock = time.monotonic() + CLOCK_PERIOD
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = divmod(log_ns, 1_000_000_000)
-        self._clock.publish(message)
+            time.sleep(min(left_s, CLOCK_PERIOD))
 
     def _await_acknowledgement(self, role: Role) -> None:
         publisher = self._publishers[role]
