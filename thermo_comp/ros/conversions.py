@@ -30,9 +30,6 @@ LONGEST_FRAME = 255
 #: An Imu with such a name is shorter; what is longer is not even read.
 _LONGEST_MESSAGE = 1024
 
-# What rclpy raises for bytes that are not the message, or for a name that is not UTF-8.
-_UNREADABLE = (RuntimeError, ValueError)
-
 _ENCAPSULATION = b'\0\1\0\0'
 _HEADER = Struct('<4siI4x')
 # An Imu is orientation 4 + 9, angular velocity 3 + 9, linear acceleration 3 + 9 float64 values;
@@ -64,15 +61,12 @@ class SampleConverter:
     def __init__(
         self, message_type: Any, frame_id: str = '', traffic: Traffic | None = None
     ) -> None:
-        self._message_type = message_type
-        self._frame_id = frame_id
+        self._message_type, self._frame_id = message_type, frame_id
         self.traffic = traffic or Traffic()
-        # Of the last kind of message: its frame, what unpacks it, where what it passes on begins.
-        self._name = b''
+        # Of the last kind of message: its frame, what unpacks it, where what it passes on begins;
+        # of the Imu: its frame and what packs it.
+        self._name, self._passed, self._frame = b'', 0, b''
         self._unpack: Callable[[bytes], tuple[Any, ...]] = Struct('').unpack
-        self._passed = 0
-        # Of the Imu: its frame and what packs it.
-        self._frame = b''
         self._pack: Callable[..., bytes] = Struct('').pack
         #: What `process` last gave, for reports.
         self.last_result: tuple[float, ...] | None = None
@@ -140,8 +134,7 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
     # rclpy's deserialization costs it as much as several samples.
     start = _values_at(data, 16)
     if not start:
-        data = _plain(data, Temperature)
-        start = _values_at(data, 16)
+        start = _values_at(data := _plain(data, Temperature), 16)
     if not start:
         return None
     _, sec, nanosec = _HEADER.unpack_from(data)
@@ -170,6 +163,7 @@ def _plain(data: bytes, message_type: Any) -> bytes:
         return b''
     try:
         written: bytes = serialize_message(deserialize_message(data, message_type))
-    except _UNREADABLE:
+    except (RuntimeError, ValueError):
+        # RuntimeError is rclpy's own, ValueError that of a name that is not UTF-8.
         return b''
     return written

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -57,7 +56,7 @@ _CLASSES = {type_name(kind): kind for kind in (Vector3Stamped, Imu, Temperature)
 _STAMP = Struct('<iI')
 
 
-class _Listener(ABC):
+class _Listener:
     """A node whose subscriptions are emptied in a thread of its own, while the context lasts."""
 
     def __init__(self, name: str, ros_args: Sequence[str]) -> None:
@@ -84,7 +83,6 @@ class _Listener(ABC):
         """Stop, take what came last, destroy the node; do nothing the second time."""
         self._stack.close()
 
-    @abstractmethod
     def _open(self) -> None:
         """Subscribe."""
 
@@ -115,8 +113,8 @@ class Recorder(_Listener):
         self._counts = dict.fromkeys(topics, 0)
         self._newest: dict[str, bytes] = {}
         self._newest_ns: int | None = None
-        # What came before any stamp.
-        self._early: list[tuple[str, list[bytes]]] = []
+        # What is not written yet: topic, messages, their log times if they have stamps.
+        self._held: list[tuple[str, list[bytes], Ints | None]] = []
 
     def __exit__(self, *raised: object) -> None:
         """Stop; finish the bag, or drop it after an error."""
@@ -162,21 +160,19 @@ class Recorder(_Listener):
     def _record(self, name: str, messages: list[bytes], _received_ns: list[int]) -> None:
         """Write messages; those without a stamp once there is one."""
         self._newest[name] = messages[-1]
+        log_ns: Ints | None = None
         if self._topics[name] is Imu:
             stamps = np.array([_STAMP.unpack_from(data, 4) for data in messages])
             log_ns = stamps[:, 0] * 10**9 + stamps[:, 1]
             self._newest_ns = int(log_ns[-1])
-            self._write(name, messages, log_ns)
-        else:
-            self._early.append((name, messages))
-        if self._newest_ns is not None:
-            for early in self._early:
-                self._write(*early, np.full(len(early[1]), self._newest_ns))
-            self._early.clear()
-
-    def _write(self, name: str, messages: list[bytes], log_ns: Ints) -> None:
-        self._writer.write_raw(name, type_name(self._topics[name]), log_ns, messages)
-        self._counts[name] += len(messages)
+        self._held.append((name, messages, log_ns))
+        if self._newest_ns is None:
+            return
+        for one, waiting, times in self._held:
+            log_ns = np.full(len(waiting), self._newest_ns) if times is None else times
+            self._writer.write_raw(one, type_name(self._topics[one]), log_ns, waiting)
+            self._counts[one] += len(waiting)
+        self._held.clear()
 
 
 class LiveTopics(_Listener):

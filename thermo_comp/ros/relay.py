@@ -12,10 +12,11 @@ that input is used, nor the first messages after it, which may still be of the o
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
+from operator import itemgetter
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -50,8 +51,8 @@ IDLE_NS = 1_000_000_000
 #: The two messages of the flag, serialized.
 _FLAGS: list[bytes] = [serialize_message(Bool(data=is_dynamic)) for is_dynamic in (False, True)]
 
-# A temperature that has arrived: received [ns], of which thermometer, stamp [ns], degC.
-_Reading = tuple[int, str, int, float]
+# A temperature that has arrived: received [ns]; of which thermometer, stamp [ns], degC.
+_Reading = tuple[int, tuple[str, int, float]]
 
 
 @contextmanager
@@ -92,9 +93,8 @@ class Relay:
             }
         imu = open_publisher(node, Imu, 'imu/data_raw', OUTPUT_QOS)
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
-        self._publish_flag = open_publisher(node, Bool, 'regime/dynamic', FLAG_QOS).publish
-        stamped = open_publisher(node, DiagnosticArray, STAMPED_TOPIC, FLAG_QOS)
-        self._publish_stamped = stamped.publish
+        self._flag = open_publisher(node, Bool, 'regime/dynamic', FLAG_QOS)
+        self._stamped = open_publisher(node, DiagnosticArray, STAMPED_TOPIC, FLAG_QOS)
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
         self._contested: set[RawSubscription] = set()
@@ -142,22 +142,20 @@ class Relay:
         return False
 
     def advance_without_samples(self, silence_ns: int) -> None:
-        """
-        Let readings take effect without samples, so that the flag stays alive.
-
-        After so long a silence none is newer than the last one by much more, whatever its stamp
-        says.
-        """
+        """Let readings take effect without samples, so that the flag stays alive."""
         if self._newest_reading_ns is None:
             return
         horizon_ns = self._newest_reading_ns - IDLE_NS
         last_ns = self._compensator.now_ns
         if last_ns is not None:
+            # None is newer than the last sample by much more, whatever its stamp says.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
-        for _, name, stamp_ns, celsius in self._readings:
-            if stamp_ns <= horizon_ns:
-                self._compensator.push(name, stamp_ns, celsius)
-        self._readings = [one for one in self._readings if one[2] > horizon_ns]
+        readings, self._readings = self._readings, []
+        for received, reading in readings:
+            if reading[1] <= horizon_ns:
+                self._compensator.push(*reading)
+            else:
+                self._readings.append((received, reading))
         self._compensator.flush(horizon_ns)
         self._publish_flags()
 
@@ -168,22 +166,19 @@ class Relay:
                 self.traffic.n_malformed += 1
             else:
                 self._newest_reading_ns = reading[0]
-                self._readings.append((received, name, *reading))
+                self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
         """Relay up to the last reading that came before the last sample; return the rest."""
         start = 0
-        later: list[_Reading] = []
-        for reading in sorted(self._readings, key=lambda one: one[0]):
-            received, name, stamp_ns, celsius = reading
-            if received > received_ns[-1]:
-                later.append(reading)
-                continue
+        self._readings.sort(key=itemgetter(0))
+        n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))
+        readings, self._readings = self._readings[:n], self._readings[n:]
+        for received, reading in readings:
             end = bisect_left(received_ns, received, start)
             self._relay(messages[start:end])
-            self._compensator.push(name, stamp_ns, celsius)
+            self._compensator.push(*reading)
             start = end
-        self._readings = later
         return messages[start:]
 
     def _relay(self, messages: list[bytes]) -> None:
@@ -203,8 +198,8 @@ class Relay:
         for stamp_ns, is_dynamic in self._compensator.take_flags():
             serial = self._compensator.calibration.unit.serial
             try:
-                self._publish_flag(_FLAGS[is_dynamic])
-                self._publish_stamped(stamped_flag(stamp_ns, is_dynamic, serial))
+                self._flag.publish(_FLAGS[is_dynamic])
+                self._stamped.publish(stamped_flag(stamp_ns, is_dynamic, serial))
             except RCLError:
                 self._count_unpublished()
             self.traffic.n_flags += 1
