@@ -52,7 +52,6 @@ class Traffic:
     n_flags: int = 0  # regime flags published, one for each reading that decides
     n_fallback: int = 0  # samples that rclpy had to bring into the plain form
     n_contested: int = 0  # messages not used because their input had more than one publisher
-    n_failures: int = 0  # callbacks of the node that ended in an exception
 
 
 class SampleConverter:

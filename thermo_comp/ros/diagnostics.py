@@ -3,9 +3,8 @@
 """
 Owns what the node says about itself: the compensator's status as a `DiagnosticStatus`.
 
-The level follows one rule. ERROR: nothing good goes out, or samples are saturated. WARN: what goes
-out is worse than the calibration promises. OK: the rest. The message names every reason, the worst
-first; the key values hold the figures.
+ERROR: nothing good goes out, or samples are saturated. WARN: what goes out is worse than the
+calibration promises. The message names every reason, the worst first; the values hold the figures.
 """
 
 from __future__ import annotations
@@ -124,9 +123,9 @@ class Reporter:
                 log.error(message.message)
 
     def _count(self) -> dict[str, int]:
-        counters, traffic = self._compensator.counters, self._relay.traffic
-        traffic.n_failures = self._loop.n_failures
-        return {'n_in': counters.n_in, **asdict(counters), **asdict(traffic)}
+        counters, traffic = self._compensator.counters, asdict(self._relay.traffic)
+        traffic['n_failures'] = self._loop.n_failures
+        return {'n_in': counters.n_in, **asdict(counters), **traffic}
 
     def _count_lost(self) -> None:
         """Count gaps in the driver's numbering, which mean something only while it is one."""

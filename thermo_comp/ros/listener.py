@@ -4,9 +4,8 @@
 Owns nodes that only listen: the node's output into a bag, its inputs as blocks.
 
 The log time of an output is the stamp of an Imu, and for anything else the newest such stamp
-before it, as in what `replay` writes; so a bag that was played faster than real time is recorded
-in its own time, whatever the clock on the wall says meanwhile. That of an input is when it was
-received.
+before it, as in what `replay` writes, however fast a bag is played. That of an input is when it
+was received.
 """
 
 from __future__ import annotations
@@ -195,11 +194,7 @@ class LiveTopics(_Listener):
         return sum(one.n_lost for one in self._heard.values())
 
     def blocks(self, wait: Callable[[float], bool]) -> Iterator[News | None]:
-        """
-        Give what has come, and None after each time; to the last message.
-
-        `wait` waits so long [s] and tells whether to end.
-        """
+        """Give what has come, and None after each `wait` [s], until that tells to end."""
         is_over = False
         while not is_over:
             is_over = wait(BLOCK_S)

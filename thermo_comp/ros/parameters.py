@@ -216,18 +216,21 @@ def _checked(name: str, value: Any) -> Any:
     return value
 
 
-#: Runs beside the samples: what takes time about a change.
-Prepare = Callable[[list[Parameter]], Any]
-#: Runs between two samples: sets what was prepared.
-Apply = Callable[[list[Parameter], Any], SetParametersResult]
-
-
 class ParameterRequests:
     """
-    What answers a node's parameter services; exceptions of the halves of a change are refusals.
+    What answers a node's parameter services.
+
+    `prepare` does what takes time about a change, beside the samples, `apply` sets what comes of
+    it, between two of them. Exceptions are refusals.
     """
 
-    def __init__(self, node: Node, loop: WaitLoop, prepare: Prepare, apply: Apply) -> None:
+    def __init__(
+        self,
+        node: Node,
+        loop: WaitLoop,
+        prepare: Callable[[list[Parameter]], Any],
+        apply: Callable[[list[Parameter], Any], SetParametersResult],
+    ) -> None:
         self._node, self._loop, self._prepare, self._apply = node, loop, prepare, apply
         self._n_waiting = 0
         self._beside = ThreadPoolExecutor(1, 'parameters')

@@ -77,11 +77,7 @@ def play(
     ros_args: Sequence[str] = (),
     progress: Callable[[float], None] = lambda _: None,
 ) -> PlayReport:
-    """
-    Publish a bag's samples and temperatures, as `opened_player`.
-
-    Begins when all topics have subscribers, after `wait_s` at most.
-    """
+    """Play a bag, as `opened_player`, when all topics have subscribers, after `wait_s` at most."""
     with opened_player(path, rate, topics, input, ros_args) as player:
         deadline = time.monotonic() + wait_s
         while player.unheard() and time.monotonic() < deadline:
@@ -138,10 +134,9 @@ class Player:
         self, progress: Callable[[float], None], throttle: Callable[[int], None] = lambda _: None
     ) -> PlayReport:
         """
-        Send the whole bag, wait until everything has arrived, and account for it.
+        Send the whole bag; ThermoCompError if a reliable subscriber stops.
 
-        `throttle` gets the number of samples sent after each window and may block. ThermoCompError
-        if a reliable subscriber stops.
+        `throttle` gets the number of samples sent after each window and may block.
         """
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())

@@ -4,8 +4,7 @@
 Owns what a process sets up before its first node: its end by a signal, its Fast DDS profile.
 
 The middleware's own handlers shut the context down from a thread of theirs, under whatever is
-using it: seldom, and on a busy machine, that ends in a segmentation fault instead of exit code 0.
-Here the interpreter only notes the signal, whichever thread the system interrupts with it; a
+using it, which seldom ends in a segmentation fault. Here the interpreter only notes the signal; a
 thread asks the loop to stop, whose own thread then takes everything down in order.
 """
 
@@ -19,19 +18,16 @@ from pathlib import Path
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-#: Where Fast DDS 2 is told of a profile. Other middlewares, and Fast DDS 3, do not look here.
-VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-#: Without that it takes this file of the working directory.
-LOCAL_PROFILE = 'DEFAULT_FASTRTPS_PROFILES.xml'
+#: Where Fast DDS 2 is told of a profile, and the file of the working directory that it takes else.
+VARIABLE, LOCAL_PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE', 'DEFAULT_FASTRTPS_PROFILES.xml'
 PROFILE = Path(__file__).with_name('fastdds_profile.xml')
 
 
 def use_profile() -> None:
     """
-    Make the node's profile that of this process; a profile of the user's stays.
+    Make the node's profile that of this process, before its first context, but for a user's own.
 
-    To be called before the first context is initialised: Fast DDS reads it once. The profile saves
-    a quarter of the node's CPU time with reliable subscribers (docs/benchmarks.md).
+    It saves a quarter of the CPU time with reliable subscribers (docs/benchmarks.md).
     """
     if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
         os.environ[VARIABLE] = str(PROFILE)

@@ -3,8 +3,8 @@
 """
 Owns the way of the samples through the node: in the order of arrival, compensated, published.
 
-A wake-up takes what has arrived of all three inputs, samples first, and works through it in the
-order of arrival. So it does not matter how the wake-ups fell.
+A wake-up takes what has arrived of all inputs, samples first, and works through it in the order
+of arrival. So it does not matter how the wake-ups fell.
 
 An input has one source. A message does not tell whose it is, so while there are two nothing of
 that input is used, nor the first messages after it, which may still be of the one that left.

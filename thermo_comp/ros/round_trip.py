@@ -112,11 +112,7 @@ def round_trip(
     overwrite: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[PlayReport, dict[str, int]]:
-    """
-    Play a bag into a node and record what comes out, in a namespace of their own.
-
-    Returns what was played and how much was recorded, by topic.
-    """
+    """Play a bag into a node; return what was played and how much was recorded, by topic."""
     namespace = f'/round_trip_{os.getpid()}'
     ros_args = ['-r', f'__ns:={namespace}']
     thermometers = ['board', *load_calibration(calibration).sensors]
@@ -168,13 +164,9 @@ def round_trip(
 
 
 def _answers(player: Node) -> bool:
-    """
-    Tell whether the node answers the player.
-
-    It then knows of the player's publishers, too, which were made before. And the first thing that
-    one process ever sends to another can get lost on a busy machine, and would come again behind
-    the samples: so it is this question.
-    """
+    """Tell whether the node answers the player: then it knows the older publishers, too."""
+    # The first thing that one process ever sends to another can get lost on a busy machine, and
+    # would come again behind the samples: so it is this question.
     client = player.create_client(GetParameters, f'{NODE_NAME}/get_parameters')
     executor = SingleThreadedExecutor(context=player.context)
     try:
