@@ -166,7 +166,7 @@ def test_what_nobody_has_foreseen(
     def fail(*_: object) -> None:
         raise RuntimeError('boom\nand more')
 
-    monkeypatch.setattr('thermo_comp.cli.bags._bag', fail)
+    monkeypatch.setattr('thermo_comp.recording.overview.survey_recording', fail)
     monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
     assert run(['info', 'x.mcap']) == 70
     (line,) = capsys.readouterr().err.splitlines()

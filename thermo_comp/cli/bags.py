@@ -7,7 +7,7 @@ corrects it, ``play`` sends it onto the live topics.
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
@@ -17,16 +17,13 @@ from . import options
 from .options import argument, option
 from .output import Output, micro_g, picked
 
-if TYPE_CHECKING:
-    from ..recording import Topics
-
 _BAG = argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
 _AS_THE_NODE = 'As the parameter of the node, in s.'
 
 
 def info(
     path: Path = argument('Bag or calibration file.', metavar='BAG|YAML'),
-    topics: 'Topics' = options.topics_part,
+    topics: Any = options.topics_part,
     out: Output = options.out,
 ) -> None:
     """
@@ -38,15 +35,11 @@ def info(
     Example:
       thermo_comp info chamber.mcap
     """
-    if path.suffix in ('.yaml', '.yml'):
-        _calibration(out, path)
-    else:
-        _bag(out, path, topics)
-
-
-def _bag(out: Output, path: Path, topics: 'Topics') -> None:
     from ..recording.overview import survey_recording
 
+    if path.suffix in ('.yaml', '.yml'):
+        _calibration(out, path)
+        return
     with out.progress(f'reading {path.name}') as done:
         survey = survey_recording(path, topics, done)
     found, thermometers = survey.info, survey.thermometers

@@ -19,7 +19,7 @@ from .options import argument, option
 from .output import Output, picked
 
 if TYPE_CHECKING:
-    from ..convert.log import ConversionReport, ForeignLog
+    from ..convert.log import ForeignLog
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
@@ -72,7 +72,7 @@ def convert(
       thermo_comp convert log.csv --columns map.yaml -o unit42
       thermo_comp convert flight.ulg --imu 1 -o unit43
     """
-    from ..convert.log import write_log
+    from ..convert.log import SLOW_HZ, write_log
 
     read_too = [] if columns is None else [columns]
     check_output(output, bag_kind(output), overwrite=force, others=[log, *read_too])
@@ -87,7 +87,44 @@ def convert(
     }
     with out.progress('converting') as done:
         report = write_log(_read(out, log, **given), output, force, done)
-    _say(out, report)
+    found, further = report.log, dict(report.messages)
+    usual = {f'{name}_messages': further.pop(name) for name in ('accel', 'board', 'case')}
+    accel = 'accel/counts' if found.input == 'counts' else 'imu/uncompensated'
+    out.line(
+        f'{found.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
+    )
+    out.line(f'{report.output}:')
+    for name, count in report.messages.items():
+        out.line(f'  {count:8} {accel if name == "accel" else f"temperature/{name}"}')
+    out.line(f'unit: {found.unit}; {report.believed}')
+    if report.rate_hz < SLOW_HZ:
+        out.line(
+            f'{report.rate_hz:.3g} Hz: good for soaks of minutes; rests by hand are too short for '
+            'it, and it sees neither vibration nor a knock between two samples'
+        )
+    if found.hint:
+        out.line(found.hint)
+    for name, finding in report.findings.items():
+        if finding.count:
+            more = ', ...' if finding.count > len(finding.lines) else ''
+            where = f' (line {", ".join(map(str, finding.lines))}{more})' if finding.lines else ''
+            out.line(f'{_FINDINGS[name]}: {finding.count}{where}')
+    start_ns = int(found.stamp_ns[0])
+    if report.stillness.moving_ns:
+        out.line('moved or shaken, not at rest:')
+        for stretch in report.stillness.moving_ns:
+            begin, end = ((stamp_ns - start_ns) * 1e-9 for stamp_ns in stretch)
+            out.line(f'  {begin:9.1f} .. {end:.1f} s')
+    out.told([(found.path, found.chosen, found.missing)])
+    out.end(
+        **picked(report, 'output rows rate_hz duration_s believed stillness'),
+        **picked(found, 'input unit missing chosen hint'),
+        source=found.path,
+        start_ns=start_ns,
+        **usual,
+        further_messages=further,
+        **report.findings,
+    )
 
 
 def _kind_of(path: Path) -> str:
@@ -145,57 +182,6 @@ def _read(out: Output, path: Path, **given: Any) -> 'ForeignLog':
     taken = columns.spoken_columns(guessed)
     out.line(f'{path}: taken as {taken}; --columns says otherwise')
     return columns.table_log(path, guessed)
-
-
-def _say(out: Output, report: 'ConversionReport') -> None:
-    """Print the account of a conversion."""
-    from ..convert.log import SLOW_HZ
-
-    log, messages = report.log, dict(report.messages)
-    accel, board, case = (messages.pop(name) for name in ('accel', 'board', 'case'))
-    out.line(
-        f'{log.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
-    )
-    out.line(f'{report.output}:')
-    counts = {
-        'accel/counts' if log.input == 'counts' else 'imu/uncompensated': accel,
-        'temperature/board': board,
-        'temperature/case': case,
-        **{f'temperature/{name}': count for name, count in messages.items()},
-    }
-    for topic, count in counts.items():
-        out.line(f'  {count:8} {topic}')
-    out.line(f'unit: {log.unit}; {report.believed}')
-    if report.rate_hz < SLOW_HZ:
-        out.line(
-            f'{report.rate_hz:.3g} Hz: good for soaks of minutes; rests by hand are too short for '
-            'it, and it sees neither vibration nor a knock between two samples'
-        )
-    if log.hint:
-        out.line(log.hint)
-    for name, finding in report.findings.items():
-        if finding.count:
-            more = ', ...' if finding.count > len(finding.lines) else ''
-            where = f' (line {", ".join(map(str, finding.lines))}{more})' if finding.lines else ''
-            out.line(f'{_FINDINGS[name]}: {finding.count}{where}')
-    start_ns = int(log.stamp_ns[0])
-    if report.stillness.moving_ns:
-        out.line('moved or shaken, not at rest:')
-        for stretch in report.stillness.moving_ns:
-            begin, end = ((stamp_ns - start_ns) * 1e-9 for stamp_ns in stretch)
-            out.line(f'  {begin:9.1f} .. {end:.1f} s')
-    out.told([(log.path, log.chosen, log.missing)])
-    out.end(
-        **picked(report, 'output rows rate_hz duration_s believed stillness'),
-        **picked(log, 'input unit missing chosen hint'),
-        source=log.path,
-        start_ns=start_ns,
-        accel_messages=accel,
-        board_messages=board,
-        case_messages=case,
-        further_messages=messages,
-        **report.findings,
-    )
 
 
 def export(

@@ -10,16 +10,13 @@ import webbrowser
 from collections.abc import Callable, Mapping
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import ThermoCompError
 from ..files import CSV, PAGE, check_output, write_atomically
 from . import options
 from .options import argument, option
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
-
-if TYPE_CHECKING:
-    from ..judging import Judgement
 
 
 def evaluate(
@@ -69,7 +66,16 @@ def evaluate(
         title=f'|f| - g over {judged.windows.window_s:g} s at rest; outside: of the calibrated '
         'ranges',
     )
-    _say_axes(out, judged)
+    columns = ['axis', 'static ug', 'dynamic ug']
+    title = 'what temperature moves each axis at rest (RMS of its windows)'
+    if judged.shifts:
+        columns += ['bias ug', '+-', 'scale ppm', '+-']
+        title += '; shift since the fit'
+    axes = [[name, *map(micro_g, rms)] for name, rms in zip('xyz', judged.axis_rms.T, strict=True)]
+    for row, one in zip(axes, judged.shifts, strict=False):
+        row += [micro_g(one.bias), micro_g(one.bias_sd)]
+        row += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
+    out.table(columns, axes, title=title)
     rates = {name: one.rate for name, one in result.judgements.items() if one.rate is not None}
     if rows := _sections(rates, millidegrees):
         out.table(
@@ -123,20 +129,6 @@ def _sections(
             ratio = f'{one.ratio:.2f}' if isfinite(one.claimed_rms) else None
             rows.append((section, name, one.n, *left, ratio))
     return rows
-
-
-def _say_axes(out: Output, judged: 'Judgement') -> None:
-    """Print what is known axis by axis: its RMS always, shifts where the positions tell."""
-    columns = ['axis', 'static ug', 'dynamic ug']
-    title = 'what temperature moves each axis at rest (RMS of its windows)'
-    if judged.shifts:
-        columns += ['bias ug', '+-', 'scale ppm', '+-']
-        title += '; shift since the fit'
-    rows = [[name, *map(micro_g, rms)] for name, rms in zip('xyz', judged.axis_rms.T, strict=True)]
-    for row, one in zip(rows, judged.shifts, strict=False):
-        row += [micro_g(one.bias), micro_g(one.bias_sd)]
-        row += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
-    out.table(columns, rows, title=title)
 
 
 def report(

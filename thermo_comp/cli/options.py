@@ -14,16 +14,13 @@ from contextlib import contextmanager
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import typer
 
 from ..errors import ThermoCompError
 from ..text import valid_serial
 from .output import Output
-
-if TYPE_CHECKING:
-    from ..recording import Topics
 
 #: A mistake in the command line, to be raised: exit code 2.
 usage = typer.BadParameter
@@ -143,7 +140,7 @@ def _topics(
         metavar='S',
     ),
     end: float | None = option('Read to there.', None, '--to', metavar='S'),
-) -> 'Topics':
+) -> Any:
     from ..recording import Part, Topics
 
     with usage_of('--from, --to: '):
@@ -162,7 +159,7 @@ def reading(input_: Input = INPUT, names: dict[str, str] = names) -> dict[str, A
 
 
 @given
-def reading_part(input_: Input = INPUT, topics: 'Topics' = topics_part) -> dict[str, Any]:
+def reading_part(input_: Input = INPUT, topics: Any = topics_part) -> dict[str, Any]:
     """Give keywords of what reads a bag or a part of it."""
     return {'topics': topics, 'input': input_}
 
