@@ -30,7 +30,7 @@ from ..thermal.settings import DetectorSettings
 from ..typing import Floats
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
-from .gyroscope import Gyroscope, RateCurve, RateSet
+from .gyroscope import Gyroscope
 from .posterior import ParameterLayout, Posterior, lay_out
 from .schema import Bounds, NotNegative, NotNegatives, Positive, Positives, Vector, check_ranges
 
@@ -200,15 +200,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Calibration:
-    """
-    One unit's calibration.
-
-    Raises
-    ------
-    ValueError
-        If parts contradict each other: naming the key, the rule and the value.
-
-    """
+    """One unit's calibration; parts that contradict each other are a ValueError."""
 
     format_version: Annotated[int, f'Version of this layout: {FORMAT_VERSION}.']
     unit: Unit
@@ -300,29 +292,24 @@ class Calibration:
         t = np.linspace(*own.temperature_range_c, _GRID) - reference
         edges = [edge for one in self.regime_sets() for edge in one.temperature_range_c]
         farthest = np.max(np.abs(np.subtract(edges, reference)))
-        sets: dict[str, RegimeSet | RateSet] = {regime: own}
-        if self.gyroscope is not None:
-            sets[f'gyroscope.{regime}'] = getattr(self.gyroscope, regime)
-        for prefix, curves in sets.items():
-            axes: tuple[AxisSet | RateCurve, ...] = curves.axes()
-            for name, axis in zip(AXES, axes, strict=True):
-                if not math.isfinite(_smallest(axis.bias_function, t)):
-                    raise ValueError(
-                        f'`{prefix}.{name}.bias_function` must be finite over its range'
-                    )
-        smallest = np.array([_smallest(axis.scale_function, t) for axis in own.axes()])
+        lost = np.zeros(3)
         with np.errstate(all='ignore'):
             # Every term of the response at its worst.
             for term in self.response:
                 if term.during in ('always', regime):
                     largest = max(map(abs, term.range)) * farthest**term.power
-                    smallest -= np.abs(np.multiply(term.scale, largest))
-        for name, least in zip(AXES, smallest.tolist(), strict=True):
+                    lost += np.abs(np.multiply(term.scale, largest))
+        for name, axis, loss in zip(AXES, own.axes(), lost.tolist(), strict=True):
+            _check_finite(axis.bias_function, t, f'{regime}.{name}')
+            least = _smallest(axis.scale_function, t) - loss
             if not least > SMALLEST_RELATIVE_SCALE:
                 raise ValueError(
                     f'`{regime}.{name}.scale_function` must stay above '
                     f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {least:.4g}'
                 )
+        rates = getattr(self.gyroscope, regime).axes() if self.gyroscope else ()
+        for name, rate in zip(AXES, rates, strict=False):
+            _check_finite(rate.bias_function, t, f'gyroscope.{regime}.{name}')
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
@@ -368,6 +355,11 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
     blocks = lay_out(pairs, len(calibration.response))
     end = blocks[-1].end
     return ParameterLayout(blocks[0::2], blocks[1::2], end, end + 3)
+
+
+def _check_finite(function: TemperatureFunction, t: Floats, key: str) -> None:
+    if not math.isfinite(_smallest(function, t)):
+        raise ValueError(f'`{key}.bias_function` must be finite over its range')
 
 
 def _smallest(function: TemperatureFunction, t: Floats) -> float:

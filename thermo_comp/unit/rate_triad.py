@@ -14,16 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from .calibration import (
-    Axes,
-    AxisReference,
-    AxisSet,
-    Calibration,
-    Provenance,
-    RegimeSet,
-    ResponseTerm,
-    parameter_layout,
-)
+from . import calibration as unit
+from .calibration import Calibration, RegimeSet, parameter_layout
 from .functions import Polynomial
 from .gyroscope import Gyroscope, RateCurve, RateSet, RateTerm
 from .posterior import Posterior
@@ -39,7 +31,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
 
     def regime(shared: RegimeSet, curves: RateSet) -> RegimeSet:
         x, y, z = (
-            AxisSet(curve.bias_function, Polynomial((1.0,)), curve.delta, sd)
+            unit.AxisSet(curve.bias_function, Polynomial((1.0,)), curve.delta, sd)
             for curve, sd in zip(curves.axes(), own.residual_sd_rad_s, strict=True)
         )
         return replace(shared, x=x, y=y, z=z)
@@ -48,15 +40,15 @@ def rate_triad(calibration: Calibration) -> Calibration:
         calibration,
         # No angular rate is out of the range of an accelerometer.
         unit=replace(calibration.unit, input='m/s^2', full_scale=math.inf),
-        axes=Axes(*(AxisReference(1.0, bias) for bias in own.bias_rad_s)),
+        axes=unit.Axes(*(unit.AxisReference(1.0, bias) for bias in own.bias_rad_s)),
         static=regime(calibration.static, own.static),
         dynamic=regime(calibration.dynamic, own.dynamic),
         noise_density_m_s2_sqrt_hz=own.noise_density_rad_s_sqrt_hz,
         slow_noise_m_s2_sqrt_h=own.slow_noise_rad_s_sqrt_h,
         misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         misalignment_sd=_NIL,
-        response=tuple(ResponseTerm(**vars(term), scale=_NIL) for term in own.response),
-        provenance=Provenance(),
+        response=tuple(unit.ResponseTerm(**vars(term), scale=_NIL) for term in own.response),
+        provenance=unit.Provenance(),
         evidence=(),
         posterior=None,
         gyroscope=None,

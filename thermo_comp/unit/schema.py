@@ -16,21 +16,12 @@ import math
 import operator
 import re
 import types
+import typing
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NoReturn,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union
 
 from ..text import counted
 
@@ -159,18 +150,18 @@ def _build(hint: Any, data: Any, key: str) -> Any:
 
 def parts_of(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """Take a hint apart that is neither a plain type nor a dataclass."""
-    if get_origin(hint) is Annotated:
+    if typing.get_origin(hint) is Annotated:
         return Annotated, (hint.__origin__, *hint.__metadata__)
-    origin = get_origin(hint)
+    origin = typing.get_origin(hint)
     if origin not in (Literal, tuple, Union, types.UnionType):
         raise TypeError(f'{hint} is no hint that a schema knows')
-    return Union if origin is types.UnionType else origin, get_args(hint)
+    return Union if origin is types.UnionType else origin, typing.get_args(hint)
 
 
 @lru_cache(maxsize=256)
 def fields_of(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the hints of a dataclass by key, and which keys must be given."""
-    hints = get_type_hints(cls, include_extras=True)
+    hints = typing.get_type_hints(cls, include_extras=True)
     fields = dataclasses.fields(cls)
     required = tuple(
         f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING
@@ -232,7 +223,7 @@ def _either(arguments: tuple[Any, ...], data: Any, key: str) -> Any:
         return data
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
-    kinds = {get_args(fields_of(hint)[0]['kind'])[0]: hint for hint in hints}
+    kinds = {typing.get_args(fields_of(hint)[0]['kind'])[0]: hint for hint in hints}
     if 'kind' not in data:
         raise SchemaError(_joined(key, 'kind'), 'this key is missing')
     kind = data['kind']
