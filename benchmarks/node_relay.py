@@ -66,7 +66,7 @@ CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 def main() -> None:
     """Run all cases."""
     arguments = _arguments()
-    os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100)
+    os.environ['ROS_DOMAIN_ID'] = str(81 + os.getpid() % 21)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     cases: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder, _cores_kept_awake(arguments.sleep) as awake:

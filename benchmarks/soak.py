@@ -301,7 +301,7 @@ def main() -> int:
     parser.add_argument('--rate', type=int, default=2000, help='samples per second')
     parser.add_argument('--json', help='write the figures to this file')
     arguments = parser.parse_args()
-    os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100))
+    os.environ.setdefault('ROS_DOMAIN_ID', str(81 + os.getpid() % 21))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
     import rclpy

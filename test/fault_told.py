@@ -154,10 +154,10 @@ TOLD = [
     ),
     Told(
         'a storm of reloads',
-        '1000 settings of `calibration_file`, 20 at a time, while 1 kHz flow',
+        '400 settings of `calibration_file`, 20 at a time, while 1 kHz flow',
         'each is answered; no sample is lost',
         '',
-        f'{_PROCESS}::test_a_thousand_reloads_at_1_khz',
+        f'{_PROCESS}::test_a_storm_of_reloads_at_1_khz',
     ),
     *(
         Told(

@@ -169,13 +169,13 @@ def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:
     assert n == sum(e[0] == 'counts' for e in events if seconds_of(e[1]) < 80.0)
 
 
-def test_a_thousand_reloads_at_1_khz(tmp_path: Path) -> None:
+def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
-    # Long enough for any machine: it ends with the thousandth answer.
+    # Long enough for any machine: it ends with the last answer.
     events = bag(rate_hz=1000.0, duration_s=60.0)
-    n_reloads = 1000
+    n_reloads = 400
     with bench(path) as node:
         answers: list[bool] = []
         node.take()
