@@ -34,18 +34,12 @@ def bag_log(
 ) -> ForeignLog:
     """Read a bag, with the topics that are None found; `unit` is what the driver publishes."""
     path = Path(path)
-    given = {'imu': imu, 'board': board, 'case': case}
     found = find_topics(path, inspect_recording(path).topics, imu, board, case)
-    chosen = [
-        said_choice(
-            name,
-            role,
-            given[role] or getattr(Topics(), role),
-            'only' if role == 'imu' else 'nearest',
-        )
-        for role, name in found.items()
-        if name
-    ]
+    chosen = []
+    for (role, name), given in zip(found.items(), (imu, board, case), strict=True):
+        among = 'only' if role == 'imu' else 'nearest'
+        usual = given or getattr(Topics(), role)
+        chosen.append(said_choice(name, role, usual, among) if name else '')
     # A name that no topic has stands for a thermometer that is not there.
     topics = Topics(
         imu=found['imu'] or '', board=found['board'] or '/none', case=found['case'] or '/none'
