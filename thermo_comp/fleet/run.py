@@ -11,6 +11,7 @@ unit without it has not been done, whatever else lies there. What was fitted wit
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -93,7 +94,8 @@ def fit_fleet(
             rows = {one.name: row for one in some if (row := results.look_up(one, how))}
             missing = [unit for unit in some if unit.name not in rows]
             if missing and client is None:
-                client = stack.enter_context(connected(scheduler, n_workers, len(some)))
+                most = min(n_workers or os.cpu_count() or 1, len(some))
+                client = stack.enter_context(connected(scheduler, most))
             n_done += len(missing)
             for unit, outcome in run(client, storage.address, missing, how) if missing else ():
                 rows[unit.name] = results.store(unit, how, outcome)

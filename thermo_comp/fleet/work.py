@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import signal
 import time
 from collections.abc import Iterator, Sequence
@@ -171,27 +170,19 @@ def dask_setup(_worker: object) -> None:
 
 
 @contextmanager
-def connected(
-    scheduler: str | None = None, n_workers: int | None = None, most: int = 1 << 30
-) -> Iterator[Any]:
+def connected(scheduler: str | None = None, n_workers: int | None = None) -> Iterator[Any]:
     """Give a client of a cluster: of one that runs, with workers of this version, or its own."""
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
     # What a worker does on its way down is in the fleet table, in words that its reader knows.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     quiet = {'logging.distributed': 'critical', 'distributed.scheduler.http.routes': []}
+    local = {'host': '127.0.0.1', 'dashboard_address': '127.0.0.1:0', 'preload': [__name__]}
     with dask.config.set(quiet), ExitStack() as stack:
         if scheduler is None:
-            cluster = LocalCluster(
-                n_workers=min(n_workers or os.cpu_count() or 1, most),
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address='127.0.0.1:0',
-                host='127.0.0.1',
-                preload=[__name__],
-            )
-            yield stack.enter_context(Client(stack.enter_context(cluster)))
+            own = Client(n_workers=n_workers, threads_per_worker=1, processes=True, **local)
+            yield stack.enter_context(own)
             return
         versions = {}
         try:
