@@ -33,6 +33,7 @@ _USUAL = Topics()
 _CHUNK_BYTES = 1 << 17
 _NAME = re.compile(r'(\d+)\.mcap')
 _PERIOD_S = 1.0
+_NEVER_NS = 2**63 - 1
 #: A look may take this part of the time.
 _SHARE = 0.2
 
@@ -143,23 +144,7 @@ class PositionBags:
                 if rows.any():
                     part.append((topic, kind, stamps[rows], one.take(rows).packed()))
         self._held = late
-        self._write(early)
-
-    def cut(self, stamp_ns: int) -> None:
-        """End the bag before a stamp."""
-        self.release(stamp_ns)
-        self._finish()
-
-    def close(self) -> None:
-        """Write what is held and end the last bag."""
-        held, self._held = self._held, []
-        self._write(held)
-        self._finish()
-
-    def _write(self, pieces: list[_Piece]) -> None:
-        if not pieces:
-            return
-        if self._writer is None:
+        if early and self._writer is None:
             self._number += 1
             path = self._path(self._number)
             metadata = {} if self._serial is None else {'serial': self._serial}
@@ -167,16 +152,23 @@ class PositionBags:
                 path, metadata=metadata, chunk_bytes=_CHUNK_BYTES, is_precious=True
             )
             self.written.append(path)
-        try:
-            for topic, kind, _, one in pieces:
-                self._writer.write_raw(topic, kind, one.log_ns, one)
-            self._writer.flush()
-        except OutputError:
-            # It is said once, and not tried again.
-            self._writer, self._held = None, []
-            raise
+        if self._writer is not None:
+            try:
+                for topic, kind, _, one in early:
+                    self._writer.write_raw(topic, kind, one.log_ns, one)
+                self._writer.flush()
+            except OutputError:
+                # It is said once, and not tried again.
+                self._writer, self._held = None, []
+                raise
 
-    def _finish(self) -> None:
+    def cut(self, stamp_ns: int) -> None:
+        """End the bag before a stamp."""
+        self.release(stamp_ns)
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()
+
+    def close(self) -> None:
+        """Write what is held and end the last bag."""
+        self.cut(_NEVER_NS)

@@ -7,13 +7,13 @@ Owns the look at a recording before a fit: how long, how fast, how warm, how sti
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
-from .columns import Block, Readings, RecordingInfo
+from .columns import Readings, RecordingInfo
 from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 from .topics import Topics
@@ -23,6 +23,10 @@ _RAMP_WINDOW_S = 120.0
 _CELL_S, _MIN_REST_S = 0.5, 3.0
 # A pause of this many usual intervals is a gap.
 _GAP_INTERVALS = 5.0
+_NO_SAMPLES = (
+    'no accelerometer samples: record accel/counts or imu/uncompensated, or name yours with '
+    '--topic counts=TOPIC or --topic imu=TOPIC'
+)
 
 
 @dataclass(frozen=True)
@@ -43,80 +47,23 @@ class ThermometerSurvey:
         return self.highest - self.lowest
 
 
-@dataclass
+@dataclass(frozen=True)
 class Survey:
     """
     What a recording holds, as far as a fit is concerned.
 
-    Gaps are pauses of more than five usual intervals; `n_backwards` counts samples whose stamp
-    does not rise; still intervals last at least 3 s, `still_s` together.
+    The rate is by the usual interval, NaN where there is none. Still intervals last at least 3 s.
+    The findings say what stands between it and a fit, each with the next step.
     """
 
     info: RecordingInfo
-    n: int = 0
-    n_gaps: int = 0
-    longest_gap_s: float = 0.0
-    n_backwards: int = 0
-    n_not_finite: int = 0
-    n_still: int = 0
-    still_s: float = 0.0
-    thermometers: Mapping[str, ThermometerSurvey] = field(default_factory=dict)
-    _step_ns: float = 0.0
-    _first_ns: int = 0
-    _last_ns: int = 0
-
-    @property
-    def duration_s(self) -> float:
-        """From the first sample to the last."""
-        return (self._last_ns - self._first_ns) * 1e-9
-
-    @property
-    def rate_hz(self) -> float:
-        """By the usual interval; NaN where there is none."""
-        return 1e9 / self._step_ns if self._step_ns else float('nan')
-
-    def add(self, block: Block) -> None:
-        """Count the samples, their gaps and their disorder while they stream by."""
-        stamp_ns = block.accel_stamp_ns
-        self.n_not_finite += int((~np.isfinite(block.accel).all(axis=1)).sum())
-        if len(stamp_ns) and not self.n:
-            self._first_ns = self._last_ns = int(stamp_ns[0])
-            self.n, stamp_ns = 1, stamp_ns[1:]
-        if not len(stamp_ns):
-            return
-        steps = np.diff(stamp_ns, prepend=self._last_ns)
-        self.n += len(stamp_ns)
-        self._last_ns = int(stamp_ns[-1])
-        rising = steps[steps > 0]
-        self.n_backwards += len(steps) - len(rising)
-        if not self._step_ns and len(rising):
-            self._step_ns = float(np.median(rising))
-        gaps = rising[rising > _GAP_INTERVALS * self._step_ns]
-        self.n_gaps += len(gaps)
-        self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
-
-    @property
-    def findings(self) -> list[str]:
-        """What stands between this recording and a fit, each with the next step."""
-        said = (
-            (self.info.truncated, f'cut off: {self.info.truncated}'),
-            (
-                not self.n,
-                'no accelerometer samples: record accel/counts or imu/uncompensated, or name '
-                'yours with --topic counts=TOPIC or --topic imu=TOPIC',
-            ),
-            *((True, one) for one in thermal_findings(self.thermometers)),
-            (
-                self.n and not self.n_still,
-                'it never rests for 3 s: the fit works on positions at rest',
-            ),
-            (
-                self.n_backwards,
-                f'{self.n_backwards} stamps do not rise: those samples are left out',
-            ),
-            (self.n_gaps, f'{self.n_gaps} gaps, the longest {self.longest_gap_s:.3g} s'),
-        )
-        return [text for is_so, text in said if is_so]
+    n: int
+    duration_s: float
+    rate_hz: float
+    n_still: int
+    still_s: float
+    thermometers: Mapping[str, ThermometerSurvey]
+    findings: list[str]
 
 
 def thermal_findings(thermometers: Mapping[str, ThermometerSurvey]) -> list[str]:
@@ -149,30 +96,62 @@ def survey_recording(
 ) -> Survey:
     """Read a recording once, in bounded memory; `progress` gets the fraction read."""
     with open_recording(path, topics, require=()) as reader:
-        survey = Survey(reader.info)
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         cells = CellAccumulator(_CELL_S, None)
         # A thermal test has few readings beside its samples.
         readings: dict[str, list[Readings]] = {}
+        first_ns = last_ns = 0
+        n = n_gaps = n_backwards = first_ns = last_ns = 0
+        longest_gap = step_ns = 0.0
         for block in reader.blocks():
-            survey.add(block)
-            rate = None if block.imu is None else block.imu.angular_velocity
-            cells.add(block.accel_stamp_ns, block.accel, rate)
             for name, one in block.temperatures.items():
                 readings.setdefault(name, []).append(one)
+            stamp_ns = block.accel_stamp_ns
+            if not len(stamp_ns):
+                continue
+            if not n:
+                first_ns = last_ns = int(stamp_ns[0])
+            steps = np.diff(stamp_ns, prepend=last_ns)[not n :]
+            last_ns = int(stamp_ns[-1])
+            rising = steps[steps > 0]
+            n_backwards += len(steps) - len(rising)
+            if not step_ns and len(rising):
+                step_ns = float(np.median(rising))
+            gaps = rising[rising > _GAP_INTERVALS * step_ns]
+            n_gaps += len(gaps)
+            longest_gap = max(longest_gap, float(np.max(gaps, initial=0)) * 1e-9)
+            n += len(stamp_ns)
+            rate = None if block.imu is None else block.imu.angular_velocity
+            cells.add(stamp_ns, block.accel, rate)
             if progress is not None and total:
-                progress(survey.n / total)
-        survey.info = reader.info
-    if survey.n > 1:
-        reduced = cells.finish()
-        still = still_intervals(reduced, _MIN_REST_S)
-        # whole cells: the first and the last may reach beyond the samples
-        still_s = sum((upper - lower) * reduced.cell_s for lower, upper in still)
-        survey.n_still, survey.still_s = len(still), min(still_s, survey.duration_s)
+                progress(n / total)
+        info = reader.info
+    reduced = cells.finish()
+    still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
     found = {name: survey_thermometer(own) for name, own in readings.items()}
-    survey.thermometers = {name: one for name, one in found.items() if one is not None}
-    return survey
+    thermometers = {name: one for name, one in found.items() if one is not None}
+    findings = [
+        (info.truncated, f'cut off: {info.truncated}'),
+        (not n, _NO_SAMPLES),
+        *((True, one) for one in thermal_findings(thermometers)),
+        (n and not still, 'it never rests for 3 s: the fit works on positions at rest'),
+        (n_backwards, f'{n_backwards} stamps do not rise: those samples are left out'),
+        (n_gaps, f'{n_gaps} gaps, the longest {longest_gap:.3g} s'),
+    ]
+    duration_s = (last_ns - first_ns) * 1e-9
+    # whole cells: the first and the last may reach beyond the samples
+    still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
+    return Survey(
+        info,
+        n,
+        duration_s,
+        1e9 / step_ns if step_ns else float('nan'),
+        len(still),
+        still_s,
+        thermometers,
+        [text for is_so, text in findings if is_so],
+    )
 
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
