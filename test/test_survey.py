@@ -96,9 +96,7 @@ def test_no_temperatures(tmp_path: Path) -> None:
 def test_gaps_and_disorder(tmp_path: Path) -> None:
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=30.0, backwards=True)
     assert '1 gaps, the longest 30.2 s' in result.findings
-    assert any('1 gaps, the longest 30.2 s' in f for f in result.findings)
     assert '1 stamps do not rise: those samples are left out' in result.findings
-    assert any('1 stamps do not rise' in f for f in result.findings)
 
 
 def test_no_samples(tmp_path: Path) -> None:

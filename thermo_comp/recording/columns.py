@@ -59,13 +59,13 @@ class RecordingInfo:
 
 def count_topics(channels: Iterable[Topic]) -> dict[str, tuple[str, int]]:
     """Make `RecordingInfo.topics` of what each channel carries."""
-    found: dict[str, tuple[str, int]] = {}
-    for topic, kind, _, count in channels:
-        known, n_before = found.get(topic, (kind, 0))
-        if kind not in known.split(' | '):
-            known = f'{known} | {kind}'
-        found[topic] = known, n_before + count
-    return found
+    found: dict[str, list[Topic]] = {}
+    for one in channels:
+        found.setdefault(one.name, []).append(one)
+    return {
+        name: (' | '.join(dict.fromkeys(o.type for o in own)), sum(o.n_messages for o in own))
+        for name, own in found.items()
+    }
 
 
 class ImuColumns(NamedTuple):

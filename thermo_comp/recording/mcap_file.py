@@ -105,23 +105,21 @@ class McapFile(BagFile):
         loaded = self._ahead(spans, lambda span: self._load(span, channels))
         yield from map(work, _in_order(zip(order, loaded, following, strict=True)))
 
-    def _ahead(self, spans: Iterable[Span], work: Callable[[Span], Done]) -> Iterator[Done]:
+    def _ahead(self, spans: Collection[Span], work: Callable[[Span], Done]) -> Iterator[Done]:
         """Read, decompress and work ahead in threads; most of it needs no interpreter lock."""
         # The pool is not this generator's own: one that is given up is closed by the garbage
         # collector, anywhere, where waiting for a thread may be a deadlock.
-        waiting: deque[tuple[int, Future[Done]]] = deque()
+        largest = max((1, *(span.size for span in spans)))
+        waiting: deque[Future[Done]] = deque()
         try:
             for span in spans:
-                while waiting and (
-                    len(waiting) == _N_AHEAD
-                    or sum(n_bytes for n_bytes, _ in waiting) + span.size > _AHEAD_BYTES
-                ):
-                    yield waiting.popleft()[1].result()
-                waiting.append((span.size, self._pool.submit(work, span)))
+                if len(waiting) >= min(_N_AHEAD, max(1, _AHEAD_BYTES // largest)):
+                    yield waiting.popleft().result()
+                waiting.append(self._pool.submit(work, span))
             while waiting:
-                yield waiting.popleft()[1].result()
+                yield waiting.popleft().result()
         finally:
-            for _, future in waiting:
+            for future in waiting:
                 future.cancel()
 
     def _load(self, span: Span, channels: Collection[int]) -> Messages:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the MCAP file being written: chunks with their message indexes, and the summary at the end.
+Owns the MCAP file being written: chunks with their message indexes, the summary at the end, and
+what rosbag2 says of it (metadata.yaml of version 9).
 
 The bulk (message records, message indexes) is numpy bytes; the few other records go through the
 `mcap` library's record classes.
@@ -13,12 +14,14 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import lz4.frame
 import numpy as np
+import yaml
 import zstandard
 from mcap import records
 from mcap.data_stream import RecordBuilder
@@ -29,10 +32,12 @@ from ..errors import RecordingError
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .mcap_file import MAGIC, METADATA_NAME
 from .messages import Messages, join_messages, scatter
-from .rosbag2_metadata import Definition, dump_yaml, information, offered_qos
+from .topics import BOOL
+from .wire import typestore
 
 Compression = Literal['none', 'lz4', 'zstd']
 
+_INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 #: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
 _ZSTD_LEVEL = -1
 # Versions of mcap differ in which of its methods are typed.
@@ -40,6 +45,24 @@ _new_builder: Callable[[], Any] = RecordBuilder
 #: Opcode, length, channel, sequence, log time, publish time.
 _RECORD_HEAD = np.dtype('u1, <u8, <u2, <u4, <i8, <i8')
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
+
+
+class Definition(NamedTuple):
+    """A message type's definition with all it depends on; its hash (RIHS01), if it is known."""
+
+    encoding: str
+    text: str
+    type_hash: str
+
+
+@lru_cache(maxsize=64)
+def known_definition(kind: str) -> Definition:
+    """Look up a message type of ROS 2 Jazzy; RecordingError for one that it does not have."""
+    store = typestore()
+    if kind not in store.fielddefs:
+        raise RecordingError(f'the definition of message type {kind} is not known')
+    text, _ = store.generate_msgdef(kind, ros_version=2)
+    return Definition('ros2msg', text, store.hash_rihs01(kind))
 
 
 class McapOutput:
@@ -88,7 +111,7 @@ class McapOutput:
             message_encoding='cdr',
             schema_id=self._schemas[kind].id,
             metadata={
-                'offered_qos_profiles': dump_yaml([offered_qos(kind)]).strip(),
+                'offered_qos_profiles': dump_yaml([_offered_qos(kind)]).strip(),
                 'topic_type_hash': definition.type_hash,
             },
         )
@@ -111,7 +134,7 @@ class McapOutput:
         self._tail = [messages.take(slice(begin, None)).packed()]
 
     def finish(self) -> dict[str, Any]:
-        """Write the last chunk, the summary and the footer; gives the `information` of rosbag2."""
+        """Write the last chunk, the summary and the footer; gives what metadata.yaml says."""
         for messages in self._tail:
             if len(messages):
                 self._put_chunk(messages)
@@ -119,7 +142,7 @@ class McapOutput:
             (topic, kind, type_hash, self._counts[channel.id])
             for topic, (channel, kind, type_hash) in self._channels.items()
         )
-        found = information(self._name, *self._times(), topics, self._metadata)
+        found = _information(self._name, *self._times(), topics, self._metadata)
         self._put_metadata('rosbag2', {'serialized_metadata': dump_yaml(found).strip()})
         self._put_record(records.DataEnd(data_section_crc=0))
         self._put_summary()
@@ -221,3 +244,69 @@ def _compressor(compression: Compression, level: int | None) -> Callable[[Any], 
     if compression == 'lz4':
         return lambda data: lz4.frame.compress(data, compression_level=level or 0)
     return lambda data: data
+
+
+def _offered_qos(kind: str) -> dict[str, Any]:
+    """Give the QoS profile that is recorded as offered: reliable, so that any reader matches."""
+    is_flag = kind == BOOL  # of which a late reader gets the last one
+    return {
+        'history': 'keep_last',
+        'depth': 1 if is_flag else 10,
+        'reliability': 'reliable',
+        'durability': 'transient_local' if is_flag else 'volatile',
+        'deadline': _INFINITE,
+        'lifespan': _INFINITE,
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': _INFINITE,
+        'avoid_ros_namespace_conventions': False,
+    }
+
+
+def _information(
+    name: str,
+    start_ns: int,
+    end_ns: int,
+    topics: Iterable[tuple[str, str, str, int]],
+    custom: Mapping[str, str],
+) -> dict[str, Any]:
+    """Build metadata.yaml as Jazzy has it; topics are name, type, hash of the type and count."""
+    counted: list[dict[str, Any]] = [
+        {
+            'topic_metadata': {
+                'name': topic,
+                'type': kind,
+                'serialization_format': 'cdr',
+                'offered_qos_profiles': [_offered_qos(kind)],
+                'type_description_hash': type_hash,
+            },
+            'message_count': count,
+        }
+        for topic, kind, type_hash, count in topics
+    ]
+    times = {
+        'duration': {'nanoseconds': end_ns - start_ns},
+        'starting_time': {'nanoseconds_since_epoch': start_ns},
+        'message_count': sum(one['message_count'] for one in counted),
+    }
+    return {
+        'version': 9,
+        'storage_identifier': 'mcap',
+        **times,
+        'topics_with_message_count': counted,
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [name],
+        'files': [{'path': name, **times}],
+        'custom_data': dict(custom) or None,
+        'ros_distro': 'jazzy',
+    }
+
+
+def dump_yaml(content: Any) -> str:
+    """Write YAML in block style with the keys in their order."""
+    # Values that stand twice are written twice.
+    dumper: Any = type('Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
+    text: str = yaml.dump(
+        content, Dumper=dumper, sort_keys=False, allow_unicode=True, width=10_000
+    )
+    return text

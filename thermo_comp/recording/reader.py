@@ -11,16 +11,18 @@ Reading order
 from __future__ import annotations
 
 import re
-from collections import ChainMap
+from collections import ChainMap, Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 
 from ..errors import RecordingError
+from ..files import read_bounded
+from ..plain_yaml import PlainYamlError, load_plain_yaml
 from .clock import Cut, without_jumps
 from .columns import (
     ROLES,
@@ -36,12 +38,13 @@ from .columns import (
 from .foreign import ForeignFile
 from .mcap_file import McapFile
 from .messages import BagFile, Done, Messages, Topic
-from .rosbag2_metadata import Description, read_metadata
 from .topics import Topics, select_topics, shown
 from .unpack import expand, translated
 from .wire import decode_blocks
 
 _N_LOADERS = 2
+_MAX_BYTES = 1 << 24
+_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 
 
 class RecordingReader:
@@ -80,12 +83,12 @@ class RecordingReader:
 
     def _open(self, path: Path) -> RecordingInfo:
         """Open the files; those that rosbag2 has compressed as a whole are expanded beside."""
-        found, note = _described(path)
+        found = _described(path)
         folder = ''
         if found.compression == 'file':
             folder = self._stack.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
         pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
-        notes = [note]
+        notes = [found.note]
         for name in found.files:
             file = name
             if folder:
@@ -235,25 +238,80 @@ def inspect_recording(path: str | Path, topics: Topics | None = None) -> Recordi
         return reader.info
 
 
-def _described(path: Path) -> tuple[Description, str | None]:
-    """Find the files of a bag, and what is missing beside them; RecordingError for no bag."""
+def _described(path: Path) -> _Description:
+    """Find the files of a bag; RecordingError for no bag."""
     if not path.exists():
         raise RecordingError('no such file or directory', path)
     if path.is_dir():
-        described = read_metadata(path)
+        described = _read_metadata(path)
         if described is not None:
-            return described, None
+            return described
         for suffix in ('.mcap', '.db3'):
             files = [one for one in path.iterdir() if one.suffix == suffix and one.is_file()]
             if files:
                 note = 'metadata.yaml is missing, the recording was not finished'
-                return Description(suffix[1:], tuple(sorted(files, key=_place_of))), note
+                return _Description(suffix[1:], tuple(sorted(files, key=_place_of)), note=note)
         raise RecordingError('not a bag: the directory has no metadata.yaml', path)
     if not path.is_file():
         raise RecordingError('not a bag: neither a file nor a directory', path)
     if path.suffix not in {'.mcap', '.db3', '.bag'}:
         raise RecordingError('not a bag: expected a directory, .mcap, .db3 or .bag', path)
-    return Description(path.suffix[1:], (path,)), None
+    return _Description(path.suffix[1:], (path,))
+
+
+@dataclass(frozen=True, slots=True)
+class _Description:
+    """
+    The files of a bag in their order, and what its metadata.yaml says.
+
+    `compression` is what rosbag2 itself has compressed one by one, ``file``, ``message`` or
+    nothing; `counts` are messages per topic, as the recorder counted; `note` is what is missing.
+    """
+
+    storage: str
+    files: tuple[Path, ...]
+    compression: str = ''
+    custom: dict[str, str] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+    note: str | None = None
+
+
+def _read_metadata(directory: Path) -> _Description | None:
+    """Read the metadata.yaml of a bag; None if it is missing or empty: the recorder was killed."""
+    path = directory / 'metadata.yaml'
+    try:
+        text = read_bounded(path, _MAX_BYTES)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, 'strerror', None) or error
+        raise RecordingError(f'cannot be read: {reason}', path) from error
+    if not text.strip():
+        return None
+    try:
+        content = load_plain_yaml(text, node_limit=_MAX_BYTES)['rosbag2_bagfile_information']
+        names = content['relative_file_paths']
+        if not isinstance(names, list) or not names:
+            raise TypeError('no files')
+        files = tuple(directory / PurePath(str(name)).name for name in names)
+        counts: Counter[str] = Counter()
+        for one in content.get('topics_with_message_count') or ():
+            counts[str(one['topic_metadata']['name'])] += int(one['message_count'])
+        description = _Description(
+            storage=str(content['storage_identifier']),
+            files=files,
+            compression=_COMPRESSIONS[str(content.get('compression_mode') or 'none').lower()],
+            custom={str(k): str(v) for k, v in (content.get('custom_data') or {}).items()},
+            counts=counts,
+        )
+    except PlainYamlError as error:
+        raise RecordingError('not valid YAML', path) from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise RecordingError('not the metadata of a rosbag2 bag', path) from error
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise RecordingError(f'the file {missing[0]} of the bag is missing', directory)
+    return description
 
 
 def _place_of(file: Path) -> tuple[int, str]:

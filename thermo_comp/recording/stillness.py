@@ -35,6 +35,7 @@ _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)
 # Stamps may lie anywhere; no unit rests in one cell for a day.
 _LONGEST_CELL_NS = 86400e9
+_MIN_SAMPLES = 30
 # A sample beyond has a square that is no number; it is none itself.
 _LARGEST = 1e100
 # The middle of words of 16 bits.
@@ -79,39 +80,27 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces samples to cells while they stream by.
+    Reduces samples to cells of `cell_s`, or of 30 samples if that is longer, while they stream by.
 
-    Cells of `cell_s` are longer where one would hold fewer than 30 samples. `full_scale` is where
-    a sample is saturated. A whole number of cells lasts `window_s`, or one of `STRETCHES` of them.
+    `full_scale` is where a sample is saturated. A whole number of cells fills `window_s`, or one
+    of `STRETCHES` of them.
     """
-
-    _MIN_SAMPLES = 30
 
     def __init__(
         self, cell_s: float, full_scale: float | None, window_s: float | None = None
     ) -> None:
-        self._asked_cell_s = cell_s
-        self._window_s = window_s
-        self._full_scale = full_scale
-        self._cell_ns = 0
-        self._start_ns = 0
+        self._asked_cell_s, self._window_s, self._full_scale = cell_s, window_s, full_scale
+        self._cell_ns = self._start_ns = 0
         self._last_ns: int | None = None
         self._shift = np.zeros(3)
         # Number, samples, time, sums and sums of squares of each cell; the last one is open.
-        self._ids: list[Ints] = [np.empty(0, np.int64)]
-        self._sums: list[Floats] = [np.empty((0, 8))]
-        self._n_dropped = 0
-        self._n_saturated = 0
-        self._is_integer = True
-        self._is_negative = False
-        self._middle = 0.0
-        self._quantum = np.zeros(3)
-        self._n_looked_at = 0
+        self._sums: list[Floats] = [np.empty((0, 9))]
+        self._n_dropped = self._n_saturated = self._n_looked_at = 0
+        self._is_integer, self._is_negative = True, False
+        self._middle, self._quantum = 0.0, np.zeros(3)
 
     def add(self, stamp_ns: Ints, samples: Floats, rate: Floats | None = None) -> None:
         """Take the next samples, shape (n, 3), in file order, and the gyroscope's rates."""
-        stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
-        samples = np.asarray(samples, dtype=np.float64)
         if not len(stamp_ns):
             return
         use = (np.abs(samples) < _LARGEST).all(axis=1)
@@ -122,15 +111,15 @@ class CellAccumulator:
                 self._look_for_sign(samples[use])
             saturated = use & (np.abs(samples - self._middle) >= self._full_scale).any(axis=1)
             self._n_saturated += int(saturated.sum())
-            use &= ~saturated
             self._n_dropped -= int(saturated.sum())
+            use &= ~saturated
         self._n_dropped += int((~use).sum())
         stamp_ns, samples = stamp_ns[use], samples[use]
         if not len(stamp_ns):
             return
         if self._last_ns is None:
             self._begin(stamp_ns, samples)
-            self._sums = [np.empty((0, 8 if rate is None else 14))]
+            self._sums = [np.empty((0, 9 if rate is None else 15))]
         self._last_ns = int(stamp_ns[-1])
         if self._n_looked_at < _QUANTUM_SAMPLES:
             found = _quantum_of(samples[: _QUANTUM_SAMPLES - self._n_looked_at])
@@ -142,17 +131,17 @@ class CellAccumulator:
 
     def forget(self, stamp_ns: int) -> None:
         """Drop the cells before a stamp."""
-        index = self.finish().index
-        n = np.searchsorted(index, (stamp_ns - self._start_ns) // max(self._cell_ns, 1))
-        self._ids, self._sums = [index[n:]], [self._sums[0][n:]]
+        first = (stamp_ns - self._start_ns) // max(self._cell_ns, 1)
+        n = int(np.searchsorted(self.finish().index, first))
+        self._sums = [self._sums[0][n:]]
 
     def finish(self) -> Cells:
         """Return all cells so far, the last one as it is."""
-        index, sums = np.concatenate(self._ids), np.concatenate(self._sums)
+        sums = np.concatenate(self._sums)
         # Whoever asks again asks for little more.
-        self._ids, self._sums = [index], [sums]
-        count = sums[:, 0]
-        total, square = np.split(sums[:, 2:], 2, axis=1)
+        self._sums = [sums]
+        index, count = sums[:, 0].astype(np.int64), sums[:, 1]
+        total, square = np.split(sums[:, 3:], 2, axis=1)
         mean = total / count[:, None]
         spread = np.maximum(square - count[:, None] * mean**2, 0.0)
         variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
@@ -164,7 +153,7 @@ class CellAccumulator:
         return Cells(
             *(self._start_ns, cell_s, self._n_dropped, self._n_saturated),
             *(self._is_integer, self._quantum, self._middle),
-            *(sums[:, 1] / count + index * cell_s, count.astype(np.int64), index),
+            *(sums[:, 2] / count + index * cell_s, count.astype(np.int64), index),
             *(mean[:, :3] + self._shift, variance[:, :3], rate, rate_variance),
         )
 
@@ -177,7 +166,7 @@ class CellAccumulator:
 
     def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
         step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
-        least = min(max(self._asked_cell_s * 1e9, self._MIN_SAMPLES * step, 1.0), _LONGEST_CELL_NS)
+        least = min(max(self._asked_cell_s * 1e9, _MIN_SAMPLES * step, 1.0), _LONGEST_CELL_NS)
         self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
@@ -188,18 +177,18 @@ class CellAccumulator:
         first = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
         columns = np.zeros((len(since), self._sums[0].shape[1]))
         n = columns.shape[1] // 2 - 1
-        columns[:, 0] = 1.0
-        columns[:, 1] = (since - ids * self._cell_ns) * 1e-9
-        columns[:, 2:5] = samples - self._shift
+        columns[:, 1] = 1.0
+        columns[:, 2] = (since - ids * self._cell_ns) * 1e-9
+        columns[:, 3:6] = samples - self._shift
         if n > 3 and rate is not None:
-            columns[:, 5:8] = np.where(np.abs(rate) < _LARGEST, rate, 0.0)
-        columns[:, 2 + n :] = columns[:, 2 : 2 + n] ** 2
+            columns[:, 6:9] = np.where(np.abs(rate) < _LARGEST, rate, 0.0)
+        columns[:, 3 + n :] = columns[:, 3 : 3 + n] ** 2
         sums = np.add.reduceat(columns, first, axis=0)
-        ids = ids[first]
-        if len(self._ids[-1]) and ids[0] == self._ids[-1][-1]:
-            sums[0] += self._sums[-1][-1]
-            self._ids[-1], self._sums[-1] = self._ids[-1][:-1], self._sums[-1][:-1]
-        self._ids.append(ids)
+        sums[:, 0] = ids[first]
+        last = self._sums[-1]
+        if len(last) and sums[0, 0] == last[-1, 0]:
+            sums[0, 1:] += last[-1, 1:]
+            self._sums[-1] = last[:-1]
         self._sums.append(sums)
 
 

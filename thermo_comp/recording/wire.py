@@ -17,6 +17,7 @@ which stamps and numbers are views. Messages of ROS 1 are serialized anew by `ro
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -27,7 +28,6 @@ from ..errors import RecordingError
 from ..typing import Bytes, Floats, Ints
 from .columns import ROLES, Block, ImuColumns, Readings, Role
 from .messages import Messages, Topic, field, gather
-from .rosbag2_metadata import typestore
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, shown
 
 #: How many float64 numbers follow the header of each type.
@@ -182,6 +182,14 @@ def encode_stamped(
         if values.ndim > 1:
             rows['numbers'][:, column : column + values.shape[1]] = values
     return data
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Any:
+    """Give the message types of ROS 2 Jazzy."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def as_cdr(messages: Messages, kind: str) -> Messages:

@@ -22,9 +22,8 @@ from ..errors import OutputError, RecordingError
 from ..files import Draft, bag_kind
 from ..typing import Bytes, Ints
 from .columns import ImuColumns
-from .mcap_out import Compression, McapOutput
+from .mcap_out import Compression, Definition, McapOutput, dump_yaml, known_definition
 from .messages import Messages
-from .rosbag2_metadata import Definition, dump_yaml, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
 from .wire import N_NUMBERS, encode_stamped
 
