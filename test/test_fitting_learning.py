@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, widths
 
-from thermo_comp.fitting.learning import Learnt, _downweight, _longer_gain, _without, learn
+from thermo_comp.fitting.learning import (
+    Learnt,
+    _downweight,
+    _longer_gain,
+    _without,
+    group_worth,
+    learn,
+)
 from thermo_comp.fitting.posterior import Regression
 from thermo_comp.fitting.unknowns import Known, Prior
-from thermo_comp.fitting.worth import group_worth
 from thermo_comp.typing import Bools, Floats
 
 ALL = ('curve', 'board', 'idle')

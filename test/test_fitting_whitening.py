@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermo_comp.fitting.whitening import Whitener
+from thermo_comp.fitting.design import Whitener
 
 
 def uneven(rng):

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.fitting import FitOptions, FitSource, fit
-from thermo_comp.fitting.gyroscope import within_positions
 from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.start import within_positions
 from thermo_comp.judging import Verdict, judge_bags
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator

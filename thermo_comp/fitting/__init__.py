@@ -6,8 +6,7 @@ Owns the fit: bags of a thermal test -> still positions -> regression -> calibra
 
 from .evidence import ResidualRow
 from .fit import FitResult, fit, fit_bags, reduce_bag
-from .gravity import normal_gravity, resolve_gravity
-from .options import FitOptions
+from .options import FitOptions, normal_gravity, resolve_gravity
 from .reduction import ReducedBag
 from .sources import FitSource
 

@@ -17,8 +17,8 @@ from .coverage import distinct_directions
 from .learning import Learnt, learn
 from .options import FitOptions
 from .posterior import Regression
-from .priors import known_of, state_of
-from .start import ConstantCalibration, constant_calibration, position_means
+from .priors import as_known, known_of
+from .start import ConstantCalibration, constant_calibration, position_means, within_positions
 from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD, Prior, initial_state
 from .verdict import POSITIONS_NEEDED
 from .windows import CURVE, SET, ThermalWindows
@@ -41,18 +41,12 @@ def regress(
     """Learn from the windows what is known of the unit, with or without a prior."""
     known = options.prior
     regression = Regression(windows.data, options.gravity, start.scale)
-    inverse = np.linalg.inv(start.misalignment)
-    state = initial_state(
-        windows.data,
-        regression.n_bags,
-        start.bias / start.scale,
-        np.ones(3),
-        np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
-        up,
-    )
+    inverse = np.asarray(np.linalg.inv(start.misalignment), dtype=np.float64)
+    bias, skew = start.bias / start.scale, inverse[[1, 2, 2], [0, 0, 1]]
+    state = initial_state(windows.data, regression.n_bags, bias, np.ones(3), skew, up)
     prior, knowns = _wide_prior(windows, start, up, options), []
     if known is not None:
-        state = state_of(known, regression, up)
+        state = as_known(known, regression, state)
         knowns = known_of(known, regression, state, windows.model.sets, options)
         prior = replace(prior, widths=windows.data.parts.astype(np.float64), known=knowns[-1])
     forced = [
@@ -102,9 +96,12 @@ def _wide_prior(
     allowed = np.array([options.groups is None or group in options.groups for group in groups])
     allowed &= windows.has_temperature
     in_scale = windows.data.in_scale & allowed
+    # RMS of what the readings do within the positions, on the largest axis.
+    within = within_positions(windows.data.mean / start.scale, windows.data.position)
+    drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
     # What a sensor does, its curve does first: the others begin as those of a good one.
     is_curve = np.array([group == CURVE for group in groups])
-    wide = np.where(is_curve, max(1.0, _drift(windows, start) / _COLUMN_BIAS_SD), 1.0)
+    wide = np.where(is_curve, max(1.0, drift / _COLUMN_BIAS_SD), 1.0)
     scale_wide = wide
     n_directions = len(distinct_directions(up))
     if n_directions == 1 and options.groups is None:
@@ -131,11 +128,3 @@ def _wide_prior(
         sigma=np.full(3, _SIGMA),
         rho=np.zeros(3),
     )
-
-
-def _drift(windows: ThermalWindows, start: ConstantCalibration) -> float:
-    """RMS of what the readings do within the positions, largest axis [m/s^2]."""
-    data = windows.data
-    reading = data.mean / start.scale
-    own = np.array([reading[data.position == p].mean(axis=0) for p in range(data.n_positions)])
-    return float(np.sqrt(np.mean((reading - own[data.position]) ** 2, axis=0)).max())

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..typing import Floats, Ints
 from ..unit.calibration import Calibration
 from ..unit.gravity import EARTH_RATE
 from ..unit.metrics import ResidualStatistics, statistics_by_regime
@@ -28,7 +27,7 @@ from .learning import Learnt, learn
 from .options import FitOptions
 from .posterior import Regression
 from .reduction import ReducedBag
-from .start import position_means
+from .start import position_means, within_positions
 from .unknowns import Prior, initial_state
 from .windows import CURVE, ThermalWindows
 
@@ -111,11 +110,3 @@ def _rows(windows: ThermalWindows, regression: Regression, learnt: Learnt) -> tu
     return tuple(
         RateRow(section, raw[section], by_fit[section], by_others[section]) for section in raw
     )
-
-
-def within_positions(rate: Floats, position: Ints) -> Floats:
-    """Take from the rates of windows, shape (n, 3), the mean of each position."""
-    _, where, count = np.unique(position, return_inverse=True, return_counts=True)
-    total = np.zeros((len(count), 3))
-    np.add.at(total, where, rate)
-    return np.asarray(rate - (total / count[:, None])[where])

@@ -12,7 +12,7 @@ nearly alone; the gyroscope, where there is one, saw no rotation.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from ..typing import Floats, Ints
 from .reduction import ReducedBag
-from .sources import FitSource, angular_velocity
+from .sources import angular_velocity
 
 # Still intervals further apart than this are not looked at for a step: too much can have happened;
 # nor those whose readings point so far from each other.
@@ -69,40 +69,22 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
         if after.start_ns - before.end_ns <= _LONGEST_GAP_S * 1e9 and up @ other > _NEAR
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
-    near = _near(bag.source, bag.start_ns, gaps)
-    found = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(near, gaps, strict=True))
+    near = zip(_near(bag, gaps), gaps, strict=True)
+    found = (_examine(part, gap, quiet_sd, bag) for part, gap in near)
     return tuple(jump for jump in found if jump is not None)
 
 
-@dataclass(frozen=True)
-class _Near:
-    """Samples beside one gap."""
-
-    time: Floats
-    accel: Floats
-    gyro: Floats | None
-
-
-def _near(
-    source: FitSource, start_ns: int, gaps: Sequence[tuple[float, float]]
-) -> Iterable[_Near]:
-    parts: list[list[tuple[Floats, Floats, Floats | None]]] = [[] for _ in gaps]
-    if gaps:
-        for block in source.blocks():
-            time = _seconds(block.accel_stamp_ns, start_ns)
-            rate = angular_velocity(block)
-            for part, (begin, end) in zip(parts, gaps, strict=True):
-                use = (time >= begin - _MARGIN_S) & (time <= end + _MARGIN_S)
-                use &= np.isfinite(block.accel).all(axis=1)
-                if use.any():
-                    part.append((time[use], block.accel[use], None if rate is None else rate[use]))
-    for part in parts:
-        time = np.concatenate([np.zeros(0), *(p[0] for p in part)])
-        accel = np.concatenate([np.zeros((0, 3)), *(p[1] for p in part)])
-        rates = [p[2] for p in part if p[2] is not None]
-        yield _Near(
-            time, accel, np.concatenate(rates) if part and len(rates) == len(part) else None
-        )
+def _near(bag: ReducedBag, gaps: Sequence[tuple[float, float]]) -> list[Floats]:
+    """Collect the samples beside each gap: time, reading, rate (NaN: none), shape (n, 7)."""
+    parts = [[np.zeros((0, 7))] for _ in gaps]
+    for block in bag.source.blocks() if gaps else ():
+        time, rate = _seconds(block.accel_stamp_ns, bag.start_ns), angular_velocity(block)
+        rate = np.full(block.accel.shape, np.nan) if rate is None else rate
+        for part, (begin, end) in zip(parts, gaps, strict=True):
+            use = (time >= begin - _MARGIN_S) & (time <= end + _MARGIN_S)
+            use &= np.isfinite(block.accel).all(axis=1)
+            part.append(np.column_stack((time[use], block.accel[use], rate[use])))
+    return [np.concatenate(part) for part in parts]
 
 
 def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
@@ -111,36 +93,40 @@ def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
 
 
 def _examine(
-    near: _Near, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
+    near: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
 ) -> Jump | None:
-    beside = (near.time <= gap[0]) | (near.time >= gap[1])
-    if min(np.sum(near.time <= gap[0]), np.sum(near.time >= gap[1])) < _FEWEST_SAMPLES:
+    time, accel, gyro = near[:, 0], near[:, 1:4], near[:, 4:]
+    before, after = time <= gap[0], time >= gap[1]
+    if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
         return None
+    beside = before | after
     # A bump passes: only what the quiet samples on both sides show is a step.
-    at = _place_of_step(near.time, near.accel, quiet_sd)
-    lasting, lasting_sd = _step(near.time[beside], near.accel[beside], near.time[at], quiet_sd)
-    if not np.any(np.abs(lasting) > _STEP_SDS * lasting_sd):
+    at = _place_of_step(time, accel, quiet_sd)
+    lasting, known, _ = _step(time[beside], accel[beside], time[at])
+    if not np.any(np.abs(lasting) > _STEP_SDS * quiet_sd * known):
         return None
-    step, step_sd = _step(near.time, near.accel, near.time[at], quiet_sd)
-    before, after = near.accel[:at], near.accel[at:]
-    spread = np.sqrt(0.5 * (_local_variance(before) + _local_variance(after)))
-    middle = 0.5 * (before.mean(axis=0) + after.mean(axis=0))
+    step, known, _ = _step(time, accel, time[at])
+    step_sd = quiet_sd * known
+    sides = accel[:at], accel[at:]
+    # Noise from neighbouring differences, which a drift does not widen.
+    spread = np.sqrt(0.25 * sum(np.mean(np.diff(one, axis=0) ** 2, axis=0) for one in sides))
+    middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
     along = float(np.linalg.norm(middle + 0.5 * step) - np.linalg.norm(middle - 0.5 * step))
     size = float(np.linalg.norm(step))
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
     needed = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
-    seen = np.nan if near.gyro is None else _turn(near.time, near.gyro, at)
+    seen = _turn(time, gyro, at)
     is_no_turn = seen < _TURN_SHARE * needed or (
         abs(along) > _NORM_SHARE * size and abs(along) > _STEP_SDS * along_sd
     )
     if not is_no_turn or np.any(spread > _QUIET_RATIO * quiet_sd):
         return None
-    warmed, warmed_sd = _temperature_step(bag, near.time[0], near.time[at], near.time[-1])
+    warmed, warmed_sd = _temperature_step(bag, time[0], time[at], time[-1])
     x, y, z = step.tolist()
     return Jump(
-        time=float(near.time[at]),
-        duration_s=float(near.time[at] - near.time[at - 1]),
+        time=float(time[at]),
+        duration_s=float(time[at] - time[at - 1]),
         step=(x, y, z),
         along=along,
         temperature_change=warmed,
@@ -155,13 +141,9 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
     time, value = time[use], bag.board.value[use]
     if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
         return np.nan, np.nan
-    jump = (time >= at).astype(np.float64)
-    columns = np.column_stack((_trend(time), jump))
-    parameters, *_ = np.linalg.lstsq(columns, value, rcond=None)
-    left = value - columns @ parameters
-    spread = float(left @ left) / max(len(value) - 3, 1)
-    covariance = np.linalg.inv(columns.T @ columns)
-    return float(parameters[2]), float(np.sqrt(spread * covariance[2, 2]))
+    (step,), known, left = _step(time, value[:, None], at)
+    spread = float(np.sum(left**2)) / max(len(value) - 3, 1)
+    return float(step), known * float(np.sqrt(spread))
 
 
 def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats) -> int:
@@ -179,26 +161,24 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats) -> int:
     return int(candidates[int(np.argmax(gain))])
 
 
-def _step(time: Floats, accel: Floats, at: float, quiet_sd: Floats) -> tuple[Floats, Floats]:
+def _step(time: Floats, values: Floats, at: float) -> tuple[Floats, float, Floats]:
     """
-    Estimate a step at a known time, beside a straight drift, and its sd from the quiet noise.
+    Estimate a step of values, shape (n, k), at a known time, beside a straight drift.
+
+    Returns, too, its sd in units of the noise, and what is left.
     """
     trend = _trend(time)
     jump = (time >= at).astype(np.float64)
     jump -= trend @ (trend.T @ jump)
     square = float(jump @ jump)
-    return np.asarray(jump @ accel / square), np.asarray(quiet_sd / np.sqrt(square))
+    step = np.asarray(jump @ values / square)
+    return step, square**-0.5, values - trend @ (trend.T @ values) - np.outer(jump, step)
 
 
 def _trend(time: Floats) -> Floats:
     """Columns of a level and a drift, orthonormal, shape (n, 2)."""
     t = time - time.mean()
     return np.column_stack([np.full(len(t), len(t) ** -0.5), t / np.sqrt(t @ t)])
-
-
-def _local_variance(samples: Floats) -> Floats:
-    """Noise from neighbouring differences, which a drift does not widen."""
-    return np.asarray(0.5 * np.mean(np.diff(samples, axis=0) ** 2, axis=0))
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:

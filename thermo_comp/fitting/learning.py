@@ -13,6 +13,8 @@ References
 ----------
 .. [1] D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992), eqs 4.8 to 4.10.
 .. [2] M. E. Tipping, Sparse Bayesian learning and the relevance vector machine, JMLR 1 (2001).
+.. [3] J. M. Dickey, The weighted likelihood ratio, linear hypotheses on normal location
+   parameters, Annals of Mathematical Statistics 42 (1971).
 
 """
 
@@ -21,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -29,7 +32,6 @@ from ..typing import Bools, Floats, Ints
 from ..unit.calibration import GroupEvidence
 from .posterior import Posterior, Regression
 from .unknowns import Known, Prior, State
-from .worth import earned, group_worth, told_of
 
 # Of the three weights of a column, what the data must tell under a wide prior to be asked.
 _SILENT = 0.05
@@ -37,8 +39,6 @@ _SILENT = 0.05
 _IDLE = 0.1
 # ... once they have moved this often.
 _PATIENCE = 4
-# Widths settle within this many rounds, as a rule in half of them.
-_MOST_ROUNDS = 40
 # A round that moves no width by more than this part is the last.
 _SETTLED = 0.03
 # The memory is as short as it can be [s]: the longest lags of a bank and the curves over
@@ -81,7 +81,7 @@ def learn(
     state: State,
     prior: Prior,
     forced: Bools | bool = False,
-    tell: Callable[[float], None] | None = None,
+    tell: Callable[[float], None] = lambda _part: None,
     held: Bools | bool = False,
     walks: bool = True,
     knowns: Sequence[Known] = (),
@@ -93,7 +93,6 @@ def learn(
     keep their width, and their place: the data cannot tell them from those of the bias, shape
     (m,). `knowns`: what may be known beforehand, for `prior.known`.
     """
-    tell = tell or (lambda _part: None)
     kept = np.broadcast_to(forced, prior.widths.shape).copy()
     kept[1] |= held
     allowed = prior
@@ -144,6 +143,60 @@ def learn(
     return Learnt(posterior, prior, group_worth(regression, posterior, prior), claim)
 
 
+def told_of(posterior: Posterior) -> Floats:
+    """Effective parameters of each column in bias and scale, of all axes, shape (2, m)."""
+    return np.asarray(np.append(posterior.told, 0.0)[posterior.layout.weights].sum(axis=1))
+
+
+def earned(mode: Floats, covariance: Floats, places: Ints, sd: float | Floats) -> float:
+    """
+    How much the log evidence falls when some weights are held at 0 (Savage-Dickey).
+
+    `mode`, `covariance`: of what belongs to the unit. `places`, `sd`: theirs, shape (k,).
+    """
+    mode, covariance = mode[places], covariance[np.ix_(places, places)]
+    root = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
+    values = np.maximum(values, 1e-12)
+    along = vectors.T @ (mode / root)
+    determinant = float(np.log(values).sum() + 2.0 * np.log(root).sum())
+    known = float(np.sum(np.log(np.broadcast_to(sd, mode.shape))))
+    return 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant - known
+
+
+def group_worth(
+    regression: Regression, posterior: Posterior, prior: Prior
+) -> tuple[GroupEvidence, ...]:
+    """Say what each group explains, spends and earns."""
+    names = np.array(regression.windows.groups)
+    columns = regression.windows.columns / regression.rms
+    mode = regression.vector(posterior.state, posterior.layout)[: len(posterior.covariance)]
+    force = regression.gravity * posterior.state.up[regression.windows.position]
+    told = told_of(posterior)
+    parts: tuple[Literal['bias', 'scale'], ...] = ('bias', 'scale')
+    result = []
+    for k, part in enumerate(parts):
+        for group in dict.fromkeys(regression.windows.groups):
+            used = (names == group) & (prior.widths[k] > 0.0)
+            if not used.any():
+                continue
+            added = columns[:, used] @ posterior.state.weights[k][:, used].T
+            if part == 'scale':
+                added = added * force
+            places, sd = posterior.layout.weights[k][:, used], prior.widths[k][used]
+            result.append(
+                GroupEvidence(
+                    group,
+                    part,
+                    float(np.sqrt(np.mean(added**2))),
+                    max(float(told[k][used].sum()), 0.0),
+                    earned(mode, posterior.covariance, places.ravel(), np.tile(sd, 3)),
+                    tuple(sd.tolist()),
+                )
+            )
+    return tuple(result)
+
+
 def _without(prior: Prior, gone: Bools) -> Prior:
     """Leave out columns, of bias and scale or of both, shape (2, m) or (m,)."""
     return replace(prior, widths=np.where(gone, 0.0, prior.widths))
@@ -162,13 +215,10 @@ def _longer_gain(
     S, q = (
         one[..., longer] for one in regression.asked_of_absent(posterior.state, prior, allowed)
     )
-    most = 0.0
-    for part in _WIDTHS:
-        width = part * allowed.widths[:, None, longer]
-        with np.errstate(divide='ignore'):
-            gain = q**2 / (1.0 / width**2 + S) - np.log1p(S * width**2)
-        most = max(most, 0.5 * float(gain.sum(axis=1).max(initial=0.0)))
-    return most
+    width = _WIDTHS[:, None, None, None] * allowed.widths[:, None, longer]
+    with np.errstate(divide='ignore'):
+        gain = q**2 / (1.0 / width**2 + S) - np.log1p(S * width**2)
+    return 0.5 * float(gain.sum(axis=2).max(initial=0.0))
 
 
 def _idle(regression: Regression, posterior: Posterior, prior: Prior, kept: Bools) -> Bools:
@@ -223,7 +273,7 @@ def _settle(
     *,
     silent: Bools,
     kept: Bools,
-    rounds: int = _MOST_ROUNDS,
+    rounds: int = 40,
 ) -> tuple[Posterior, Prior]:
     """
     Repeat the fixed point of widths and white noise until nothing moves.
@@ -233,8 +283,7 @@ def _settle(
     for k in range(rounds):
         posterior = regression.solve(state, prior, n_steps=2)
         state = posterior.state
-        vector = regression.vector(state, posterior.layout)
-        sd, told = prior.widths, told_of(posterior)
+        layout, sd, told = posterior.layout, prior.widths, told_of(posterior)
         power = np.sum(state.weights**2, axis=1)
         asked = (sd > 0.0) & ~silent
         # A width that is as good as 0; a column that stays all the same keeps it.
@@ -245,17 +294,15 @@ def _settle(
         change = float(np.abs(np.log(new[lively] / sd[lively])).max(initial=0.0))
         gone = asked & (told < _IDLE) & ~kept & (k >= _PATIENCE)
         offset_sd, skew_sd = prior.offset_sd, prior.skew_sd
-        told_offset, power = _told_of(posterior, vector, posterior.layout.offset)
-        if told_offset > 0.3:
+        if (told_offset := float(posterior.told[layout.offset].sum())) > 0.3:
             per_position = len(regression.windows.time) / regression.windows.n_positions
             of_mean = float(np.mean(prior.sigma)) / np.sqrt(per_position)
             least = max(0.03 * of_mean, prior.least_offset_sd)
-            offset_sd = max(np.sqrt(power / told_offset), least)
+            offset_sd = max(np.sqrt(np.sum(state.offset**2) / told_offset), least)
             if told_offset > 1.0:
                 change = max(change, float(np.abs(np.log(offset_sd / prior.offset_sd))))
-        told_skew, power = _told_of(posterior, vector, posterior.layout.skew)
-        if told_skew > 1.0:
-            skew_sd = max(np.sqrt(power / told_skew), 1e-6)
+        if (told_skew := float(posterior.told[layout.skew].sum())) > 1.0:
+            skew_sd = max(np.sqrt(np.sum(state.skew**2) / told_skew), 1e-6)
         start_share = _start_share(regression, posterior)
         change = max(change, float(np.abs(np.log(start_share / prior.start_share))) / 2.0)
         sigma = _sigma(posterior, prior)
@@ -271,12 +318,6 @@ def _settle(
         if change < _SETTLED and not gone.any():
             break
     return regression.solve(state, prior), prior
-
-
-def _told_of(posterior: Posterior, vector: Floats, places: Ints) -> tuple[float, float]:
-    """Effective parameters of some unknowns, and the sum of their squares."""
-    where = places.ravel()
-    return float(posterior.told[where].sum()), float(np.sum(vector[where] ** 2))
 
 
 def _start_share(regression: Regression, posterior: Posterior) -> float:
@@ -344,8 +385,7 @@ def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:
             found = replace(found, sigma=_sigma(fitted, found))
             return regression.solve(posterior.state, found, n_steps=1).log_evidence, found
 
-        grid = 10.0 ** np.arange(-7.0, -0.9, 1.0)
-        none = evidence(0.0)[0]
+        grid, none = 10.0 ** np.arange(-7.0, -0.9, 1.0), evidence(0.0)[0]
         values = [evidence(float(value))[0] for value in grid]
         best = int(np.argmax(values))
         rho[axis] = 0.0

@@ -98,8 +98,7 @@ class Posterior:
     told: what of each unknown the data told, not the prior, 0..1, shape (n,)
     covariance: of what belongs to the unit, shape (n_unit, n_unit)
     variance: of all unknowns, shape (n,)
-    residual: measured minus predicted [m/s^2], shape (n_windows, 3)
-    whitened: the same, whitened, in units of sigma, shape (n_windows, 3)
+    whitened: measured minus predicted, whitened, in units of sigma, shape (n_windows, 3)
     log_evidence: logarithm of the marginal likelihood, but for a constant of the data
     """
 
@@ -108,21 +107,16 @@ class Posterior:
     told: Floats
     covariance: Floats
     variance: Floats
-    residual: Floats
     whitened: Floats
     log_evidence: float
 
 
 @dataclass(frozen=True)
 class _Equations:
-    """
-    Of one linearisation: Hessian and gradient, residuals, whitened ones, minus twice the
-    log likelihood.
-    """
+    """Of one linearisation: Hessian, gradient, whitened residuals, minus twice log likelihood."""
 
     hessian: Floats
     gradient: Floats
-    residual: Floats
     white: Floats
     size: float
 
@@ -159,7 +153,7 @@ class Regression(Design):
             hessian[np.ix_(layout.skew, np.arange(own.start, own.stop))] = hessian[
                 own, layout.skew
             ].T
-        return _Equations(hessian, gradient, residual, white, size)
+        return _Equations(hessian, gradient, white, size)
 
     def _block(
         self, state: State, prior: Prior, layout: Layout, p: int, axis: int, filtered: Floats
@@ -321,21 +315,10 @@ class Regression(Design):
         covariance, blocks = factor.covariances()
         variance = np.concatenate([np.diag(block) for block in (covariance, *blocks)])
         told = 1.0 - precision * variance
+        ends = [layout.n_unit, *(block.stop for block in layout.blocks)]
         for where, matrix in matrices:
-            if where.start == 0:
-                block = covariance
-            else:
-                k = next(k for k, b in enumerate(layout.blocks) if b.start <= where.start < b.stop)
-                at = slice(where.start - layout.blocks[k].start, None)
-                block = blocks[k][at, at]
-            told[where] = 1.0 - np.einsum('ij,ji->i', matrix, block)
-        return Posterior(
-            state,
-            layout,
-            told,
-            covariance,
-            variance,
-            equations.residual,
-            equations.white,
-            evidence,
-        )
+            # What is known together ends with the unit's, or with one bag's.
+            at = slice(-len(matrix), None)
+            own = (covariance, *blocks)[ends.index(where.stop)][at, at]
+            told[where] = 1.0 - np.einsum('ij,ji->i', matrix, own)
+        return Posterior(state, layout, told, covariance, variance, equations.white, evidence)

@@ -72,27 +72,16 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
     )
 
 
-def state_of(calibration: Calibration, regression: Regression, up: Floats) -> State:
-    """Return the regression's unknowns as a calibration has them, whose scale is nominal."""
+def as_known(calibration: Calibration, regression: Regression, state: State) -> State:
+    """Give a state the bias and weights of a calibration, whose scale is nominal."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
     # Of each axis the level of the static set, and behind it what else there is beside that.
     both = np.array([[values[one.static : one.end] for one in part] for part in layout[:2]])
     both[..., layout.bias[0].dynamic] -= both[..., 0]
-    K = constants_of(calibration).scale
-    both[0] /= K[:, None]
-    inverse = np.linalg.inv(np.array(calibration.misalignment))
-    n_lags = len(regression.windows.start_covariance)
-    return State(
-        kappa=np.ones(3),
-        bias=both[0, :, 0],
-        weights=both[..., 1:] * regression.rms,
-        skew=np.array([inverse[1, 0], inverse[2, 0], inverse[2, 1]]),
-        up=up,
-        offset=np.zeros((len(up), 3)),
-        start=np.zeros((regression.n_bags, n_lags)),
-    )
+    both[0] /= regression.nominal_scale[:, None]
+    return replace(state, bias=both[0, :, 0], weights=both[..., 1:] * regression.rms)
 
 
 def known_of(

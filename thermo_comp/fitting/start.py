@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ..errors import FitError
-from ..typing import Floats
+from ..typing import Floats, Ints
 from .unknowns import Windows
 
 # Even a cheap sensor that drifts over 60 K stays within this of an ellipsoid; motion does not.
@@ -98,3 +98,11 @@ def position_means(windows: Windows) -> Floats:
     total = np.add.reduceat(windows.weight, first)
     weighted = np.add.reduceat(windows.mean * windows.weight[:, None], first, axis=0)
     return np.asarray(weighted / total[:, None])
+
+
+def within_positions(measured: Floats, position: Ints) -> Floats:
+    """Take from what the windows measure, shape (n, 3), the mean of each position."""
+    _, where, count = np.unique(position, return_inverse=True, return_counts=True)
+    total = np.zeros((len(count), 3))
+    np.add.at(total, where, measured)
+    return np.asarray(measured - (total / count[:, None])[where])
