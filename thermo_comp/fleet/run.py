@@ -177,7 +177,6 @@ def render_fleet(
             draw_distances,
             [one.quantity.label for one in summary.spreads],
             [one.z for one in summary.spreads],
-            [one.names for one in summary.spreads],
             summary.limit,
         ),
     )

@@ -71,7 +71,7 @@ def draw_dynamics(evidence: Evidence) -> Figure:
     bend.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
     bend.set_ylabel('K/min²')
     bend.set_title(f'second derivative of T {shown.leader}')
-    style.few_ticks(bend, 4)
+    bend.locator_params(axis='y', nbins=4)
     _draw_flag(flag, shown, unit)
     figure.align_ylabels(panels[:-1])
     return figure
@@ -88,7 +88,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
         _plot(axes, evidence, residual / MICRO_G, unit, label=AXES)
         axes.set_ylabel('µg')
         axes.axhline(0.0, color='black', linewidth=0.5)
-        style.few_ticks(axes)
+        axes.locator_params(axis='y', nbins=5)
         if rung != RAW:
             _symmetric(axes, residual[rows])
         parts = [
@@ -247,7 +247,7 @@ def draw_histograms(evidence: Evidence) -> Figure:
         axes.set_ylim(0.0, None)
         axes.set_ylabel('windows, %')
         axes.xaxis.set_major_locator(MaxNLocator(6))
-        style.few_ticks(axes, 4)
+        axes.locator_params(axis='y', nbins=4)
         axes.set_title(f'{name}, {label}: sd {number(sd)} µg')
         axes.set_xlabel('|f| − g, µg')
     return figure

@@ -11,10 +11,7 @@ from matplotlib.figure import Figure
 
 from ..typing import Floats
 from . import style
-from .html import label_text
 
-# More names than these would lie over each other.
-_MOST_NAMES = 12
 _SECTION_LINES: dict[str, style.Line] = {
     'raw': style.RUNG_LINES['raw'],
     'static': style.STATIC_LINE,
@@ -41,34 +38,17 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
     return figure
 
 
-def draw_distances(
-    labels: Sequence[str],
-    distances: Sequence[Floats],
-    names: Sequence[Sequence[str]],
-    limit: float,
-) -> Figure:
-    """Draw each unit's distance from the middle, by quantity; beyond `limit` with its name."""
+def draw_distances(labels: Sequence[str], distances: Sequence[Floats], limit: float) -> Figure:
+    """Draw each unit's distance from the middle, by quantity; beyond `limit` as a diamond."""
     figure = style.new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
     shown = min(max(1.15 * limit, 4.0), 12.0)
-    n_named = 0
-    for row, (z, units) in enumerate(zip(distances, names, strict=True)):
+    for row, z in enumerate(distances):
         at = np.clip(z, -1.04 * shown, 1.04 * shown)
         is_far = np.abs(z) > limit
         marks = ((~is_far, '|', style.GREY, 6.0), (is_far, 'D', style.RED, 3.5))
         for rows, mark, color, size in marks:
             axes.plot(at[rows], np.full(int(rows.sum()), row), mark, color=color, ms=size)
-        for i in np.flatnonzero(is_far)[: max(_MOST_NAMES - n_named, 0)]:
-            n_named += 1
-            axes.annotate(
-                label_text(units[i], 18),
-                (float(at[i]), row),
-                xytext=(4 if at[i] < 0 else -4, 0),
-                textcoords='offset points',
-                ha='left' if at[i] < 0 else 'right',
-                va='center',
-                fontsize=7,
-            )
     for edge in (-limit, limit):
         axes.axvline(edge, color=style.BLACK, linewidth=0.8, linestyle=(0, (5, 2)))
     axes.set_xlim(-1.1 * shown, 1.1 * shown)

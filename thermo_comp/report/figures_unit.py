@@ -101,9 +101,9 @@ def _draw_less_line(
         look = {'marker': curve.marker, 'markersize': 3.5, 'markevery': [0, -1]}
         axes.plot(at, value, label=curve.name, **look, **curve.line)
     title = f'{AXES[k % 3]}: {minus(f"{slope:+.3g}")} {unit}/K'
-    axes.set_title(f'{title}, ±{number(widest, 2)} {unit}' if widest else title)
+    axes.set_title(f'{title}, ±{number(widest, 2)}' if widest else title)
     axes.axvline(reference, color=style.GREY, linewidth=0.8)
-    style.few_ticks(axes)
+    axes.locator_params(axis='y', nbins=5)
 
 
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:

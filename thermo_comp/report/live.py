@@ -3,10 +3,9 @@
 """
 Owns the live view: the certificate served on this machine, made anew when its files change.
 
-The page asks for the version of its files once a second and reloads itself when that differs. A
-file that cannot be read, as while it is being written, is said above the last good page. Served
-on the loopback interface only, and only under its own names, so that no other site's page can
-reach it through the browser.
+The page asks for the version of its files once a second. A file that cannot be read, as while it
+is being written, is said above the last good page. Served on the loopback interface and under its
+own names only, so that no other site's page can reach it through the browser.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator
 
 from ..typing import Floats, Ints
 from .evidence import CHOSEN, RAW
@@ -46,28 +46,21 @@ STATIC_LINE: Line = {'color': BLUE, 'linestyle': '-', 'linewidth': 1.4}
 DYNAMIC_LINE: Line = {'color': RED, 'linestyle': _DASHED, 'linewidth': 1.4}
 
 _RC: dict[str, Any] = {
-    'font.family': 'sans-serif',
     'font.sans-serif': ['DejaVu Sans', 'Verdana', 'Helvetica', 'Arial', 'sans-serif'],
     'font.size': 8.5,
     'axes.titlesize': 8.5,
     'axes.titlelocation': 'left',
-    'axes.titlepad': 4.0,
-    'axes.labelsize': 8.5,
     'axes.linewidth': 0.7,
     'axes.spines.top': False,
     'axes.spines.right': False,
     'axes.grid': True,
     'axes.axisbelow': True,
-    'grid.color': '#DDDDDD',
-    'grid.linewidth': 0.5,
     'xtick.labelsize': 8,
     'ytick.labelsize': 8,
-    'xtick.major.width': 0.7,
-    'ytick.major.width': 0.7,
-    'legend.fontsize': 8,
+    'grid.color': '#DDDDDD',
+    'grid.linewidth': 0.5,
     'legend.frameon': False,
     'legend.handlelength': 2.8,
-    'legend.columnspacing': 1.4,
     'legend.borderaxespad': 0.0,
     'legend.borderpad': 0.0,
     'hatch.linewidth': 0.5,
@@ -149,11 +142,6 @@ def shared_legend(figure: Figure, axes: Axes, n_columns: int) -> None:
     handles, labels = axes.get_legend_handles_labels()
     place: Any = 'outside upper left'
     figure.legend(handles, labels, loc=place, borderaxespad=0.5, ncols=n_columns)
-
-
-def few_ticks(axes: Axes, n: int = 5) -> None:
-    """Keep the y axis of a low panel readable."""
-    axes.yaxis.set_major_locator(MaxNLocator(n))
 
 
 def log_axis(axes: Axes, low: float, high: float) -> None:
