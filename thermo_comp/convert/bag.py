@@ -72,23 +72,18 @@ def find_topics(
     imu = imu or _most(path, _of_type(present, IMU), 'Imu')
     if imu is None:
         raise RecordingError('the bag holds no Imu messages', path=path)
-    thermometers = [name for name in _of_type(present, TEMPERATURE) if name not in (board, case)]
+
+    def free() -> list[str]:
+        return [name for name in _of_type(present, TEMPERATURE) if name not in (board, case)]
+
     if case is None:
         baros = _of_type(present, _PRESSURE)
-        nearer = [
-            name
-            for name in thermometers
-            if max((_common(name, baro) for baro in baros), default=0) > _common(name, imu)
-        ]
+        nearer = [name for name in free() if _shared(name, baros) > _shared(name, [imu])]
         case = _most(path, nearer, 'case')
-        thermometers = [name for name in thermometers if name != case]
     if board is None:
-        beside = max((_common(name, imu) for name in thermometers), default=0)
-        nearest = [name for name in thermometers if _common(name, imu) == beside]
-        board = _most(path, nearest, 'board')
-        thermometers = [name for name in thermometers if name != board]
-    if case is None:
-        case = _most(path, thermometers, 'case')
+        beside = max((_shared(name, [imu]) for name in free()), default=0)
+        board = _most(path, [one for one in free() if _shared(one, [imu]) == beside], 'board')
+    case = case or _most(path, free(), 'case')
     return {'imu': imu, 'board': board, 'case': case}
 
 
@@ -96,10 +91,10 @@ def _of_type(present: Present, kind: str) -> list[str]:
     return sorted(name for name, (found, count) in present.items() if found == kind and count)
 
 
-def _common(one: str, other: str) -> int:
-    """Count the namespaces that two topics share."""
-    names = (PurePosixPath('/', name.strip('/')) for name in (one, other))
-    return len(set.intersection(*({*name.parents} for name in names)))
+def _shared(name: str, others: list[str]) -> int:
+    """Count the namespaces that a topic shares with the nearest of others."""
+    own, *theirs = ({*PurePosixPath('/', one.strip('/')).parents} for one in (name, *others))
+    return max((len(own & one) for one in theirs), default=0)
 
 
 def _most(path: Path, names: list[str], what: str) -> str | None:

@@ -207,9 +207,7 @@ def write_log(
             'backwards': _finding(np.diff(stamp_ns, prepend=stamp_ns[0]) < 0, line),
             'repeated': _finding(is_repeated, line),
         },
-        believed=believed_unit(stillness.magnitude)[1]
-        if np.isfinite(stillness.magnitude)
-        else 'it never rests, so its unit was not checked',
+        believed=believed_unit(stillness.magnitude)[1],
         stillness=stillness,
     )
 
@@ -290,9 +288,8 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
         run = slice(first, first + _RUN_ROWS)
         reduced.add(stamp_ns[run], accel[run])
     cells = reduced.finish()
-    full = cells.count >= _MIN_SAMPLES
-    if full.any():
-        full &= cells.count >= 0.5 * np.median(cells.count)
+    usual = float(np.median(cells.count)) if len(cells.count) else 0.0
+    full = cells.count >= max(_MIN_SAMPLES, 0.5 * usual)
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
@@ -314,6 +311,8 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
 
 def believed_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
     """Say which unit a still |a| speaks for (``counts`` and ``unknown`` among them), and why."""
+    if not np.isfinite(magnitude):
+        return 'unknown', 'it never rests, so its unit was not checked'
     said = f'|a| at rest is {magnitude:.4g}'
     for unit, gravity in PER_G.items():
         if abs(magnitude / gravity - 1.0) <= _TOLERANCE:
