@@ -3,8 +3,8 @@
 """
 Owns the options that several commands share, and what the library takes made of them.
 
-The default of a command's parameter is one option, or, marked by `given`, a function that makes
-the parameter of several: a command says what it wants, and `expanded` offers typer the options.
+The default of a command's parameter is one option, or a function that makes the parameter of
+several: a command says what it wants, and `expanded` offers typer the options.
 """
 
 import inspect
@@ -14,12 +14,13 @@ from contextlib import contextmanager
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import typer
 
 from ..errors import ThermoCompError
 from ..text import valid_serial
+from ..unit.gravity import parse_acceleration
 from .output import Output
 
 #: A mistake in the command line, to be raised: exit code 2.
@@ -36,22 +37,13 @@ def argument(text: str, default: Any = ..., **rules: Any) -> Any:
     return typer.Argument(default, help=text, **rules)
 
 
-class _Given(NamedTuple):
-    make: Callable[..., Any]
-
-
-def given(make: Callable[..., Any]) -> Any:
-    """Mark a function as the default of parameters that it makes of its options."""
-    return _Given(expanded(make))
-
-
-def expanded(command: Callable[..., Any]) -> Callable[..., Any]:
+def expanded(command: Callable[..., Any]) -> Any:
     """Make a function of options alone, as typer takes it, of one of what is made of them."""
     makers: dict[str, Callable[..., Any]] = {}
     options: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
-        if isinstance(parameter.default, _Given):
-            makers[name] = parameter.default.make
+        if inspect.isfunction(parameter.default):
+            makers[name] = parameter.default
             options += inspect.signature(makers[name]).parameters.values()
         else:
             options.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
@@ -101,7 +93,7 @@ INPUT = option('What is read from the bag.', 'auto', '--input')
 Input = Literal['auto', 'counts', 'imu']
 
 
-@given
+@expanded
 def out(
     as_json: bool = option('Print the result as one JSON object.', False, '--json'),
     quiet: bool = QUIET,
@@ -110,7 +102,7 @@ def out(
     return Output(as_json, quiet)
 
 
-@given
+@expanded
 def names(
     topic: list[str] | None = option(
         'Where an input stands: counts, imu, board, case, temperature/NAME.', metavar='INPUT=TOPIC'
@@ -149,22 +141,22 @@ def _topics(
         return Topics.named(names, part)
 
 
-topics_part = given(_topics)
+topics_part = expanded(_topics)
 
 
-@given
+@expanded
 def reading(input_: Input = INPUT, names: dict[str, str] = names) -> dict[str, Any]:
     """Give keywords of what reads a bag."""
     return {'topics': _topics(names, None, None), 'input': input_}
 
 
-@given
+@expanded
 def reading_part(input_: Input = INPUT, topics: Any = topics_part) -> dict[str, Any]:
     """Give keywords of what reads a bag or a part of it."""
     return {'topics': topics, 'input': input_}
 
 
-@given
+@expanded
 def place(
     gravity: float | None = option('Local gravity in m/s^2.', metavar='G'),
     latitude: float | None = option('Latitude in degrees, with --height.'),
@@ -181,7 +173,7 @@ def place(
         return normal_gravity(latitude, height)
 
 
-@given
+@expanded
 def judging(
     gravity: float | None = place,
     window_s: float = option('Length of a window at rest, in s.', 60.0, '--window', metavar='S'),
@@ -195,7 +187,7 @@ def judging(
     }
 
 
-@given
+@expanded
 def fitting(
     gravity: float | None = place,
     model: Literal['response', 'golovach'] = option(
@@ -232,8 +224,6 @@ def fitting(
 
 def acceleration(text: str | None, name: str) -> float | None:
     """Read an acceleration with its unit [m/s^2]; None where none is given."""
-    from ..unit.gravity import parse_acceleration
-
     with usage_of(f'{name}: '):
         return None if text is None else parse_acceleration(text)
 

@@ -11,6 +11,7 @@ metadata, file names) can neither forge a line nor move the cursor, and any term
 import dataclasses
 import json
 import math
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ from ..text import one_line
 from ..unit.gravity import MICRO_G
 
 Cell = str | int | float | None
+# Or a dash, for none.
+_NUMBER = re.compile(r'-|[-+]?\d+\.?\d*(e[-+]\d+)?')
 
 
 class Output:
@@ -36,7 +39,7 @@ class Output:
     def line(self, text: str = '') -> None:
         """Print one sentence of the result."""
         if not (self.as_json or self.quiet):
-            _print(text)
+            _print(text, sys.stdout)
 
     def note(self, text: str) -> None:
         """Print one sentence about the run, on stderr."""
@@ -77,7 +80,7 @@ class Output:
         """Print a table of aligned columns, numbers flush right; None is a dash."""
         if not (self.as_json or self.quiet):
             for line in aligned(columns, rows, title):
-                _print(line)
+                _print(line, sys.stdout)
 
     @contextmanager
     def live(self) -> Iterator[Callable[..., None] | None]:
@@ -135,9 +138,8 @@ def error(message: str) -> None:
     _print(f'thermo_comp: error: {" ".join(message.split())}', sys.stderr)
 
 
-def _print(text: str, file: TextIO | None = None) -> None:
+def _print(text: str, stream: TextIO) -> None:
     """Print one line."""
-    stream = sys.stdout if file is None else file
     print(_shown(text, stream), file=stream)
 
 
@@ -181,7 +183,7 @@ def aligned(
     cells = [[text(cell) for cell in row] for row in rows]
     if title:
         yield title
-    right = [all(_is_number(row[i]) for row in cells) for i in range(len(columns))]
+    right = [all(_NUMBER.fullmatch(row[i]) for row in cells) for i in range(len(columns))]
     lines = [list(columns), *cells]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for row in lines:
@@ -189,14 +191,6 @@ def aligned(
             cell.rjust(width) if is_right else cell.ljust(width)
             for cell, width, is_right in zip(row, widths, right, strict=True)
         ).rstrip()
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return cell == '-'
-    return True
 
 
 def picked(value: object, names: str) -> dict[str, Any]:
