@@ -26,7 +26,7 @@ from ..text import one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from .reader import LoadedCalibration
-from .relay import Relay, open_publisher
+from .relay import Relay
 from .waitloop import WaitLoop, type_name
 
 #: After so long without samples [s] readings take effect without them.
@@ -73,8 +73,7 @@ class Reporter:
 
     def __init__(self, node: Node, loop: WaitLoop, relay: Relay, compensator: Compensator) -> None:
         self._node, self._loop, self._relay, self._compensator = node, loop, relay, compensator
-        qos = QoSProfile(depth=10)
-        self._publisher = open_publisher(node, DiagnosticArray, '/diagnostics', qos)
+        self._publisher = loop.publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         self._level = DiagnosticStatus.STALE
         self._n_publishers = 0
         self._last_samples = time.monotonic()

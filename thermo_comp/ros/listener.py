@@ -202,19 +202,15 @@ class LiveTopics(_Listener):
                 self._stack.close()
             waiting = [self._waiting.get() for _ in range(self._waiting.qsize())]
             if waiting:
-                yield from self._decode(waiting)
+                feeds = dict(enumerate(self._feeds.items()))
+                numbers = {role: number for number, (role, _) in feeds.items()}
+                messages = Messages.of(
+                    [one for _, messages, _ in waiting for one in messages],
+                    [numbers[role] for role, messages, _ in waiting for _ in messages],
+                    [one for _, _, received_ns in waiting for one in received_ns],
+                ).in_order()
+                yield from map(News, decode_blocks(messages, feeds, numbers, keep_raw=True))
             yield None
-
-    def _decode(self, waiting: list[tuple[Role, list[bytes], list[int]]]) -> Iterator[News]:
-        """Decode what came, in the order of arrival."""
-        feeds = dict(enumerate(self._feeds.items()))
-        numbers = {role: number for number, (role, _) in feeds.items()}
-        messages = Messages.of(
-            [one for _, messages, _ in waiting for one in messages],
-            [numbers[role] for role, messages, _ in waiting for _ in messages],
-            [one for _, _, received_ns in waiting for one in received_ns],
-        )
-        yield from map(News, decode_blocks(messages.in_order(), feeds, numbers, keep_raw=True))
 
     def _look(self) -> None:
         """Subscribe to what is published; say what is not."""

@@ -13,20 +13,14 @@ that input is used, nor the first messages after it, which may still be of the o
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from copy import copy
+from collections.abc import Callable
 from operator import itemgetter
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
@@ -34,7 +28,7 @@ from std_msgs.msg import Bool
 from ..online.compensator import Compensator
 from ..online.stamped_flag import STAMPED_TOPIC, stamped_flag
 from .conversions import SampleConverter, Traffic, read_temperature
-from .parameters import NodeConfig, ParameterError
+from .parameters import NodeConfig
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
 INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
@@ -55,24 +49,6 @@ _FLAGS: list[bytes] = [serialize_message(Bool(data=is_dynamic)) for is_dynamic i
 _Reading = tuple[int, tuple[str, int, float]]
 
 
-@contextmanager
-def _opening() -> Iterator[None]:
-    """Say what a name or a quality of service of the user's does."""
-    try:
-        yield
-    except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
-        raise ParameterError(f'a topic cannot be opened: {error}') from error
-
-
-def open_publisher(node: Node, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
-    """Create a publisher whose quality of service is open to overrides."""
-    overridable = QoSOverridingOptions.with_default_policies()
-    with _opening():
-        return node.create_publisher(
-            message_type, topic, copy(qos), qos_overriding_options=overridable
-        )
-
-
 class Relay:
     """What stands between the inputs of a node and its outputs."""
 
@@ -83,18 +59,15 @@ class Relay:
         self.traffic = Traffic()
         self.samples = self.open_samples(config)
         self.configure(config, self.samples)
-        with _opening():
-            #: By their names.
-            self.thermometers = {
-                name: loop.subscribe(
-                    Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False
-                )
-                for name in compensator.thermal.inputs
-            }
-        imu = open_publisher(node, Imu, 'imu/data_raw', OUTPUT_QOS)
+        #: By their names.
+        self.thermometers = {
+            name: loop.subscribe(Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False)
+            for name in compensator.thermal.inputs
+        }
+        imu = loop.publisher(Imu, 'imu/data_raw', OUTPUT_QOS)
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
-        self._flag = open_publisher(node, Bool, 'regime/dynamic', FLAG_QOS)
-        self._stamped = open_publisher(node, DiagnosticArray, STAMPED_TOPIC, FLAG_QOS)
+        self._flag = loop.publisher(Bool, 'regime/dynamic', FLAG_QOS)
+        self._stamped = loop.publisher(DiagnosticArray, STAMPED_TOPIC, FLAG_QOS)
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
         self._contested: set[RawSubscription] = set()
@@ -105,9 +78,8 @@ class Relay:
         return {'sample': self.samples, **self.thermometers}
 
     def open_samples(self, config: NodeConfig) -> RawSubscription:
-        """Subscribe to the samples of a configuration; ParameterError if that cannot be."""
-        with _opening():
-            return self._loop.subscribe(*INPUTS[config.input], SAMPLE_QOS)
+        """Subscribe to the samples of a configuration."""
+        return self._loop.subscribe(*INPUTS[config.input], SAMPLE_QOS)
 
     def configure(self, config: NodeConfig, samples: RawSubscription) -> None:
         """Go over to a configuration and the samples that were opened for it."""

@@ -26,16 +26,18 @@ from typing import Any
 
 import rclpy
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
+from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
+from ..errors import ThermoCompError
 from ..text import one_line
 
 #: While samples flow, the rest of the node is looked after this often [ns].
@@ -121,17 +123,16 @@ class WaitLoop:
         self, message_type: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
     ) -> RawSubscription:
         """Subscribe in serialized form; the first hot one wakes the loop, others wait a little."""
-        subscription = self._node.create_subscription(
-            message_type,
-            topic,
-            lambda _: None,  # never called: that is for an executor to do
-            copy(qos),  # rclpy writes the overrides into it
-            raw=True,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        # Its callback is never called: that is for an executor to do.
+        create = partial(self._node.create_subscription, callback=lambda _: None, raw=True)
+        subscription = _opened(create, message_type, topic, qos)
         self._raw.append(RawSubscription(subscription, is_hot))
         self._is_stale = True
         return self._raw[-1]
+
+    def publisher(self, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
+        """Open a publisher."""
+        return _opened(self._node.create_publisher, message_type, topic, qos)
 
     def unsubscribe(self, raw: RawSubscription) -> None:
         """Destroy a subscription of this loop."""
@@ -285,6 +286,18 @@ class _WaitSet:
         places = [(one, kind, add(handle)) for one, kind, add, handle in self._content]
         self._set.wait(timeout_ns)
         return [one for one, kind, place in places if self._set.is_ready(kind, place)]
+
+
+def _opened(create: Callable[..., Any], message_type: Any, topic: str, qos: QoSProfile) -> Any:
+    """Open a topic with the overrides of its QoS; ThermoCompError where name or QoS are wrong."""
+    overridable = QoSOverridingOptions.with_default_policies()
+    try:
+        # rclpy writes the overrides into the profile.
+        return create(
+            message_type, topic, qos_profile=copy(qos), qos_overriding_options=overridable
+        )
+    except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
+        raise ThermoCompError(f'a topic cannot be opened: {error}') from error
 
 
 def _take_message(subscription: Subscription) -> bool:
