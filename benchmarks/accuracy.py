@@ -28,16 +28,12 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import Block
 from thermo_comp.recording.columns import Readings
-from thermo_comp.simulation import (
-    MICRO_G,
-    STANDARD_GRAVITY,
-    SimulatedRun,
-    arrays,
-    plan,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import plan
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import Calibration, parameter_layout
+from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 WINDOW_S = 60.0
 N_SIBLINGS = 10

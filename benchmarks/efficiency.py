@@ -15,18 +15,13 @@ from dataclasses import replace
 import numpy as np
 from accuracy import WINDOW_S, fit_and_correct
 
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    Position,
-    UnitModel,
-    arrays,
-    parse_cyclogram,
-    positions,
-    simulate,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
 from thermo_comp.simulation.drift import PartEffect
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import arrays, simulate
+from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Floats
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
 def exact_unit(seed: int) -> UnitModel:

@@ -23,13 +23,10 @@ from pathlib import Path
 
 import numpy as np
 
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    parse_cyclogram,
-    positions,
-    simulate_blocks,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import simulate_blocks
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
 def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:

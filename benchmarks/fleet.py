@@ -35,13 +35,10 @@ from thermo_comp.fleet import FleetOptions, Row, fit_fleet
 from thermo_comp.fleet.units import FoundUnit, Storage, find_units
 from thermo_comp.fleet.work import connected, run
 from thermo_comp.recording import BagWriter
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    parse_cyclogram,
-    positions,
-    simulate,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import simulate
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: An hour over 35 K at a sample per second, so that hundreds of units are simulated in minutes.
 PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2

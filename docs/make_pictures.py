@@ -19,7 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyBboxPatch, Polygon, Rectangle
 
 import thermo_comp as tc
-from thermo_comp.simulation import parse_cyclogram, positions, simulate, unit_preset
+from thermo_comp.simulation.campaign import parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import simulate
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / 'docs' / 'images'

@@ -117,7 +117,7 @@ class Desk:
             ]
             path.write_text('\n'.join(['t,ax,ay,az,temp', *rows]) + '\n')
         elif name == 'tumble.txt':
-            from thermo_comp.simulation import positions
+            from thermo_comp.simulation.campaign import positions
 
             rng = np.random.default_rng(5)
             rests = np.repeat(9.8154 * positions(12, 2) + (0.1, -0.2, 0.3), 500, axis=0)

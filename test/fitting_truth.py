@@ -12,7 +12,7 @@ import numpy as np
 
 from thermo_comp.fitting.posterior import Regression
 from thermo_comp.fitting.unknowns import Prior, State, Windows, initial_state
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 from thermo_comp.typing import Floats
 
 GRAVITY = 9.81

@@ -12,14 +12,11 @@ import numpy as np
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet import FleetOptions
 from thermo_comp.recording import BagWriter
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    UnitModel,
-    parse_cyclogram,
-    positions,
-    simulate,
-)
-from thermo_comp.simulation import unit_preset as preset
+from thermo_comp.simulation.campaign import parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset as preset
+from thermo_comp.simulation.run import simulate
+from thermo_comp.simulation.unit import UnitModel
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: Half an hour over 36 K; the ramps of a freezer, not of a chamber.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')

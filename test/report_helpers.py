@@ -14,14 +14,10 @@ from builders import ArrayBlock
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.recording import BagWriter
 from thermo_comp.report import Evidence, evidence_of_fit, render_report
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    SimulatedRun,
-    parse_cyclogram,
-    positions,
-    simulate,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import SimulatedRun, simulate
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = '15 12min, 30@1.5 14min, 15@1.5 8min'
 RATE_HZ = 5.0

@@ -8,7 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermo_comp.simulation import Cyclogram, SimulatedRun, UnitModel
+from thermo_comp.simulation.campaign import Cyclogram
+from thermo_comp.simulation.run import SimulatedRun
+from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Bools, Floats
 
 

@@ -13,7 +13,7 @@ from position_helpers import GRAVITY, MG, Rest
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.options import REFUSALS
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 
 # The response is none of the matter, and takes its time.
 COUNTS = FitOptions(gravity=GRAVITY, groups=('curve',))

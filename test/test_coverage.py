@@ -17,7 +17,7 @@ from thermo_comp.fitting.coverage import (
     spoken_direction,
     worst_sd,
 )
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 
 FACES = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
 NOTHING = np.empty((0, 3))

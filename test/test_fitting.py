@@ -16,20 +16,14 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    Position,
-    SimulatedRun,
-    UnitModel,
-    arrays,
-    parse_cyclogram,
-    positions,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import SimulatedRun, arrays
+from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
-from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 from thermo_comp.unit.metrics import norm_residual, residual_statistics
 
 RATE_HZ = 4.0

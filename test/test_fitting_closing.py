@@ -12,19 +12,14 @@ import pytest
 from test_fitting import FACES, sources_of
 
 from thermo_comp.fitting import FitOptions, fit
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    Position,
-    SimulatedRun,
-    arrays,
-    parse_cyclogram,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import Position, parse_cyclogram
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.thermal.state import WEIGHT
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.typing import Floats
-from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 Closes = Literal['board', 'case']
 #: Soaks long enough for the board to relax.

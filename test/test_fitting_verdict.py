@@ -22,7 +22,7 @@ from thermo_comp.fitting.verdict import (
     judge_windows,
 )
 from thermo_comp.fitting.windows import Model, Sets, ThermalWindows
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.functions import Polynomial
 from thermo_comp.unit.gravity import MICRO_G

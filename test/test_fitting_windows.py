@@ -14,14 +14,9 @@ from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit_bags, redu
 from thermo_comp.fitting.options import sets_of
 from thermo_comp.fitting.reduction import ReducedBag
 from thermo_comp.fitting.windows import Model, ThermalWindows, thermal_windows
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    Position,
-    arrays,
-    parse_cyclogram,
-    positions,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import arrays
 from thermo_comp.thermal.memory import MemorySpec, ThermalMemory, memory_on_grid
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
 from thermo_comp.thermal.state import Layout
@@ -31,6 +26,7 @@ from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.columns import Column, ColumnTable, bank, memory_of
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 10min, 35@1 10min, 15@1 10min')
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY)

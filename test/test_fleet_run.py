@@ -27,7 +27,7 @@ from thermo_comp.fleet.run import Results
 from thermo_comp.fleet.units import Storage, find_units
 from thermo_comp.fleet.work import connected, outcome_of
 from thermo_comp.recording import Topics
-from thermo_comp.simulation import unit_preset
+from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.unit.calibration_file import load_calibration
 
 distributed = pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')

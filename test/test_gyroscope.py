@@ -22,7 +22,9 @@ from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.recording import Block, ImuColumns
 from thermo_comp.recording.columns import Readings
-from thermo_comp.simulation import arrays, plan, unit_preset
+from thermo_comp.simulation.campaign import plan
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import arrays
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.functions import Polynomial
 from thermo_comp.unit.gravity import EARTH_RATE, STANDARD_GRAVITY

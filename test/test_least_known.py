@@ -12,7 +12,7 @@ from position_helpers import GRAVITY, Rest
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.coverage import least_known
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',))
 FACES = np.vstack((np.eye(3), -np.eye(3)))

@@ -14,7 +14,7 @@ from position_helpers import START_NS
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.coverage import rough_centre
 from thermo_comp.fitting.fit import about
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 
 GRAVITY = 9.80665
 OPTIONS = FitOptions(gravity=GRAVITY)

@@ -12,7 +12,7 @@ from position_helpers import GRAVITY, MG, START_NS, Rest
 from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import FitSource
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 from thermo_comp.unit.calibration import parameter_layout
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')

@@ -13,7 +13,9 @@ import pytest
 from builders import SECOND_NS
 from simulation_helpers import rippled
 
-from thermo_comp.simulation import parse_cyclogram, simulate, unit_preset
+from thermo_comp.simulation.campaign import parse_cyclogram
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import simulate
 from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.thermal.plausibility import STILL_READINGS, Fault, still_readings
 from thermo_comp.thermal.regime import Regime

@@ -15,17 +15,12 @@ from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.fitting.priors import population
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    Position,
-    SimulatedRun,
-    arrays,
-    parse_cyclogram,
-    positions,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = unit_preset('products', 1)

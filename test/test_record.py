@@ -17,26 +17,28 @@ import numpy as np
 import pytest
 from conftest import ROOT, Cli
 
-from thermo_comp import simulation
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording import BagWriter, Topics, open_recording
 from thermo_comp.recording.growing import growing_blocks, numbered_bags
+from thermo_comp.simulation.campaign import parse_cyclogram, positions
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import simulate_blocks
 from thermo_comp.unit.calibration_file import load_calibration
 
 N_POSITIONS, SOAK_S, TURN_S, RATE = 9, 200.0, 20.0, 10.0
-UNIT = simulation.unit_preset('plain', 1)
-UPS = simulation.positions(N_POSITIONS, 2)
+UNIT = unit_preset('plain', 1)
+UPS = positions(N_POSITIONS, 2)
 START_NS = 1_767_225_600_000_000_000
 
 
 def write_session(path: Path, ups: np.ndarray = UPS, chunk_bytes: int = 1 << 14) -> Path:
     """Write one bag of a unit that rests in each position in turn, with hands on it between."""
     rng = np.random.default_rng(5)
-    program = simulation.parse_cyclogram(f'20 {SOAK_S:g}s')
+    program = parse_cyclogram(f'20 {SOAK_S:g}s')
     start_ns = START_NS
     with BagWriter(path, metadata={'serial': 'lab-7'}, chunk_bytes=chunk_bytes) as writer:
         for seed, up in enumerate(ups):
-            (run,) = simulation.simulate_blocks(
+            (run,) = simulate_blocks(
                 UNIT,
                 program,
                 up,

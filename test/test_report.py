@@ -34,8 +34,8 @@ from thermo_comp.report.figures import figures_of
 from thermo_comp.report.figures_bags import draw_positions
 from thermo_comp.report.html import spelt
 from thermo_comp.report.style import drawing
-from thermo_comp.simulation import STANDARD_GRAVITY
 from thermo_comp.thermal.regime import Regime
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 

@@ -16,7 +16,7 @@ from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.jumps import find_jumps
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.verdict import describe
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',))
 

@@ -13,22 +13,13 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from thermo_comp.simulation import (
-    MICRO_G,
-    PLAN_NAMES,
-    STANDARD_GRAVITY,
-    TRIAD_NAMES,
-    Position,
-    UnitModel,
-    arrays,
-    parse_cyclogram,
-    plan,
-    simulate,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
 from thermo_comp.simulation.drift import FlowEffect, PartHistory, SlipEffect
-from thermo_comp.simulation.unit import SwitchedLoad
+from thermo_comp.simulation.presets import TRIAD_NAMES, unit_preset
+from thermo_comp.simulation.run import arrays, simulate
+from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
 from thermo_comp.typing import Floats
+from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
 

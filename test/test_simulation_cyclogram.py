@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulation_helpers import rates_k_min
 
-from thermo_comp.simulation import CYCLOGRAM_NAMES, Cyclogram, parse_cyclogram
+from thermo_comp.simulation.campaign import CYCLOGRAM_NAMES, Cyclogram, parse_cyclogram
 
 
 @pytest.mark.parametrize('name', [name for name in CYCLOGRAM_NAMES if name != 'soak'])

@@ -15,18 +15,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermo_comp.simulation import (
-    MICRO_G,
-    UNIT_NAMES,
-    Cyclogram,
-    UnitModel,
-    parse_cyclogram,
-    positions,
-    simulate,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import Cyclogram, parse_cyclogram, positions
 from thermo_comp.simulation.drift import PartHistory, drift_of
+from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
+from thermo_comp.simulation.run import simulate
+from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Floats
+from thermo_comp.unit.gravity import MICRO_G
 
 RATE_HZ = 10.0
 MINUTE = 60

@@ -11,21 +11,13 @@ import pytest
 from scipy.signal import welch
 from simulation_helpers import ideal_regime, noiseless, rippled
 
-from thermo_comp.simulation import (
-    MICRO_G,
-    STANDARD_GRAVITY,
-    START_NS,
-    Cyclogram,
-    SimulatedRun,
-    UnitModel,
-    parse_cyclogram,
-    positions,
-    simulate,
-    simulate_blocks,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import Cyclogram, parse_cyclogram, positions
 from thermo_comp.simulation.drift import PartEffect
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import START_NS, SimulatedRun, simulate, simulate_blocks
+from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Floats
+from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 UP = np.array([0.48, -0.6, 0.64])
 DEMO = parse_cyclogram('demo')

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from thermo_comp.simulation import UNIT_NAMES, parse_cyclogram, unit_preset
+from thermo_comp.simulation.campaign import parse_cyclogram
 from thermo_comp.simulation.drift import CreepEffect, PartHistory
 from thermo_comp.simulation.network import AIR, Link, ThermalNetwork, ThermalResponse
+from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
 
 # Solved in closed form, so only rounding remains; temperatures are tens of degrees.
 ROUNDING = 1e-9

@@ -10,7 +10,7 @@ from position_helpers import START_NS, Imu, ImuBlock
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, fit, reduce_bag
-from thermo_comp.simulation import positions
+from thermo_comp.simulation.campaign import positions
 
 GRAVITY = 9.80665
 MG = GRAVITY * 1e-3

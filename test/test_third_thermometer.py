@@ -21,19 +21,15 @@ from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.judging import evaluate
 from thermo_comp.recording import BagWriter, Topics, read_recording
 from thermo_comp.replay import replay
-from thermo_comp.simulation import (
-    STANDARD_GRAVITY,
-    SimulatedRun,
-    parse_cyclogram,
-    positions,
-    simulate,
-    unit_preset,
-)
+from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.drift import PartEffect
 from thermo_comp.simulation.network import AIR, Link, ThermalNetwork
+from thermo_comp.simulation.presets import unit_preset
+from thermo_comp.simulation.run import SimulatedRun, simulate
 from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
 from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 10min, 40@1 40min, 5@1 40min')
 MICRO_G = STANDARD_GRAVITY * 1e-6

@@ -25,7 +25,8 @@ from .output import Cell, Output, micro_g, picked
 
 if TYPE_CHECKING:
     from ..recording import BagWriter
-    from ..simulation import SimulatedRun, UnitModel
+    from ..simulation.run import SimulatedRun
+    from ..simulation.unit import UnitModel
     from ..unit.calibration import Calibration
 
 _OUTPUT = 'imu/data_raw'
@@ -81,17 +82,18 @@ def simulate(
     Example:
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
     """
-    from .. import __version__, simulation
+    from .. import __version__
     from ..recording import BagWriter
+    from ..simulation import campaign, presets, run
 
     with options.usage_of():
-        specimen = simulation.unit_preset(unit, unit_seed)
+        specimen = presets.unit_preset(unit, unit_seed)
         if plan is None:
-            program = simulation.parse_cyclogram(profile)
-            ups = simulation.positions(positions, position_seed)
-            stations = tuple(simulation.Position(profile, program, up) for up in ups)
+            program = campaign.parse_cyclogram(profile)
+            ups = campaign.positions(positions, position_seed)
+            stations = tuple(campaign.Position(profile, program, up) for up in ups)
         else:
-            stations = simulation.plan(plan, position_seed)
+            stations = campaign.plan(plan, position_seed)
     if sibling is not None:
         specimen = specimen.sibling(sibling)
     n = len(stations)
@@ -120,7 +122,7 @@ def simulate(
                 'truth': json.dumps(truth),
             }
             with options.usage_of():
-                runs = simulation.simulate_blocks(
+                runs = run.simulate_blocks(
                     specimen,
                     station.program,
                     station.up,

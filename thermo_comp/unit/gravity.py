@@ -28,11 +28,10 @@ _UNITS = {
 
 def spoken(acceleration: float) -> str:
     """Say an error in ug, or from 1 mg on in mg, with two or three digits."""
-    micro_g = acceleration / MICRO_G
-    if not abs(micro_g) >= 999.5:
-        return f'{micro_g:.2g} ug' if abs(micro_g) < 99.5 else f'{micro_g:.0f} ug'
-    milli_g = micro_g / 1e3
-    return f'{milli_g:.2g} mg' if abs(milli_g) < 99.5 else f'{milli_g:.0f} mg'
+    value, unit = acceleration / MICRO_G, 'ug'
+    if abs(value) >= 999.5:
+        value, unit = value / 1e3, 'mg'
+    return f'{value:.2g} {unit}' if abs(value) < 99.5 else f'{value:.0f} {unit}'
 
 
 def parse_acceleration(text: str) -> float:

@@ -15,13 +15,12 @@ import dataclasses
 import math
 import operator
 import re
-import types
 import typing
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union
+from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from ..text import counted
 
@@ -150,12 +149,7 @@ def _build(hint: Any, data: Any, key: str) -> Any:
 
 def parts_of(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """Take a hint apart that is neither a plain type nor a dataclass."""
-    if typing.get_origin(hint) is Annotated:
-        return Annotated, (hint.__origin__, *hint.__metadata__)
-    origin = typing.get_origin(hint)
-    if origin not in (Literal, tuple, Union, types.UnionType):
-        raise TypeError(f'{hint} is no hint that a schema knows')
-    return Union if origin is types.UnionType else origin, typing.get_args(hint)
+    return typing.get_origin(hint), typing.get_args(hint)
 
 
 @lru_cache(maxsize=256)
