@@ -40,11 +40,11 @@ def test_the_bank():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()) == {
-        'now': 1, 'board': 15, 'neighbour': 15, 'product': 8, 'mixed': 9, 'square': 8,
+        'now': 1, 'board': 15, 'neighbour': 15, 'product': 16, 'mixed': 9, 'square': 24,
         'even': 21, 'play': 8,
     }  # fmt: skip
     assert by_group(bank(('case', 'tip'))) == {
-        'now': 2, 'board': 15, 'neighbour': 30, 'product': 8, 'mixed': 18, 'square': 8,
+        'now': 2, 'board': 15, 'neighbour': 30, 'product': 16, 'mixed': 18, 'square': 24,
         'even': 42, 'play': 8,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))

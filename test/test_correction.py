@@ -234,7 +234,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     state = np.array(state)
     moved = np.repeat(state[:, np.newaxis], len(draws), axis=1)
     wide = replace(
-        unit, response=tuple(replace(one, range=(-1000.0, 1000.0)) for one in unit.response)
+        unit, response=tuple(replace(one, range=(-4000.0, 4000.0)) for one in unit.response)
     )
     # Squares of lags bend: the spread is asked for where they are straight.
     small = 0.05

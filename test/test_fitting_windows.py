@@ -171,7 +171,9 @@ def test_the_lag_of_a_column_moves_it_as_its_start_says(bags: list[ReducedBag]) 
         after = table.values(moved[:, np.newaxis])
         slope = (after - before)[column_number, 0] / 1e-6
         u = state[layout.lags[column.lag]]
-        expected = (2.0 * u if column.kind == 'square' else 1.0) * 7.0**column.power
+        expected = {'square': 2.0 * u, 'cube': 3.0 * u * u}.get(
+            column.kind, 1.0
+        ) * 7.0**column.power
         assert slope == pytest.approx(expected, rel=1e-4)
 
 

@@ -272,7 +272,7 @@ def _triple(values: Floats) -> tuple[float, float, float]:
 def _column_range(column: Column, values: Floats) -> tuple[float, float]:
     if column.kind == 'even':
         return column.range
-    reach = _LINEAR_REACH**2 if column.kind == 'square' else _LINEAR_REACH
+    reach = _LINEAR_REACH ** {'square': 2, 'cube': 3}.get(column.kind, 1)
     return _widened(values, reach, 0.01)
 
 

@@ -31,6 +31,8 @@ _WINDOW_S = 60.0
 CURVE, SET = 'curve', 'set'
 #: A short rest still has so many windows: from less, no noise is learnt.
 FEWEST_WINDOWS = 20
+# After this every lag has forgotten how it began [s].
+_EVER_S = 1e9
 
 
 @dataclass(frozen=True)
@@ -134,19 +136,21 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     n_positions = 0
     has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
     for bag, reduced in enumerate(bags):
-        begin, grid, states, shares = _states(reduced, spec, model)
-        raw = table.raw(states.T)
-        curves, groups = sets.columns(states[:, BOARD] - reference, states[:, WEIGHT])
-        factors, _ = table.factors(states[:, BOARD], states[:, WEIGHT])
-        values = [*curves, *(raw * factors)]
-        moved = _moved(columns, spec, states, shares, reference)
-        whole = np.column_stack((states[:, [BOARD, RATE, WEIGHT, GRADIENT]], *raw, *values, moved))
+        begin, grid, states = _states(reduced, spec, model)
         for interval in reduced.intervals:
             use = interval.time >= begin
             if not use.any():
                 continue
             time, count = interval.time[use], interval.count[use]
-            rows = np.column_stack([np.interp(time, grid, column) for column in whole.T])
+            at = np.array([np.interp(time, grid, column) for column in states.T])
+            board, weight = at[BOARD], at[WEIGHT]
+            raw = table.raw(at)
+            curves, groups = sets.columns(board - reference, weight)
+            factors, _ = table.factors(board, weight)
+            moved = _moved(table, table.slopes(at) * factors, time - grid[0])
+            rows = np.array(
+                [board, at[RATE], weight, at[GRADIENT], *raw, *curves, *(raw * factors), *moved]
+            ).T
             if has_rate and interval.angular_rate is not None:
                 rows = np.hstack((rows, interval.angular_rate[use]))
             merged = _merged(time, count, interval.mean[use], rows)
@@ -160,9 +164,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     moved_at, end = 4 + k + m, 4 + k + m + len(columns)
     lag = [-1] * len(groups)
     lag += [
-        spec.lags.index(column.lag)
-        if column.lag and column.kind in ('board', 'neighbour', 'square')
-        else -1
+        spec.lags.index(column.lag) if column.lag and column.kind != 'play' else -1
         for column in columns
     ]
     data = Windows(
@@ -197,19 +199,15 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     )
 
 
-def _states(
-    bag: ReducedBag, spec: MemorySpec, model: Model
-) -> tuple[float, Floats, Floats, Floats]:
-    """
-    Run the tracker: where its estimate has settled, grid, states, shares of the start states.
-    """
+def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[float, Floats, Floats]:
+    """Run the tracker: where its estimate has settled, grid from its first reading, states."""
     if not len(bag.board.value):
-        # Nothing is known: a unit that stays at the reference.
+        # Nothing is known: a unit that has always been at the reference.
         width = Layout(spec).width
         still = np.zeros((2, width))
         still[:, BOARD] = model.reference_temperature
-        ends: Floats = np.array([-1.0, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
-        return -1.0, ends, still, np.zeros((2, len(spec.lags)))
+        ends: Floats = np.array([-_EVER_S, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
+        return -1.0, ends, still
     tracker = ThermalTracker(model.detector, MemorySpec(spec.sensors), ThermalConfig())
     shortest = min(
         (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
@@ -222,26 +220,17 @@ def _states(
     gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
     memory = memory_on_grid(spec, step_s, states[:, BOARD], gradients)
     states = np.hstack((states, memory))
-    age = grid - start_s
-    shares = np.exp(-age[:, None] / np.array([tau for _, tau in spec.lags]))
     settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
-    return float(grid[int(np.argmax(settled))]), grid, states, shares
+    return float(grid[int(np.argmax(settled))]), grid, states
 
 
-def _moved(
-    columns: Sequence[Column], spec: MemorySpec, states: Floats, shares: Floats, reference: float
-) -> Floats:
-    """Differentiate each column by the start state of its lag, shape (n, k)."""
-    t = states[:, BOARD] - reference
-    result = np.zeros((len(states), len(columns)))
-    places = Layout(spec).lags
-    for k, column in enumerate(columns):
-        if column.lag is None or column.kind == 'play':
-            continue
-        share = shares[:, spec.lags.index(column.lag)]
-        if column.kind == 'square':
-            share = 2.0 * states[:, places[column.lag]] * share
-        result[:, k] = share * t**column.power
+def _moved(table: ColumnTable, slopes: Floats, age_s: Floats) -> Floats:
+    """Differentiate each column by the start state of its lag, shape (k, n)."""
+    result = np.zeros_like(slopes)
+    for k, column in enumerate(table.columns):
+        if column.lag and column.kind != 'play':
+            _, tau = column.lag
+            result[k] = slopes[k] * np.exp(-age_s / tau)
     return result
 
 

@@ -15,6 +15,7 @@ board      T_board - L_tau(T_board)    parts that lag the board
 neighbour  L_tau(g_s)                  parts between the thermometers
 square     (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a flow
            g_s^2 where tau is 0
+cube       (T_board - L_tau)^3         the same, and a flow that grows faster than its cause
 even       tanh((g_s / width)^2)       heat load whichever way the heat flows
 size       abs(g_s)                    the same, as a heat pump's
 play       P_r(v) - v, v = t or        rate-independent hysteresis
@@ -23,7 +24,7 @@ play       P_r(v) - v, v = t or        rate-independent hysteresis
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
 and t at those of the calibrated temperatures. The groups of the bank are its kinds; *product* and
-*mixed* are board, and now and neighbour, of power 1: coefficients that change with temperature.
+*mixed* are board, and now and neighbour, of a power: coefficients that change with temperature.
 
 This is the one table of columns: tracker, fit, correction, covariance and file take theirs from
 here, so that another regressor is an entry of `bank` and, if it is of a new kind, of `_FORMS`.
@@ -45,7 +46,7 @@ from .functions import by_element, hold
 from .schema import Bounds, NotNegative, check_ranges
 
 #: A range that holds nothing back, of any value.
-UNBOUNDED: Final = (-1000.0, 1000.0)
+UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the bank: from a few readings to the longest memory that bags can show [s].
 #: Lags themselves are fine enough for one of 100 ug/K between two of them; their products are not
 #: so large, and take every other.
@@ -66,14 +67,14 @@ class Column:
         'What evidence judges together.',
     ]
     kind: Annotated[
-        Literal['now', 'rate', 'board', 'neighbour', 'square', 'size', 'even', 'play'],
+        Literal['now', 'rate', 'board', 'neighbour', 'square', 'cube', 'size', 'even', 'play'],
         'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without '
-        'lag; abs(g_s); tanh((g_s / width)^2); play of t minus t, where '
+        'lag; (T - lagged T)^3; abs(g_s); tanh((g_s / width)^2); play of t minus t, where '
         'g_s = T_s - T_board.',
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
     tau_s: Annotated[
-        NotNegative, 'Time constant of the lag (board, neighbour, square; play: 0 = none).'
+        NotNegative, 'Time constant of the lag (board, neighbour, square, cube; play: 0 = none).'
     ] = 0.0
     width_k: Annotated[NotNegative, 'Width of even, half-width of play.'] = 0.0
     power: Annotated[int, Bounds(at_least=0), 'The value is multiplied by t to this power.'] = 0
@@ -123,10 +124,13 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
     ]
     coarse = [column for column in board if column.tau_s in BANK_TAUS]
     flow = [*now, *(column for column in neighbour if column.tau_s in BANK_TAUS)]
-    product = [replace(column, group='product', power=1) for column in coarse]
+    product = [replace(one, group='product', power=power) for power in (1, 2) for one in coarse]
     mixed = [replace(column, group='mixed', power=1) for column in flow]
-    # A part's own curve bends over its own temperature t - m: (t - m)^2 = t^2 - 2 t m + m^2.
-    square = [replace(column, group='square', kind='square') for column in coarse]
+    # A part's own curve bends over its own temperature t - m: (t - m)^2 = t^2 - 2 t m + m^2, and
+    # (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
+    square = [replace(one, group='square', kind='square') for one in coarse]
+    square += [replace(one, power=1) for one in square]
+    square += [replace(one, group='square', kind='cube') for one in coarse]
     even = [
         Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
         for sensor in sensors
@@ -170,6 +174,7 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
 _FORMS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
     'line': (lambda x: x, np.ones_like),
     'square': (lambda x: x * x, lambda x: 2.0 * x),
+    'cube': (lambda x: x * x * x, lambda x: 3.0 * x * x),
     'size': (np.abs, np.sign),
     'even': (
         lambda x: by_element(math.tanh, x * x),
