@@ -96,7 +96,7 @@ class Desk:
             self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
             # Short: some examples play it as slowly as it was recorded.
-            self._cli('simulate', '--profile', '20 4s', '-o', path, '-q')
+            self._cli('simulate', '--profile', '20 2s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
             self._cli('simulate', *program, '-o', path, '-q')
