@@ -74,8 +74,8 @@ def convert(
     """
     from ..convert.log import SLOW_HZ, write_log
 
-    read_too = [] if columns is None else [columns]
-    check_output(output, bag_kind(output), overwrite=force, others=[log, *read_too])
+    inputs = [log] if columns is None else [log, columns]
+    check_output(output, bag_kind(output), overwrite=force, others=inputs)
     given = {
         'columns': columns,
         'rate_hz': rate_hz,
@@ -148,7 +148,6 @@ def as_bags(
         bags = {}
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
-            bags[path].parent.mkdir()
             write_log(_read(out, path, columns=columns, rate_hz=rate_hz), bags[path])
         yield [bags.get(path, path) for path in paths]
 

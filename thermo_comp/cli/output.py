@@ -51,18 +51,15 @@ class Output:
         Say of bags what was chosen in them, once for those that are alike, and what is missing.
         """
         alike: dict[str, list[object]] = {}
-        torn = []
         for bag, chosen, missing in bags:
             if chosen:
                 alike.setdefault(chosen, []).append(bag)
             if missing:
-                torn.append(f'{bag}: {missing}')
+                self.note(f'{bag}: {missing}')
+                self._is_torn = True
         for said, names in alike.items():
             more = f' and {len(names) - 1} more' if len(names) > 1 else ''
             self.note(f'{names[0]}{more}: {said}')
-        for one in torn:
-            self.note(one)
-        self._is_torn |= bool(torn)
 
     def end(self, code: int = 0, /, **data: Any) -> None:
         """

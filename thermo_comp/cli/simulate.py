@@ -200,7 +200,13 @@ def demo(
     from ..ros.round_trip import round_trip
     from ..unit.calibration_file import save_calibration
 
-    folder = _sample_bags(bags)
+    # Where the user says, here, or in the source tree.
+    places = [bags] if bags else [Path('bags'), Path(__file__).parents[2] / 'bags']
+    folder = next((one for one in places if (one / 'held_out.mcap').is_file()), None)
+    if folder is None:
+        raise ThermoCompError(
+            f'no sample bags in {places[0]}: run it in a clone of the repository, or give --bags'
+        )
     output.mkdir(parents=True, exist_ok=True)
     held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'
     fit_bags = sorted((folder / 'fit').glob('*.mcap'))
@@ -270,17 +276,6 @@ def demo(
     )
     if not is_same or n_out != n_in:
         raise ThermoCompError('the node lost messages or differs from the offline replay')
-
-
-def _sample_bags(given: Path | None) -> Path:
-    """Find the sample bags: where the user says, here, or in the source tree."""
-    places = [given] if given else [Path('bags'), Path(__file__).parents[2] / 'bags']
-    for place in places:
-        if (place / 'held_out.mcap').is_file():
-            return place
-    raise ThermoCompError(
-        f'no sample bags in {places[0]}: run it in a clone of the repository, or give --bags'
-    )
 
 
 def _equals_offline(recorded: Path, bag: Path, calibration: 'Calibration') -> bool:
