@@ -156,7 +156,7 @@ def test_a_chunk_of_a_ros1_bag_expands_within_limits(
     header, stamp = (
         store.types[name] for name in ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time')
     )
-    monkeypatch.setattr('thermo_comp.recording.unpack.MAX_CHUNK_BYTES', 1 << 22)
+    monkeypatch.setattr('thermo_comp.recording.chunks.MAX_CHUNK_BYTES', 1 << 22)
     for n_bytes, is_read in ((1 << 20, True), (1 << 23, False)):
         path = tmp_path / f'{n_bytes}.bag'
         writer = Writer(path)

@@ -13,9 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.recording.chunks import locate, walk
+from thermo_comp.recording.chunks import DamagedError, locate, walk
 from thermo_comp.recording.messages import Messages
-from thermo_comp.recording.unpack import DamagedError
 
 MESSAGE, CHANNEL = 5, 4
 

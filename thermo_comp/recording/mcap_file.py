@@ -33,9 +33,8 @@ from mcap.stream_reader import StreamReader
 
 from ..errors import RecordingError
 from ..files import open_regular
-from .chunks import HEAD_BYTES, PREFIX, Span, load, parse_chunk_head
+from .chunks import HEAD_BYTES, PREFIX, DamagedError, Span, load, parse_chunk_head, translated
 from .messages import BagFile, Done, Messages, Topic, Work, join_messages
-from .unpack import DamagedError, translated
 
 MAGIC = b'\x89MCAP0\r\n'
 _BEGIN = MAGIC + bytes([Opcode.HEADER])

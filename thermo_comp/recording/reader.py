@@ -23,6 +23,7 @@ from tempfile import TemporaryDirectory
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
+from .chunks import expand, translated
 from .clock import Cut, without_jumps
 from .columns import (
     ROLES,
@@ -39,7 +40,6 @@ from .foreign import ForeignFile
 from .mcap_file import McapFile
 from .messages import BagFile, Done, Messages, Topic
 from .topics import Topics, select_topics, shown
-from .unpack import expand, translated
 from .wire import decode_blocks
 
 _N_LOADERS = 2
