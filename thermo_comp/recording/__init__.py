@@ -8,8 +8,7 @@ The only package that knows `rosbags` and `mcap`.
 
 from __future__ import annotations
 
-from .columns import ROLES, Block, ImuColumns, Input, Recording, RecordingInfo, Role
-from .messages import Messages
+from .columns import ROLES, Block, ImuColumns, Input, Messages, Recording, RecordingInfo, Role
 from .reader import RecordingReader, inspect_recording, open_recording, read_recording
 from .topics import Part, Topics
 from .writer import STAMP_END_NS, BagWriter

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Bytes, Ints
-from .messages import Messages, field, gather
+from .columns import Messages, gather, number_at
 
 #: Opcode and length in front of each record.
 PREFIX = struct.Struct('<BQ')
@@ -95,9 +95,8 @@ class Span:
     """
     A stretch of a file: a chunk, one whose end is missing, or messages outside any chunk.
 
-    `position` and `length` [bytes] are those of its records, with `index_length` bytes of message
-    indexes behind it; `size` is its content's, `start_ns` and `end_ns` the log times of its
-    messages.
+    `position` and `length` [bytes] are its records', without the message indexes behind it; `size`
+    is its content's; start and end are log times.
     """
 
     position: int
@@ -190,8 +189,8 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
     # Unsigned on purpose: a length that is too small wraps around to one that is too large.
-    length = field(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
-    if int(np.max(length)) > len(data) or (field(head, 0, 'u1') != MESSAGE).any():
+    length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
+    if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
         return None
     size = length.view(np.int64)
     begins = np.concatenate(([0], at + size + MESSAGE_HEAD_BYTES))
@@ -202,11 +201,9 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
 
 def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
-    Go from record to record as far as they are whole.
+    Go from record to record as far as they are whole, and say what is wrong with the next.
 
-    Returns the messages and what is wrong with the first record that is not whole, if there is
-    one. Before zeros, which are no record, the last message is left out: its own end may be zeros,
-    too. Raises DamagedError for impossible times.
+    Before zeros the last message is left out: its own end may be zeros, too.
     """
     view = data.data
     places: list[int] = []
@@ -232,16 +229,16 @@ def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
         at = end
     found = np.array(places[:-1] if reason == _ZERO_OPCODE else places, np.int64)
     head = gather(data, found, MESSAGE_HEAD_BYTES)
-    size = field(head, 1, '<i8') - _MESSAGE_FIELDS_BYTES
+    size = number_at(head, 1, '<i8') - _MESSAGE_FIELDS_BYTES
     return _messages(data, found, size, head), reason
 
 
 def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Messages:
-    log_ns = field(head, 15, '<i8').astype(np.int64)
+    log_ns = number_at(head, 15, '<i8').astype(np.int64)
     if len(log_ns) and int(np.min(log_ns)) < 0:
         raise DamagedError('a message has a log time beyond the year 2262')
     # Copied: each role looks at all of them.
-    channel = field(head, 9, '<u2').astype(np.uint16)
+    channel = number_at(head, 9, '<u2').astype(np.uint16)
     return Messages(data, at + MESSAGE_HEAD_BYTES, size, channel, log_ns)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import RecordingError
 from .chunks import inflate_message, inflate_ros1_chunk, translated
-from .messages import BagFile, Done, Messages, Topic, Work
+from .columns import BagFile, Done, Messages, Topic, Work
 
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9

@@ -22,8 +22,7 @@ import numpy as np
 from ..errors import OutputError, RecordingError
 from ..files import MCAP, check_output
 from ..typing import Ints
-from .columns import Block, Input, RecordingInfo, Role
-from .messages import Messages
+from .columns import Block, Input, Messages, RecordingInfo, Role
 from .reader import open_recording
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics
 from .writer import BagWriter

@@ -34,7 +34,7 @@ from mcap.stream_reader import StreamReader
 from ..errors import RecordingError
 from ..files import open_regular
 from .chunks import HEAD_BYTES, PREFIX, DamagedError, Span, load, parse_chunk_head, translated
-from .messages import BagFile, Done, Messages, Topic, Work, join_messages
+from .columns import BagFile, Done, Messages, Topic, Work, join_messages
 
 MAGIC = b'\x89MCAP0\r\n'
 _BEGIN = MAGIC + bytes([Opcode.HEADER])

@@ -30,8 +30,8 @@ from mcap.opcode import Opcode
 from .. import __version__
 from ..errors import RecordingError
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
+from .columns import Messages, join_messages, scatter
 from .mcap_file import MAGIC, METADATA_NAME
-from .messages import Messages, join_messages, scatter
 from .topics import BOOL
 from .wire import typestore
 

@@ -27,18 +27,21 @@ from .chunks import expand, translated
 from .clock import Cut, without_jumps
 from .columns import (
     ROLES,
+    BagFile,
     Block,
+    Done,
     Input,
+    Messages,
     Recording,
     RecordingInfo,
     Role,
+    Topic,
     count_topics,
     gathered,
     joined,
 )
 from .foreign import ForeignFile
 from .mcap_file import McapFile
-from .messages import BagFile, Done, Messages, Topic
 from .topics import Topics, select_topics, shown
 from .wire import decode_blocks
 

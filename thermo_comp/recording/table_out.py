@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from numpy.typing import NDArray
 
@@ -27,49 +28,35 @@ def table_writer(
     Write a table, by its suffix one of `TABLES`; it takes its name when the block ends well.
 
     Yields what takes columns by name, shape (n,) each, the same ones every time. A CSV file has no
-    place for the metadata. Raises OutputError if it may not or cannot be written, or pyarrow is
-    missing.
+    place for the metadata. OutputError if it may not or cannot be written, or pyarrow is missing.
     """
     kind = TABLES[Path(path).suffix]
-    with drafted(path, kind, overwrite=overwrite) as partial:
+    with drafted(path, kind, overwrite=overwrite) as partial, partial.open('wb') as file:
         if kind is CSV:
-            yield from _csv(partial)
-        else:
-            yield from _parquet(partial, path, metadata)
-
-
-def _csv(partial: Path) -> Iterator[WriteRows]:
-    with partial.open('w', encoding='utf-8', newline='') as file:
-
-        def write(columns: Mapping[str, NDArray[Any]]) -> None:
-            if not file.tell():
-                file.write(','.join(columns) + '\n')
-            # str of a float has all its digits.
-            cells = [map(str, column.tolist()) for column in columns.values()]
-            file.writelines(','.join(row) + '\n' for row in zip(*cells, strict=True))
-
-        yield write
-
-
-def _parquet(partial: Path, path: str | Path, metadata: Mapping[str, str]) -> Iterator[WriteRows]:
-    try:
-        import pyarrow as pa
-        from pyarrow import parquet as pq
-    except ImportError as error:
-        raise OutputError("needs pyarrow: pip install 'thermo_comp[parquet]'", path) from error
-    with partial.open('wb') as file:
-        writer: Any = None
-
-        def write(columns: Mapping[str, NDArray[Any]]) -> None:
-            nonlocal writer
-            arrays = {name: pa.array(column) for name, column in columns.items()}
-            table = pa.table(arrays, metadata=dict(metadata))
-            if writer is None:
-                writer = pq.ParquetWriter(file, table.schema)
-            writer.write_table(table)
-
+            yield lambda columns: _write_csv(file, columns)
+            return
         try:
+            import pyarrow as pa
+            from pyarrow import parquet as pq
+        except ImportError as error:
+            raise OutputError("needs pyarrow: pip install 'thermo_comp[parquet]'", path) from error
+        with ExitStack() as stack:
+            writer: Any = None
+
+            def write(columns: Mapping[str, NDArray[Any]]) -> None:
+                nonlocal writer
+                arrays = {name: pa.array(column) for name, column in columns.items()}
+                table = pa.table(arrays, metadata=dict(metadata))
+                writer = writer or stack.enter_context(pq.ParquetWriter(file, table.schema))
+                writer.write_table(table)
+
             yield write
-        finally:
-            if writer is not None:
-                writer.close()
+
+
+def _write_csv(file: BinaryIO, columns: Mapping[str, NDArray[Any]]) -> None:
+    # str of a float has all its digits.
+    cells = [map(str, column.tolist()) for column in columns.values()]
+    rows: Iterable[Iterable[str]] = zip(*cells, strict=True)
+    if not file.tell():
+        rows = chain([columns], rows)
+    file.writelines(f'{",".join(row)}\n'.encode() for row in rows)

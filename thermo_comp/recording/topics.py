@@ -84,13 +84,11 @@ WHOLE = Part()
 @dataclass(frozen=True, slots=True)
 class Topics:
     """
-    Where the inputs stand in a bag.
+    Where the inputs stand in a bag, and which part of it is read.
 
-    A name matches with or without its leading slash and, where only one topic of the bag fits,
-    with any namespace in front: ``accel/counts`` finds ``/imu0/accel/counts``. Where a usual name
-    is not there, the bag's only topic of the type is taken. Further thermometers are found by
-    themselves, ``temperature/<name>`` in the namespace of the board's, or named in `further`.
-    `part` is what of the bag is read.
+    A name matches with or without its leading slash and, where only one topic fits, with any
+    namespace in front. Where a usual name is not there, the bag's only topic of the type is taken.
+    Further thermometers are found beside the board's, ``temperature/<name>``, or named.
     """
 
     counts: str = 'accel/counts'
@@ -147,32 +145,28 @@ def select_topics(
     """
     Find the topics that feed the roles, as far as they have messages.
 
-    Gives these, what the accelerometer's is, and what was taken for want of the usual name. Raises
-    RecordingError for an empty bag, and for a topic that is ambiguous, of another type, or missing
-    or without messages where it is required.
+    Gives these, what the accelerometer's is, and what was taken for want of the usual name.
+    RecordingError for a topic that is ambiguous, of another type, or required and not there.
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages')
     found: dict[Role, str] = {}
-    taken = None
-    chosen = []
+    keys: dict[Role, str] = {}
     inputs = ['counts', 'imu'] if input == 'auto' else [input]
-    for role, keys in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
-        names = {key: name for key in keys if (name := _find(present, topics, key)) is not None}
-        key = next((own for own, name in names.items() if present[name][1]), next(iter(names), ''))
-        if not key:
-            if role in require:
-                raise _missing(present, {own: getattr(topics, own) for own in keys})
-            continue
-        name = _of_type(present, names[key], _TYPES[key])
-        if present[name][1]:
-            found[role] = name
-            taken = key if role == 'accel' else taken
-            chosen.append(said_choice(name, key, getattr(topics, key)))
+    for role, own in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
+        names = {key: name for key in own if (name := _find(present, topics, key)) is not None}
+        key = next((key for key, name in names.items() if present[name][1]), next(iter(names), ''))
+        if key:
+            name = _of_type(present, names[key], _TYPES[key])
+            if present[name][1]:
+                found[role], keys[role] = name, key
+            elif role in require:
+                raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
-            raise RecordingError('the topic has no messages', key=shown(name))
+            raise _missing(present, {key: getattr(topics, key) for key in own})
+    chosen = [said_choice(found[role], key, getattr(topics, key)) for role, key in keys.items()]
     found |= _further(present, topics, found, is_read=bool(require))
-    return found, cast(Any, taken), '; '.join(filter(None, chosen)) or None
+    return found, cast(Any, keys.get('accel')), '; '.join(filter(None, chosen)) or None
 
 
 def _further(
@@ -213,10 +207,8 @@ def _fits(name: str, wanted: str) -> bool:
 def _match(present: Present, wanted: str, key: str) -> str | None:
     """Find a topic by its name, or the only one that has the name behind a namespace."""
     bare = wanted.strip('/')
-    exact = [name for name in present if name.strip('/') == bare]
-    if exact:
-        return exact[0]
-    spaced = sorted(name for name in present if name.endswith('/' + bare))
+    spaced = [name for name in present if name.strip('/') == bare][:1]
+    spaced = spaced or sorted(name for name in present if name.endswith('/' + bare))
     if len(spaced) > 1:
         raise RecordingError(
             f'several topics end in it: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
@@ -229,11 +221,9 @@ def _match(present: Present, wanted: str, key: str) -> str | None:
 def _find(present: Present, topics: Topics, key: str) -> str | None:
     wanted: str = getattr(topics, key)
     name = _match(present, wanted, key)
-    if name is not None:
-        return name
     # A case is no board, and a bag without a case's thermometer is an ordinary one.
-    if key == 'case' or wanted != getattr(_USUAL, key):
-        return None
+    if name is not None or key == 'case' or wanted != getattr(_USUAL, key):
+        return name
     taken = [getattr(topics, other) for other in _TYPES if other != key]
     taken += topics.further.values()
     only = [

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from ..errors import RecordingError
 from ..typing import Bytes, Floats, Ints
-from .columns import ROLES, Block, ImuColumns, Readings, Role
-from .messages import Messages, Topic, field, gather
+from .columns import ROLES, Block, ImuColumns, Messages, Readings, Role, Topic, gather, number_at
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, shown
 
 #: How many float64 numbers follow the header of each type.
@@ -115,7 +114,7 @@ def decode_stamped(messages: Messages, kind: str) -> Stamped:
     width = int(size[0]) if (size == size[0]).all() else HEAD_BYTES
     rows = gather(messages.data, messages.start, width)
     # Usually they are alike: of one length, in one byte order, with one length of the frame.
-    for key in (size, field(rows, 0, 'u2'), field(rows, 12, 'u4')):
+    for key in (size, number_at(rows, 0, 'u2'), number_at(rows, 12, 'u4')):
         if (key != key[0]).any():
             found = Stamped(np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object))
             order = np.argsort(key, kind='stable')
@@ -125,26 +124,26 @@ def decode_stamped(messages: Messages, kind: str) -> Stamped:
                 ):
                     column[own] = part
             return found
-    representation = int(field(rows, 0, '>u2')[0])
+    representation = int(number_at(rows, 0, '>u2')[0])
     if representation > 1:
         raise RecordingError(
             f'serialized with representation {representation:#06x}, '
             'only plain CDR (0 or 1) is read'
         )
     endian = '<' if representation else '>'
-    frame_size = int(field(rows, 12, f'{endian}u4')[0])
+    frame_size = int(number_at(rows, 12, f'{endian}u4')[0])
     # (12 + length + 7) // 8 * 8, counted from after the encapsulation
     at = (frame_size + (HEAD_BYTES + 3) & -8) + 4
     length = rows.dtype.itemsize
     if not 0 <= length - (at + 8 * n_numbers) <= _MAX_PADDING:
         raise _misfit('a header and its numbers')
-    stamp_ns = field(rows, 4, f'{endian}i4').astype(np.int64)
+    stamp_ns = number_at(rows, 4, f'{endian}i4').astype(np.int64)
     stamp_ns *= _NS
-    stamp_ns += field(rows, 8, f'{endian}u4')
+    stamp_ns += number_at(rows, 8, f'{endian}u4')
     values: Floats = np.ndarray(
         (n, n_numbers), f'{endian}f8', rows.data, offset=at, strides=(length, 8)
     )
-    frame = field(rows, HEAD_BYTES, f'S{frame_size}') if frame_size else np.zeros(n, 'S1')
+    frame = number_at(rows, HEAD_BYTES, f'S{frame_size}') if frame_size else np.zeros(n, 'S1')
     return Stamped(stamp_ns, values.astype(np.float64, 'C'), frame)
 
 

@@ -21,9 +21,8 @@ from numpy.typing import ArrayLike
 from ..errors import OutputError, RecordingError
 from ..files import Draft, bag_kind
 from ..typing import Bytes, Ints
-from .columns import ImuColumns
+from .columns import ImuColumns, Messages
 from .mcap_out import Compression, Definition, McapOutput, dump_yaml, known_definition
-from .messages import Messages
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
 from .wire import N_NUMBERS, encode_stamped
 

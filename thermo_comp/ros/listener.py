@@ -29,8 +29,8 @@ from std_msgs.msg import Bool
 
 from ..online.stamped_flag import STAMPED_TOPIC
 from ..recording import BagWriter, Input, Role, Topics
+from ..recording.columns import Messages, Topic
 from ..recording.growing import News
-from ..recording.messages import Messages, Topic
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
 from ..recording.wire import decode_blocks
 from ..typing import Ints
