@@ -48,12 +48,10 @@ _Columns = dict[str, npt.NDArray[Any]]
 _CENTURY_US = 100 * 366 * 86400 * 10**6
 #: No noise at all, but for the rounding of sums [parts of g].
 _NO_NOISE = 1e-6
-_TOPICS = (
-    *('sensor_accel', 'sensor_gyro', 'sensor_baro'),
-    *('sensor_combined', 'vehicle_air_data'),
-)
 _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
+_BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}
+_TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_combined', *_BAROMETERS)
 _INFORMATION = {'px4_hardware': 'ver_hw', 'px4_software': 'ver_sw_release', 'px4_uuid': 'sys_uuid'}
 #: `accelerometer_timestamp_relative` of a message without an accelerometer.
 _NOT_THERE = 2**31 - 1
@@ -106,17 +104,11 @@ def _ulog(path: Path) -> _Held:
             by_topic[data.name][int(data.multi_id)] = data.data
     baros = {
         number: Readings(_stamps(columns), _column(columns, name))
-        for topic, name in (
-            ('vehicle_air_data', 'baro_temp_celcius'),
-            ('sensor_baro', 'temperature'),
-        )
+        for topic, name in _BAROMETERS.items()
         for number, columns in by_topic[topic].items()
     }
-    metadata = {
-        key: str(log.msg_info_dict[name])
-        for key, name in _INFORMATION.items()
-        if name in log.msg_info_dict
-    }
+    info = log.msg_info_dict
+    metadata = {key: str(info[name]) for key, name in _INFORMATION.items() if name in info}
     if log.dropouts:
         lost_ms = sum(int(dropout.duration) for dropout in log.dropouts)
         metadata['px4_dropouts'] = f'{len(log.dropouts)}, {lost_ms} ms in all'
@@ -166,9 +158,12 @@ def _combined(columns: _Columns) -> list[_Columns]:
 
 
 def _stamps(columns: _Columns) -> Ints:
+    """Give the stamps of microseconds since the start; `NO_STAMP` beyond a century: damage."""
     # When the sample was taken, where the log says it; older logs only say when it was published.
-    name = 'timestamp_sample' if 'timestamp_sample' in columns else 'timestamp'
-    return _stamps_ns(columns[name])
+    whole = columns['timestamp_sample' if 'timestamp_sample' in columns else 'timestamp']
+    size = whole.astype(np.float64)
+    is_time = (size >= 0.0) & (size < _CENTURY_US)
+    return np.where(is_time, np.where(is_time, whole, 0).astype(np.int64) * 1000, NO_STAMP)
 
 
 def _column(columns: _Columns, name: str) -> Floats:
@@ -275,14 +270,6 @@ def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments:
             return read(*arguments)
         except Exception as failure:
             raise RecordingError(f'not {what} ({failure})', path=path) from failure
-
-
-def _stamps_ns(microseconds: npt.NDArray[Any]) -> Ints:
-    """Turn microseconds since the start into stamps; `NO_STAMP` beyond a century: damage."""
-    whole = np.asarray(microseconds)
-    size = whole.astype(np.float64)
-    is_time = (size >= 0.0) & (size < _CENTURY_US)
-    return np.where(is_time, np.where(is_time, whole, 0).astype(np.int64) * 1000, NO_STAMP)
 
 
 def _instance(found: Mapping[int, T], wanted: int | None, what: str, path: Path) -> T:
