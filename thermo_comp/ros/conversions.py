@@ -12,6 +12,7 @@ float64 values. A message of any other form is brought into this one by rclpy fi
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from struct import Struct
 from struct import error as StructError  # noqa: N812
@@ -109,13 +110,10 @@ class SampleConverter:
         is_imu = self._message_type is Imu
         skip, rest = (_PASSED, 72) if is_imu else (0, 0)
         size = skip + 24 + rest
-        start = _values_at(data, size)
-        if not start:
-            data = _plain(data, self._message_type)
-            self.traffic.n_fallback += bool(data)
-            start = _values_at(data, size)
+        given, (data, start) = data, _plain(data, size, self._message_type)
         if not start:
             return b''
+        self.traffic.n_fallback += data is not given
         self._passed = start if is_imu else 0
         end = 16 + int.from_bytes(data[12:16], 'little')
         # Behind the name there is anything.
@@ -131,9 +129,7 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
     """Read the stamp [ns] and the temperature of a serialized Temperature; None if it is none."""
     # A node that sleeps between samples pays for each line of code it has not touched for long:
     # rclpy's deserialization costs it as much as several samples.
-    start = _values_at(data, 16)
-    if not start:
-        start = _values_at(data := _plain(data, Temperature), 16)
+    data, start = _plain(data, 16, Temperature)
     if not start:
         return None
     _, sec, nanosec = _HEADER.unpack_from(data)
@@ -149,20 +145,18 @@ def _values_at(data: bytes, size: int) -> int:
     name = data[16 : 16 + length]
     if not length or len(data) != start + size or name.find(0) != length - 1:
         return 0
-    try:
+    with suppress(UnicodeDecodeError):
         name.decode()
-    except UnicodeDecodeError:
-        return 0
-    return start
+        return start
+    return 0
 
 
-def _plain(data: bytes, message_type: Any) -> bytes:
-    """Let rclpy write a message anew; nothing if it cannot read it."""
-    if len(data) > _LONGEST_MESSAGE:
-        return b''
-    try:
-        written: bytes = serialize_message(deserialize_message(data, message_type))
-    except (RuntimeError, ValueError):
+def _plain(data: bytes, size: int, message_type: Any) -> tuple[bytes, int]:
+    """Give a message, in another form as rclpy writes it, and where its values begin or 0."""
+    start = _values_at(data, size)
+    if not start and len(data) <= _LONGEST_MESSAGE:
         # RuntimeError is rclpy's own, ValueError that of a name that is not UTF-8.
-        return b''
-    return written
+        with suppress(RuntimeError, ValueError):
+            data = serialize_message(deserialize_message(data, message_type))
+            start = _values_at(data, size)
+    return data, start

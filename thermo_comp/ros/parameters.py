@@ -236,9 +236,9 @@ class ParameterRequests:
         self._beside = ThreadPoolExecutor(1, 'parameters')
         for service in node.services:
             if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
-                loop.serve(service, partial(self._take, service.srv_type))
+                loop.handlers[service] = partial(self._take, service.srv_type)
             elif service.srv_type.__module__.startswith('rcl_interfaces.'):
-                loop.serve(service, partial(_reply, service))
+                loop.handlers[service] = partial(_reply, service)
 
     def close(self) -> None:
         """Finish what is being prepared; nothing is applied any more."""

@@ -21,7 +21,6 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
@@ -41,9 +40,6 @@ FLAG_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Without samples, readings take effect but for those not older than the newest by this [ns]: a
 #: sample that Fast DDS has to repeat can be 3 s late.
 IDLE_NS = 1_000_000_000
-
-#: The two messages of the flag, serialized.
-_FLAGS: list[bytes] = [serialize_message(Bool(data=is_dynamic)) for is_dynamic in (False, True)]
 
 # A temperature that has arrived: received [ns]; of which thermometer, stamp [ns], degC.
 _Reading = tuple[int, tuple[str, int, float]]
@@ -170,7 +166,7 @@ class Relay:
         for stamp_ns, is_dynamic in self._compensator.take_flags():
             serial = self._compensator.calibration.unit.serial
             try:
-                self._flag.publish(_FLAGS[is_dynamic])
+                self._flag.publish(Bool(data=is_dynamic))
                 self._stamped.publish(stamped_flag(stamp_ns, is_dynamic, serial))
             except RCLError:
                 self._count_unpublished()

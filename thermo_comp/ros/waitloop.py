@@ -109,7 +109,8 @@ class WaitLoop:
         self._rest_ns = int(rest_s * 1e9)
         self._guard = GuardCondition(None, None, context=node.context)
         self._raw: list[RawSubscription] = []
-        self._handlers: dict[Service, Serve] = {}
+        #: What takes the requests of services in place of callbacks that have to answer at once.
+        self.handlers: dict[Service, Serve] = {}
         self._soon: deque[Callable[[], None]] = deque()
         #: Callbacks that ended in an exception.
         self.n_failures = 0
@@ -139,10 +140,6 @@ class WaitLoop:
         self._raw.remove(raw)
         self._is_stale = True
         self._node.destroy_subscription(raw.subscription)
-
-    def serve(self, service: Service, callback: Serve) -> None:
-        """Let this take the requests of a service, whose own callback has to answer at once."""
-        self._handlers[service] = callback
 
     def call_soon(self, callback: Callable[[], None]) -> None:
         """Call back in the loop's thread, one callback a wake-up; callable from any thread."""
@@ -239,8 +236,8 @@ class WaitLoop:
         def answer(response: Any) -> None:
             service.send_response(response, header)
 
-        if service in self._handlers:
-            self._handlers[service](request, answer)
+        if service in self.handlers:
+            self.handlers[service](request, answer)
         else:
             answer(service.callback(request, service.srv_type.Response()))
         return True
