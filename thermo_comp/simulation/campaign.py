@@ -61,11 +61,7 @@ PLAN_NAMES = ('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held
 
 @dataclass(frozen=True)
 class Cyclogram:
-    """
-    Air temperature [degC] in the chamber over time [s]: straight lines between points.
-
-    Before the first point the air rests at the first temperature, after the last one at the last.
-    """
+    """Air temperature [degC] over time [s]: straight lines between points, at rest outside."""
 
     time_s: tuple[float, ...]
     temperature_c: tuple[float, ...]

@@ -56,11 +56,7 @@ class Thermostat:
 
 @dataclass(frozen=True)
 class ThermalNetwork:
-    """
-    Parts with heat capacities [J/K], the paths between them, and the power [W] they dissipate.
-
-    The keys of `capacity` name the parts and fix their order.
-    """
+    """Parts with heat capacities [J/K], the paths between them, and the power [W] they spend."""
 
     capacity: Mapping[str, float]
     links: tuple[Link, ...]
@@ -77,22 +73,21 @@ class ThermalNetwork:
         """Whether a path's flow is no multiple of the difference."""
         return any(link.exponent != 1.0 for link in self.links)
 
+    @property
+    def _places(self) -> dict[str, int]:
+        return {AIR: -1, **{name: i for i, name in enumerate(self.nodes)}}
+
     def system(self) -> tuple[Floats, Floats, Floats]:
         """Return A, b and p, shapes (k, k), (k,) and (k,), convection left out."""
-        n = len(self.nodes)
+        n, index = len(self.nodes), self._places
         size = n + (0 if self.thermostat is None else 2)
-        A, b, p = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-        index = {name: i for i, name in enumerate(self.nodes)}
+        both, p = np.zeros((size + 1, size + 1)), np.zeros(size)
         for link in self.links:
-            for here, there in ((link.a, link.b), (link.b, link.a)):
-                if here == AIR or link.exponent != 1.0:
-                    continue
-                i = index[here]
-                A[i, i] -= link.conductance
-                if there == AIR:
-                    b[i] += link.conductance
-                else:
-                    A[i, index[there]] += link.conductance
+            if link.exponent == 1.0:
+                i, j = index[link.a], index[link.b]
+                both[[i, j], [i, j]] -= link.conductance
+                both[[i, j], [j, i]] += link.conductance
+        A, b = both[:-1, :-1].copy(), both[:-1, -1].copy()
         for name, watts in self.power.items():
             p[index[name]] += watts
         heat = self.thermostat
@@ -114,22 +109,20 @@ class ThermalNetwork:
 
     def convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
         """Return what convection adds to ``dx/dt`` of one state, and its derivatives by it."""
-        index = {name: i for i, name in enumerate(self.nodes)}
-        flow, slope = np.zeros(len(state)), np.zeros((len(state), len(state)))
+        index, at = self._places, np.append(state, air)
+        flow, slope = np.zeros(len(at)), np.zeros((len(at), len(at)))
         for link in self.links:
             if link.exponent == 1.0:
                 continue
-            ends = [index.get(name) for name in (link.a, link.b)]
-            a, b = (air if i is None else state[i] for i in ends)
-            size = link.conductance * abs(a - b) ** (link.exponent - 1.0)
-            for sign, i, name in ((-1.0, ends[0], link.a), (1.0, ends[1], link.b)):
-                if i is None:
-                    continue
-                flow[i] += sign * size * (a - b) / self.capacity[name]
-                for other, j in ((1.0, ends[0]), (-1.0, ends[1])):
-                    if j is not None:
-                        slope[i, j] += sign * other * link.exponent * size / self.capacity[name]
-        return flow, slope
+            i, j = index[link.a], index[link.b]
+            size = link.conductance * abs(at[i] - at[j]) ** (link.exponent - 1.0)
+            for here, there in ((i, j), (j, i)):
+                if here >= 0:
+                    capacity = self.capacity[self.nodes[here]]
+                    flow[here] -= size * (at[here] - at[there]) / capacity
+                    slope[here, here] -= link.exponent * size / capacity
+                    slope[here, there] += link.exponent * size / capacity
+        return flow[:-1], slope[:-1, :-1]
 
     def settled(self, air: float, power: Floats | None = None) -> Floats:
         """Return the state after an endless soak under constant powers, shape (k,)."""

@@ -72,11 +72,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
 
 
 def dump_calibration(calibration: Calibration) -> str:
-    """
-    Write a Calibration as YAML text with all digits.
-
-    Raises CalibrationError if the value would not be accepted when read back.
-    """
+    """Write a Calibration as YAML text; CalibrationError if that would not be read as the same."""
     text: str = yaml.dump(
         plain(calibration),
         Dumper=_Dumper,

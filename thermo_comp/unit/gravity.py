@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns standard gravity, which defines the unit g, and how accelerations are said and read in it.
-"""
+"""Owns standard gravity, which defines g, and how accelerations are said and read in it."""
 
 from __future__ import annotations
 
@@ -35,11 +33,7 @@ def spoken(acceleration: float) -> str:
 
 
 def parse_acceleration(text: str) -> float:
-    """
-    Read an acceleration with its unit, like ``100ug``, ``0.5 mg`` or ``1e-3 m/s^2``.
-
-    Raises ValueError if it is not a positive number with a unit.
-    """
+    """Read a positive acceleration with its unit, like ``100ug``, ``0.5 mg`` or ``1e-3 m/s^2``."""
     found = re.fullmatch(r'\s*(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)\s*(\S+)\s*', text)
     value = float(found[1]) * _UNITS.get(found[2].replace('\u03bc', 'µ'), 0.0) if found else 0.0
     if not 0.0 < value < math.inf:

@@ -37,20 +37,14 @@ def in_a_soak(
 
 
 def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
-    """
-    Evaluate bias [m/s^2] and scale [input units per m/s^2], shapes (n, 3), at states, shape
-    (n, width), as `ramp_states` gives them.
-    """
+    """Evaluate bias [m/s^2] and scale [input units per m/s^2] at states, shapes (n, 3)."""
     correction = Correction(calibration)
     bias, scale = correction.bias_scale(states.T)
     return (bias / correction.K).T, scale.T
 
 
 def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
-    """
-    Predict the standard deviation of the bias, with what the sets leave unexplained [m/s^2], and
-    of the relative scale, shapes (n, 3), at states, shape (n, width).
-    """
+    """Predict the sd of the bias [m/s^2] and of the relative scale at states, shapes (n, 3)."""
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
     forgotten = [0.0] * len(correction.memory.lags)
@@ -85,10 +79,7 @@ def ramp_states(
 
 
 def step_states(calibration: Calibration, temperature: float, since_s: Floats) -> Floats:
-    """
-    Think up the states at times [s] after board and case have jumped by 1 K together, out of a
-    soak; inf gives the soak that follows, shape (n,).
-    """
+    """Think up the states at times [s] after board and case jumped by 1 K, out of a soak."""
     states = ramp_states(calibration, np.full(len(since_s), temperature))
     for (name, tau), place in Layout(Correction(calibration).memory).lags.items():
         if name == BOARD_INPUT:

@@ -81,11 +81,7 @@ NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 
 
 def build(hint: type[Value], data: Any, key: str = '') -> Value:
-    """
-    Build what a type hint says from plain values.
-
-    Raises SchemaError if a key is unknown or missing, or a value is not what the hint says.
-    """
+    """Build what a type hint says from plain values, or raise SchemaError of the key."""
     result: Value = _build(hint, data, key)
     return result
 

@@ -84,11 +84,7 @@ class _OfFile:
 
 
 def read_version_1(data: dict[str, Any]) -> Calibration:
-    """
-    Build a Calibration from the plain values of a file of version 1.
-
-    Raises SchemaError if a key is unknown or missing, or a value is not acceptable.
-    """
+    """Build a Calibration from the plain values of a file of version 1, or raise SchemaError."""
     for key in _NEW_KEYS:
         if key in data:
             raise SchemaError(key, 'unknown key in a file of version 1')
