@@ -12,30 +12,26 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import builders
 import numpy as np
 import pytest
-from report_helpers import RATE_HZ, certificate, evidence, fitted, run, write_bag
+from report_helpers import LEFT_OUT_RMS, RATE_HZ, certificate, evidence, fitted, run, write_bag
 from simulation_helpers import ideal_regime
 
 from thermo_comp import __version__
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
-from thermo_comp.fitting.reduction import Readings
+from thermo_comp.fitting.reduction import Readings, ReducedBag
 from thermo_comp.judging import open_bags
+from thermo_comp.judging.history import history_of
 from thermo_comp.recording import BagWriter
-from thermo_comp.report import (
-    Evidence,
-    evidence_of_bags,
-    evidence_of_fit,
-    render_report,
-    write_report,
-)
+from thermo_comp.report import Evidence, evidence_of_bags, render_report, write_report
 from thermo_comp.report.evidence import LEFT_OUT
-from thermo_comp.report.figures import figures_of
-from thermo_comp.report.figures_bags import draw_positions
+from thermo_comp.report.figures import drawn_figures, figures_of
+from thermo_comp.report.figures_unit import draw_history
 from thermo_comp.report.html import spelt
-from thermo_comp.report.style import drawing
+from thermo_comp.report.style import drawing, svg
 from thermo_comp.thermal.regime import Regime
-from thermo_comp.unit.gravity import STANDARD_GRAVITY
+from thermo_comp.unit.calibration import Provenance
 
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 
@@ -92,6 +88,11 @@ def bag(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope='module')
+def opened(bag) -> list[ReducedBag]:
+    return open_bags([bag])
+
+
+@pytest.fixture(scope='module')
 def page() -> Page:
     return Page(certificate())
 
@@ -114,24 +115,13 @@ def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
         assert fact in page.text
     for one in figures_of(evidence()):
         assert one.question in page.text
-    # Nine positions: none can be left out, and nothing is said of it.
     assert not re.search(r'\bnan\b', page.text)
 
 
-def test_certificate_says_what_the_other_positions_say_of_each():
-    # One micro-g for the first position, two for the next and so on; the last cannot do without.
-    rms = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(len(fitted().positions))]
-    rms[-1] = np.nan
-    positions = tuple(
-        replace(one, left_out_rms=value)
-        for one, value in zip(fitted().positions, rms, strict=True)
-    )
-    found = evidence_of_fit(replace(fitted(), positions=positions))
-    shown = [one.residual_rms.get(LEFT_OUT) for one in found.positions]
-    assert shown == [*rms[:-1], None]
-    with drawing():
-        draw_positions(found).draw_without_rendering()
-    page = words_of(found)
+def test_certificate_says_what_the_other_positions_say_of_each(page):
+    # The last one cannot be left out.
+    shown = [one.residual_rms.get(LEFT_OUT) for one in evidence().positions]
+    assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
     assert 'Left out: with what the other positions say' in page.text
 
@@ -154,19 +144,19 @@ def test_page_has_each_id_once_and_refers_to_ids_it_has(page):
     assert set(re.findall(r'(?:url\(|href=")#([^)"]*)', page.source)) <= set(ids)
 
 
-def test_bag_says_whether_its_fit_has_seen_it(bag):
+def test_bag_says_whether_its_fit_has_seen_it(opened):
     calibration = fitted().calibration
     assert 'positions in bags of its own fit' in Page(certificate()).text
-    unseen = evidence_of_bags(open_bags([bag]), calibration)
+    unseen = evidence_of_bags(opened, calibration)
     assert '1 position in bags that the fit has not seen' in words_of(unseen).text
     sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].source.sha256),)
     provenance = replace(calibration.provenance, sources=sources)
-    seen = evidence_of_bags(open_bags([bag]), replace(calibration, provenance=provenance))
+    seen = evidence_of_bags(opened, replace(calibration, provenance=provenance))
     assert '1 position in bags of its own fit' in words_of(seen).text
 
 
-def test_bag_alone_shows_temperatures_derivatives_and_flag(bag, tmp_path):
-    found = evidence_of_bags(open_bags([bag]))
+def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
+    found = evidence_of_bags(opened)
     shown = found.shown
     truth = run(0).truth
     # In the middle of the first ramp the case heats at the chamber's 1.5 K/min or a little less.
@@ -186,13 +176,6 @@ def test_bag_alone_shows_temperatures_derivatives_and_flag(bag, tmp_path):
     assert 'no calibration was judged' in page.text
     assert [one.name for one in figures_of(found)] == ['temperatures', 'dynamics']
     assert all(one.question in page.text for one in figures_of(found))
-
-
-def test_calibration_alone_makes_a_page(tmp_path):
-    page = page_of(bare(), tmp_path)
-    assert 'no recording was judged' in page.text
-    assert '01.mcap' in page.text
-    assert f'{1:064x}' in page.text
 
 
 def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
@@ -215,14 +198,19 @@ def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
         calibration, unit=replace(calibration.unit, serial=evil), provenance=provenance
     )
     found = evidence_of_bags(open_bags([bag]), calibration)
-    page = page_of(found, tmp_path)
+    # Dates are all that drawings have of others.
+    history = history_of([calibration, replace(calibration, provenance=Provenance(created=evil))])
+    with drawing():
+        dates = svg(draw_history(replace(found, history=history)), 'x', evil)
+    page = Page(render_report(found, figures=[(one, dates) for one in figures_of(found)]))
     assert page.text.count(evil) >= 6
+    assert page.text.count(evil[:10]) > page.text.count(evil)  # drawn, too
     assert '$\\frac{.mcap' in page.text
     assert not page.names() & {'script', 'img'}
     assert not any(name.startswith('on') for _, attributes in page.tags for name in attributes)
 
 
-def test_hours_of_bag_stay_a_small_page(tmp_path):
+def test_hours_of_bag_stay_a_small_page():
     # A day of readings at 2 Hz, and of windows at rest: hundreds of them to a pixel.
     shown, windows = evidence().shown, evidence().windows
     time = np.arange(0.0, 86400.0, 0.5)
@@ -240,8 +228,8 @@ def test_hours_of_bag_stay_a_small_page(tmp_path):
     )
     bag = replace(shown.bag, temperatures={'board': readings, 'case': readings})
     vars(long)['shown'] = replace(shown, bag=bag, duration_s=86400.0)
-    write_report(long, tmp_path / 'long.html')
-    assert (tmp_path / 'long.html').stat().st_size < 2_000_000
+    figures = [one for one in figures_of(long) if one.name not in ('functions', 'step')]
+    assert len(render_report(long, figures=drawn_figures(figures)).encode()) < 1_900_000
 
 
 def test_bag_is_read_in_bounded_memory(tmp_path):
@@ -263,9 +251,12 @@ def test_bag_is_read_in_bounded_memory(tmp_path):
     assert peak < 64 * opened.n_samples
 
 
-def test_figures_as_png(tmp_path):
+def test_calibration_alone_makes_a_page_and_its_figures_as_png(tmp_path):
     folder = tmp_path / 'new' / 'figures'
-    write_report(bare(), tmp_path / 'page.html', figures=folder)
+    page = page_of(bare(), tmp_path, figures=folder)
+    assert 'no recording was judged' in page.text
+    assert '01.mcap' in page.text
+    assert f'{1:064x}' in page.text
     # Those that need no bags; every other one is drawn for the page.
     names = [one.name for one in figures_of(evidence())]
     without_bags = [name for name in names if name in ('functions', 'step', 'hysteresis')]
@@ -281,16 +272,16 @@ def test_page_is_written_atomically(tmp_path):
     target.write_text('<!doctype html>old')
     folder = tmp_path / 'figures'
     folder.write_text('in the way')
+    plain = evidence_of_bags([], builders.calibration())
     with pytest.raises(OutputError, match='figures is no directory'):
-        write_report(bare(), target, figures=folder)
+        write_report(plain, target, figures=folder)
     assert target.read_text() == '<!doctype html>old'
     assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']
 
 
-def test_verdict_and_its_colour(bag):
+def test_verdict_and_its_colour(opened):
     assert evidence().level in ('good', 'reserved')
     calibration = fitted().calibration
-    opened = open_bags([bag])
     narrow = {
         name: replace(getattr(calibration, name), temperature_range_c=(19.0, 22.0))
         for name in ('static', 'dynamic')
@@ -305,15 +296,15 @@ def test_verdict_and_its_colour(bag):
     assert spelt(strict.judgement.reason) in page.text
 
 
-def test_another_units_calibration_is_refused(bag):
+def test_another_units_calibration_is_refused(opened):
     calibration = fitted().calibration
     other = replace(calibration, unit=replace(calibration.unit, serial='other'))
     with pytest.raises(CalibrationError, match='other'):
-        evidence_of_bags(open_bags([bag]), other)
-    assert evidence_of_bags(open_bags([bag]), other, serial='').serial == 'other'
+        evidence_of_bags(opened, other)
+    assert evidence_of_bags(opened, other, serial='').serial == 'other'
 
 
-def test_refusals(bag, tmp_path):
+def test_refusals(tmp_path):
     with pytest.raises(RecordingError, match='no such file'):
         open_bags([tmp_path / 'none.mcap'])
 
