@@ -310,15 +310,17 @@ def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
 
 def _together(surveys: Sequence[Surveys]) -> Surveys:
     """Describe thermometers over several positions."""
-    found: dict[str, ThermometerSurvey] = {}
-    for name, one in ((name, one) for survey in surveys for name, one in survey.items()):
-        other = found.get(name, one)
-        found[name] = replace(
-            one,
-            n=one.n + (other.n if name in found else 0),
-            lowest=min(one.lowest, other.lowest),
-            highest=max(one.highest, other.highest),
-            steepest_heating_k_min=max(one.steepest_heating_k_min, other.steepest_heating_k_min),
-            steepest_cooling_k_min=min(one.steepest_cooling_k_min, other.steepest_cooling_k_min),
+    found: dict[str, list[ThermometerSurvey]] = {}
+    for name, one in (item for survey in surveys for item in survey.items()):
+        found.setdefault(name, []).append(one)
+    return {
+        name: replace(
+            own[-1],
+            n=sum(one.n for one in own),
+            lowest=min(one.lowest for one in own),
+            highest=max(one.highest for one in own),
+            steepest_heating_k_min=max(one.steepest_heating_k_min for one in own),
+            steepest_cooling_k_min=min(one.steepest_cooling_k_min for one in own),
         )
-    return found
+        for name, own in found.items()
+    }

@@ -147,11 +147,7 @@ def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """
-    Return the parameters of a calibration in the order of its posterior.
-
-    Levels of the scale, relative to the scale factor, are 0.
-    """
+    """Return the parameters in the order of the posterior; levels of the scale are 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):

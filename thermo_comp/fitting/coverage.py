@@ -90,9 +90,7 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
 
 def farthest(up: Floats) -> tuple[Floats, float]:
     """Find the direction that is farthest from all of `up` (n, 3), and how far [deg]."""
-    if not len(up):
-        return _SPHERE[0], 180.0
-    nearest = np.max(_SPHERE @ up.T, axis=1)
+    nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
 

@@ -31,13 +31,7 @@ _ADDED = ('kappa', 'bias', 'weights', 'skew', 'offset', 'start')
 
 
 class Whitener:
-    """
-    Filters series of windows, position by position, side by side.
-
-    position: position of each window; windows of a position are consecutive and in time order,
-        shape (n,)
-    time: their times [s], shape (n,)
-    """
+    """Filters series of windows, in order of position and time, position by position."""
 
     def __init__(self, position: Ints, time: Floats) -> None:
         starts = np.flatnonzero(np.r_[True, position[1:] != position[:-1]])
@@ -55,12 +49,7 @@ class Whitener:
         self._interval = interval
 
     def gains(self, weight: Floats, rho: float) -> tuple[Floats, Floats]:
-        """
-        Run the filter's variances.
-
-        `weight`: relative information of each window, shape (n,). Returns kalman gain, and sd of
-        the innovation in units of sigma, shape (n_steps, n_positions).
-        """
+        """Give Kalman gain and sd of the innovation [sigma], shape (n_steps, n_positions)."""
         noise = 1.0 / weight[self._row]
         gain, root = np.zeros_like(noise), np.sqrt(noise)
         if rho <= 0.0:
@@ -75,11 +64,7 @@ class Whitener:
         return gain, root
 
     def filter(self, series: Floats, gains: tuple[Floats, Floats]) -> Floats:
-        """
-        Whiten series.
-
-        `series`: one series per column, shape (n, k).
-        """
+        """Whiten series, shape (n, k)."""
         gain, root = gains
         result = np.empty_like(series)
         if not gain.any():
@@ -159,9 +144,7 @@ class Design:
         return found
 
     def layout(self, used: Bools) -> Layout:
-        """
-        Give every unknown its place; `used`: columns that bias and scale have, shape (2, m).
-        """
+        """Give every unknown its place; `used`: columns of bias and scale, shape (2, m)."""
         n = 0
 
         def take(*shape: int) -> Ints:
@@ -271,9 +254,7 @@ class Design:
         return result
 
     def force(self, state: State) -> Floats:
-        """
-        Correct the windows as the compensator would: offsets and start states unknown, (n, 3).
-        """
+        """Correct the windows as the compensator would, that knows no offset, shape (n, 3)."""
         along = self.measured - state.bias - self._columns @ state.weights[0].T
         along /= state.kappa * (1.0 + self._columns @ state.weights[1].T)
         return np.asarray(along @ np.linalg.inv(state.inverse).T)

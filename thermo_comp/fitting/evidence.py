@@ -67,11 +67,7 @@ class ResidualRow:
 def residual_rows(
     windows: ThermalWindows, regression: Regression, learnt: Learnt
 ) -> tuple[tuple[ResidualRow, ...], Floats]:
-    """
-    Compare the steps of the model on the same windows.
-
-    Returns ``|f| - g`` of each window by the other positions [m/s^2].
-    """
+    """Compare the steps of the model; give ``|f| - g`` by the other positions, too [m/s^2]."""
     state = learnt.posterior.state
     steps = [regression.force(replace(state, weights=np.zeros_like(state.weights)))]
     rungs = (_with_only(regression, learnt, groups) for groups in ((CURVE,), (CURVE, SET)))
@@ -121,11 +117,7 @@ def position_reports(
     learnt: Learnt,
     left_out: Floats,
 ) -> tuple[PositionReport, ...]:
-    """
-    List the positions with what the fit left on each.
-
-    `left_out`: ``|f| - g`` by the others, shape (n,).
-    """
+    """List the positions with what the fit, and what the others (`left_out`), left on each."""
     data, state = windows.data, learnt.posterior.state
     residual = norm_residual(regression.force(state), regression.gravity)
     result = []

@@ -64,7 +64,7 @@ class FitResult:
 
 
 def fit(
-    sources: Sequence[FitSource], options: FitOptions, progress: Progress | None = None
+    sources: Sequence[FitSource], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """
     Fit a calibration to bags of a thermal test.
@@ -76,8 +76,7 @@ def fit(
         raise FitError('no bag was given')
     bags = []
     for number, source in enumerate(sources):
-        if progress is not None:
-            progress(0.5 * number / len(sources))
+        progress(0.5 * number / len(sources))
         bags.append(reduce_bag(source, options))
     return fit_bags(bags, options, progress)
 
@@ -99,16 +98,15 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
 
 
 def fit_bags(
-    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress | None = None
+    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
-    tell = progress or (lambda _part: None)
     offset = find_offset(bags, options)
     if not offset.any():
-        return _fit(bags, options, tell)
+        return _fit(bags, options, progress)
     note = f'no force reads {" ".join(f"{word:g}" for word in offset)}: words with an offset'
     known = options.prior and about(options.prior, -offset)
-    found = _fit([centred(bag, offset) for bag in bags], replace(options, prior=known), tell)
+    found = _fit([centred(bag, offset) for bag in bags], replace(options, prior=known), progress)
     return replace(
         found,
         calibration=with_notes(about(found.calibration, offset), [f'offset: {note}']),

@@ -162,11 +162,7 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats) -> int:
 
 
 def _step(time: Floats, values: Floats, at: float) -> tuple[Floats, float, Floats]:
-    """
-    Estimate a step of values, shape (n, k), at a known time, beside a straight drift.
-
-    Returns, too, its sd in units of the noise, and what is left.
-    """
+    """Estimate a step beside a drift, its sd in units of the noise, and what is left, (n, k)."""
     trend = _trend(time)
     jump = (time >= at).astype(np.float64)
     jump -= trend @ (trend.T @ jump)
@@ -182,9 +178,7 @@ def _trend(time: Floats) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """
-    Angle turned through within a second of the step, against the gyro's own level on each side.
-    """
+    """Angle turned through within a second of the step, against the level on each side."""
     levels = (np.median(gyro[:at], axis=0), np.median(gyro[at:], axis=0))
     dt = np.diff(time)
     angle = np.zeros(3)

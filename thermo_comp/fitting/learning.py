@@ -149,11 +149,7 @@ def told_of(posterior: Posterior) -> Floats:
 
 
 def earned(mode: Floats, covariance: Floats, places: Ints, sd: float | Floats) -> float:
-    """
-    How much the log evidence falls when some weights are held at 0 (Savage-Dickey).
-
-    `mode`, `covariance`: of what belongs to the unit. `places`, `sd`: theirs, shape (k,).
-    """
+    """How much the log evidence falls when some weights are held at 0 (Savage-Dickey)."""
     mode, covariance = mode[places], covariance[np.ix_(places, places)]
     root = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
@@ -275,11 +271,7 @@ def _settle(
     kept: Bools,
     rounds: int = 40,
 ) -> tuple[Posterior, Prior]:
-    """
-    Repeat the fixed point of widths and white noise until nothing moves.
-
-    `silent`: columns whose width the data cannot tell; `kept`: that may not leave, shape (2, m).
-    """
+    """Repeat the fixed point; silent columns keep their width, kept ones may not leave, (2, m)."""
     for k in range(rounds):
         posterior = regression.solve(state, prior, n_steps=2)
         state = posterior.state
@@ -350,11 +342,7 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
 
 
 def _downweight(regression: Regression, posterior: Posterior) -> None:
-    """
-    Take windows that are far off their neighbours for as noisy as they look.
-
-    A knock stands alone; what a model does not explain lasts, and counts.
-    """
+    """Take windows far off their neighbours for as noisy as they look: a knock stands alone."""
     base = regression.windows.weight[:, None]
     size = posterior.whitened * np.sqrt(base / regression.weight)
     edges = np.flatnonzero(np.diff(regression.windows.position)) + 1

@@ -93,8 +93,6 @@ class Posterior:
     """
     The mode and its surroundings.
 
-    state: the mode
-    layout: places of its elements
     told: what of each unknown the data told, not the prior, 0..1, shape (n,)
     covariance: of what belongs to the unit, shape (n_unit, n_unit)
     variance: of all unknowns, shape (n,)

@@ -39,11 +39,7 @@ _EXACT = 1e-6
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """
-    Return the response of a calibration as columns.
-
-    Raises FitError if a column belongs to one regime alone, as in files of version 1.
-    """
+    """Return the response as columns; FitError if one is of one regime, as in version 1."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
@@ -87,12 +83,7 @@ def as_known(calibration: Calibration, regression: Regression, state: State) -> 
 def known_of(
     calibration: Calibration, regression: Regression, state: State, sets: Sets, options: FitOptions
 ) -> list[Known]:
-    """
-    Turn a calibration into the prior of a regression on its columns: several, for the evidence.
-
-    Each takes more of every parameter's variance for its own. Raises FitError if the calibration
-    makes no claim.
-    """
+    """Turn a calibration into priors on its columns, for the evidence, FitError without claim."""
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an import makes no claim to build on')
     K = constants_of(calibration).scale
@@ -121,11 +112,7 @@ def known_of(
 
 
 def population(calibrations: Sequence[Calibration]) -> Calibration:
-    """
-    Make the prior of a type of unit from the calibrations of some.
-
-    Raises FitError if the units are too few or their calibrations not alike.
-    """
+    """Make the prior of a type of unit from some; FitError if they are too few or not alike."""
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
     first = calibrations[0]
@@ -148,13 +135,10 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     for one in calibrations:
         for column, key in zip(prior_columns(one), _unranged(prior_columns(one)), strict=True):
             keys.setdefault(key, []).append(column.range)
-    columns = [
-        replace(key, range=(min(r[0] for r in ranges), max(r[1] for r in ranges)))
-        for key, ranges in keys.items()
-    ]
+    like = _like(calibrations, [replace(key, range=_union(own)) for key, own in keys.items()])
     K = np.array([constants_of(one).scale for one in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
-    told = [_told(one, columns, mean_K) for one in calibrations]
+    told = [_told(one, like, mean_K) for one in calibrations]
     vectors = np.array([vector for vector, _ in told])
     mean = vectors.mean(axis=0)
     away = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
@@ -164,7 +148,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     scatter *= 1.0 + 1.0 / len(vectors)
     # What none of the units told is as alike in all as their prior was: it stays as unknown.
     scatter += np.mean([covariance for _, covariance in told], axis=0)
-    return with_parameters(_like(calibrations, columns), mean_K, mean, scatter)
+    return with_parameters(like, mean_K, mean, scatter)
 
 
 def _unranged(columns: Sequence[Column]) -> list[Column]:
@@ -172,40 +156,28 @@ def _unranged(columns: Sequence[Column]) -> list[Column]:
     return [replace(column, range=(0.0, 1.0)) for column in columns]
 
 
-def _told(
-    calibration: Calibration, columns: Sequence[Column], mean_K: Floats
-) -> tuple[Floats, Floats]:
-    """
-    Return a unit's parameters and covariance in the order of a file with these columns.
-
-    At the mean scale factors; 0 for columns that it does not have. Raises FitError if the
-    calibration makes no claim.
-    """
+def _told(calibration: Calibration, like: Calibration, mean_K: Floats) -> tuple[Floats, Floats]:
+    """Return a unit's parameters and covariance at the places of others, at the mean scale."""
     if calibration.posterior is None:
         raise FitError(
             f'{calibration.unit.serial} has no covariance: an import says nothing of its type'
         )
-    everything = _unranged(columns)
+    everything = _unranged(prior_columns(like))
     terms = [everything.index(column) for column in _unranged(prior_columns(calibration))]
     scale = constants_of(calibration).scale
     values, factor = parameters_of(calibration), np.ones(calibration.posterior.n_parameters)
-    layout = parameter_layout(calibration)
+    layout, into = parameter_layout(calibration), parameter_layout(like)
     for axis, (bias, relative) in enumerate(zip(layout.bias, layout.scale, strict=True)):
         factor[bias.static : bias.end] = mean_K[axis] / scale[axis]
         values[[relative.static, relative.dynamic]] = np.log(scale[axis] / mean_K[axis])
-    places: list[int] = []
-    n = 0
-    for block in (block for pair in zip(*layout[:2], strict=True) for block in pair):
-        n_curves = block.response - block.static
-        places += [*range(n, n + n_curves), *(n + n_curves + k for k in terms)]
-        n += n_curves + len(columns)
-    places += range(n, n + 3)
-    vector, covariance = np.zeros(n + 3), np.zeros((n + 3, n + 3))
-    vector[places] = values * factor
-    covariance[np.ix_(places, places)] = calibration.posterior.covariance() * np.outer(
-        factor, factor
-    )
-    return vector, covariance
+    places = np.arange(into.n_parameters - len(values), into.n_parameters)
+    blocks = zip((*layout.bias, *layout.scale), (*into.bias, *into.scale), strict=True)
+    for own, block in blocks:
+        response = [block.response + k for k in terms]
+        places[own.static : own.end] = [*range(block.static, block.response), *response]
+    placed = np.zeros((into.n_parameters, len(values)))
+    placed[places, np.arange(len(values))] = factor
+    return placed @ values, placed @ calibration.posterior.covariance() @ placed.T
 
 
 def _shape(calibration: Calibration) -> list[tuple[str, int]]:

@@ -190,11 +190,7 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
 def thermal_states(
     bag: ReducedBag, tracker: ThermalTracker, step_s: float
 ) -> tuple[float, Floats]:
-    """
-    Drive a tracker with a bag's readings and sample it on a grid, shape (n, width).
-
-    Returns, too, when the grid begins, since the bag's first sample [s].
-    """
+    """Sample a tracker on a grid, shape (n, width); say when that begins in the bag [s], too."""
     readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
     reading = next(readings, None)
     step_ns = round(step_s * 1e9)

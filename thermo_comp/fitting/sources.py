@@ -31,10 +31,6 @@ def angular_velocity(block: object) -> Floats | None:
     return rate if rate.any() else None
 
 
-def _no_recording() -> RecordingReader | None:
-    return None
-
-
 @dataclass(frozen=True)
 class FitSource:
     """
@@ -47,7 +43,7 @@ class FitSource:
     blocks: Callable[[], Iterable[AccelBlock]]
     sha256: str | None = None
     serial: str | None = None
-    reader: Callable[[], RecordingReader | None] = _no_recording
+    reader: Callable[[], RecordingReader | None] = lambda: None
 
 
 def fit_sources(

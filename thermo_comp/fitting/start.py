@@ -43,12 +43,7 @@ class ConstantCalibration:
 def constant_calibration(
     means: Floats, gravity: float, with_misalignment: bool
 ) -> ConstantCalibration:
-    """
-    Fit bias, scale and, if asked, misalignment to position means.
-
-    `means`: mean raw vector of each position, shape (n, 3). Raises FitError if the positions lie
-    on no ellipsoid.
-    """
+    """Fit the triad to position means, shape (n, 3); FitError if they lie on no ellipsoid."""
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
     half = 0.5 * (means.max(axis=0) - means.min(axis=0))
     if not np.all(half > 0.0):

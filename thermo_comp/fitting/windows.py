@@ -162,11 +162,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
     k, m = len(columns), len(groups) + len(columns)
     moved_at, end = 4 + k + m, 4 + k + m + len(columns)
-    lag = [-1] * len(groups)
-    lag += [
-        spec.lags.index(column.lag) if column.lag and column.kind != 'play' else -1
-        for column in columns
-    ]
+    lag = [spec.lags.index(one.lag) if one.lag and one.kind != 'play' else -1 for one in columns]
     data = Windows(
         position=position,
         bag=bag_of,
@@ -175,7 +171,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
         mean=mean,
         columns=rows[:, 4 + k : moved_at],
         groups=(*groups, *(column.group for column in columns)),
-        lag=np.array(lag, dtype=np.int64),
+        lag=np.array([-1] * len(groups) + lag, dtype=np.int64),
         tau=np.array([0.0] * len(groups) + [column.tau_s for column in columns]),
         start=np.hstack((np.zeros((len(time), len(groups))), rows[:, moved_at:end])),
         start_covariance=start_covariance(spec.lags),
@@ -203,8 +199,7 @@ def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[float, Flo
     """Run the tracker: where its estimate has settled, grid from its first reading, states."""
     if not len(bag.board.value):
         # Nothing is known: a unit that has always been at the reference.
-        width = Layout(spec).width
-        still = np.zeros((2, width))
+        still = np.zeros((2, Layout(spec).width))
         still[:, BOARD] = model.reference_temperature
         ends: Floats = np.array([-_EVER_S, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
         return -1.0, ends, still
@@ -237,9 +232,7 @@ def _moved(table: ColumnTable, slopes: Floats, age_s: Floats) -> Floats:
 def _merged(
     time: Floats, count: Floats, mean: Floats, rows: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """
-    Count-weighted means of neighbouring windows up to a length, or to a part of a short rest.
-    """
+    """Count-weighted means of neighbours up to a length, or to a part of a short rest."""
     window_s = min(_WINDOW_S, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or _WINDOW_S)
     slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))
     first = np.flatnonzero(np.r_[True, np.diff(slot) != 0])
