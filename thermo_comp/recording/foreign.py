@@ -30,8 +30,8 @@ class ForeignFile(BagFile):
         super().__init__(name)
         self._is_packed = is_packed
         is_ros1 = path.suffix == '.bag'
-        self.storage = {'.bag': 'ros1', '.mcap': 'mcap'}.get(path.suffix, 'sqlite3')
         encoding = 'ros1' if is_ros1 else 'cdr'
+        self.storage = {'.bag': 'ros1', '.mcap': 'mcap'}.get(path.suffix, 'sqlite3')
         with translated(name, is_foreign=True):
             reader: Any = Reader1(path) if is_ros1 else Reader2(path)
             self._reader = reader
@@ -47,10 +47,8 @@ class ForeignFile(BagFile):
                     raise RecordingError('a topic has no name or no type')
                 self.topics[number] = Topic(one.topic, one.msgtype, encoding, one.msgcount)
                 if one.msgdef.data and not is_ros1:
-                    self.definitions[one.msgtype] = (
-                        f'ros2{one.msgdef.format.name.lower()}',
-                        one.msgdef.data,
-                    )
+                    kind = f'ros2{one.msgdef.format.name.lower()}'
+                    self.definitions[one.msgtype] = kind, one.msgdef.data
 
     def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
         """Read the messages of channels in reading order, and do some work on them."""
@@ -58,23 +56,20 @@ class ForeignFile(BagFile):
 
     def _messages(self, channels: Collection[int]) -> Iterator[Messages]:
         """Read messages of channels, the numbers of the reader's connections."""
-        chosen = {number: self._reader.connections[number] for number in channels}
-        known = {(one.topic, one.msgtype): number for number, one in chosen.items()}
-        numbers: list[int] = []
-        times: list[int] = []
-        pieces: list[bytes] = []
+        chosen = [self._reader.connections[number] for number in channels]
+        known = {(one.topic, one.msgtype): n for n, one in zip(channels, chosen, strict=True)}
+        batch: list[tuple[bytes, int, int]] = []
         n_bytes = 0
-        for one, log_ns, data in self._reader.messages(connections=list(chosen.values())):
-            numbers.append(known[one.topic, one.msgtype])
-            times.append(log_ns)
-            pieces.append(inflate_message(data) if self._is_packed else data)
-            n_bytes += len(pieces[-1])
-            is_long = n_bytes >= _BATCH_BYTES or log_ns - times[0] > _BATCH_NS
-            if is_long or len(pieces) >= _BATCH_MESSAGES:
-                yield Messages.of(pieces, numbers, times)
-                numbers, times, pieces, n_bytes = [], [], [], 0
-        if pieces:
-            yield Messages.of(pieces, numbers, times)
+        for one, log_ns, packed in self._reader.messages(connections=chosen):
+            data = inflate_message(packed) if self._is_packed else packed
+            batch.append((data, known[one.topic, one.msgtype], log_ns))
+            n_bytes += len(data)
+            is_long = n_bytes >= _BATCH_BYTES or log_ns - batch[0][2] > _BATCH_NS
+            if is_long or len(batch) >= _BATCH_MESSAGES:
+                yield Messages.of(*zip(*batch, strict=True))
+                batch, n_bytes = [], 0
+        if batch:
+            yield Messages.of(*zip(*batch, strict=True))
 
     def close(self) -> None:
         """Close the file."""

@@ -116,6 +116,7 @@ class McapOutput:
             },
         )
         self._channels[topic] = channel, kind, definition.type_hash
+        self._counts[channel.id] = 0
         self._put_record(channel)
         return channel.id
 
@@ -306,7 +307,4 @@ def dump_yaml(content: Any) -> str:
     """Write YAML in block style with the keys in their order."""
     # Values that stand twice are written twice.
     dumper: Any = type('Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
-    text: str = yaml.dump(
-        content, Dumper=dumper, sort_keys=False, allow_unicode=True, width=10_000
-    )
-    return text
+    return str(yaml.dump(content, None, dumper, sort_keys=False, allow_unicode=True, width=10_000))

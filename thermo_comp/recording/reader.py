@@ -14,7 +14,7 @@ import re
 from collections import ChainMap, Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath
@@ -50,9 +50,13 @@ _MAX_BYTES = 1 << 24
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 
 
-class RecordingReader:
+class RecordingReader(AbstractContextManager['RecordingReader']):
     """
-    An open bag; use it as a context manager.
+    An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
+
+    Of the accelerometer's topics ``auto`` prefers the counts. Roles that are required are an error
+    where they are absent; the others' columns are just empty. Raises RecordingError for what is no
+    bag, an empty or damaged one, a missing or ambiguous topic, a wrong message type.
 
     `info` is what the bag says of itself; once all blocks are read, its `truncated` names what did
     not come. `topics` are the bag's own names of each role's, `definitions` encoding and text of
@@ -61,11 +65,13 @@ class RecordingReader:
 
     def __init__(
         self,
-        path: Path,
-        topics: Topics,
-        input: Input,  # noqa: A002 - the parameter's public name
-        require: Collection[Role],
+        path: str | Path,
+        topics: Topics | None = None,
+        input: Input = 'auto',  # noqa: A002 - the parameter's public name
+        *,
+        require: Collection[Role] = ROLES,
     ) -> None:
+        path, topics = Path(path), topics or Topics()
         self._stack = ExitStack()
         self._files: list[BagFile] = []
         try:
@@ -195,30 +201,12 @@ class RecordingReader:
         self._stack.close()
         self._files.clear()
 
-    def __enter__(self) -> RecordingReader:
-        """Give the open reader."""
-        return self
-
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the files."""
         self.close()
 
 
-def open_recording(
-    path: str | Path,
-    topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
-    *,
-    require: Collection[Role] = ROLES,
-) -> RecordingReader:
-    """
-    Open a bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
-
-    Of the accelerometer's topics ``auto`` prefers the counts. Roles that are required are an error
-    where they are absent; the others' columns are just empty. Raises RecordingError for what is no
-    bag, an empty or damaged one, a missing or ambiguous topic, a wrong message type.
-    """
-    return RecordingReader(Path(path), topics or Topics(), input, require)
+open_recording = RecordingReader
 
 
 def read_recording(

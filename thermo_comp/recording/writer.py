@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +33,7 @@ _AUTO_FLUSH_BYTES = 1 << 26
 _Column = tuple[int, str, ArrayLike, int]
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager['BagWriter']):
     """
     Write a bag, ``*.mcap`` or a rosbag2 directory; use it as a context manager.
 
@@ -176,10 +176,6 @@ class BagWriter:
                 file.close()
         if not self._is_precious:
             self._draft.drop()
-
-    def __enter__(self) -> BagWriter:
-        """Give the open writer."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish the bag, or drop it where the block raised."""
