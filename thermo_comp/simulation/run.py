@@ -96,12 +96,7 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
 
 
 def arrays(
-    unit: UnitModel,
-    stations: Iterable[Position],
-    seed: int = 0,
-    *,
-    rate_hz: float = 4.0,
-    gravity: float = STANDARD_GRAVITY,
+    unit: UnitModel, stations: Iterable[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
     """Run a unit through a test in memory; each position has a seed of its own, stamps from 0."""
     solved: dict[Cyclogram, Truth] = {}
@@ -113,7 +108,6 @@ def arrays(
             one.up,
             rate_hz=rate_hz,
             seed=1000 * seed + number,
-            gravity=gravity,
             start_ns=0,
             # A load is switched by the seed.
             like=None if unit.load else solved.get(one.program),
