@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..typing import Floats
-from .calibration import AXES, FORMAT_VERSION, AxisSet, Calibration, ResponseTerm, parameter_layout
+from .calibration import AXES, FORMAT_VERSION, Calibration, ResponseTerm, parameter_layout
 from .posterior import posterior_of
 from .schema import Positive, SchemaError, build, check_ranges, naming
 
@@ -115,9 +115,10 @@ def read_version_1(data: dict[str, Any]) -> Calibration:
     used = tuple(term for term in terms if is_known or any(term.bias + term.scale))
     with naming(''):
         calibration = replace(calibration, response=used)
-    if not is_known:
-        return calibration
-    return replace(calibration, posterior=posterior_of(_matrix(calibration, axes), tolerance=0.0))
+    if is_known:
+        posterior = posterior_of(_matrix(calibration, axes), tolerance=0.0)
+        calibration = replace(calibration, posterior=posterior)
+    return calibration
 
 
 def _cut(data: dict[str, Any], part: type[_Part], *path: str) -> _Part:
@@ -140,15 +141,11 @@ def _matrix(calibration: Calibration, axes: list[list[_OfAxis]]) -> Floats:
         for a, (name, axis) in enumerate(zip(AXES, own, strict=True)):
             if not axis.covariance:
                 continue
-            axis_set: AxisSet = getattr(getattr(calibration, regime), name)
             places: list[int] = []
-            for block, function in (
-                (layout.bias[a], axis_set.bias_function),
-                (layout.scale[a], axis_set.scale_function),
-            ):
-                level = getattr(block, regime)
+            for block in (layout.bias[a], layout.scale[a]):
+                # Level and coefficients of a set end where what follows begins.
+                places += range(block[number], block[number + 1])
                 first_term = block.response + number * n_terms
-                places += range(level, level + 1 + function.n_free)
                 places += range(first_term, first_term + 2 + len(axis.memory.bias))
             with naming(f'{regime}.{name}'):
                 matrix[np.ix_(places, places)] = _full(axis.covariance, len(places))
