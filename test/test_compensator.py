@@ -255,9 +255,9 @@ def test_beyond_the_range_the_edge_holds_and_the_covariance_grows():
 
     edge, inside = at(35.0)
     out, outside = at(41.0)
-    assert inside.temperature_excess_k == pytest.approx(0.0, abs=1e-6)
-    assert outside.temperature_excess_k == pytest.approx(6.0, abs=1e-6)
-    assert outside.relative_excess == pytest.approx(6.0 / 15.0, rel=1e-6)
+    assert inside.excess.temperature == pytest.approx(0.0, abs=1e-6)
+    assert outside.excess.temperature == pytest.approx(6.0, abs=1e-6)
+    assert outside.excess.relative == pytest.approx(6.0 / 15.0, rel=1e-6)
     assert out[:3] == pytest.approx(edge[:3], abs=1e-8)
     # At the least the slope at the edge times the excess: 0.5 counts/K * 6 K / 300 counts.
     assert math.sqrt(out[3]) > 0.5 * 6.0 / 300.0

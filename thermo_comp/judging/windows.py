@@ -274,7 +274,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
             continue
         row['force'] = corrected[:3]
         row['variance'] = variance_along(corrected[:3], corrected[3:])
-        row['excess'] = status.relative_excess
+        row['excess'] = status.excess.relative
         state = status.state
         row['board'], row['rate'], row['weight'] = state.board, state.rate, state.weight
         if compensator.corrects_rate:

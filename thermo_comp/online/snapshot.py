@@ -4,17 +4,51 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf, sqrt
 
+from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
+from ..thermal.state import ThermalState
+from ..unit.correction import Excess
 from .compensator import Compensator
-from .status import CompensatorStatus
+from .status import GravityResidual
 
 #: The board temperature is called stale beyond this many of its usual intervals.
 STALE_INTERVALS = 5.0
 #: ... but never sooner than this [s].
 SHORTEST_STALE_S = 0.5
+
+_INSIDE = Excess(0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class CompensatorStatus:
+    """How a compensator stands."""
+
+    stamp_ns: int | None
+    #: By thermometer what is wrong with its readings, and the size of a step not believed [K].
+    faults: Mapping[str, tuple[Fault, float]]
+    #: How far the stamps of the readings that wait are ahead of the samples' [s].
+    pending_ahead_s: float
+    #: None until there is a board temperature.
+    state: ThermalState | None = None
+    #: Ages of the last used readings at the last sample [s]; infinite when there was none.
+    board_age_s: float = inf
+    case_age_s: float = inf
+    is_board_stale: bool = True
+    is_board_lost: bool = True
+    is_case_lost: bool = True
+    excess: Excess = _INSIDE
+    #: Whether the board has led the case in a ramp: the two topics are swapped, most likely.
+    is_lead_reversed: bool = False
+    #: |f| - g while the platform stands; None before it has stood.
+    gravity: GravityResidual | None = None
+    #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
+    is_refuted: bool = False
+    #: What is uncertain of the bias of each axis' angular rate [rad/s]; None where none is known.
+    rate_bias_sd: tuple[float, ...] | None = None
 
 
 def take_snapshot(compensator: Compensator) -> CompensatorStatus:
@@ -24,13 +58,12 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     stamp_ns = compensator.now_ns
     if stamp_ns is None:
         stamp_ns = tracker.updated_ns
-    counters = replace(compensator.counters)
     ahead_s = 0.0 if stamp_ns is None else thermal.queue.ahead(stamp_ns)
     faults = {name: (check.fault, check.step) for name, check in tracker.checks.items()}
     board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
     if stamp_ns is None or (board_ns is None and not thermal.is_unmeasured):
-        return CompensatorStatus(counters, stamp_ns, faults=faults, pending_ahead_s=ahead_s)
-    board_age = math.inf if board_ns is None else (stamp_ns - board_ns) * 1e-9
+        return CompensatorStatus(stamp_ns, faults, ahead_s)
+    board_age = inf if board_ns is None else (stamp_ns - board_ns) * 1e-9
     # Half the time-out at the latest, so that a warning always comes before the error.
     stale_after = compensator.config.temperature_timeout_s / 2.0
     usual = STALE_INTERVALS * tracker.board.interval_s
@@ -38,26 +71,21 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         stale_after = max(usual, SHORTEST_STALE_S)
     state = thermal.sample(stamp_ns)
     is_dynamic = tracker.detector.regime == Regime.DYNAMIC
-    excess = thermal.correction.excess(state, is_dynamic=is_dynamic)
     return CompensatorStatus(
-        counters,
         stamp_ns,
+        faults,
+        ahead_s,
         thermal.state_at(stamp_ns),
         board_age,
-        math.inf if case_ns is None else (stamp_ns - case_ns) * 1e-9,
+        inf if case_ns is None else (stamp_ns - case_ns) * 1e-9,
         board_age > stale_after,
         board_age > compensator.config.temperature_timeout_s,
         not tracker.is_live(stamp_ns, tracker.case),
-        excess.relative,
-        excess.temperature,
-        excess.rate * 60.0,
-        gradient_excess_k=excess.gradient,
-        faults=faults,
-        is_lead_reversed=tracker.lead.is_reversed,
-        gravity=compensator.gravity.result,
-        is_refuted=compensator.gravity.is_refuted,
-        rate_bias_sd=_rate_bias_sd(compensator),
-        pending_ahead_s=ahead_s,
+        thermal.correction.excess(state, is_dynamic=is_dynamic),
+        tracker.lead.is_reversed,
+        compensator.gravity.result,
+        compensator.gravity.is_refuted,
+        _rate_bias_sd(compensator),
     )
 
 
@@ -67,4 +95,4 @@ def _rate_bias_sd(compensator: Compensator) -> tuple[float, ...] | None:
         return None
     noises = [(1.0 + thermal.noise_excess) * one for one in thermal.rate_correction.noise]
     pairs = zip(line[12::3], noises, strict=True)
-    return tuple(math.sqrt(max(0.0, whole - noise)) for whole, noise in pairs)
+    return tuple(sqrt(max(0.0, whole - noise)) for whole, noise in pairs)

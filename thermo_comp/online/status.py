@@ -1,17 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what surrounds the compensator's arithmetic: its settings, its counters, its status."""
+"""Owns what surrounds the compensator's arithmetic: its settings, its counters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from math import inf
+from dataclasses import dataclass
 from operator import attrgetter
 
-from ..thermal.plausibility import Fault
 from ..thermal.settings import ThermalConfig, refuse_outside
-from ..thermal.state import ThermalState
 
 
 @dataclass(frozen=True)
@@ -98,38 +94,3 @@ class GravityResidual:
     def sigmas(self) -> float:
         """Size of the residual in its own standard deviations."""
         return abs(self.residual) / self.residual_sd
-
-
-@dataclass(frozen=True, slots=True)
-class CompensatorStatus:
-    """Snapshot for diagnostics."""
-
-    counters: Counters
-    stamp_ns: int | None
-    #: None until there is a board temperature.
-    state: ThermalState | None = None
-    #: Ages of the last used readings at the last sample [s]; infinite when there was none.
-    board_age_s: float = inf
-    case_age_s: float = inf
-    is_board_stale: bool = True
-    is_board_lost: bool = True
-    is_case_lost: bool = True
-    #: How far outside the calibrated ranges, in half ranges; 0 inside.
-    relative_excess: float = 0.0
-    #: Board temperature beyond the calibrated range [K], signed; rate beyond [K/min].
-    temperature_excess_k: float = 0.0
-    rate_excess_k_min: float = 0.0
-    #: T_case - T_board beyond the calibrated range [K], signed.
-    gradient_excess_k: float = 0.0
-    #: By thermometer what is wrong with its readings, and the size of a step not believed [K].
-    faults: Mapping[str, tuple[Fault, float]] = field(default_factory=dict)
-    #: Whether the board has led the case in a ramp: the two topics are swapped, most likely.
-    is_lead_reversed: bool = False
-    #: |f| - g while the platform stands; None before it has stood.
-    gravity: GravityResidual | None = None
-    #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
-    is_refuted: bool = False
-    #: What is uncertain of the bias of each axis' angular rate [rad/s]; None where none is known.
-    rate_bias_sd: tuple[float, ...] | None = None
-    #: How far the stamps of the readings that wait are ahead of the samples' [s].
-    pending_ahead_s: float = 0.0

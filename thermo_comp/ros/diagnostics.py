@@ -20,8 +20,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from ..online.compensator import Compensator
-from ..online.snapshot import take_snapshot
-from ..online.status import CompensatorStatus
+from ..online.snapshot import CompensatorStatus, take_snapshot
 from ..text import one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
@@ -169,9 +168,9 @@ class Reporter:
             'board age [s]': f'{status.board_age_s:.3f}',
             'case age [s]': f'{status.case_age_s:.3f}',
             **{f'{name} fault': fault.value for name, (fault, _) in status.faults.items()},
-            'gradient excess [K]': f'{status.gradient_excess_k:.3f}',
-            'temperature excess [K]': f'{status.temperature_excess_k:.3f}',
-            'rate excess [K/min]': f'{status.rate_excess_k_min:.3f}',
+            'gradient excess [K]': f'{status.excess.gradient:.3f}',
+            'temperature excess [K]': f'{status.excess.temperature:.3f}',
+            'rate excess [K/min]': f'{60.0 * status.excess.rate:.3f}',
         }
         if gravity is not None:
             values |= {
@@ -274,9 +273,9 @@ def _findings(
     if status.state is not None and status.is_case_lost and needs_board:
         yield _WARN, 'case temperature lost, the board sensor decides the regime'
     for excess, what in (
-        (status.gradient_excess_k, 'case minus board {:+.2f} K'),
-        (status.temperature_excess_k, 'board temperature {:+.2f} K'),
-        (status.rate_excess_k_min, 'temperature rate {:+.2f} K/min'),
+        (status.excess.gradient, 'case minus board {:+.2f} K'),
+        (status.excess.temperature, 'board temperature {:+.2f} K'),
+        (60.0 * status.excess.rate, 'temperature rate {:+.2f} K/min'),
     ):
         if excess:
             yield _WARN, f'{what.format(excess)} outside the calibrated range, held at its edge'
