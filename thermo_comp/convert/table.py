@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import csv
 import os
+from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from io import TextIOWrapper
 from itertools import chain, islice
+from math import nan
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
@@ -31,8 +33,6 @@ from .log import NO_STAMP, library
 Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns']
 
-# A row is parsed in one go with this many others: bounded memory for text, one array each.
-_CHUNK_ROWS = 65536
 _SNIFF_BYTES = 65536
 # A logger's preamble is no longer than this.
 _PREAMBLE_ROWS = 1000
@@ -157,27 +157,25 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
     """
     first = list(islice(rows, _PREAMBLE_ROWS))
     is_row = [_n_cells(row) == width for _, row in first]
-    is_first = [
-        is_row[k] and 2 * sum(map(_is_number, row)) > width for k, (_, row) in enumerate(first)
-    ]
+    n_numbers = [sum(_number(cell) is not None for cell in row) for _, row in first]
+    is_first = [one and 2 * n > width for one, n in zip(is_row, n_numbers, strict=True)]
     if not any(is_first):
         is_first, has_header = is_row, has_header is not False
     begin = is_first.index(True) if any(is_first) else 0
     while begin and is_row[begin - 1]:
         begin -= 1
     if has_header is None:
-        has_header = not any(map(_is_number, first[begin][1]))
+        has_header = not n_numbers[begin]
     headings = first[begin][1] if has_header and first else []
     return [cell.strip() for cell in headings], chain(first[begin + bool(headings) :], rows)
 
 
-def _is_number(cell: str) -> bool:
-    """Return whether a cell reads as a number (NaN and infinity count as such)."""
+def _number(cell: str) -> float | None:
+    """Read a cell as a number, of which NaN and infinity are some."""
     try:
-        float(cell)
+        return float(cell)
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def _collect(
@@ -193,24 +191,22 @@ def _collect(
     at = None if stamp.column is None else _place(path, stamp.column, headings, width)
     needed = 1 + max([*places.values(), -1 if at is None else at])
 
-    lines: list[Ints] = []
-    blocks: list[Floats] = []
-    stamps: list[Ints] = []
-    n_short = 0
-    rows = chain([first], rows)
-    while chunk := list(islice(rows, _CHUNK_ROWS)):
-        whole = [(number, row) for number, row in chunk if len(row) >= needed]
-        n_short += len(chunk) - len(whole)
-        lines.append(np.array([number for number, _ in whole], dtype=np.int64))
-        block = [_floats([row[i] for _, row in whole]) for i in places.values()]
-        blocks.append(np.reshape(block, (len(places), len(whole))))
+    line, stamps, n_short = array('q'), array('q'), 0
+    values = {name: array('d') for name in places}
+    for number, row in chain([first], rows):
+        if len(row) < needed:
+            n_short += 1
+            continue
+        line.append(number)
+        for name, place in places.items():
+            value = _number(row[place])
+            values[name].append(nan if value is None else value)
         if at is not None:
-            stamps.append(exact_ns([row[at] for _, row in whole], stamp.unit))
-    line = np.concatenate(lines)
+            stamps.append(exact_ns(row[at], stamp.unit))
     return Table(
-        line=line,
-        values=dict(zip(places, np.concatenate(blocks, axis=1), strict=True)),
-        stamp_ns=np.concatenate(stamps) if stamps else stamp.ticks(len(line)),
+        line=np.array(line),
+        values={name: np.array(column) for name, column in values.items()},
+        stamp_ns=stamp.ticks(len(line)) if at is None else np.array(stamps),
         n_short=n_short,
         has_headings=bool(headings),
     )
@@ -233,25 +229,13 @@ def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int
     raise RecordingError(why, path=path)
 
 
-def _floats(cells: Sequence[str]) -> Floats:
+def exact_ns(cell: object, unit: TimeUnit | None) -> int:
+    """Return the stamp of a decimal number, exact to the last digit; else `NO_STAMP`."""
     try:
-        return np.array(cells, dtype=np.float64)
-    except ValueError:
-        return np.array([float(cell) if _is_number(cell) else np.nan for cell in cells])
-
-
-def exact_ns(cells: Iterable[object], unit: TimeUnit | None) -> Ints:
-    """Return stamps of decimal numbers, exact to the last digit; else `NO_STAMP`."""
-    stamps = []
-    for cell in cells:
-        stamps.append(NO_STAMP)
-        try:
-            number = Decimal(str(cell).strip()) * 10 ** STAMP_EXPONENTS[unit or 'ns']
-            if abs(number) < 2**63 - 1:
-                stamps[-1] = round(number)
-        except ArithmeticError:
-            continue
-    return np.array(stamps, dtype=np.int64)
+        number = Decimal(str(cell).strip()) * 10 ** STAMP_EXPONENTS[unit or 'ns']
+        return round(number) if abs(number) < 2**63 - 1 else NO_STAMP
+    except ArithmeticError:
+        return NO_STAMP
 
 
 def read_parquet(
@@ -291,6 +275,6 @@ def read_parquet(
         stamps, unit = cells[stamp.column], stamp.unit
         if pa.types.is_timestamp(stamps.type):
             unit, stamps = stamps.type.unit, stamps.cast(pa.int64())
-        stamp_ns = exact_ns(stamps.to_pylist(), unit)
+        stamp_ns = np.array([exact_ns(cell, unit) for cell in stamps.to_pylist()])
     line = np.arange(1, table.num_rows + 1, dtype=np.int64)
     return Table(line, values, stamp_ns)
