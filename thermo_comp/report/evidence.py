@@ -44,12 +44,7 @@ _SIMULATED = 'truth'
 
 @dataclass(frozen=True)
 class Position:
-    """
-    One still position.
-
-    `up` is the direction of the specific force in the output frame, `residual_rms` by rung the
-    RMS of ``|f| - g`` [m/s^2], `LEFT_OUT` where the fit could do without the position.
-    """
+    """One still position: the force's direction in the output frame, RMS of |f| - g by rung."""
 
     number: int
     bag: int
@@ -222,27 +217,28 @@ def evidence_of_bags(
     Raises CalibrationError for a calibration of another unit; RecordingError if samples are too
     slow for such windows.
     """
-    found = Evidence(serial or '', calibration, gravity, tuple(bags))
+    windows = judgement = None
+    said = sorted({bag.source.serial for bag in bags if bag.source.serial})
     if calibration is None:
         windows = corrected_windows(bags, None, gravity=gravity, window_s=window_s)
-        found = replace(found, windows=windows)
     else:
         for bag in bags:
             check_unit(calibration, bag.info, serial)
+        serial = calibration.unit.serial
+        gravity = calibration.gravity_m_s2 if gravity is None else gravity
         judgement = judge_bags(
             bags, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
         )
-        found = replace(
-            found,
-            serial=calibration.unit.serial,
-            gravity=calibration.gravity_m_s2 if gravity is None else gravity,
-            windows=None if judgement is None else judgement.windows,
-            judgement=judgement,
-            findings=_against(calibration),
-            history=history_of([calibration, *others]) if others else (),
-        )
-    said = sorted({bag.source.serial for bag in bags if bag.source.serial})
-    return replace(found, serial=found.serial or ', '.join(said) or 'unknown')
+    return Evidence(
+        serial=serial or ', '.join(said) or 'unknown',
+        calibration=calibration,
+        gravity=gravity,
+        bags=tuple(bags),
+        windows=judgement.windows if judgement else windows,
+        judgement=judgement,
+        findings=_against(calibration) if calibration else (),
+        history=history_of([calibration, *others]) if calibration and others else (),
+    )
 
 
 def evidence_of_fit(result: FitResult) -> Evidence:

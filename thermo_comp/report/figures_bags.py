@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.ticker import ScalarFormatter
 
 from ..thermal.regime import Regime
 from ..typing import Bools, Floats
@@ -29,7 +29,7 @@ _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position of which most is left [pt].
 _RING = 22.0
-# More number labels of a dot plot would overlap, and more rows fill no page.
+# More rows fill no page.
 _MOST = 24
 
 
@@ -109,7 +109,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
     """Draw |f| over time, before and after, and after in detail (the paper's Fig. 7)."""
     gravity, residuals = given(evidence.gravity), evidence.residuals
     corrected = [rung for rung in residuals if rung != RAW]
-    sets = [list(residuals), *([corrected] if corrected else [])]
+    sets = [one for one in (list(residuals), corrected) if one]
     figure, panels, _, unit = _panels(evidence, [1.6] * len(sets), more=0.4)
     for axes, drawn in zip(panels, sets, strict=True):
         for rung in drawn:
@@ -135,11 +135,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """
-    Make panels over the time of the bag that is shown, shaded where the flag says dynamic.
-
-    Returns the bag, and the seconds in the unit of the time axis, as well.
-    """
+    """Make panels over the time of the shown bag, shaded where it is dynamic; [s] of a unit."""
     shown = given(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
@@ -235,8 +231,7 @@ def draw_histograms(evidence: Evidence) -> Figure:
         n_bins = int(np.clip(np.sqrt(len(values)), 9, 33))
         edges = np.linspace(-limit, limit, n_bins + 1)
         share = np.histogram(values, edges)[0] / len(values) * 100.0
-        axes.stairs(share, edges, fill=True, color='#CCCCCC')
-        axes.stairs(share, edges, color='#666666', linewidth=0.7)
+        axes.stairs(share, edges, fill=True, fc='#CCCCCC', ec='#666666', linewidth=0.7)
         sd, mean = float(values.std()), float(values.mean())
         if sd > 0.0:
             middle = np.linspace(-limit, limit, 121)
@@ -246,7 +241,7 @@ def draw_histograms(evidence: Evidence) -> Figure:
         axes.set_xlim(-limit, limit)
         axes.set_ylim(0.0, None)
         axes.set_ylabel('windows, %')
-        axes.xaxis.set_major_locator(MaxNLocator(6))
+        axes.locator_params(axis='x', nbins=6)
         axes.locator_params(axis='y', nbins=4)
         axes.set_title(f'{name}, {label}: sd {number(sd)} µg')
         axes.set_xlabel('|f| − g, µg')

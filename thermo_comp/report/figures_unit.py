@@ -186,11 +186,7 @@ def draw_step(evidence: Evidence) -> Figure:
 
 
 def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
-    """
-    Evaluate what is still to come of bias and scale after a step by 1 K up to the reference.
-
-    Returns the minutes since the step, bias [micro-g] and scale [ppm], shapes (n, 3).
-    """
+    """Give minutes since a step by 1 K, what is to come of bias [ug] and scale [ppm] (n, 3)."""
     minutes = np.geomspace(*_STEP_MINUTES, _N_CURVE)
     since_s = np.append(minutes * 60.0, np.inf)
     states = step_states(calibration, calibration.reference_temperature_c, since_s)
@@ -217,11 +213,7 @@ def draw_hysteresis(evidence: Evidence) -> Figure:
 
 
 def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
-    """
-    Evaluate the bias in a run through the range and back that is too slow for any lag.
-
-    Returns the temperatures, and the bias on the way up and down [micro-g], shapes (n, 3).
-    """
+    """Give temperatures, and the bias [ug] on a slow way up them and down, shapes (n, 3)."""
     lower, upper = calibration.static.temperature_range_c
     temperature = np.linspace(lower, upper, _N_CURVE)
     plays = StateLayout(Correction(calibration).memory).plays

@@ -124,7 +124,7 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _seen(evidence: Evidence) -> list[str]:
-    """Say which bags the verdict rests on, and what the flag marked in the one that is shown."""
+    """Say which bags the verdict rests on, and where the regime was never known."""
     said = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
@@ -134,17 +134,8 @@ def _seen(evidence: Evidence) -> list[str]:
             f'{np.min(board):.1f} to {np.max(board):.1f} °C.'
         )
     shown = evidence.shown
-    known = [] if shown is None else [s for s in shown.stretches if s.regime >= 0]
-    if shown is not None and not known:
+    if shown is not None and all(one.regime == Regime.UNKNOWN for one in shown.stretches):
         said.append('The regime was never known: the bag is too short for the detector.')
-    elif shown is not None:
-        dynamic = [s for s in known if s.regime == Regime.DYNAMIC]
-        part = sum(s.stop - s.start for s in dynamic) / sum(s.stop - s.start for s in known)
-        said.append(
-            f'In bag {shown.bag.source.name} the flag marked '
-            f'{counted(len(dynamic), "dynamic stretch", "es")}, {100.0 * part:.0f} % of the time '
-            'in which the regime was known.'
-        )
     return said
 
 
