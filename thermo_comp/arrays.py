@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -136,7 +136,7 @@ def correct(
     if unknown:
         known = ', '.join(('board', *calibration.sensors))
         raise ValueError(f'`{unknown[0]}` is no thermometer of this calibration: it has {known}')
-    given = _Block.of(time_s, counts, {'board': board, **sensors})
+    given = _block(time_s, counts, {'board': board, **sensors}, 0)
     compensator = Compensator(calibration, config)
     block = process_block(compensator, given)
     stamps = given.accel_stamp_ns
@@ -246,40 +246,38 @@ def fit(
             # What a fit reads of a thermometer that is not there.
             nothing: Temperature = ([], [])
             readings = {'board': nothing, 'case': nothing, **one.temperatures}
-            block = _Block.of(one.time_s, one.counts, readings, one.start_ns)
+            block = _block(one.time_s, one.counts, readings, one.start_ns)
             sources.append(FitSource(one.name, partial(list, [block]), serial=one.serial))
     return run(sources, FitOptions(gravity=gravity, **options)).calibration
 
 
-@dataclass(frozen=True)
-class _Block:
+class _Block(NamedTuple):
     """What `process_block` takes, and a fit."""
 
     accel_stamp_ns: Ints
     accel: Floats
     temperatures: dict[str, Readings]
 
-    @classmethod
-    def of(
-        cls,
-        time_s: npt.ArrayLike,
-        counts: npt.ArrayLike,
-        temperatures: Mapping[str, Temperature],
-        start_ns: int = 0,
-    ) -> _Block:
-        """Check arrays of a caller's; a reading waits for its sample."""
-        stamps = _stamps('time_s', time_s)
-        samples = _numbers('counts', counts)
-        if samples.shape != (len(stamps), 3):
-            raise ValueError(
-                f'`counts` must have the shape ({len(stamps)}, 3), a row for each time, '
-                f'got {samples.shape}'
-            )
-        readings = {}
-        for name, value in temperatures.items():
-            own, celsius = _readings(name, value, stamps, _is_date(time_s))
-            readings[name] = (own + start_ns, celsius, np.zeros(len(own), dtype=np.int64))
-        return cls(stamps + start_ns, samples, readings)
+
+def _block(
+    time_s: npt.ArrayLike,
+    counts: npt.ArrayLike,
+    readings: Mapping[str, Temperature],
+    start_ns: int,
+) -> _Block:
+    """Check arrays of a caller's; a reading waits for its sample."""
+    stamps = _stamps('time_s', time_s)
+    samples = _numbers('counts', counts)
+    if samples.shape != (len(stamps), 3):
+        raise ValueError(
+            f'`counts` must have the shape ({len(stamps)}, 3), a row for each time, '
+            f'got {samples.shape}'
+        )
+    found = {}
+    for name, value in readings.items():
+        own, celsius = _readings(name, value, stamps, _is_date(time_s))
+        found[name] = (own + start_ns, celsius, np.zeros(len(own), dtype=np.int64))
+    return _Block(stamps + start_ns, samples, found)
 
 
 def _is_date(value: object) -> bool:

@@ -4,13 +4,15 @@
 Owns YAML as plain values: mappings, lists, texts, numbers, true, false and null, of bounded size.
 
 Scalars are those of YAML 1.2, so 1e-05 is a number and `no` is a text. No aliases, so no alias
-bombs; no tags, so no objects; no key twice. One pass over the events of the parser, without
-recursion, so no depth and no number of nodes is reached before it is refused.
+bombs; no tags, so no objects; no key twice. One pass over the events of the parser, so no depth
+and no number of nodes is reached before it is refused.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -80,49 +82,43 @@ def is_plain_text(text: str) -> bool:
 
 
 def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
-    document: list[Any] = []
-    #: The open collections, innermost last; a mapping with the key that waits for its value.
-    open_ones: list[Any] = [document]
-    keys: list[Any] = [None]
-    has_document = False
-    for n, event in enumerate(yaml.parse(text, Loader=_LOADER)):
-        mark: Any = event.start_mark
-        line = mark.line + 1
-        if n > node_limit:
-            raise PlainYamlError(f'more than {node_limit} keys and values')
-        if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
-            if event.tag not in (None, '!'):
-                raise PlainYamlError('YAML tags are not accepted', line)
-            holder = open_ones[-1]
-            value: Any = [] if isinstance(event, yaml.SequenceStartEvent) else {}
-            if isinstance(event, yaml.ScalarEvent):
-                value = _scalar(event.value, line) if event.implicit[0] else event.value
-            if type(holder) is list:
-                holder.append(value)
-            elif keys[-1] is not None:
-                holder[keys[-1]] = value
-                keys[-1] = None
-            elif type(value) is not str:
-                raise _invalid(line, f'a key must be a text, got {value!r:.40}')
-            elif value in holder:
-                raise _invalid(line, f'the key {value!r:.60} stands twice')
-            else:
-                keys[-1] = value
-            if isinstance(event, yaml.CollectionStartEvent):
-                if len(open_ones) > depth_limit:
-                    raise PlainYamlError(f'nested deeper than {depth_limit}', line)
-                open_ones.append(value)
-                keys.append(None)
-        elif isinstance(event, yaml.CollectionEndEvent):
-            open_ones.pop()
-            keys.pop()
-        elif isinstance(event, yaml.AliasEvent):
+    def bounded() -> Iterator[Any]:
+        for n, event in enumerate(yaml.parse(text, Loader=_LOADER)):
+            if n > node_limit:
+                raise PlainYamlError(f'more than {node_limit} keys and values')
+            yield event
+
+    def value(event: Any, depth: int) -> Any:
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
             raise PlainYamlError('YAML aliases are not accepted', line)
-        elif isinstance(event, yaml.DocumentStartEvent):
-            if has_document:
-                raise PlainYamlError('expected one YAML document, found more')
-            has_document = True
-    return document[0] if document else None
+        if event.tag not in (None, '!'):
+            raise PlainYamlError('YAML tags are not accepted', line)
+        if isinstance(event, yaml.ScalarEvent):
+            return _scalar(event.value, line) if event.implicit[0] else event.value
+        if depth == depth_limit:
+            raise PlainYamlError(f'nested deeper than {depth_limit}', line)
+        inner = takewhile(lambda one: not isinstance(one, yaml.CollectionEndEvent), events)
+        if isinstance(event, yaml.SequenceStartEvent):
+            return [value(one, depth + 1) for one in inner]
+        found: dict[str, Any] = {}
+        for one in inner:
+            key, line = value(one, depth + 1), one.start_mark.line + 1
+            if type(key) is not str:
+                raise _invalid(line, f'a key must be a text, got {key!r:.40}')
+            if key in found:
+                raise _invalid(line, f'the key {key!r:.60} stands twice')
+            found[key] = value(next(events), depth + 1)
+        return found
+
+    events = bounded()
+    documents: list[Any] = []
+    for event in events:
+        if isinstance(event, yaml.DocumentStartEvent) and documents:
+            raise PlainYamlError('expected one YAML document, found more')
+        if isinstance(event, yaml.NodeEvent):
+            documents.append(value(event, 0))
+    return documents[0] if documents else None
 
 
 def _scalar(text: str, line: int) -> Any:
