@@ -3,10 +3,9 @@
 """
 Owns messages while they come: what is new in somebody else's bag, and numbered bags of ours.
 
-Each look reads a growing bag from its beginning, which any storage can, and passes over what was
-there before; so looks are as far apart as they take long. What comes becomes a folder of numbered
-bags, `01.mcap`, `02.mcap`, ... under the node's own names. Where one ends and the next begins is
-known a little late, so the newest messages are held back.
+Each look reads a growing bag from its beginning, so looks are as far apart as they take long.
+What comes becomes a folder of bags, `01.mcap`, `02.mcap`, ... under the node's own names. Where
+one ends is known a little late, so the newest messages are held back.
 """
 
 from __future__ import annotations
@@ -51,10 +50,9 @@ def growing_blocks(
     wait: Callable[[float], bool],
 ) -> Iterator[News | None]:
     """
-    Give what is new in a bag, and None at the end of each look.
+    Give what is new in a bag, and None at the end of each look, until the bag is whole.
 
-    `wait` waits so long [s] and tells whether to end. It ends by itself when the bag is whole.
-    Raises RecordingError for what is no bag.
+    `wait` waits so long [s] and tells whether to end.
     """
     if not path.exists():
         raise RecordingError('no such file or directory', path)
@@ -102,11 +100,7 @@ _Piece = tuple[str, str, Ints, Messages]
 
 
 class PositionBags:
-    """
-    Writes the bags; the next number is taken when its first message is written.
-
-    Raises OutputError where a bag cannot be written. `close` finishes the last one.
-    """
+    """Writes the bags; the next number is taken when its first message is written."""
 
     def __init__(self, folder: Path, serial: str | None) -> None:
         self._folder, self._serial = folder, serial

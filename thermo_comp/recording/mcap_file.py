@@ -4,11 +4,9 @@
 Owns the fast path: one MCAP file, mapped, and its messages chunk by chunk in bounded memory.
 
 An ordinary file says in its summary which stretches hold its messages. One without a usable
-summary, or cut off anywhere, is gone through record by record from the front, and its messages are
-counted. Whatever is not a message is read by the `mcap` library, from bytes that are there.
-
-Reading order is log time and, for equal log times, the place in the file: what a ROS player gives.
-It needs the time spans in the heads of the chunks to be true, which is checked.
+summary, or cut off anywhere, is gone through record by record, and its messages are counted.
+Whatever is no message is read by the `mcap` library. Reading order is log time and, for equal
+ones, the place in the file; it needs the time spans of the chunks to be true, which is checked.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import re
 from collections import ChainMap, Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath
@@ -50,17 +50,14 @@ _MAX_BYTES = 1 << 24
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 
 
-class RecordingReader(AbstractContextManager['RecordingReader']):
+class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
 
-    Of the accelerometer's topics ``auto`` prefers the counts. Roles that are required are an error
-    where they are absent; the others' columns are just empty. Raises RecordingError for what is no
-    bag, an empty or damaged one, a missing or ambiguous topic, a wrong message type.
-
-    `info` is what the bag says of itself; once all blocks are read, its `truncated` names what did
-    not come. `topics` are the bag's own names of each role's, `definitions` encoding and text of
-    each message type's, where the bag carries it.
+    ``auto`` prefers the counts; roles that are required are an error where they are absent. `info`
+    is what the bag says of itself; once all blocks are read, its `truncated` names what did not
+    come. `topics` are the bag's own names of each role's, `definitions` encoding and text of types.
+    Raises RecordingError for what is no bag, a damaged one, a missing or ambiguous topic.
     """
 
     def __init__(
@@ -71,9 +68,10 @@ class RecordingReader(AbstractContextManager['RecordingReader']):
         *,
         require: Collection[Role] = ROLES,
     ) -> None:
+        super().__init__()
         path, topics = Path(path), topics or Topics()
-        self._stack = ExitStack()
         self._files: list[BagFile] = []
+        self.callback(self._files.clear)
         try:
             self.info = self._open(path)
             self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
@@ -81,11 +79,10 @@ class RecordingReader(AbstractContextManager['RecordingReader']):
                 found = select_topics(self.info.topics, topics, input, require)
             self.topics: Mapping[Role, str] = found[0]
             self.info = replace(self.info, input=found[1], chosen=found[2])
-        except OSError as error:
+        except BaseException as error:
             self.close()
-            raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
-        except BaseException:
-            self.close()
+            if isinstance(error, OSError):
+                raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
         self._cut = Cut(path, topics.part)
@@ -95,7 +92,7 @@ class RecordingReader(AbstractContextManager['RecordingReader']):
         found = _described(path)
         folder = ''
         if found.compression == 'file':
-            folder = self._stack.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
+            folder = self.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
         pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
         notes = [found.note]
         for name in found.files:
@@ -110,13 +107,13 @@ class RecordingReader(AbstractContextManager['RecordingReader']):
                 one = McapFile(file, name, pool)
             else:
                 one = ForeignFile(file, name, is_packed=is_packed)
-            self._stack.callback(one.close)
+            self.callback(one.close)
             self._files.append(one)
             if one.truncated is not None:
                 front = f'{name.name}: ' if len(found.files) > 1 else ''
                 notes.append(front + one.truncated)
         # Ended before the files that its threads read.
-        self._stack.callback(pool.shutdown, wait=True, cancel_futures=True)
+        self.callback(pool.shutdown, wait=True, cancel_futures=True)
         topics = count_topics(topic for one in self._files for topic in one.topics.values())
         for topic, n_promised in found.counts.items():
             notes.append(_loss(topic, topics.get(topic, ('', 0))[1], n_promised))
@@ -131,12 +128,7 @@ class RecordingReader(AbstractContextManager['RecordingReader']):
         )
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
-        """
-        Read the bag from its beginning in bounded memory, RecordingError for damaged data.
-
-        `raw` keeps the serialized messages in `Block.raw`; `n_messages` is about how many make a
-        block, 0 for as few as are read at good speed.
-        """
+        """Read the bag from its beginning, in blocks of about so many messages, or of few (0)."""
         return self._cut.blocks(self._blocks(raw, n_messages))
 
     def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
@@ -196,15 +188,6 @@ class RecordingReader(AbstractContextManager['RecordingReader']):
         """Where the part that is read begins, since the bag's first sample [s]; known then."""
         return self._cut.since_s
 
-    def close(self) -> None:
-        """Close the files and remove what was expanded."""
-        self._stack.close()
-        self._files.clear()
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Close the files."""
-        self.close()
-
 
 open_recording = RecordingReader
 
@@ -252,12 +235,7 @@ def _described(path: Path) -> _Description:
 
 @dataclass(frozen=True, slots=True)
 class _Description:
-    """
-    The files of a bag in their order, and what its metadata.yaml says.
-
-    `compression` is what rosbag2 itself has compressed one by one, ``file``, ``message`` or
-    nothing; `counts` are messages per topic, as the recorder counted; `note` is what is missing.
-    """
+    """The files of a bag: what was compressed by itself, counted per topic, and is missing."""
 
     storage: str
     files: tuple[Path, ...]

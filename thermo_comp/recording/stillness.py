@@ -3,12 +3,10 @@
 """
 Owns still intervals: raw samples -> short cells (count, mean, variance) -> where nothing moved.
 
-Cells of about half a second are accumulated while the samples stream by; a bag of any length
-costs some 100 bytes per cell. Two tests are relative to the bag's own quiet level: the variance
-inside a cell (vibration, handling) and the step between neighbouring cells (a turn, a knock that
-left another attitude). A step starts a new interval, because a shift of one microradian is
-already one micro-g. Two are absolute, because a flight has a quietest tenth, too: a sensor at rest
-scatters by no more than its noise, and its gyroscope does not turn.
+Two tests are relative to the bag's own quiet level: the variance inside a cell (vibration,
+handling) and the step between neighbouring cells (a turn, a knock): a step starts a new interval,
+because a shift of one microradian is already one micro-g. Two are absolute, because a flight has a
+quietest tenth, too: a sensor at rest scatters by no more than its noise, and does not turn.
 """
 
 from __future__ import annotations
@@ -49,12 +47,10 @@ class Cells:
     """
     Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
 
-    `time` is the mean since `start_ns` [s]; `index` the number of the cell on the bag's time grid,
-    so that neighbours differ by 1. Dropped are samples with a component that is not finite or a
-    stamp that does not rise. `is_integer` where all are whole numbers (counts); `quantum` is the
-    step of the samples, 0 when they have none to speak of. `middle` is that of words of 16 bits
-    without a sign (offset binary), where the samples can be nothing else, or 0. `rate` and
-    `rate_variance` are those of the gyroscope [rad/s], of zeros where there is none.
+    `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
+    Dropped are samples that are not finite or whose stamp does not rise. `quantum` is their step,
+    0 when they have none; `middle` that of words of 16 bits without a sign, where they can be
+    nothing else, or 0. The rates are the gyroscope's [rad/s], zeros where there is none.
     """
 
     start_ns: int
@@ -225,8 +221,7 @@ def still_intervals(
     """
     Find the runs of cells in which nothing moved: half-open ranges of cell numbers, in order.
 
-    `still_sd` is the largest scatter of samples at rest [parts of g], `ratio` that of a variance
-    over the quiet level.
+    `still_sd` is the largest scatter at rest [parts of g], `ratio` of a variance to the quiet one.
     """
     full = _is_full(cells)
     believable = full & _is_under(cells, still_sd) & ~_is_turning(cells)

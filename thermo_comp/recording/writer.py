@@ -37,12 +37,10 @@ class BagWriter(AbstractContextManager['BagWriter']):
     """
     Write a bag, ``*.mcap`` or a rosbag2 directory; use it as a context manager.
 
-    Without a `level` the compression is a fast one; `chunk_bytes` counts before it. What
-    `is_precious` is not dropped where it cannot be finished. Messages are buffered until `flush`,
-    which merges all topics in log-time order; 64 MiB of them are flushed unasked. A process that
-    is killed leaves what is written in a hidden file beside the target, a torn bag. Raises
-    OutputError for what may not or cannot be written; the methods also ValueError for shapes that
-    do not fit and times that no ROS stamp can hold. Log times are the stamps, if not given.
+    Messages are buffered until `flush`, which merges all topics in log-time order, or 64 MiB.
+    What `is_precious` is not dropped where it cannot be finished. A process that is killed leaves
+    a torn bag in a hidden file beside the target. Raises OutputError for what may not or cannot be
+    written; ValueError for shapes that do not fit and times that no ROS stamp can hold.
     """
 
     def __init__(
@@ -77,8 +75,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         log_ns: ArrayLike | None = None,
     ) -> None:
         """Write geometry_msgs/Vector3Stamped: counts per cycle, shape (n, 3)."""
-        columns = [(0, 'xyz', xyz, 3)]
-        self._write_stamped(topic, VECTOR3_STAMPED, stamp_ns, log_ns, frame_id, columns)
+        column = (0, 'xyz', xyz, 3)
+        self._write_stamped(topic, VECTOR3_STAMPED, stamp_ns, log_ns, frame_id, [column])
 
     def write_temperature(
         self,
@@ -249,9 +247,7 @@ def _of_rows(rows: Bytes, log_ns: Ints) -> Messages:
 
 def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
     """Check a column of nanoseconds: `n` integers, none negative; ValueError for another."""
-    times = np.atleast_1d(np.asarray(values))
-    if times.size == 0:
-        times = times.astype(np.int64)
+    times = np.atleast_1d(values if np.size(values) else np.empty(0, np.int64))
     if times.dtype.kind not in 'iu' or times.ndim != 1:
         raise ValueError(f'`{name}` must be one row of integers, got {times.dtype}')
     if n is not None and len(times) != n:
