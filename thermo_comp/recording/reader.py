@@ -56,7 +56,7 @@ class RecordingReader(ExitStack):
 
     ``auto`` prefers the counts; roles that are required are an error where they are absent. `info`
     is what the bag says of itself; once all blocks are read, its `truncated` names what did not
-    come. `topics` are the bag's own names of each role's, `definitions` encoding and text of types.
+    come. `topics` are the bag's own names, `definitions` encoding and text of message types.
     Raises RecordingError for what is no bag, a damaged one, a missing or ambiguous topic.
     """
 
