@@ -22,7 +22,7 @@ from .options import argument, option
 from .output import Cell, Output, micro, picked
 
 if TYPE_CHECKING:
-    from ..fitting.acquisition import Account, Acquisition, Position
+    from ..fitting.acquisition import Account, Position
     from ..typing import Floats
 
 _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
@@ -58,12 +58,25 @@ def record(
       thermo_comp record held_out.mcap --positions 1 --soak 1h -o bags/unit44
     """
     from ..fitting.acquisition import Acquisition
+    from ..recording import open_recording
     from ..recording.growing import PositionBags, growing_blocks, numbered_bags
     from ..ros.process import SignalWatch
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
     known = numbered_bags(output)
-    bags = PositionBags(output, _take_known(out, test, known, serial))
+    # Each bag that is there is a position, and says whose it is.
+    with out.progress('reading what is there', total=len(known)) as done:
+        for number, path in enumerate(known, 1):
+            with open_recording(path, require=()) as reader:
+                own = reader.info.metadata.get('serial')
+                if serial is not None and own not in (serial, None):
+                    raise ThermoCompError(f'{path} is of unit {own}, not {serial}')
+                serial = serial or own
+                for block in reader.blocks():
+                    test.add(block)
+            test.begin()
+            done(number)
+    bags = PositionBags(output, serial)
     over = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
     told: dict[str, str] = {}
@@ -134,26 +147,6 @@ def _duration(text: str) -> float:
         raise options.usage(f'--soak: expected a duration like 45min, 1.5h or 30s, got {text!r}')
     seconds = float(found[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[found[2]]
     return options.positive(seconds, '--soak')
-
-
-def _take_known(
-    out: Output, test: 'Acquisition', known: list[Path], serial: str | None
-) -> str | None:
-    """Go on after the bags that are there, each a position; return whose they are."""
-    from ..recording import open_recording
-
-    with out.progress('reading what is there', total=len(known)) as done:
-        for number, path in enumerate(known, 1):
-            with open_recording(path, require=()) as reader:
-                own = reader.info.metadata.get('serial')
-                if serial is not None and own not in (serial, None):
-                    raise ThermoCompError(f'{path} is of unit {own}, not {serial}')
-                serial = serial or own
-                for block in reader.blocks():
-                    test.add(block)
-            test.begin()
-            done(number)
-    return serial
 
 
 def _tell(out: Output, account: 'Account', problems: Sequence[str], told: dict[str, str]) -> None:
