@@ -169,26 +169,20 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
         model = float(np.sqrt(max(claimed**2 - noise**2 - attitude**2, 0.0)))
-    rms = judgement.headline_rms
-    drift_k = info.thermometers.standard_uncertainty_k
+    rest = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
+    drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
+    if drift_k is not None:
+        drift = drift_k * _slope(calibration)
+        slope = f'{drift_k:g} K times the slope of the correction'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
+    beyond = 'what the residual exceeds noise, attitude and model by'
     return (
         Contribution('noise', 'A', noise, seconds),
         Contribution('gravity', 'B', info.gravity.standard_uncertainty_m_s2, info.gravity.source),
         Contribution('attitude', 'A', attitude, 'axes not at right angles; |f| needs no fixture'),
-        Contribution(
-            'thermometers',
-            'B',
-            None if drift_k is None else drift_k * _slope(calibration),
-            '' if drift_k is None else f'{drift_k:g} K times the slope of the correction',
-        ),
+        Contribution('thermometers', 'B', drift, slope),
         Contribution('model', 'A', model, 'posterior of all parameters at the judged windows'),
-        Contribution(
-            'repeatability',
-            'A',
-            float(np.sqrt(max(rms**2 - claimed**2, 0.0))),
-            'what the residual exceeds noise, attitude and model by',
-        ),
+        Contribution('repeatability', 'A', rest, beyond),
     )
 
 

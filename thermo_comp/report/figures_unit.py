@@ -28,6 +28,12 @@ BAND_SDS = 1.96
 _N_CURVE = 61
 #: From a few readings to where the longest lag of the bank has forgotten.
 _STEP_MINUTES = (0.2, 500.0)
+# Line, hatch and marker.
+_WAYS: dict[str, tuple[style.Line, str, str]] = {
+    'soak': (style.STATIC_LINE, '////', 'o'),
+    'heating': (style.DYNAMIC_LINE, '\\\\\\\\', '^'),
+    'cooling': (style.AXIS_LINES[2], '....', 'v'),
+}
 _POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
 
 
@@ -145,20 +151,17 @@ class Curve(NamedTuple):
 def curves(calibration: Calibration) -> list[Curve]:
     """Evaluate a soak and, where they differ, ramps at half of the fastest rate."""
     static, dynamic = calibration.regime_sets()
-    looks = [('soak', static, 0.0, style.STATIC_LINE, '////', 'o')]
-    cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
+    ways = [('soak', static, 0.0)]
     if calibration.response or static != dynamic:
-        for word, rate, line, hatch, marker in (
-            ('heating', heating, style.DYNAMIC_LINE, '\\\\\\\\', '^'),
-            ('cooling', cooling, style.AXIS_LINES[2], '....', 'v'),
-        ):
-            if rate:
-                name = f'{word} at {abs(rate):g} K/min'
-                looks.append((name, dynamic, rate / 60.0, line, hatch, marker))
+        cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
+        ramps = (('heating', dynamic, heating), ('cooling', dynamic, cooling))
+        ways += [one for one in ramps if one[2]]
     reference = np.array([calibration.reference_temperature_c])
     bias_0, scale_0 = bias_and_scale(calibration, ramp_states(calibration, reference))
     found = []
-    for name, part, rate, line, hatch, marker in looks:
+    for way, part, rate_k_min in ways:
+        rate = rate_k_min / 60.0
+        name = f'{way} at {abs(rate_k_min):g} K/min' if rate else way
         lower, upper = part.temperature_range_c
         temperature = np.linspace(lower, upper, _N_CURVE)
         begun = lower if rate > 0.0 else upper
@@ -168,7 +171,7 @@ def curves(calibration: Calibration) -> list[Curve]:
         sd_bias, sd_scale = sd_of_states(calibration, states)
         value = np.hstack(((bias - bias_0) / MICRO_G, (scale / scale_0 - 1.0) * 1e6))
         sd = np.hstack((sd_bias / MICRO_G, sd_scale * 1e6))
-        found.append(Curve(name, line, hatch, marker, temperature, value, sd))
+        found.append(Curve(name, *_WAYS[way], temperature, value, sd))
     return found
 
 
@@ -200,10 +203,8 @@ def draw_hysteresis(evidence: Evidence) -> Figure:
     figure, panels = _axis_panels('loop, µg', sharey=True)
     for i, axes in enumerate(panels):
         middle = (heating[:, i] + cooling[:, i]) / 2.0
-        for name, bias, line, marker in (
-            ('heating', heating, style.DYNAMIC_LINE, '^'),
-            ('cooling', cooling, style.AXIS_LINES[2], 'v'),
-        ):
+        for name, bias in (('heating', heating), ('cooling', cooling)):
+            line, _, marker = _WAYS[name]
             look: style.Line = {'marker': marker, 'markevery': 12, 'markersize': 3.5}
             axes.plot(temperature, bias[:, i] - middle, label=name, **look, **line)
         axes.set_title(f'bias {AXES[i]}')
