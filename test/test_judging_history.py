@@ -66,7 +66,10 @@ def test_what_is_no_history() -> None:
     assert not any(drift.is_sure for drift in silent)
 
 
-def test_commands_tell_the_history(cli, tmp_path: Path) -> None:
+def test_commands_tell_the_history(cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What a drawing shows is tested with the figures.
+    undrawn = 'thermo_comp.report.page.drawn_figures'
+    monkeypatch.setattr(undrawn, lambda figures: [(one, '') for one in figures])
     now = fitted().calibration
     axes = dataclasses.replace(
         now.axes, x=dataclasses.replace(now.axes.x, bias=now.axes.x.bias + 10.0)

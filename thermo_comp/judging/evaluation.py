@@ -27,10 +27,6 @@ from .windows import WINDOW_S, corrected_windows, sum_length
 _NOISES = 4.0
 
 
-def _silent(_part: float) -> None:
-    pass
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """What recordings tell of calibrations, by name; the notes say what was not judged."""
@@ -47,7 +43,7 @@ def open_bags(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     window_s: float = WINDOW_S,
-    progress: Callable[[float], None] = _silent,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
     Read bags, in bounded memory, for windows of `window_s` seconds.
@@ -105,7 +101,7 @@ def evaluate(
     topics: Topics | None = None,
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     serial: str | None = None,
-    progress: Callable[[float], None] = _silent,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Evaluation:
     """
     Judge one or more calibrations of a unit, given with their names, on its recordings.
