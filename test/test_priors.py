@@ -116,10 +116,10 @@ def fitted_curve(number: int):
 
 
 def test_new_rests_make_an_old_calibration_better():
-    old = fitted(4).calibration
-    later = [source(record) for record in test_of(4, 3, 6)]
+    old = fitted(9).calibration
+    later = [source(record) for record in test_of(9, 9, 12)]
     options = FitOptions(
-        STANDARD_GRAVITY, serial='unit-4', prior=old, ageing_bias=1e-4, ageing_scale=2e-5
+        STANDARD_GRAVITY, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5
     )
     new = fit(later, options).calibration
     # Three positions measure three combinations of the six levels that have aged by 10 ug (bias)

@@ -9,7 +9,6 @@ is what a new attitude will see.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,6 @@ from ..typing import Floats
 from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from .learning import Learnt
 from .posterior import Regression
-from .reduction import ReducedBag
 from .unknowns import State
 from .windows import CURVE, SET, ThermalWindows
 
@@ -111,23 +109,15 @@ def left_out_force(regression: Regression, learnt: Learnt) -> Floats:
 
 
 def position_reports(
-    windows: ThermalWindows,
-    bags: Sequence[ReducedBag],
-    regression: Regression,
-    learnt: Learnt,
-    left_out: Floats,
+    windows: ThermalWindows, regression: Regression, learnt: Learnt, left_out: Floats
 ) -> tuple[PositionReport, ...]:
     """List the positions with what the fit, and what the others (`left_out`), left on each."""
-    data, state = windows.data, learnt.posterior.state
+    state = learnt.posterior.state
     residual = norm_residual(regression.force(state), regression.gravity)
     result = []
-    for number in range(data.n_positions):
-        rows = data.position == number
-        bag = bags[int(data.bag[rows][0])]
-        starts = [interval.time[0] for interval in bag.intervals]
-        at = np.searchsorted(starts, data.time[rows][0], side='right')
-        interval = bag.intervals[max(0, int(at) - 1)]
-        x, y, z = (float(v) for v in state.up[number])
+    for number, (bag, interval) in enumerate(windows.rests):
+        rows = windows.data.position == number
+        x, y, z = state.up[number].tolist()
         result.append(
             PositionReport(
                 source=bag.source.name,

@@ -223,7 +223,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         calibration=calibration,
         learnt=learnt,
         residuals=residuals,
-        positions=position_reports(windows, bags, regression, learnt, left_out),
+        positions=position_reports(windows, regression, learnt, left_out),
         findings=tuple(findings),
         least_known=least,
         windows=windows,

@@ -21,7 +21,7 @@ from ..thermal.tracker import ThermalTracker
 from ..typing import Floats, Ints
 from ..unit.columns import Column, ColumnTable, memory_of
 from ..unit.functions import TemperatureFunction
-from .reduction import ReducedBag
+from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
 from .unknowns import Windows
 
@@ -97,6 +97,7 @@ class ThermalWindows:
     raw: the response's columns before powers of t and ranges, shape (n, k)
     angular_rate: mean of it [rad/s], shape (n, 3); (n, 0) where a bag lacks it
     typical_count: samples in a typical window
+    rests: the bag and the interval of each position
     """
 
     model: Model
@@ -108,6 +109,7 @@ class ThermalWindows:
     raw: Floats
     angular_rate: Floats
     typical_count: float
+    rests: tuple[tuple[ReducedBag, StillInterval], ...] = ()
 
     @property
     def was_measured(self) -> bool:
@@ -133,7 +135,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     parts: list[tuple[Floats, ...]] = []
     numbers: list[tuple[Ints, Ints]] = []
     groups: list[str] = []
-    n_positions = 0
+    rests: list[tuple[ReducedBag, StillInterval]] = []
     has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
     for bag, reduced in enumerate(bags):
         begin, grid, states = _states(reduced, spec, model)
@@ -156,8 +158,8 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             merged = _merged(time, count, interval.mean[use], rows)
             n = len(merged[0])
             parts.append(merged)
-            numbers.append((np.full(n, n_positions), np.full(n, bag)))
-            n_positions += 1
+            numbers.append((np.full(n, len(rests)), np.full(n, bag)))
+            rests.append((reduced, interval))
     time, count, mean, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
     k, m = len(columns), len(groups) + len(columns)
@@ -192,6 +194,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
         raw=rows[:, 4 : 4 + k],
         angular_rate=rows[:, end:],
         typical_count=float(np.median(count)),
+        rests=tuple(rests),
     )
 
 
