@@ -255,10 +255,10 @@ def test_a_longer_memory_promises_what_it_brings() -> None:
     assert _longer_gain(regression, posterior, short, allowed, 2000.0) < 3.0
 
 
-def test_how_bags_begin_is_learnt(calm: tuple[Regression, Learnt, Truth]) -> None:
-    assert 0.0 <= calm[1].prior.start_share <= 0.15
-    _, found = learnt_of(Truth(start_sd=1.0), 18, 9)
-    assert 0.8 <= found.prior.start_share <= 1.0
+@pytest.mark.parametrize(('start_sd', 'lower', 'upper'), [(0.0, 0.0, 0.15), (1.0, 0.8, 1.0)])
+def test_how_bags_begin_is_learnt(start_sd: float, lower: float, upper: float) -> None:
+    _, found = learnt_of(Truth(start_sd=start_sd), 18, 9)
+    assert lower <= found.prior.start_share <= upper
 
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
