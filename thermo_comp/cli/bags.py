@@ -71,7 +71,7 @@ def info(
         int(bool(found.truncated)),
         path=path,
         **picked(found, 'storage truncated metadata input chosen'),
-        topics={name: {'type': kind, 'messages': count} for name, kind, count in rows},
+        topics={name: {'type': kind, 'messages': n} for name, (kind, n) in found.topics.items()},
         samples=survey.n,
         still_intervals=survey.n_still,
         board=thermometers.get('board'),
