@@ -10,7 +10,6 @@ very same changes: what is uncertain of the bias there, less what it has in comm
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,37 +67,26 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     def mean_of(rows: Floats) -> Floats:
         return means_by(place, rows, weight)[place]
 
-    claims = rate_triad(calibration).has_uncertainty
-    claimed = np.full_like(corrected, np.nan)
+    triad = rate_triad(calibration)
+    claims, claimed = triad.has_uncertainty, np.full_like(corrected, np.nan)
     if claims:
-        claimed = np.sqrt(_variance(windows, calibration, variance, counts, mean_of))
+        # What is claimed for the changes, from what is for the rate of one message.
+        correction = Correction(triad, Correction(calibration).memory)
+        whole, away = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
+        slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
+        # Of the thermometers' noise, and of lags that started unseen, a rest's mean has little.
+        rest = np.maximum(variance - np.array(correction.noise) - slow - whole, 0.0)
+        white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
+        noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
+        hours = counts[:, None] * windows.window_s / 3600.0
+        # A walk strays from its mean over a time by a sixth of what it gains in that time.
+        walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
+        claimed = np.sqrt(rest + away + noise + walk)
     changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))
     is_judged = counts > 1
     sections = sections_of(windows.select(is_judged), *changes[:, is_judged])
     kind, reason = _verdict(sections, windows.window_s, claims)
     return RateJudgement(kind, reason, sections)
-
-
-def _variance(
-    windows: Windows,
-    calibration: Calibration,
-    variance: Floats,
-    counts: Floats,
-    mean_of: Callable[[Floats], Floats],
-) -> Floats:
-    """Say what is claimed for the changes, from what is for the rate of one message."""
-    triad = rate_triad(calibration)
-    correction = Correction(triad, Correction(calibration).memory)
-    whole, away = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
-    slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
-    # Of the thermometers' noise, and of lags that started unseen, a rest's mean has little.
-    rest = np.maximum(variance - np.array(correction.noise) - slow - whole, 0.0)
-    white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
-    noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
-    hours = counts[:, None] * windows.window_s / 3600.0
-    # A walk strays from its mean over a time by a sixth of what it gains in that time.
-    walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
-    return np.asarray(rest + away + noise + walk)
 
 
 def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict, str]:
