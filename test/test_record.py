@@ -25,7 +25,7 @@ from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import simulate_blocks
 from thermo_comp.unit.calibration_file import load_calibration
 
-N_POSITIONS, SOAK_S, TURN_S, RATE = 9, 200.0, 20.0, 10.0
+N_POSITIONS, SOAK_S, TURN_S, RATE = 9, 100.0, 20.0, 10.0
 UNIT = unit_preset('plain', 1)
 UPS = positions(N_POSITIONS, 2)
 START_NS = 1_767_225_600_000_000_000
@@ -151,7 +151,7 @@ class TestGrowing:
     def test_a_whole_bag_becomes_one_for_each_position(
         self, session: Path, cli: Cli, tmp_path: Path
     ) -> None:
-        options = ('--positions', f'{N_POSITIONS}', '--soak', '180s', '-o', tmp_path / 'bags')
+        options = ('--positions', f'{N_POSITIONS}', '--soak', '80s', '-o', tmp_path / 'bags')
         finished = cli('record', session, *options, '--json')
         result = json.loads(finished.stdout)
         check_positions(result)
@@ -172,7 +172,7 @@ class TestGrowing:
                 '--positions',
                 '3',
                 '--soak',
-                '180s',
+                '80s',
                 '-o',
                 bags,
                 '--json',
@@ -238,7 +238,7 @@ class TestLive:
         self, play: Callable[..., Any], session: Path, cli: Cli, tmp_path: Path
     ) -> None:
         bags = tmp_path / 'bags'
-        options = ('--positions', f'{N_POSITIONS}', '--soak', '180s', '--serial', 'lab-7')
+        options = ('--positions', f'{N_POSITIONS}', '--soak', '80s', '--serial', 'lab-7')
         recording = Recording(*options, '-o', bags, '--json')
         recording.wait_for('nobody publishes /accel/counts or /imu/uncompensated')
         play(session, rate=0.0, wait_s=30.0)
@@ -258,7 +258,7 @@ class TestLive:
         self, play: Callable[..., Any], tmp_path: Path
     ) -> None:
         bags, session = tmp_path / 'bags', write_session(tmp_path / 'session.mcap', UPS[:2])
-        recording = Recording('--soak', '180s', '-o', bags, '--json')
+        recording = Recording('--soak', '80s', '-o', bags, '--json')
         recording.wait_for('nobody publishes')
         play(session, rate=0.0, wait_s=30.0)
         recording.wait_for('position 2: good')

@@ -108,7 +108,7 @@ def by_hand(rng, n_rests: int, rest_s: float, shaky: tuple[int, ...], misalignme
     return force @ np.linalg.inv(matrix).T * (1.01, 0.99, 1.02) + (0.3, -0.2, 0.1)
 
 
-@pytest.mark.parametrize(('rest_s', 'shaky'), [(6.0, (2, 5, 9)), (3.5, ()), (3.5, (0, 3, 7))])
+@pytest.mark.parametrize(('rest_s', 'shaky'), [(6.0, (2, 5, 9)), (3.5, (0, 3, 7))])
 def test_each_short_rest_is_found(rng, rest_s, shaky):
     accel = by_hand(rng, 10, rest_s, shaky)
     result = fit([source(accel)], OPTIONS)
