@@ -167,16 +167,7 @@ class TestGrowing:
         for number, part in enumerate((UPS[:2], UPS[2:3]), 1):
             bag = write_session(tmp_path / f'part{number}.mcap', part)
             finished = cli(
-                'record',
-                bag,
-                '--positions',
-                '3',
-                '--soak',
-                '80s',
-                '-o',
-                bags,
-                '--json',
-                code=None,
+                'record', bag, '--positions', '3', '--soak', '80s', '-o', bags, '--json', code=None
             )
             result = json.loads(finished.stdout)
             # Not all of it is there yet, and the bag is over.

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the time of a recording: the part that is read, and stamps on which no jump is a long one.
+Owns stamps on which no jump is a long one.
 
-A clock that is set while it runs (1970, then NTP) or a recorder that slept leaves a hole of years
-in the stamps. Whatever walks a grid of time would walk it. After an hour without a reading nothing
-is known of a unit's thermal state any more, so an hour tells as much as a year: a longer jump,
-either way, becomes an hour.
+A clock that is set while it runs or a recorder that slept leaves a hole of years in the stamps,
+and whatever walks a grid of time would walk it. After an hour without a reading nothing is known
+of a unit's thermal state, so a longer jump, either way, becomes an hour.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import numpy as np
 from ..errors import RecordingError
 from ..typing import Ints
 from .columns import Block
-from .topics import Part
 
 #: What a longer jump of the stamps becomes [ns].
 LONGEST_PAUSE_NS = 3600 * 10**9
@@ -75,38 +73,3 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
                 for (name, one), by in zip(block.temperatures.items(), parts, strict=False)
             },
         )
-
-
-class Cut:
-    """Leaves out of blocks what is outside a part; `since_s` is where it begins in the bag."""
-
-    def __init__(self, path: Path, part: Part) -> None:
-        self._path, self._part = path, part
-        self.since_s = 0.0
-
-    def blocks(self, blocks: Iterable[Block]) -> Iterator[Block]:
-        """Cut blocks; RecordingError where no sample is left."""
-        if self._part.is_whole:
-            yield from blocks
-            return
-        first_ns: int | None = None
-        last_ns = n_kept = 0
-        for block in blocks:
-            if len(block):
-                last_ns = int(block.accel_stamp_ns[-1])
-                first_ns = int(block.accel_stamp_ns[0]) if first_ns is None else first_ns
-            stamps = {name: one.stamp_ns for name, one in block.temperatures.items()}
-            stamps['accel'] = block.accel_stamp_ns
-            begin, end = self._part.limits_ns(first_ns)
-            left = block.take({k: (own >= begin) & (own < end) for k, own in stamps.items()})
-            if len(left) and not n_kept:
-                self.since_s = (int(left.accel_stamp_ns[0]) - (first_ns or 0)) * 1e-9
-            n_kept += len(left)
-            if left.n_messages:
-                yield left
-        if not n_kept and first_ns is not None:
-            raise RecordingError(
-                f'no sample is in {self._part}: they are stamped from {first_ns * 1e-9:.3f} '
-                f'to {last_ns * 1e-9:.3f}, which is {(last_ns - first_ns) * 1e-9:.1f} s',
-                self._path,
-            )

@@ -24,7 +24,7 @@ from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
 from .chunks import expand, translated
-from .clock import Cut, without_jumps
+from .clock import without_jumps
 from .columns import (
     ROLES,
     BagFile,
@@ -85,7 +85,8 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        self._cut = Cut(path, topics.part)
+        #: Where the part that is read begins, since the bag's first sample [s]; known then.
+        self.since_s = 0.0
 
     def _open(self, path: Path) -> RecordingInfo:
         """Open the files; those that rosbag2 has compressed as a whole are expanded beside."""
@@ -129,7 +130,7 @@ class RecordingReader(ExitStack):
 
     def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         """Read the bag from its beginning, in blocks of about so many messages, or of few (0)."""
-        return self._cut.blocks(self._blocks(raw, n_messages))
+        return self._cut(self._blocks(raw, n_messages))
 
     def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         n_read = dict.fromkeys(self.topics, 0)
@@ -181,12 +182,34 @@ class RecordingReader(ExitStack):
         """Read the bag for whoever walks its time: without the jumps of its clock."""
         if self._part.is_stamped:
             return without_jumps(self.blocks(), self.info.path)
-        return self._cut.blocks(without_jumps(self._blocks(), self.info.path))
+        return self._cut(without_jumps(self._blocks(), self.info.path))
 
-    @property
-    def since_s(self) -> float:
-        """Where the part that is read begins, since the bag's first sample [s]; known then."""
-        return self._cut.since_s
+    def _cut(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        """Leave out what is outside the part; RecordingError where no sample is left."""
+        if self._part.is_whole:
+            yield from blocks
+            return
+        first_ns: int | None = None
+        last_ns = n_kept = 0
+        for block in blocks:
+            if len(block):
+                last_ns = int(block.accel_stamp_ns[-1])
+                first_ns = int(block.accel_stamp_ns[0]) if first_ns is None else first_ns
+            stamps = {name: one.stamp_ns for name, one in block.temperatures.items()}
+            stamps['accel'] = block.accel_stamp_ns
+            begin, end = self._part.limits_ns(first_ns)
+            left = block.take({k: (own >= begin) & (own < end) for k, own in stamps.items()})
+            if len(left) and not n_kept:
+                self.since_s = (int(left.accel_stamp_ns[0]) - (first_ns or 0)) * 1e-9
+            n_kept += len(left)
+            if left.n_messages:
+                yield left
+        if not n_kept and first_ns is not None:
+            raise RecordingError(
+                f'no sample is in {self._part}: they are stamped from {first_ns * 1e-9:.3f} '
+                f'to {last_ns * 1e-9:.3f}, which is {(last_ns - first_ns) * 1e-9:.1f} s',
+                self.info.path,
+            )
 
 
 open_recording = RecordingReader
