@@ -164,11 +164,7 @@ def parameters_of(calibration: Calibration) -> Floats:
 def with_parameters(
     calibration: Calibration, scale_factor: Floats, values: Floats, covariance: Floats
 ) -> Calibration:
-    """
-    Give a calibration other parameters, in the order of its posterior, and their covariance.
-
-    `scale_factor`: K [input units per m/s^2], shape (3,); levels of the scale are not looked at.
-    """
+    """Give a calibration K, and parameters in the order of its posterior but for its levels."""
     layout = parameter_layout(calibration)
     regimes = []
     for k, regime in enumerate(calibration.regime_sets()):
@@ -244,14 +240,11 @@ def _board_lag(windows: ThermalWindows) -> float:
 
 
 def _slow_error(windows: ThermalWindows, learnt: Learnt) -> Floats:
-    """
-    Say what the bias does of itself: another one in each mounting, and a walk [m/s^2].
-
-    The walk's mean square over a run as long as the bags is half of what it has at the end.
-    """
+    """Say what the bias does of itself: another one in each mounting, and a walk [m/s^2]."""
     prior = learnt.prior
     data = windows.data
     length = [float(np.ptp(data.time[data.bag == bag])) for bag in np.unique(data.bag)]
+    # Its mean square over a run as long as the bags is half of what it has at the end.
     walked = prior.sigma**2 * prior.rho * float(np.median(length)) / 2.0
     return np.sqrt(prior.offset_sd**2 + walked)
 

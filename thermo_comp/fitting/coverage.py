@@ -225,13 +225,9 @@ def spoken_direction(up: Floats) -> str:
     size = np.abs(up)
     axes = [sign for sign, one in zip(signs, size, strict=True) if one > 0.1]
     reading = ', '.join(f'{name} {value:+.2f} g' for name, value in zip('xyz', up, strict=True))
-    if np.ptp(size[size > 0.1]) > 0.1:
-        return f'{_listed(axes)} up in part: {reading}'
-    return f'{_listed(axes)} up{" alike" if len(axes) > 1 else ""}: {reading}'
-
-
-def _listed(names: list[str]) -> str:
-    return ' and '.join(filter(None, (', '.join(names[:-1]), names[-1])))
+    said = ' and '.join(filter(None, (', '.join(axes[:-1]), axes[-1])))
+    how = ' in part' if np.ptp(size[size > 0.1]) > 0.1 else ' alike' if len(axes) > 1 else ''
+    return f'{said} up{how}: {reading}'
 
 
 def _cube() -> Floats:

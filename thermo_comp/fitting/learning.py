@@ -71,10 +71,6 @@ class Learnt:
     worth: tuple[GroupEvidence, ...]
     claim: Posterior
 
-    def has(self, group: str) -> bool:
-        """Whether a group of columns has a place."""
-        return any(one.group == group for one in self.worth)
-
 
 def learn(
     regression: Regression,

@@ -192,12 +192,13 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
     """Make a calibration like some, of these columns, which its parameters wait for."""
     first = calibrations[0]
+    slow = [[axis.residual_sd_m_s2 for axis in one.static.axes()] for one in calibrations]
     regimes = []
     for k, regime in enumerate(first.regime_sets()):
         each = [one.regime_sets()[k] for one in calibrations]
         x, y, z = (
-            replace(own, residual_sd_m_s2=_median(calibrations, axis))
-            for axis, own in enumerate(regime.axes())
+            replace(own, residual_sd_m_s2=float(sd))
+            for own, sd in zip(regime.axes(), np.median(slow, axis=0), strict=True)
         )
         temperatures = _union([one.temperature_range_c for one in each])
         rates = _union([one.rate_range_k_min for one in each])
@@ -217,10 +218,6 @@ def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Cal
         posterior=None,
         gyroscope=None,
     )
-
-
-def _median(calibrations: Sequence[Calibration], axis: int) -> float:
-    return float(np.median([one.static.axes()[axis].residual_sd_m_s2 for one in calibrations]))
 
 
 def _union(ranges: Sequence[tuple[float, float]]) -> tuple[float, float]:

@@ -24,12 +24,7 @@ _LARGEST_RMS = 0.05
 
 @dataclass(frozen=True)
 class ConstantCalibration:
-    """
-    The nine parameters of a triad at one temperature.
-
-    bias, scale: input units; input units per m/s^2, shape (3,)
-    misalignment: M, lower triangular with a unit diagonal, shape (3, 3)
-    """
+    """The triad at one temperature: bias [input units], scale [the same per m/s^2], M."""
 
     bias: Floats
     scale: Floats

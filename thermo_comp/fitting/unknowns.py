@@ -65,13 +65,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class Known:
-    """
-    What is known of the unit's own parameters together, e.g. by an earlier calibration.
-
-    mean: in the order of `Layout`: kappa, bias, weights of each axis, then the skew, shape
-        (n_unit,)
-    precision: inverse covariance, shape (n_unit, n_unit)
-    """
+    """What is known of the unit's own parameters, as `Layout` has them: mean, 1 / covariance."""
 
     mean: Floats
     precision: Floats

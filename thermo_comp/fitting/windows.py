@@ -48,13 +48,12 @@ class Sets:
     dynamic: TemperatureFunction
     is_shared: bool = True
 
-    def columns(self, t: Floats, weight: Floats) -> tuple[list[Floats], list[str]]:
-        """Evaluate the columns of the sets, and name their groups."""
+    def columns(self, t: Floats, weight: Floats) -> list[Floats]:
+        """Evaluate the columns of the sets."""
         static, dynamic = self.static.basis(t), self.dynamic.basis(t)
         if not self.is_shared:
             static = [(1.0 - weight) * value for value in static]
-        switched = [weight, *(weight * value for value in dynamic)]
-        return [*static, *switched], [group for group, _ in self.levels()]
+        return [*static, weight, *(weight * value for value in dynamic)]
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
@@ -134,7 +133,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     table = ColumnTable(columns, spec, reference)
     parts: list[tuple[Floats, ...]] = []
     numbers: list[tuple[Ints, Ints]] = []
-    groups: list[str] = []
+    groups = [group for group, _ in sets.levels()]
     rests: list[tuple[ReducedBag, StillInterval]] = []
     has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
     for bag, reduced in enumerate(bags):
@@ -147,7 +146,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             at = np.array([np.interp(time, grid, column) for column in states.T])
             board, weight = at[BOARD], at[WEIGHT]
             raw = table.raw(at)
-            curves, groups = sets.columns(board - reference, weight)
+            curves = sets.columns(board - reference, weight)
             factors, _ = table.factors(board, weight)
             moved = _moved(table, table.slopes(at) * factors, time - grid[0])
             rows = np.array(
