@@ -190,12 +190,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     findings += enforce(verdict.judge_windows(windows, up, has_case), options)
     tell(0.7)
     regression, learnt = regress(windows, start, up, options, tell)
-    if (
-        has_case
-        and known is None
-        and options.detector is None
-        and any(one.group == SET for one in learnt.worth)
-    ):
+    asks = has_case and known is None and options.detector is None
+    if asks and any(one.group == SET for one in learnt.worth):
         # Only the sets feel when the regime closes: with the case, or with the board too.
         others = thermal_windows(bags, replace(model, detector=replace(detector, closes='case')))
         again = Regression(others.data, options.gravity, start.scale)
