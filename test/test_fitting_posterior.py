@@ -185,12 +185,12 @@ def test_truth_comes_out_without_noise(rng: np.random.Generator) -> None:
 
 def test_claimed_sd_is_the_scatter() -> None:
     # Under the right priors the inverse Hessian is the Cramer-Rao bound: errors over claimed sd
-    # have an rms of 1. 60 units of 3 x 2 + 3 + 24 numbers, some of them correlated: the rms of
+    # have an rms of 1. 100 units of 3 x 2 + 3 + 24 numbers, some of them correlated: the rms of
     # each kind is known to 8 % at the worst.
     rng = np.random.default_rng(11)
     truth = Truth(walk=0.05 * MICRO, offset_sd=MICRO, start_sd=0.3)
     pulls: dict[str, list[Floats]] = {name: [] for name in ('kappa', 'bias', 'skew', 'weights')}
-    for _ in range(60):
+    for _ in range(100):
         windows, up = table_of(truth, 12, rng, n_windows=15, step_s=320.0)
         regression, state = begin(windows, up)
         prior = prior_of(truth)

@@ -59,7 +59,7 @@ def regress(
         prior,
         np.array(forced),
         lambda part: tell(0.7 + 0.25 * part),
-        held=(prior.widths[1] > 0.0) & (len(distinct_directions(up)) < POSITIONS_NEEDED),
+        held=(prior.widths[1] > 0.0) & (len(distinct_directions(up)) == 1),
         # What the sets alone leave is a response, and no noise.
         walks=windows.raw.shape[1] > 0
         and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
@@ -103,15 +103,13 @@ def _wide_prior(
     is_curve = np.array([group == CURVE for group in groups])
     wide = np.where(is_curve, max(1.0, drift / _COLUMN_BIAS_SD), 1.0)
     scale_wide = wide
-    n_directions = len(distinct_directions(up))
-    if n_directions == 1 and options.groups is None:
-        # In one attitude a lag looks like a tilt or a curve: the curve is what others can use.
-        allowed &= is_curve
-        in_scale &= is_curve
-    if n_directions < POSITIONS_NEEDED:
-        # Too few attitudes to tell it from the bias: the curve stays at its prior.
+    if len(distinct_directions(up)) == 1:
+        # One attitude does not tell it from the bias: its curve stays at its prior.
         in_scale &= is_curve
         scale_wide = np.ones(len(groups))
+        if options.groups is None:
+            # Nor a lag from a tilt or a curve: the curve is what others can use.
+            allowed &= is_curve
     if options.model == 'golovach':
         # The paper's sets stay whatever they earn: their prior says nothing.
         wide, scale_wide = 50.0 * wide, 50.0 * scale_wide

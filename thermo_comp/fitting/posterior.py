@@ -37,6 +37,10 @@ _LEAST_LEFT = 1e-5
 _JITTER = 1e-13
 # Start states of neighbouring lags are told apart to fewer digits.
 _START_JITTER = 1e-10
+# A step that promises less than this part of a noise variance per reading may be the last ...
+_FAR = 0.01
+# ... of no more than so many; one that overshoots is halved up to so many times.
+_MOST_STEPS, _MOST_HALVINGS = 25, 12
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
 
 
@@ -122,19 +126,21 @@ class _Equations:
 class Regression(Design):
     """The Gauss-Newton on the data of a fit; see `Design` for the parameters."""
 
-    def _equations(self, state: State, prior: Prior, layout: Layout) -> _Equations:
-        """Hessian and gradient of minus the log likelihood, and the residuals."""
+    def _whiten(self, state: State, prior: Prior) -> tuple[Floats, Floats, float]:
+        """Residuals without their walk, the same in sds, and minus twice the log likelihood."""
         residual = self.residual(state)
-        white = np.empty_like(residual)
         filtered = np.empty_like(residual)
         size = 0.0
         for axis in range(3):
             found = self._whitened(axis, float(prior.rho[axis]))
-            w = self._whitener.filter(residual[:, axis : axis + 1], found.gains)[:, 0]
-            filtered[:, axis] = w
-            white[:, axis] = w / prior.sigma[axis]
-            size += float(white[:, axis] @ white[:, axis]) + found.determinant
-            size += 2.0 * len(w) * float(np.log(prior.sigma[axis]))
+            filtered[:, axis] = self._whitener.filter(residual[:, [axis]], found.gains)[:, 0]
+            size += found.determinant + 2.0 * len(residual) * float(np.log(prior.sigma[axis]))
+        white = filtered / prior.sigma
+        return filtered, white, size + float(np.sum(white * white))
+
+    def _equations(self, state: State, prior: Prior, layout: Layout) -> _Equations:
+        """Hessian and gradient of minus the log likelihood, and the residuals."""
+        filtered, white, size = self._whiten(state, prior)
         hessian = np.zeros((layout.n, layout.n))
         gradient = np.zeros(layout.n)
         width = layout.axis.shape[1]
@@ -279,14 +285,17 @@ class Regression(Design):
     def solve(
         self, state: State, prior: Prior, n_steps: int = 6, tolerance: float = 1e-3
     ) -> Posterior:
-        """Find the mode under a prior."""
+        """
+        Find the mode under a prior, in so many steps or, where it is far, in as many as it takes.
+        """
         layout = self.layout(prior.widths > 0.0)
         precision = self.precision(prior, layout)
         matrices = self._inform(prior, layout)
         mean = self.prior_mean(prior, layout)
         # What takes no part any more is 0.
         state = self._moved(state, np.zeros(layout.n), layout)
-        for k in range(n_steps):
+        far = _FAR * self.windows.mean.size
+        for k in range(_MOST_STEPS):
             equations = self._equations(state, prior, layout)
             hessian, away = equations.hessian, self.vector(state, layout) - mean
             pull = precision * away
@@ -298,8 +307,19 @@ class Regression(Design):
             gradient = equations.gradient - pull
             step = factor.solve(gradient)
             promised = 0.5 * float(step @ gradient)
-            if promised < tolerance or k == n_steps - 1:
+            is_near = promised < far or k == _MOST_STEPS - 1
+            if promised < tolerance or (k >= n_steps - 1 and is_near):
                 break
+            size = equations.size + float(away @ pull)
+            # Where bags hardly tell bias, scale and attitude apart a whole step overshoots.
+            for _ in range(_MOST_HALVINGS if promised > 1.0 else 0):
+                moved = self._moved(state, step, layout)
+                off = self.vector(moved, layout) - mean
+                pulled = float(precision @ off**2)
+                pulled += sum(float(off[at] @ matrix @ off[at]) for at, matrix in matrices)
+                if self._whiten(moved, prior)[2] + pulled < size:
+                    break
+                step = 0.5 * step
             state = self._moved(state, step, layout)
         determinant = float(np.log(precision[precision > 0.0]).sum())
         determinant += sum(float(np.linalg.slogdet(matrix)[1]) for _, matrix in matrices)
