@@ -42,7 +42,7 @@ terms of their sets become columns of the response, `during` one regime; what is
 The reader refuses, with the file, the key, the value and what was expected: unknown or missing
 keys, texts where numbers belong, NaN and infinity, ranges that do not rise, functions that are not
 normalised at the reference, a scale that could reach zero within its ranges, a posterior of another
-size, a newer `format_version`, YAML aliases and tags, files above 4 MiB. Numbers are written with all
+size, a newer `format_version`, YAML aliases and tags, files above 8 MiB. Numbers are written with all
 their digits and the posterior in single precision, so a file that is read and written again is the
 same file.
 

@@ -55,7 +55,7 @@ TOLD = [
             ('truncated', 'the first key or line that fails'),
             ('deleted', 'No such file or directory'),
             ('made unreadable', 'cannot be read'),
-            ('1 GB', 'at most 4 MiB; not read'),
+            ('1 GB', 'at most 8 MiB; not read'),
             ('a YAML alias bomb', 'aliases are not accepted; not built'),
             ('a directory', 'not a regular file'),
             ('a FIFO', 'not a regular file; never waited for'),

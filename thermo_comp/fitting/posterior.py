@@ -39,8 +39,9 @@ _JITTER = 1e-13
 _START_JITTER = 1e-10
 # A step that promises less than this part of a noise variance per reading may be the last ...
 _FAR = 0.01
-# ... of no more than so many; one that overshoots is halved up to so many times.
-_MOST_STEPS, _MOST_HALVINGS = 25, 12
+# ... of no more than so many. One that overshoots is tried again, up to so many times, with the
+# bias, the scale [g] and the attitudes [rad] held where they are, at first to this sd.
+_MOST_STEPS, _MOST_TRIES, _BENDS = 25, 8, 1e-3
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
 
 
@@ -292,44 +293,45 @@ class Regression(Design):
         precision = self.precision(prior, layout)
         matrices = self._inform(prior, layout)
         mean = self.prior_mean(prior, layout)
+        information = np.diag(precision)
+        for where, matrix in matrices:
+            information[where, where] += matrix
+
+        def look(state: State) -> tuple[State, _Equations, Floats, float]:
+            """Give a state, its equations, the gradient, and what is to be smallest."""
+            equations = self._equations(state, prior, layout)
+            away = self.vector(state, layout) - mean
+            pull = information @ away
+            return state, equations, equations.gradient - pull, equations.size + float(away @ pull)
+
+        # Where bags hardly tell bias, scale and attitude apart, these bend the way down.
+        stiff, damping = np.zeros(layout.n), 0.0
+        for places in (layout.kappa, layout.skew, layout.up):
+            stiff[places] = _BENDS**-2
+        stiff[layout.bias] = (_BENDS * (self.gravity or 1.0)) ** -2
         # What takes no part any more is 0.
-        state = self._moved(state, np.zeros(layout.n), layout)
+        state, equations, gradient, size = look(self._moved(state, np.zeros(layout.n), layout))
         far = _FAR * self.windows.mean.size
         for k in range(_MOST_STEPS):
-            equations = self._equations(state, prior, layout)
-            hessian, away = equations.hessian, self.vector(state, layout) - mean
-            pull = precision * away
-            hessian[np.diag_indices(layout.n)] += precision
-            for where, matrix in matrices:
-                hessian[where, where] += matrix
-                pull[where] += matrix @ away[where]
-            factor = Factor(hessian, layout)
-            gradient = equations.gradient - pull
+            factor = Factor(equations.hessian + information, layout)
             step = factor.solve(gradient)
             promised = 0.5 * float(step @ gradient)
             is_near = promised < far or k == _MOST_STEPS - 1
             if promised < tolerance or (k >= n_steps - 1 and is_near):
                 break
-            size = equations.size + float(away @ pull)
-            # Where bags hardly tell bias, scale and attitude apart a whole step overshoots.
-            for _ in range(_MOST_HALVINGS if promised > 1.0 else 0):
-                moved = self._moved(state, step, layout)
-                off = self.vector(moved, layout) - mean
-                pulled = float(precision @ off**2)
-                pulled += sum(float(off[at] @ matrix @ off[at]) for at, matrix in matrices)
-                if self._whiten(moved, prior)[2] + pulled < size:
+            for _ in range(_MOST_TRIES):
+                if damping:
+                    damped = information + np.diag(damping * stiff)
+                    step = Factor(equations.hessian + damped, layout).solve(gradient)
+                found = look(self._moved(state, step, layout))
+                if found[-1] < size or promised < 1.0:
                     break
-                step = 0.5 * step
-            state = self._moved(state, step, layout)
+                damping = max(10.0 * damping, 1.0)
+            damping = 0.01 * damping if damping > 0.1 else 0.0
+            state, equations, gradient, size = found
         determinant = float(np.log(precision[precision > 0.0]).sum())
         determinant += sum(float(np.linalg.slogdet(matrix)[1]) for _, matrix in matrices)
-        evidence = -0.5 * (
-            equations.size
-            + float(away @ pull)
-            - 2.0 * promised
-            + factor.log_determinant
-            - determinant
-        )
+        evidence = -0.5 * (size - 2.0 * promised + factor.log_determinant - determinant)
         covariance, blocks = factor.covariances()
         variance = np.concatenate([np.diag(block) for block in (covariance, *blocks)])
         told = 1.0 - precision * variance

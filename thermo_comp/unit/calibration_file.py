@@ -24,7 +24,7 @@ from .version_1 import read_version_1
 
 #: With the whole bank of columns and one thermometer beside the board a calibration takes some
 #: 900 kB, nearly all of it the posterior; this is enough for two of them.
-SIZE_LIMIT = 1 << 22
+SIZE_LIMIT = 1 << 23
 
 
 def load_calibration(path: str | Path) -> Calibration:
