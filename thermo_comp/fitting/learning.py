@@ -365,8 +365,8 @@ def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:
             trial[axis] = value
             found = replace(before, rho=trial)
             # The white noise gives way to the walk.
-            fitted = regression.solve(posterior.state, found, n_steps=1)
-            found = replace(found, sigma=_sigma(fitted, found))
+            left = replace(posterior, whitened=regression.whiten(posterior.state, found)[1])
+            found = replace(found, sigma=_sigma(left, found))
             return regression.solve(posterior.state, found, n_steps=1).log_evidence, found
 
         grid, none = 10.0 ** np.arange(-7.0, -0.9, 1.0), evidence(0.0)[0]

@@ -38,10 +38,10 @@ _JITTER = 1e-13
 # Start states of neighbouring lags are told apart to fewer digits.
 _START_JITTER = 1e-10
 # A step that promises less than this part of a noise variance per reading may be the last ...
-_FAR = 0.01
-# ... of no more than so many. One that overshoots is tried again, up to so many times, with the
-# bias, the scale [g] and the attitudes [rad] held where they are, at first to this sd.
-_MOST_STEPS, _MOST_TRIES, _BENDS = 25, 8, 1e-3
+_FAR = 0.1
+# ... of no more than so many. One that overshoots is tried again, up to so many times, with bias
+# and scale [g], attitudes [rad] and starts [K] held where they are, at first to these sds.
+_MOST_STEPS, _MOST_TRIES, _BENDS, _BENDS_K = 6, 6, 1e-3, 0.1
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
 
 
@@ -127,7 +127,7 @@ class _Equations:
 class Regression(Design):
     """The Gauss-Newton on the data of a fit; see `Design` for the parameters."""
 
-    def _whiten(self, state: State, prior: Prior) -> tuple[Floats, Floats, float]:
+    def whiten(self, state: State, prior: Prior) -> tuple[Floats, Floats, float]:
         """Residuals without their walk, the same in sds, and minus twice the log likelihood."""
         residual = self.residual(state)
         filtered = np.empty_like(residual)
@@ -141,7 +141,7 @@ class Regression(Design):
 
     def _equations(self, state: State, prior: Prior, layout: Layout) -> _Equations:
         """Hessian and gradient of minus the log likelihood, and the residuals."""
-        filtered, white, size = self._whiten(state, prior)
+        filtered, white, size = self.whiten(state, prior)
         hessian = np.zeros((layout.n, layout.n))
         gradient = np.zeros(layout.n)
         width = layout.axis.shape[1]
@@ -287,7 +287,8 @@ class Regression(Design):
         self, state: State, prior: Prior, n_steps: int = 6, tolerance: float = 1e-3
     ) -> Posterior:
         """
-        Find the mode under a prior, in so many steps or, where it is far, in as many as it takes.
+        Find the mode under a prior, in so many steps or, where it is far, in as many as it takes;
+        one step only looks where a state is.
         """
         layout = self.layout(prior.widths > 0.0)
         precision = self.precision(prior, layout)
@@ -308,6 +309,7 @@ class Regression(Design):
         stiff, damping = np.zeros(layout.n), 0.0
         for places in (layout.kappa, layout.skew, layout.up):
             stiff[places] = _BENDS**-2
+        stiff[layout.start] = _BENDS_K**-2
         stiff[layout.bias] = (_BENDS * (self.gravity or 1.0)) ** -2
         # What takes no part any more is 0.
         state, equations, gradient, size = look(self._moved(state, np.zeros(layout.n), layout))
@@ -316,7 +318,7 @@ class Regression(Design):
             factor = Factor(equations.hessian + information, layout)
             step = factor.solve(gradient)
             promised = 0.5 * float(step @ gradient)
-            is_near = promised < far or k == _MOST_STEPS - 1
+            is_near = promised < far or n_steps == 1 or k == _MOST_STEPS - 1
             if promised < tolerance or (k >= n_steps - 1 and is_near):
                 break
             for _ in range(_MOST_TRIES):
@@ -324,7 +326,7 @@ class Regression(Design):
                     damped = information + np.diag(damping * stiff)
                     step = Factor(equations.hessian + damped, layout).solve(gradient)
                 found = look(self._moved(state, step, layout))
-                if found[-1] < size or promised < 1.0:
+                if found[-1] < size or promised < far:
                     break
                 damping = max(10.0 * damping, 1.0)
             damping = 0.01 * damping if damping > 0.1 else 0.0
