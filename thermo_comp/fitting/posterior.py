@@ -314,12 +314,13 @@ class Regression(Design):
         # What takes no part any more is 0.
         state, equations, gradient, size = look(self._moved(state, np.zeros(layout.n), layout))
         far = _FAR * self.windows.mean.size
-        for k in range(_MOST_STEPS):
+        last = max(n_steps, _MOST_STEPS) - 1 if n_steps > 1 else 0
+        for k in range(last + 1):
             factor = Factor(equations.hessian + information, layout)
             step = factor.solve(gradient)
             promised = 0.5 * float(step @ gradient)
-            is_near = promised < far or n_steps == 1 or k == _MOST_STEPS - 1
-            if promised < tolerance or (k >= n_steps - 1 and is_near):
+            is_enough = k == last or (k >= n_steps - 1 and promised < far)
+            if promised < tolerance or is_enough:
                 break
             for _ in range(_MOST_TRIES):
                 if damping:
