@@ -89,7 +89,7 @@ def table_of(
         columns=np.concatenate(shapes),
         groups=GROUPS,
         lag=np.array([-1, -1, 0, 1, -1, -1]),
-        tau=np.array([0.0, 0.0, *TAUS, 0.0, 0.0]),
+        reach=np.array([0.0, 0.0, *TAUS, 0.0, 0.0]),
         start=np.tile(share, (n_positions, 1)),
         start_covariance=START,
         in_scale=np.ones(len(GROUPS), dtype=bool),

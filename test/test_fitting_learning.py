@@ -231,14 +231,14 @@ def test_a_longer_memory_promises_what_it_brings() -> None:
     windows, up = table_of(truth, 12, np.random.default_rng(8), n_windows=60)
     regression, state = begin(windows, up)
     allowed = prior_of(truth)
-    short = _without(allowed, windows.tau > 2000.0)
+    short = _without(allowed, windows.reach > 2000.0)
     assert (short.widths[0] > 0.0).tolist() == [True, True, True, False, False, False]
     posterior = regression.solve(state, short, n_steps=12, tolerance=1e-9)
     promised = _longer_gain(regression, posterior, short, allowed, 2000.0)
 
     def gain(width: float) -> float:
         longer = replace(short, widths=short.widths.copy())
-        longer.widths[0, windows.tau > 2000.0] = width
+        longer.widths[0, windows.reach > 2000.0] = width
         return regression.solve(state, longer, 12, 1e-9).log_evidence - posterior.log_evidence
 
     # The bias needs it more than the scale. What its start state takes beside it is not promised.

@@ -42,7 +42,8 @@ _PATIENCE = 4
 # A round that moves no width by more than this part is the last.
 _SETTLED = 0.03
 # The memory is as short as it can be [s]: the longest lags of a bank and the curves over
-# temperature are almost one thing to bags that all begin at one temperature.
+# temperature are almost one thing to bags that all begin at one temperature. Last come the
+# columns of the third order, which few units need.
 _REACHES_S = (2000.0, 4000.0, np.inf)
 # ... which is more than what a model that is almost right gains by a longer one.
 _LONGER_EARNED = 10.0
@@ -103,7 +104,7 @@ def learn(
     silent[1] |= held
     settle = partial(_settle, regression, silent=silent, kept=kept)
     for reach in _REACHES_S if asks else (np.inf,):
-        prior = _without(allowed, (regression.windows.tau > reach) & ~kept)
+        prior = _without(allowed, (regression.windows.reach > reach) & ~kept)
         # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
         posterior, prior = settle(state, prior, rounds=_PATIENCE)
         _downweight(regression, posterior)
@@ -203,7 +204,7 @@ def _longer_gain(
     With S and q of its weights, and their width at its best, it adds ``sum(q^2 / (1 / sd^2 + S) -
     log(1 + S sd^2)) / 2``.
     """
-    longer = regression.windows.tau > reach
+    longer = regression.windows.reach > reach
     S, q = (
         one[..., longer] for one in regression.asked_of_absent(posterior.state, prior, allowed)
     )

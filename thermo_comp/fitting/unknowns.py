@@ -28,7 +28,7 @@ class Windows:
         shape (n, m)
     groups: group of each column
     lag: the lag whose start state moves a column; -1 for none, shape (m,)
-    tau: time constant that each column has or follows [s]; 0 for none, shape (m,)
+    reach: how long a memory asks for each column [s]; 0 for none, shape (m,)
     start: derivative of each column by that state, shape (n, m)
     start_covariance: prior of the start states [K^2], shape (n_lags, n_lags)
     in_scale: which columns the scale may have as well as the bias, shape (m,)
@@ -42,7 +42,7 @@ class Windows:
     columns: Floats
     groups: tuple[str, ...]
     lag: Ints
-    tau: Floats
+    reach: Floats
     start: Floats
     start_covariance: Floats
     in_scale: Bools

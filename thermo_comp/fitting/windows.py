@@ -173,7 +173,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
         columns=rows[:, 4 + k : moved_at],
         groups=(*groups, *(column.group for column in columns)),
         lag=np.array([-1] * len(groups) + lag, dtype=np.int64),
-        tau=np.array([0.0] * len(groups) + [column.tau_s for column in columns]),
+        reach=np.array([0.0] * len(groups) + [column.reach_s for column in columns]),
         start=np.hstack((np.zeros((len(time), len(groups))), rows[:, moved_at:end])),
         start_covariance=start_covariance(spec.lags),
         # Fc is 1 at the reference in either regime, so the scale has no level of its own there;

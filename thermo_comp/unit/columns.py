@@ -112,6 +112,12 @@ class Column:
             return self.sensor, self.tau_s
         return (BOARD_INPUT, self.tau_s) if self.tau_s and self.kind != 'even' else None
 
+    @property
+    def reach_s(self) -> float:
+        """How long a memory asks for the column [s]: for one of the third order, the longest."""
+        order = {'board': 1, 'square': 2, 'cube': 3}.get(self.kind, 0) + self.power
+        return math.inf if self.lag and order > 2 else self.tau_s
+
 
 def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
     """Return all columns that a response may have, none held to a range yet."""
