@@ -9,25 +9,26 @@ will do: lists, columns of pandas, arrays of xarray.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from .files import shown_name
 from .online.batch import process_block
-from .online.blocks import Readings, said_anew
 from .online.compensator import Compensator
 from .online.status import CompensatorConfig, Counters
 from .typing import Bools, Floats, Ints
 from .unit.calibration import Calibration
 
 if TYPE_CHECKING:
-    from .recording import Topics
+    from .recording import Block, Topics
 
 #: A temperature: one value for each sample, or (time_s, value) of readings of their own.
 Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
@@ -36,6 +37,8 @@ Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
 _MINUTE_NS = 60_000_000_000
 #: Farther from their origin than this times are not in seconds [s].
 _LONGEST_S = 4e9
+#: A thermometer that stands still is heard again after this, so that nobody takes it for lost.
+_REPEAT_NS = 10_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,20 +254,12 @@ def fit(
     return run(sources, FitOptions(gravity=gravity, **options)).calibration
 
 
-class _Block(NamedTuple):
-    """What `process_block` takes, and a fit."""
-
-    accel_stamp_ns: Ints
-    accel: Floats
-    temperatures: dict[str, Readings]
-
-
 def _block(
     time_s: npt.ArrayLike,
     counts: npt.ArrayLike,
     readings: Mapping[str, Temperature],
     start_ns: int,
-) -> _Block:
+) -> Block:
     """Check arrays of a caller's; a reading waits for its sample."""
     stamps = _stamps('time_s', time_s)
     samples = _numbers('counts', counts)
@@ -277,7 +272,9 @@ def _block(
     for name, value in readings.items():
         own, celsius = _readings(name, value, stamps, _is_date(time_s))
         found[name] = (own + start_ns, celsius, np.zeros(len(own), dtype=np.int64))
-    return _Block(stamps + start_ns, samples, found)
+    # What is read of a block here; a whole one would need the libraries for bags.
+    block = SimpleNamespace(accel_stamp_ns=stamps + start_ns, accel=samples, temperatures=found)
+    return cast('Block', block)
 
 
 def _is_date(value: object) -> bool:
@@ -336,3 +333,20 @@ def _readings(name: str, value: Temperature, stamps: Ints, is_date: bool) -> tup
         )
     read = said_anew(stamps, values)
     return stamps[read], values[read]
+
+
+def said_anew(stamp_ns: Ints, celsius: Floats) -> Ints:
+    """
+    Find which rows of a temperature column are readings: finite, and a change or ten seconds old.
+
+    What is filled up to the rate of other columns would look like a thermometer that stands still.
+    """
+    kept: list[int] = []
+    last_ns, last = 0, math.nan
+    for row, (now_ns, value) in enumerate(zip(stamp_ns.tolist(), celsius.tolist(), strict=True)):
+        # A stamp before the last one is a restart of the clock, and worth a reading.
+        is_new = value != last or now_ns - last_ns >= _REPEAT_NS or now_ns < last_ns
+        if is_new and math.isfinite(value):
+            kept.append(row)
+            last_ns, last = now_ns, value
+    return np.array(kept, dtype=np.int64)

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from . import __version__
 from .errors import CalibrationError, OutputError
 from .files import shown_name
-from .online.batch import process_block
-from .online.blocks import CompensatedBlock
+from .online.batch import CompensatedBlock, process_block
 from .online.compensator import Compensator
 from .online.stamped_flag import STAMPED_TOPIC, STAMPED_TYPE, stamped_flag
 from .online.status import CompensatorConfig, Counters

@@ -19,10 +19,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from .. import __version__
+from ..arrays import said_anew
 from ..errors import RecordingError
 from ..files import shown_name
 from ..fitting.sources import digest
-from ..online.blocks import said_anew
 from ..recording import STAMP_END_NS, BagWriter, ImuColumns, Topics
 from ..recording.stillness import CellAccumulator
 from ..text import valid_serial

@@ -15,7 +15,6 @@ from pathlib import Path
 
 from ..errors import FitError
 from ..files import shown_name
-from ..online.blocks import AccelBlock
 from ..recording import Block, Input, RecordingInfo, RecordingReader, Role, Topics, open_recording
 from ..typing import Floats
 
@@ -40,7 +39,7 @@ class FitSource:
     """
 
     name: str
-    blocks: Callable[[], Iterable[AccelBlock]]
+    blocks: Callable[[], Iterable[Block]]
     sha256: str | None = None
     serial: str | None = None
     reader: Callable[[], RecordingReader | None] = lambda: None

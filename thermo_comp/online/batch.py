@@ -9,33 +9,54 @@ is gathered, evaluated for all segments together and applied to all samples by t
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import TypeAlias
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.correction import Correction
-from .blocks import AccelBlock, CompensatedBlock
-from .compensator import TIME_JUMP_NS, Compensator
-from .kernel import Lines
+from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
+
+if TYPE_CHECKING:
+    from ..recording.columns import Block
 
 #: Readings yet to come, the next one last: samples before it, thermometer, stamp, degC.
 _Arrivals: TypeAlias = list[tuple[int, str, int, float]]
 #: Why a sample does not go out, 0 where it does.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
 _TOO_FAST, _REFUTED = _REASONS['n_too_fast'], _REASONS['n_refuted']
-#: Rows of `Lines.correct` that are specific force x, y, z and covariance xx, xy, xz, yy, yz, zz.
+#: Samples corrected at a time: their columns stay in the cache.
+PIECE: Final = 4096
+#: Values of `corrected` in the order of a block's columns: the covariance as a whole matrix.
+_COLUMNS: Final = (0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8)
+#: Rows of these that are specific force x, y, z and covariance xx, xy, xz, yy, yz, zz.
 _SAMPLE = [0, 1, 2, 3, 4, 5, 7, 8, 11]
 
 
+@dataclass(frozen=True)
+class CompensatedBlock:
+    """The published samples of a block."""
+
+    #: Which samples of the block these are, shape (n,).
+    index: Ints
+    stamp_ns: Stamps
+    #: [m/s^2], shape (n, 3).
+    specific_force: Floats
+    #: Row-major 3x3 [m^2/s^4], shape (n, 9).
+    covariance: Floats
+    #: [rad/s], and variances [rad^2/s^2], shape (n, 3), where a rate is given and corrected.
+    angular_rate: Floats | None = None
+    angular_rate_variance: Floats | None = None
+
+
 def process_block(
-    compensator: Compensator, block: AccelBlock, angular_rate: Floats | None = None
+    compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
     """
-    Correct a block, e.g. a `recording.Block`, with the bits that `Compensator.process` gives, and
+    Correct a block with the bits that `Compensator.process` gives, and
     the angular rate of its samples, shape (n, 3), with those of `correct_rate`.
 
     Flags wait in `Compensator.take_flags`, counts in its `counters`.
@@ -149,25 +170,54 @@ def _apply(
     force = rate = np.empty((12, 0))
     has_rate = angular_rate is not None and of_rate is not None
     if segments:
-        lines = _lines(correction, segments, 0)
-        force = lines.correct(stamps, samples, correction.misalignment)
+        force = _corrected(correction, segments, stamps, samples)
         is_kept = _judge(compensator, segments, stamps, samples, force)
         if angular_rate is not None and of_rate is not None:
-            rate = _lines(of_rate, segments, 9).correct(stamps, angular_rate, None)[:, is_kept]
+            rate = _corrected(of_rate, segments, stamps, angular_rate, is_rate=True)[:, is_kept]
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
     rates = (rate[:3].T, rate[3:6].T) if has_rate else ()
     return CompensatedBlock(index, stamps, force[:3].T, force[3:].T, *rates)
 
 
-def _lines(correction: Correction, segments: list[tuple[Segment, int]], first: int) -> Lines:
-    """Evaluate a correction for all segments; its slow variances are those from the `first` on."""
+def _corrected(
+    correction: Correction,
+    segments: list[tuple[Segment, int]],
+    stamps: Stamps,
+    samples: Floats,
+    is_rate: bool = False,
+) -> Floats:
+    """
+    Correct the samples (n, 3) of segments: specific force and row-major covariance, shape (12, n);
+    or angular rates: these and variances, shape (6, n).
+    """
     each = [segment for segment, _ in segments]
     start, end, slow = (np.array([one[part] for one in each]).T for part in (4, 5, 6))
     excess = np.array([one.noise_excess for one in each])
-    table = correction.line(start, end, slow[first : first + 9], excess)
-    starts = np.array([one.start_ns for one in each], dtype=np.int64)
-    return Lines(starts, table, np.array([count for _, count in segments]))
+    table = correction.line(start, end, slow[9:] if is_rate else slow[:9], excess)
+    start_ns = np.array([one.start_ns for one in each], dtype=np.int64)
+    ends = np.cumsum([count for _, count in segments])
+    order = range(6) if is_rate else _COLUMNS
+    n = len(stamps)
+    result = np.empty((len(order), n))
+    # What is not finite is corrected like the rest; whoever asked leaves it out.
+    with np.errstate(invalid='ignore', over='ignore'):
+        for begin in range(0, n, PIECE):
+            stop = min(begin + PIECE, n)
+            low = int(np.searchsorted(ends, begin, 'right'))
+            high = int(np.searchsorted(ends, stop, 'left')) + 1
+            counts = np.diff(np.minimum(ends[low:high], stop), prepend=begin)
+            dt = (stamps[begin:stop] - np.repeat(start_ns[low:high], counts)) * 1e-9
+            line = np.repeat(table[:, low:high], counts, axis=1)
+            x, y, z = samples[begin:stop].T
+            values = (
+                corrected_rate(line, dt, x, y, z)
+                if is_rate
+                else corrected(line, correction.misalignment, dt, x, y, z)
+            )
+            for column, place in zip(result, order, strict=True):
+                column[begin:stop] = values[place]
+    return result
 
 
 def _judge(

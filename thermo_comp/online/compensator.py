@@ -15,11 +15,12 @@ per sample, and a batch comes to the same verdicts.
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, TypeVar
 
+from ..typing import Floats
 from ..unit.calibration import Calibration
 from .gravity_check import GravityCheck
-from .kernel import corrected, corrected_rate
 from .sample_checks import StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, ThermalSide
 from .status import CompensatorConfig, Counters
@@ -29,6 +30,8 @@ TIME_JUMP_NS: Final = 1_000_000_000
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
+#: One sample's, or those of many.
+Number = TypeVar('Number', float, Floats)
 
 
 class Compensator:
@@ -221,3 +224,46 @@ class Compensator:
         self.thermal.flags.clear()
         self._forget_samples()
         self.last_ns = self.event_ns = EVER_NS
+
+
+def corrected(
+    line: Iterable[Number],
+    misalignment: tuple[float, ...],
+    dt: Number,
+    x: Number,
+    y: Number,
+    z: Number,
+) -> tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]:
+    """Give specific force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s into a segment."""
+    (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
+     ax, lx, qx, ay, ly, qy, az, lz, qz) = line  # fmt: skip
+    yx, zx, zy, var_yx, var_zx, var_zy = misalignment
+    # Eq. (7), solved for the input of each axis.
+    x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
+    y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
+    z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)
+    vx = ax + x * (lx + x * qx)
+    vy = ay + y * (ly + y * qy)
+    vz = az + z * (lz + z * qz)
+    xx = x * x
+    cxy = yx * vx
+    cxz = zx * vx
+    return (
+        x,
+        yx * x + y,
+        zx * x + zy * y + z,
+        vx,
+        cxy,
+        cxz,
+        yx * cxy + vy + xx * var_yx,
+        yx * cxz + zy * vy,
+        zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy,
+    )
+
+
+def corrected_rate(
+    line: Iterable[Number], dt: Number, x: Number, y: Number, z: Number
+) -> tuple[Number, Number, Number, Number, Number, Number]:
+    """Give the angular rate x, y, z and the variance of each axis, `dt` s into a segment."""
+    bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = line
+    return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz
