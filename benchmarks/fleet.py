@@ -31,9 +31,10 @@ from typing import Any
 import numpy as np
 
 from thermo_comp.fitting import FitOptions
-from thermo_comp.fleet import FleetOptions, Row, fit_fleet
+from thermo_comp.fleet.run import fit_fleet
+from thermo_comp.fleet.table import Row
 from thermo_comp.fleet.units import FoundUnit, Storage, find_units
-from thermo_comp.fleet.work import connected, run
+from thermo_comp.fleet.work import FleetOptions, connected, run
 from thermo_comp.recording import BagWriter
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset

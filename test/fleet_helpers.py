@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from thermo_comp.fitting import FitOptions
-from thermo_comp.fleet import FleetOptions
+from thermo_comp.fleet.work import FleetOptions
 from thermo_comp.recording import BagWriter
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset as preset

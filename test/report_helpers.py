@@ -15,7 +15,8 @@ from builders import ArrayBlock
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.recording import BagWriter
-from thermo_comp.report import Evidence, evidence_of_fit, render_report
+from thermo_comp.report.evidence import Evidence, evidence_of_fit
+from thermo_comp.report.page import render_report
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, simulate

@@ -22,10 +22,10 @@ from fleet_helpers import OPTIONS, damage, write_unit
 from thermo_comp.cli.app import run as run_command
 from thermo_comp.errors import FleetError
 from thermo_comp.fitting import FitOptions
-from thermo_comp.fleet import COLUMNS, FleetOptions, Row, fit_fleet, read_parquet
-from thermo_comp.fleet.run import Results
+from thermo_comp.fleet.run import Results, fit_fleet
+from thermo_comp.fleet.table import COLUMNS, Row, read_parquet
 from thermo_comp.fleet.units import Storage, find_units
-from thermo_comp.fleet.work import connected, outcome_of
+from thermo_comp.fleet.work import FleetOptions, connected, outcome_of
 from thermo_comp.recording import Topics
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.unit.calibration_file import load_calibration

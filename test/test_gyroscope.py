@@ -16,7 +16,8 @@ from thermo_comp.errors import CalibrationError
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.start import within_positions
-from thermo_comp.judging import Verdict, judge_bags
+from thermo_comp.judging.evaluation import judge_bags
+from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.snapshot import take_snapshot

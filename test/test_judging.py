@@ -15,8 +15,10 @@ from builders import GRAVITY, axis_set, calibration, regime_set
 
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.fitting.sources import digest
-from thermo_comp.judging import Judgement, Verdict, Windows, evaluate, judge
-from thermo_comp.judging.windows import csv_of
+from thermo_comp.judging.evaluation import evaluate
+from thermo_comp.judging.judgement import Judgement, judge
+from thermo_comp.judging.verdicts import Verdict
+from thermo_comp.judging.windows import Windows, csv_of
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording import BagWriter, Topics, open_recording

@@ -25,7 +25,7 @@ from recorded.data import GRAVITY, faces_bag, freezer_bag, handheld_bag
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
-from thermo_comp.judging import evaluate
+from thermo_comp.judging.evaluation import evaluate
 from thermo_comp.recording import Part, Topics
 
 MG = GRAVITY * 1e-3

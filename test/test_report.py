@@ -21,14 +21,14 @@ from simulation_helpers import ideal_regime
 from thermo_comp import __version__
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.fitting.reduction import Readings, ReducedBag
-from thermo_comp.judging import open_bags
+from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.judging.history import history_of
 from thermo_comp.recording import BagWriter
-from thermo_comp.report import Evidence, evidence_of_bags, render_report, write_report
-from thermo_comp.report.evidence import LEFT_OUT
+from thermo_comp.report.evidence import LEFT_OUT, Evidence, evidence_of_bags
 from thermo_comp.report.figures import drawn_figures, figures_of
 from thermo_comp.report.figures_unit import draw_history
 from thermo_comp.report.html import spelt
+from thermo_comp.report.page import render_report, write_report
 from thermo_comp.report.style import drawing, svg
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.unit.calibration import Provenance

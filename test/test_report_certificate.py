@@ -16,15 +16,18 @@ from hypothesis import strategies as st
 from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.errors import ThermoCompError
-from thermo_comp.judging import open_bags
-from thermo_comp.report import (
+from thermo_comp.judging.evaluation import open_bags
+from thermo_comp.report.certificate import (
     CertificateInfo,
-    evidence_of_bags,
+    budget,
+    combined,
+    conformity_rule,
     load_certificate_info,
-    render_report,
+    results,
 )
-from thermo_comp.report.certificate import budget, combined, conformity_rule, results
+from thermo_comp.report.evidence import evidence_of_bags
 from thermo_comp.report.html import rounded
+from thermo_comp.report.page import render_report
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 

@@ -13,32 +13,12 @@ from builders import axis_set, calibration, regime_set, rich_calibration, term
 from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
 from matplotlib.container import ErrorbarContainer
-from matplotlib.patches import StepPatch
 from report_helpers import evidence, fitted
 
 from thermo_comp.judging.history import history_of
+from thermo_comp.report import figures_bags as of_bags
+from thermo_comp.report import figures_unit as of_unit
 from thermo_comp.report.figures import figures_of
-from thermo_comp.report.figures_bags import (
-    draw_dynamics,
-    draw_every_position,
-    draw_gravity,
-    draw_histograms,
-    draw_positions,
-    draw_residuals,
-    draw_temperatures,
-    equal_area,
-)
-from thermo_comp.report.figures_unit import (
-    curves,
-    draw_functions,
-    draw_history,
-    draw_hysteresis,
-    draw_rates,
-    draw_step,
-    hysteresis_loop,
-    soak_measurements,
-    step_answer,
-)
 from thermo_comp.report.html import label_text, number
 from thermo_comp.report.page import position_error, schuler_peak
 from thermo_comp.report.style import drawing, svg
@@ -60,7 +40,7 @@ def test_bias_and_scale_curves_by_hand():
         dynamic=dynamic,
         response=(term('board', (0.3, 0.0, 0.0), (0.0, 1e-6, 0.0), tau_s=600.0),),
     )
-    soak, heating = curves(one)
+    soak, heating = of_unit.curves(one)
     assert (soak.name, heating.name) == ('soak', 'heating at 1 K/min')
     count = 1.0 / 300.0 / MICRO_G
     t = soak.temperature - 20.0
@@ -70,7 +50,7 @@ def test_bias_and_scale_curves_by_hand():
     assert heating.value[:, 0] == pytest.approx((0.3 * t + 0.5 + 0.3 * behind) * count)
     assert heating.value[:, 2] == pytest.approx((0.3 * t + 0.5) * count)
     assert heating.value[:, 4] == pytest.approx(70.0 * t + behind)
-    minutes, bias, scale = step_answer(one)
+    minutes, bias, scale = of_unit.step_answer(one)
     left = np.exp(-minutes / 10.0)
     assert bias[:, 0] == pytest.approx(0.3 * left * count)
     assert scale[:, 1] == pytest.approx(left, abs=1e-9)
@@ -80,7 +60,7 @@ def test_bias_and_scale_curves_by_hand():
 def test_hysteresis_loop_by_hand():
     # 3 counts per kelvin of a play of 2 K: it is pushed from one end to the other within 4 K.
     one = calibration(response=(term('play', (3.0, 0.0, 0.0), width_k=2.0),))
-    temperature, heating, cooling = hysteresis_loop(one)
+    temperature, heating, cooling = of_unit.hysteresis_loop(one)
     count = 1.0 / 300.0 / MICRO_G
     lower, upper = one.static.temperature_range_c
     up = np.maximum(2.0 - (temperature - lower), -2.0)
@@ -96,7 +76,7 @@ def test_a_soak_measures_what_the_calibration_lacks():
     up = np.array([one.up for one in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
     wrong = replace(evidence(), windows=replace(windows, force=up * length[:, None]))
-    temperature, errors = soak_measurements(wrong)
+    temperature, errors = of_unit.soak_measurements(wrong)
     assert len(temperature) >= len(wrong.positions)
     bias, scale = errors[:, :3], errors[:, 3:]
     known = np.isfinite(scale)
@@ -112,10 +92,10 @@ def test_metres_of_a_navigator_by_hand():
 
 
 def test_map_of_the_sphere_keeps_areas():
-    assert equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
-    assert equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
+    assert of_bags.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
+    assert of_bags.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
     # The cap above 45 degrees is 1 - sin 45 of a hemisphere, so is its disc of the unit disc.
-    x, y = equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
+    x, y = of_bags.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
 
@@ -143,11 +123,8 @@ def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
     """Give what a reader without colours tells lines apart by: dashes, marker, darkness."""
     if isinstance(line, ErrorbarContainer):
         line = line.lines[0]
-    if isinstance(line, StepPatch):
-        dashes, colour, marker = line.get_linestyle(), line.get_edgecolor(), ''
-    else:
-        dashes, colour = line._unscaled_dash_pattern, line.get_color()
-        marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
+    dashes, colour = line._unscaled_dash_pattern, line.get_color()
+    marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
     darkness = round(float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))), 1)
     return str(dashes), marker, darkness
 
@@ -155,17 +132,16 @@ def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
 @pytest.mark.parametrize(
     'draw',
     [
-        draw_temperatures,
-        draw_dynamics,
-        draw_residuals,
-        draw_gravity,
-        draw_histograms,
-        draw_functions,
-        draw_positions,
-        draw_every_position,
-        draw_step,
-        draw_hysteresis,
-        draw_history,
+        of_bags.draw_temperatures,
+        of_bags.draw_dynamics,
+        of_bags.draw_residuals,
+        of_bags.draw_gravity,
+        of_unit.draw_functions,
+        of_bags.draw_positions,
+        of_bags.draw_every_position,
+        of_unit.draw_step,
+        of_unit.draw_hysteresis,
+        of_unit.draw_history,
     ],
 )
 def test_figures_are_legible_in_black_and_white(draw):
@@ -208,7 +184,7 @@ def test_every_figure_asks_a_question():
 
 def test_label_of_a_drawing_is_escaped():
     with drawing():
-        text = svg(draw_temperatures(evidence()), 'x', '"><script>')
+        text = svg(of_bags.draw_temperatures(evidence()), 'x', '"><script>')
     assert '<script>' not in text
     assert 'aria-label="&quot;&gt;&lt;script&gt;"' in text
 
@@ -216,7 +192,7 @@ def test_label_of_a_drawing_is_escaped():
 def test_rates_are_those_of_the_gyroscope():
     unit = rich_calibration()
     with drawing():
-        figure = draw_rates(replace(evidence(), calibration=unit))
+        figure = of_unit.draw_rates(replace(evidence(), calibration=unit))
     own = unit.gyroscope
     for axes, curve in zip(figure.axes, own.static.axes(), strict=True):
         soak = axes.get_lines()[0]

@@ -18,7 +18,7 @@ import pytest
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
-from thermo_comp.judging import evaluate
+from thermo_comp.judging.evaluation import evaluate
 from thermo_comp.recording import BagWriter, Topics, read_recording
 from thermo_comp.replay import replay
 from thermo_comp.simulation.campaign import parse_cyclogram, positions

@@ -89,7 +89,7 @@ def fit(
     sources, kind = fit_sources(bags, **reading)
     info = None
     if certificate_info is not None:
-        from ..report import load_certificate_info
+        from ..report.certificate import load_certificate_info
 
         info = load_certificate_info(certificate_info, serial or sources[0].serial)
     with options.usage_of():
@@ -111,7 +111,8 @@ def fit(
     out.told((bag.source.name, bag.info.chosen, bag.info.truncated) for bag in result.bags)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
-        from ..report import evidence_of_fit, write_report
+        from ..report.evidence import evidence_of_fit
+        from ..report.page import write_report
 
         write_report(evidence_of_fit(result), report, info=info, overwrite=force)
     _say(out, result, output, report, verbose)
@@ -177,7 +178,9 @@ def fleet_fit(
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
     """
     from ..fitting import FitOptions
-    from ..fleet import FleetOptions, fit_fleet, read_parquet
+    from ..fleet.run import fit_fleet
+    from ..fleet.table import read_parquet
+    from ..fleet.work import FleetOptions
 
     with options.usage_of():
         wanted = FleetOptions(fit=FitOptions(**settings), **reading, certificates=certificates)

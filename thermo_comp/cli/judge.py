@@ -41,7 +41,7 @@ def evaluate(
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
     """
-    from ..judging import evaluate as run
+    from ..judging.evaluation import evaluate as run
     from ..judging.history import drifts_of, history_of
     from ..judging.windows import csv_of
     from ..unit.calibration_file import load_calibration
@@ -114,7 +114,7 @@ def _sections(
     judgements: Mapping[str, Any], shown: Callable[[float], str | None]
 ) -> list[tuple[Cell, ...]]:
     """Give what each calibration leaves in each section, below what there was."""
-    from ..judging import SECTIONS
+    from ..judging.verdicts import SECTIONS
 
     rows: list[tuple[Cell, ...]] = []
     for section in SECTIONS:
@@ -154,9 +154,11 @@ def report(
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
     """
-    from ..judging import open_bags
+    from ..judging.evaluation import open_bags
     from ..judging.history import drifts_of
-    from ..report import evidence_of_bags, load_certificate_info, write_report
+    from ..report.certificate import load_certificate_info
+    from ..report.evidence import evidence_of_bags
+    from ..report.page import write_report
     from ..unit.calibration_file import load_calibration
 
     paths = bags or []

@@ -194,9 +194,11 @@ def demo(
     # Before the first import of ROS: on this machine only.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     from ..arrays import fit
-    from ..judging import SECTIONS, evaluate
+    from ..judging.evaluation import evaluate
+    from ..judging.verdicts import SECTIONS
     from ..recording import inspect_recording
-    from ..report import evidence_of_bags, write_report
+    from ..report.evidence import evidence_of_bags
+    from ..report.page import write_report
     from ..ros.round_trip import round_trip
     from ..unit.calibration_file import save_calibration
 

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..judging import Verdict
 from ..judging.history import Drift
+from ..judging.verdicts import Verdict
 from ..typing import Floats
 from .table import COLUMNS, Column, Row, is_fitted
 

@@ -22,7 +22,8 @@ from ..errors import FleetError
 from ..files import CSV, PARQUET, write_atomically
 from ..fitting import FitResult
 from ..fitting.verdict import can_tell_misalignment
-from ..judging import Judgement, Verdict
+from ..judging.judgement import Judgement
+from ..judging.verdicts import Verdict
 from ..text import one_line
 from ..typing import Floats
 from ..unit.calibration import AXES

@@ -145,7 +145,8 @@ def _fitted(
     row: dict[str, Cell], bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
 ) -> tuple[dict[str, Cell], str, str]:
     """Fit bags; give the whole row, the calibration and the certificate."""
-    from ..report import evidence_of_fit, render_report
+    from ..report.evidence import evidence_of_fit
+    from ..report.page import render_report
 
     result = fit_bags(bags, how)
     calibration = dump_calibration(result.calibration)

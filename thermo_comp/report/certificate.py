@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ..errors import ThermoCompError
-from ..judging import Verdict
+from ..judging.verdicts import Verdict
 from ..plain_yaml import read_plain_yaml
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration

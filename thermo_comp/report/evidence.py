@@ -19,9 +19,11 @@ from ..fitting.coverage import LeastKnown, least_known
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector
 from ..fitting.verdict import Finding
-from ..judging import WINDOW_S, Judgement, Verdict, Windows, corrected_windows, judge_bags
+from ..judging.evaluation import judge_bags
 from ..judging.history import Epoch, history_of
-from ..judging.windows import means_by, usual_window
+from ..judging.judgement import Judgement
+from ..judging.verdicts import Verdict
+from ..judging.windows import WINDOW_S, Windows, corrected_windows, means_by, usual_window
 from ..replay import check_unit
 from ..typing import Floats
 from ..unit.calibration import Calibration, Source

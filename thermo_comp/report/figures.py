@@ -10,17 +10,9 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
+from . import figures_bags as of_bags
+from . import figures_unit as of_unit
 from .evidence import Evidence
-from .figures_bags import (
-    draw_dynamics,
-    draw_every_position,
-    draw_gravity,
-    draw_histograms,
-    draw_positions,
-    draw_residuals,
-    draw_temperatures,
-)
-from .figures_unit import draw_functions, draw_history, draw_hysteresis, draw_rates, draw_step
 from .html import label_text
 from .style import drawing, svg
 
@@ -66,14 +58,14 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     read = f'Grey: the time in which the flag says dynamic. {bag} After Fig.'
     yield (
         'How did the unit follow the chamber?',
-        draw_temperatures,
+        of_bags.draw_temperatures,
         'Readings of both thermometers. The board lags behind the case, so the case '
         f'is the first to tell that a ramp has begun. {read} 3 of the paper.',
     )
     window_s = 0.0 if windows is None else windows.window_s
     yield (
         'When do the readings drift, and does the flag mark it?',
-        draw_dynamics,
+        of_bags.draw_dynamics,
         f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
         f'rates of the temperatures and, below, the second derivative of the {shown.leader} '
         'temperature, whose pulses open and close the dynamic state; (c) the state that follows, '
@@ -84,14 +76,14 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         return
     yield (
         'What does the correction leave on each axis?',
-        draw_residuals,
+        of_bags.draw_residuals,
         'Residual of each axis in the output frame. The attitude in a position is not known: '
         'the mean direction seen there stands for it. Each panel has a scale of its own. '
         f'{read} 6 of the paper.',
     )
     yield (
         'Does |f| stay constant over the whole program?',
-        draw_gravity,
+        of_bags.draw_gravity,
         f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
         'a unit at rest must show zero whatever the temperature does. Above: before and after '
         'the correction; below: after it, in a scale of its own. '
@@ -107,7 +99,7 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     has_band = calibration.posterior is not None
     yield (
         'What is corrected, and how well is it known?',
-        draw_functions,
+        of_unit.draw_functions,
         'Bias and scale factor over temperature, in a soak and in ramps through the whole range '
         'that begin in a soak at its end, less the value at '
         f'{calibration.reference_temperature_c:g} °C (grey line) and less a straight line, whose '
@@ -125,7 +117,7 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         judged = None if evidence.judgement is None else evidence.judgement.rate
         yield (
             'What is corrected of the angular rate?',
-            draw_rates,
+            of_unit.draw_rates,
             'Bias of the gyroscope over temperature, in a soak and in ramps as above, less the '
             'value at the reference temperature and less a straight line, whose slope stands '
             'above each panel. Hatched: 95 % band, of the constant as well, which the Earth’s '
@@ -135,14 +127,14 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if any(term.lag for term in calibration.response):
         yield (
             'For how long does the unit remember a change of temperature?',
-            draw_step,
+            of_unit.draw_step,
             'Board and case jump by 1 K together: how far bias and scale are from where they '
             'will settle. Where a line meets zero, the unit has settled.',
         )
     if any(term.kind == 'play' for term in calibration.response):
         yield (
             'Does the bias come back on another way than it went?',
-            draw_hysteresis,
+            of_unit.draw_hysteresis,
             'A run through the whole range and back, too slow for any lag: bias of each axis less '
             'the middle of both ways. No curve over temperature can correct the width of the '
             'loop.',
@@ -150,7 +142,7 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if len(evidence.history) > 1:
         yield (
             'What has drifted between the calibrations of this unit?',
-            draw_history,
+            of_unit.draw_history,
             'Bias and scale in a soak at the reference temperature, by the date of each '
             'calibration, less those of the first; bars: 95 % of what each leaves open.',
         )
@@ -158,17 +150,10 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
 
 def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     """Give the figures of all positions."""
-    if evidence.residuals and evidence.positions:
-        yield (
-            'Is what is left noise, or is there something to model?',
-            draw_histograms,
-            '|f| − g over all windows of all positions, by regime, with the normal distribution '
-            'of the same mean and spread. Where the bars follow the line, what is left is noise.',
-        )
     if evidence.residuals and len(evidence.positions) > 1:
         yield (
             'Does the correction hold in every position?',
-            draw_every_position,
+            of_bags.draw_every_position,
             'A row for each position: |f| − g after the correction, over the time since the '
             'position began; all rows have the scale that is written above. Black and wide in '
             'the static, red and thin in the dynamic regime. On the right the RMS.',
@@ -176,7 +161,7 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if evidence.positions:
         yield (
             'Are the positions well spread, and does one stand out?',
-            draw_positions,
+            of_bags.draw_positions,
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
             'of elevation. A position that stands out was moved, or is not of this unit.',

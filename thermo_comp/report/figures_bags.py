@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the figures of bags: over the time of one, as the paper's Fig. 3, 4, 6 and 7 from the user's
-data, and over all positions: where they point, what is left in each, how it scatters.
+data, and over all positions: where they point, what is left in each.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
 
 from ..thermal.regime import Regime
 from ..typing import Bools, Floats
@@ -107,7 +106,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
 
 def draw_gravity(evidence: Evidence) -> Figure:
     """Draw |f| over time, before and after, and after in detail (the paper's Fig. 7)."""
-    gravity, residuals = given(evidence.gravity), evidence.residuals
+    residuals = evidence.residuals
     corrected = [rung for rung in residuals if rung != RAW]
     sets = [one for one in (list(residuals), corrected) if one]
     figure, panels, _, unit = _panels(evidence, [1.6] * len(sets), more=0.4)
@@ -117,15 +116,6 @@ def draw_gravity(evidence: Evidence) -> Figure:
             _plot(axes, evidence, value, unit, label=rung, **style.RUNG_LINES[rung])
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_ylabel('|f| − g, µg')
-        right = axes.secondary_yaxis(
-            'right',
-            functions=(
-                lambda micro_g: np.asarray(micro_g) * MICRO_G + gravity,
-                lambda value: (np.asarray(value) - gravity) / MICRO_G,
-            ),
-        )
-        right.set_ylabel('|f|, m/s²')
-        right.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
         style.legend_above(axes)
     for rung in corrected:
         _symmetric(panels[-1], residuals[rung][_rows(evidence)])
@@ -210,42 +200,6 @@ def _symmetric(axes: Axes, residual: Floats) -> None:
     limit = 1.15 * float(np.quantile(np.abs(residual), 0.998)) / MICRO_G
     if limit > 0.0:
         axes.set_ylim(-limit, limit)
-
-
-def draw_histograms(evidence: Evidence) -> Figure:
-    """Draw how what is left is distributed, by regime, with the normal distribution beside it."""
-    name, residual = list(evidence.residuals.items())[-1]
-    dynamic = given(evidence.windows).is_dynamic
-    parts = [
-        (label, residual[rows] / MICRO_G, line)
-        for label, rows, line in (
-            ('static', ~dynamic, style.STATIC_LINE),
-            ('dynamic', dynamic, style.DYNAMIC_LINE),
-        )
-        if rows.any()
-    ]
-    figure = style.new_figure(2.0)
-    panels = figure.subplots(1, len(parts), squeeze=False)[0]
-    for axes, (label, values, line) in zip(panels, parts, strict=True):
-        limit = max(float(np.quantile(np.abs(values), 0.998)) * 1.1, 1e-3)
-        n_bins = int(np.clip(np.sqrt(len(values)), 9, 33))
-        edges = np.linspace(-limit, limit, n_bins + 1)
-        share = np.histogram(values, edges)[0] / len(values) * 100.0
-        axes.stairs(share, edges, fill=True, fc='#CCCCCC', ec='#666666', linewidth=0.7)
-        sd, mean = float(values.std()), float(values.mean())
-        if sd > 0.0:
-            middle = np.linspace(-limit, limit, 121)
-            bell = np.exp(-0.5 * ((middle - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
-            axes.plot(middle, bell * (edges[1] - edges[0]) * 100.0, **line)
-        axes.axvline(0.0, color='black', linewidth=0.5)
-        axes.set_xlim(-limit, limit)
-        axes.set_ylim(0.0, None)
-        axes.set_ylabel('windows, %')
-        axes.locator_params(axis='x', nbins=6)
-        axes.locator_params(axis='y', nbins=4)
-        axes.set_title(f'{name}, {label}: sd {number(sd)} µg')
-        axes.set_xlabel('|f| − g, µg')
-    return figure
 
 
 def draw_every_position(evidence: Evidence) -> Figure:

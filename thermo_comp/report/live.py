@@ -21,7 +21,7 @@ from typing import Any
 
 from ..errors import ThermoCompError
 from ..fitting import ReducedBag
-from ..judging import open_bags
+from ..judging.evaluation import open_bags
 from ..recording import RecordingInfo
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence, evidence_of_bags
