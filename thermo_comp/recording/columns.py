@@ -10,7 +10,6 @@ A column is a numpy array with one row per message. All times are integer nanose
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -142,9 +141,9 @@ def join_messages(pieces: Sequence[Messages]) -> Messages:
     )
 
 
-class BagFile(ABC):
+class BagFile:
     """
-    One open file of a bag; `path` is what errors call it.
+    What is known of one open file of a bag; `path` is what errors call it.
 
     `topics` are by the number of their channel, `definitions` encoding and text by message type,
     start and end log times; `truncated` says what is missing.
@@ -160,14 +159,6 @@ class BagFile(ABC):
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         self.truncated: str | None = None
-
-    @abstractmethod
-    def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
-        """Read the messages of channels in reading order, and do some work on them."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the file."""
 
 
 @dataclass(frozen=True, slots=True)

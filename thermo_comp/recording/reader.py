@@ -19,11 +19,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
-from .chunks import expand, translated
+from .chunks import expand, inflate_message, inflate_ros1_chunk, translated
 from .clock import without_jumps
 from .columns import (
     ROLES,
@@ -36,17 +37,20 @@ from .columns import (
     RecordingInfo,
     Role,
     Topic,
+    Work,
     count_topics,
     gathered,
     joined,
 )
-from .foreign import ForeignFile
 from .mcap_file import McapFile
 from .topics import Topics, select_topics, shown
 from .wire import decode_blocks
 
 _N_LOADERS = 2
 _MAX_BYTES = 1 << 24
+#: What is decoded at once of a foreign file.
+_BATCH_MESSAGES = 1 << 14
+_BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 
 
@@ -70,7 +74,7 @@ class RecordingReader(ExitStack):
     ) -> None:
         super().__init__()
         path, topics = Path(path), topics or Topics()
-        self._files: list[BagFile] = []
+        self._files: list[McapFile | ForeignFile] = []
         self.callback(self._files.clear)
         try:
             self.info = self._open(path)
@@ -103,7 +107,7 @@ class RecordingReader(ExitStack):
                 with translated(name):
                     notes.append(expand(name, file))
             is_packed = found.compression == 'message'
-            one: BagFile
+            one: McapFile | ForeignFile
             if found.storage == 'mcap' and not is_packed:
                 one = McapFile(file, name, pool)
             else:
@@ -321,3 +325,62 @@ def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
     if n_read >= n_promised:
         return None
     return f'{shown(topic)}: {n_read} of the {n_promised} messages promised are there'
+
+
+class ForeignFile(BagFile):
+    """
+    A file that is not plain MCAP (sqlite3, ROS 1), read by `rosbags`, and decoded many messages
+    at a time; `is_packed` where each message is compressed by itself.
+    """
+
+    def __init__(self, path: Path, name: Path, *, is_packed: bool = False) -> None:
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+
+        super().__init__(name)
+        self._is_packed = is_packed
+        is_ros1 = path.suffix == '.bag'
+        encoding = 'ros1' if is_ros1 else 'cdr'
+        self.storage = {'.bag': 'ros1', '.mcap': 'mcap'}.get(path.suffix, 'sqlite3')
+        with translated(name, is_foreign=True):
+            reader: Any = Reader1(path) if is_ros1 else Reader2(path)
+            self._reader = reader
+            reader.open()
+            for at, chunk in reader.chunks.items() if is_ros1 else ():
+                reader.chunks[at] = chunk._replace(decompressor=inflate_ros1_chunk)
+            if reader.message_count:
+                self.start_ns = int(reader.start_time)
+                self.end_ns = int(reader.end_time) - 1
+            for number, one in enumerate(reader.connections):
+                # A database holds whatever it was given, in any column.
+                if not (isinstance(one.topic, str) and isinstance(one.msgtype, str)):
+                    raise RecordingError('a topic has no name or no type')
+                self.topics[number] = Topic(one.topic, one.msgtype, encoding, one.msgcount)
+                if one.msgdef.data and not is_ros1:
+                    kind = f'ros2{one.msgdef.format.name.lower()}'
+                    self.definitions[one.msgtype] = kind, one.msgdef.data
+
+    def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
+        """Read the messages of channels in reading order, and do some work on them."""
+        yield from map(work, self._messages(channels))
+
+    def _messages(self, channels: Collection[int]) -> Iterator[Messages]:
+        """Read messages of channels, the numbers of the reader's connections."""
+        chosen = [self._reader.connections[number] for number in channels]
+        known = {(one.topic, one.msgtype): n for n, one in zip(channels, chosen, strict=True)}
+        batch: list[tuple[bytes, int, int]] = []
+        n_bytes = 0
+        for one, log_ns, packed in self._reader.messages(connections=chosen):
+            data = inflate_message(packed) if self._is_packed else packed
+            batch.append((data, known[one.topic, one.msgtype], log_ns))
+            n_bytes += len(data)
+            is_long = n_bytes >= _BATCH_BYTES or log_ns - batch[0][2] > _BATCH_NS
+            if is_long or len(batch) >= _BATCH_MESSAGES:
+                yield Messages.of(*zip(*batch, strict=True))
+                batch, n_bytes = [], 0
+        if batch:
+            yield Messages.of(*zip(*batch, strict=True))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._reader.close()
