@@ -66,9 +66,7 @@ def test_presets_agree_with_a_numerical_integrator(name: str, is_warm: bool) -> 
     time = np.linspace(0.0, program.duration_s, 200)
     states = response.states(time)
     solved = solve_ivp(
-        lambda t, x: (
-            A @ x + b * program.at(t) + p + network.convection(x, float(program.at(t)))[0]
-        ),
+        lambda t, x: A @ x + b * program.at(t) + p + network.convection(x, float(program.at(t))),
         (0.0, program.duration_s),
         states[0],
         method='LSODA',

@@ -5,24 +5,23 @@ Owns the heat paths: lumped parts joined by conductances, self-heating, the ther
 
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
 parts, then the thermostat's integral and set point; `u` is the air temperature; `p` holds the
-constant powers. Between knots of the air the solution is a straight line plus decaying modes. A
-network with convection has no modes and is integrated, interval by interval.
+constant powers. Between knots of the air the solution is a straight line plus decaying modes. What
+convection carries beyond the line through its flow at 1 K is held from second to second.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import solve_ivp
+from scipy.optimize import root
 
 from ..typing import Floats
 
 AIR = 'air'
+_STEP_S = 1.0  # of convection
 _CHUNK = 65536  # instants evaluated at once; bounds the memory of the mode table
 
 
@@ -78,15 +77,14 @@ class ThermalNetwork:
         return {AIR: -1, **{name: i for i, name in enumerate(self.nodes)}}
 
     def system(self) -> tuple[Floats, Floats, Floats]:
-        """Return A, b and p, shapes (k, k), (k,) and (k,), convection left out."""
+        """Return A, b and p, shapes (k, k), (k,) and (k,), as if every exponent were 1."""
         n, index = len(self.nodes), self._places
         size = n + (0 if self.thermostat is None else 2)
         both, p = np.zeros((size + 1, size + 1)), np.zeros(size)
         for link in self.links:
-            if link.exponent == 1.0:
-                i, j = index[link.a], index[link.b]
-                both[[i, j], [i, j]] -= link.conductance
-                both[[i, j], [j, i]] += link.conductance
+            i, j = index[link.a], index[link.b]
+            both[[i, j], [i, j]] -= link.conductance
+            both[[i, j], [j, i]] += link.conductance
         A, b = both[:-1, :-1].copy(), both[:-1, -1].copy()
         for name, watts in self.power.items():
             p[index[name]] += watts
@@ -107,35 +105,30 @@ class ThermalNetwork:
         p[:n] /= rows
         return A, b, p
 
-    def convection(self, state: Floats, air: float) -> tuple[Floats, Floats]:
-        """Return what convection adds to ``dx/dt`` of one state, and its derivatives by it."""
+    def convection(self, state: Floats, air: float) -> Floats:
+        """Return what exponents other than 1 add to ``dx/dt`` of one state, shape (k,)."""
         index, at = self._places, np.append(state, air)
-        flow, slope = np.zeros(len(at)), np.zeros((len(at), len(at)))
+        flow = np.zeros(len(at))
         for link in self.links:
-            if link.exponent == 1.0:
-                continue
             i, j = index[link.a], index[link.b]
-            size = link.conductance * abs(at[i] - at[j]) ** (link.exponent - 1.0)
-            for here, there in ((i, j), (j, i)):
-                if here >= 0:
-                    capacity = self.capacity[self.nodes[here]]
-                    flow[here] -= size * (at[here] - at[there]) / capacity
-                    slope[here, here] -= link.exponent * size / capacity
-                    slope[here, there] += link.exponent * size / capacity
-        return flow[:-1], slope[:-1, :-1]
+            away = at[i] - at[j]
+            more = link.conductance * (abs(away) ** (link.exponent - 1.0) - 1.0) * away
+            flow[[i, j]] += -more, more
+        flow[: len(self.nodes)] /= list(self.capacity.values())
+        return flow[:-1]
 
     def settled(self, air: float, power: Floats | None = None) -> Floats:
         """Return the state after an endless soak under constant powers, shape (k,)."""
         A, b, p = self.system()
         drive = p if power is None else power
-        if not self.is_convective:
-            return np.asarray(np.linalg.solve(A, -b * air - drive), dtype=np.float64)
-        # Newton's steps; the flow is convex, so some fifty reach the last digit from anywhere.
-        state = np.full(len(b), air + 1.0)
-        for _ in range(50):
-            flow, slope = self.convection(state, air)
-            state = state - np.linalg.solve(A + slope, A @ state + b * air + drive + flow)
-        return state
+        state = np.linalg.solve(A, -b * air - drive)
+        if self.is_convective:
+
+            def change(x: Floats) -> Floats:
+                return np.asarray(A @ x + b * air + drive + self.convection(x, air))
+
+            state = root(change, state, tol=1e-13).x
+        return np.asarray(state, dtype=np.float64)
 
     def equilibrium(self, air: float) -> Floats:
         """Return the temperatures [degC] of the parts after an endless soak, shape (n_parts,)."""
@@ -143,11 +136,9 @@ class ThermalNetwork:
 
     def air_for(self, node: str, temperature: float) -> float:
         """Return the air temperature whose endless soak brings a part to a temperature."""
-        i, air = self.nodes.index(node), 0.0
-        for _ in range(20 if self.is_convective else 1):
-            cold, hot = self.equilibrium(air)[i], self.equilibrium(air + 1.0)[i]
-            air += float((temperature - cold) / (hot - cold))
-        return air
+        i = self.nodes.index(node)
+        found = root(lambda air: self.equilibrium(air[0])[i] - temperature, 0.0, tol=1e-13)
+        return float(found.x[0])
 
 
 class ThermalResponse:
@@ -188,54 +179,36 @@ class ThermalResponse:
         # Parts and set point begin with the air, the integral with nothing.
         cold = np.full(len(p), air[0])
         cold[len(network.nodes) : len(p) - 1] = 0.0
-        self._integrated: list[Any] = []
         if network.is_convective:
-            self._integrate(air, drive, network.settled(air[0], drive[0]) if is_warm else cold)
-            return
+            steps = np.arange(self._time[0], self._time[-1], _STEP_S)
+            fine = np.union1d(self._time, steps)
+            drive = drive[np.searchsorted(self._time, fine[:-1], side='right') - 1]
+            air, self._time = np.interp(fine, self._time, air), fine
         inverse = np.linalg.inv(A)
         rate, modes = np.linalg.eig(A)
+        unmix = np.linalg.inv(modes)
         self._rate, self._modes = rate, modes
 
         length = np.diff(self._time)
-        slope = np.diff(air) / length
-        # Straight part of each interval: alpha + beta (t - t_knot).
-        self._beta = -slope[:, None] * (inverse @ b)
+        # Straight part of each interval, alpha + beta (t - t_knot), and each mode at its start.
+        self._beta = -(np.diff(air) / length)[:, None] * (inverse @ b)
         self._alpha = (self._beta - np.outer(air[:-1], b) - drive) @ inverse.T
-        unmix = np.linalg.inv(modes)
-        # Amplitude of each mode at the start of each interval.
-        jump = (self._alpha[1:] - self._alpha[:-1] - self._beta[:-1] * length[:-1, None]) @ unmix.T
-        amplitude = np.empty((len(length), len(rate)), dtype=complex)
-        state = -inverse @ (b * air[0] + drive[0]) if is_warm else cold
-        amplitude[0] = unmix @ (state - self._alpha[0])
-        for k in range(1, len(length)):
-            decayed = np.exp(rate * length[k - 1]) * amplitude[k - 1]
-            amplitude[k] = decayed - jump[k - 1]
-        self._amplitude = amplitude
-
-    def _integrate(self, air: Floats, drive: Floats, state: Floats) -> None:
-        A, b, _ = self.network.system()
-        for k, (begin, end) in enumerate(pairwise(self._time)):
-
-            def flow(t: float, x: Floats, k: int = k) -> Floats:
-                now = float(np.interp(t, self._time, air))
-                return np.asarray(A @ x + b * now + drive[k] + self.network.convection(x, now)[0])
-
-            solved = solve_ivp(
-                flow, (begin, end), state, 'LSODA', dense_output=True, rtol=1e-9, atol=1e-9
-            )
-            state = solved.y[:, -1]
-            self._integrated.append(solved.sol)
+        self._amplitude = np.empty((len(length), len(rate)), dtype=complex)
+        state = network.settled(air[0], drive[0]) if is_warm else cold
+        before = network.convection(state, air[0])
+        for k, lasts in enumerate(length):
+            # The mean over the interval, foreseen from the last two (Adams and Bashforth).
+            now = network.convection(state, air[k])
+            self._alpha[k] -= inverse @ (1.5 * now - 0.5 * before)
+            self._amplitude[k] = unmix @ (state - self._alpha[k])
+            decayed = modes @ (np.exp(rate * lasts) * self._amplitude[k])
+            state, before = self._alpha[k] + self._beta[k] * lasts + decayed.real, now
 
     def states(self, time: ArrayLike) -> Floats:
         """Return the parts' temperatures, the thermostat's integral [W] and set point, (m, k)."""
         time = np.atleast_1d(np.asarray(time, dtype=float))
         k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
         states = np.empty((len(time), len(self.network.system()[1])))
-        if self._integrated:
-            for interval in np.unique(k):
-                here = k == interval
-                states[here] = self._integrated[interval](time[here]).T
-            return states
         for first in range(0, len(time), _CHUNK):
             piece = slice(first, first + _CHUNK)
             at, since = k[piece], time[piece] - self._time[k[piece]]
