@@ -20,7 +20,7 @@ import pytest
 from fleet_helpers import OPTIONS, damage, write_unit
 
 from thermo_comp.cli.app import run as run_command
-from thermo_comp.errors import FleetError
+from thermo_comp.errors import ThermoCompError
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet.run import Results, fit_fleet
 from thermo_comp.fleet.table import COLUMNS, Row, read_parquet
@@ -169,7 +169,9 @@ class TestScheduler:
         self, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
-        with pytest.raises(FleetError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers'):
+        with pytest.raises(
+            ThermoCompError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers'
+        ):
             fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
 
     def test_it_has_no_worker(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +180,7 @@ class TestScheduler:
             distributed.LocalCluster(
                 n_workers=0, processes=False, protocol='tcp', dashboard_address='127.0.0.1:0'
             ) as cluster,
-            pytest.raises(FleetError, match='has no worker'),
+            pytest.raises(ThermoCompError, match='has no worker'),
             connected(cluster.scheduler_address),
         ):
             pass
@@ -192,7 +194,7 @@ class TestScheduler:
         assert [row['verdict'] for row in result.rows] == ['refused']
         # A worker of another version would fit something else under the same key.
         monkeypatch.setattr('thermo_comp.fleet.work.__version__', '9.9')
-        with pytest.raises(FleetError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
+        with pytest.raises(ThermoCompError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
 
 

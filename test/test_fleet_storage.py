@@ -17,7 +17,7 @@ from fleet_helpers import OPTIONS, damage, write_unit
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from thermo_comp.errors import FleetError
+from thermo_comp.errors import ThermoCompError
 from thermo_comp.fitting.sources import digest
 from thermo_comp.fleet.units import FoundUnit, Storage, StoredFile, find_units, group_files
 from thermo_comp.fleet.work import process_unit
@@ -105,7 +105,7 @@ class TestElsewhere:
         assert str(outcome.row['left_out']).startswith('unit/a.mcap: ')
 
     def test_a_protocol_that_nobody_knows(self) -> None:
-        with pytest.raises(FleetError, match='nowhere://x: Protocol not known'):
+        with pytest.raises(ThermoCompError, match='nowhere://x: Protocol not known'):
             Storage('nowhere://x')
 
 
@@ -182,11 +182,11 @@ class TestDiscovery:
         assert Storage('memory://bags').address == 'memory://bags'
 
     def test_nothing_there(self, tmp_path: Path) -> None:
-        with pytest.raises(FleetError, match='no bag in it; expected DIR/UNIT/BAG'):
+        with pytest.raises(ThermoCompError, match='no bag in it; expected DIR/UNIT/BAG'):
             find_units(Storage(str(tmp_path)))
-        with pytest.raises(FleetError, match='cannot be listed: no such directory'):
+        with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
             find_units(Storage(str(tmp_path / 'gone')))
-        with pytest.raises(FleetError, match='cannot be listed: no such directory'):
+        with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
             find_units(Storage('memory://never-made'))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from thermo_comp.errors import FleetError
+from thermo_comp.errors import ThermoCompError
 from thermo_comp.fleet.run import Results, render_fleet
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
 from thermo_comp.fleet.table import COLUMNS, Row, read_parquet, row_of, write_tables
@@ -194,12 +194,12 @@ class TestTable:
 
     def test_what_is_no_fleet_table(self, tmp_path: Path) -> None:
         (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')
-        with pytest.raises(FleetError, match=r'x\.parquet: no fleet table'):
+        with pytest.raises(ThermoCompError, match=r'x\.parquet: no fleet table'):
             read_parquet(tmp_path / 'x.parquet')
         from pyarrow import parquet
 
         parquet.write_table(pa.table({'a': [1]}), tmp_path / 'y.parquet')
-        with pytest.raises(FleetError, match='lacks the columns serial and verdict'):
+        with pytest.raises(ThermoCompError, match='lacks the columns serial and verdict'):
             read_parquet(tmp_path / 'y.parquet')
 
     def test_the_page_of_the_docs_lists_every_column(self) -> None:
@@ -227,5 +227,5 @@ def test_no_name_leads_out_of_the_results(name: str, tmp_path: Path) -> None:
 
 def test_results_need_a_folder(tmp_path: Path) -> None:
     (tmp_path / 'file').touch()
-    with pytest.raises(FleetError, match='file: cannot be made'):
+    with pytest.raises(ThermoCompError, match='file: cannot be made'):
         Results(tmp_path / 'file')

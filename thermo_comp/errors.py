@@ -48,10 +48,6 @@ class OutputError(ThermoCompError):
     """An output that may not or cannot be written, with its name."""
 
 
-class FleetError(ThermoCompError):
-    """A fleet that cannot be fitted as a whole: no bags, no scheduler, a missing library."""
-
-
 class FitError(ThermoCompError):
     """
     Data that cannot carry the fit asked of it; the text says what is missing and what to record.

@@ -24,7 +24,7 @@ from urllib.parse import quote
 import numpy as np
 
 from .. import files
-from ..errors import FitError, FleetError
+from ..errors import FitError, ThermoCompError
 from ..fitting.priors import UNITS_NEEDED, population
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import load_calibration, save_calibration
@@ -77,10 +77,10 @@ def fit_fleet(
     earlier: Sequence[Row] = (),
     tell: Callable[[int, int, Row], None] | None = None,
 ) -> FleetResult:
-    """Fit all units whose results are not there yet; FleetError, OutputError if it cannot."""
+    """Fit all units whose results are not there yet; ThermoCompError, OutputError if it cannot."""
     for name in ('distributed', 'fsspec', 'pyarrow'):
         if find_spec(name) is None:
-            raise FleetError(
+            raise ThermoCompError(
                 f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({name} is not installed)"
             )
     storage = Storage(url)
@@ -198,14 +198,14 @@ def render_fleet(
 
 
 class Results:
-    """The folder of results, made if it is not there; raises FleetError if it cannot be."""
+    """The folder of results, made if it is not there; raises ThermoCompError if it cannot be."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
             (folder / 'units').mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise FleetError(f'{folder}: cannot be made: {error.strerror}') from error
+            raise ThermoCompError(f'{folder}: cannot be made: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
         """Return the folder of a unit's files; no name leads out of the fleet's."""

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import FleetError
+from ..errors import ThermoCompError
 from ..files import CSV, PARQUET, write_atomically
 from ..fitting import FitResult
 from ..fitting.verdict import can_tell_misalignment
@@ -243,14 +243,14 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read a table of an earlier run; what it lacks is empty. Raises FleetError if it is none."""
+    """Read a table of an earlier run; what it lacks is empty. ThermoCompError if it is none."""
     from pyarrow import ArrowException, parquet
 
     try:
         found = parquet.read_table(path).to_pylist()
     except (ArrowException, OSError) as error:
-        raise FleetError(f'{path}: no fleet table: {" ".join(str(error).split())}') from error
+        raise ThermoCompError(f'{path}: no fleet table: {" ".join(str(error).split())}') from error
     names = {one.name for one in COLUMNS}
     if not all('serial' in row and 'verdict' in row for row in found):
-        raise FleetError(f'{path}: no fleet table: it lacks the columns serial and verdict')
+        raise ThermoCompError(f'{path}: no fleet table: it lacks the columns serial and verdict')
     return [row_of(**{k: v for k, v in row.items() if k in names}) for row in found]

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from ..errors import FleetError, RecordingError
+from ..errors import RecordingError, ThermoCompError
 from ..recording import open_recording
 from ..text import one_line
 
@@ -59,7 +59,7 @@ class FoundUnit:
 
 
 class Storage:
-    """A folder here or at a URL like ``s3://bucket/bags``; FleetError for a strange protocol."""
+    """A folder here or at a URL like ``s3://bucket/bags``, of a known protocol."""
 
     def __init__(self, url: str) -> None:
         import fsspec
@@ -68,7 +68,7 @@ class Storage:
         try:
             self._fs, root = fsspec.core.url_to_fs(url)
         except (ImportError, ValueError) as error:
-            raise FleetError(f'{url}: {words(error)}') from error
+            raise ThermoCompError(f'{url}: {words(error)}') from error
         self._root = str(root).rstrip('/')
         self._is_local = 'file' in self._fs.protocol
         # What another process must be told to find it, wherever that was started.
@@ -85,7 +85,7 @@ class Storage:
             if not found and not self._fs.isdir(self._root):
                 raise NotADirectoryError(errno.ENOTDIR, 'no such directory')
         except Exception as error:  # each file system has exceptions of its own
-            raise FleetError(f'{self.url}: cannot be listed: {words(error)}') from error
+            raise ThermoCompError(f'{self.url}: cannot be listed: {words(error)}') from error
         files = []
         for path, facts in found.items():
             name = path.removeprefix(f'{self._root}/')
@@ -127,10 +127,10 @@ def words(error: Exception) -> str:
 
 
 def find_units(storage: Storage) -> list[FoundUnit]:
-    """Find the units by name; raises FleetError where nothing can be listed or there is no bag."""
+    """Find the units by name; ThermoCompError where nothing can be listed or there is no bag."""
     bags = group_files(storage.files())
     if not bags:
-        raise FleetError(
+        raise ThermoCompError(
             f'{storage.url}: no bag in it; expected DIR/UNIT/BAG or DIR/LOT/UNIT/BAG, where BAG '
             'is .mcap, .db3, .bag or a rosbag2 directory'
         )

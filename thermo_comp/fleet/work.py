@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from .. import __version__
-from ..errors import FitError, FleetError, RecordingError, ThermoCompError
+from ..errors import FitError, RecordingError, ThermoCompError
 from ..fitting import FitOptions, ReducedBag, fit_bags, reduce_bag
 from ..fitting.sources import digest, recording_source
 from ..recording import Input, Topics
@@ -194,11 +194,11 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
             said = f'a worker lacks thermo_comp {__version__}'
             versions = client.run(version)
         except Exception as error:  # whatever an import fails with over there
-            raise FleetError(f'{scheduler}: {said}') from error
+            raise ThermoCompError(f'{scheduler}: {said}') from error
         for worker, found in versions.items():
             if found != __version__:
                 said = f'worker {worker} runs thermo_comp {found}, not {__version__}'
-                raise FleetError(f'{scheduler}: {said}')
+                raise ThermoCompError(f'{scheduler}: {said}')
         yield client
 
 
