@@ -137,8 +137,11 @@ class ThermalNetwork:
     def air_for(self, node: str, temperature: float) -> float:
         """Return the air temperature whose endless soak brings a part to a temperature."""
         i = self.nodes.index(node)
-        found = root(lambda air: self.equilibrium(air[0])[i] - temperature, 0.0, tol=1e-13)
-        return float(found.x[0])
+
+        def miss(air: Floats) -> float:
+            return float(self.equilibrium(air[0])[i] - temperature)
+
+        return float(root(miss, 0.0, tol=1e-13).x[0])
 
 
 class ThermalResponse:
