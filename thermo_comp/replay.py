@@ -41,7 +41,7 @@ from .recording import (
     Topics,
     open_recording,
 )
-from .recording.table_out import TABLES, WriteRows, table_writer
+from .recording.writer import TABLES, WriteRows, table_writer
 from .typing import Ints
 from .unit.calibration import Calibration
 

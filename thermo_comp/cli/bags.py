@@ -163,7 +163,7 @@ def replay(
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
     """
     from ..online.status import DROPPED, CompensatorConfig
-    from ..recording.table_out import TABLES
+    from ..recording.writer import TABLES
     from ..replay import replay as run
     from ..unit.calibration_file import load_calibration
 

@@ -14,10 +14,10 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import lz4.frame
 import numpy as np
@@ -37,9 +37,13 @@ from .wire import typestore
 
 Compression = Literal['none', 'lz4', 'zstd']
 
+#: Each with a level that zstd has.
+_COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
+    'none': lambda data, _: data,
+    'lz4': lambda data, _: lz4.frame.compress(data),
+    'zstd': zstandard.compress,
+}
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
-#: A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
-_ZSTD_LEVEL = -1
 # Versions of mcap differ in which of its methods are typed.
 _new_builder: Callable[[], Any] = RecordBuilder
 #: Opcode, length, channel, sequence, log time, publish time.
@@ -47,22 +51,17 @@ _RECORD_HEAD = np.dtype('u1, <u8, <u2, <u4, <i8, <i8')
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 
-class Definition(NamedTuple):
-    """A message type's definition with all it depends on; its hash (RIHS01), if it is known."""
-
-    encoding: str
-    text: str
-    type_hash: str
-
-
 @lru_cache(maxsize=64)
-def known_definition(kind: str) -> Definition:
-    """Look up a message type of ROS 2 Jazzy; RecordingError for one that it does not have."""
+def known_definition(kind: str) -> tuple[str, str, str]:
+    """
+    Look up encoding, text with all it depends on, and hash (RIHS01) of a message type of ROS 2
+    Jazzy; RecordingError for one that it does not have.
+    """
     store = typestore()
     if kind not in store.fielddefs:
         raise RecordingError(f'the definition of message type {kind} is not known')
     text, _ = store.generate_msgdef(kind, ros_version=2)
-    return Definition('ros2msg', text, store.hash_rihs01(kind))
+    return 'ros2msg', text, store.hash_rihs01(kind)
 
 
 class McapOutput:
@@ -72,17 +71,16 @@ class McapOutput:
         self,
         path: Path,
         compression: Compression,
-        level: int | None,
+        level: int,
         chunk_bytes: int,
         metadata: Mapping[str, str],
         name: str,
     ) -> None:
         self._name, self._metadata, self._chunk_bytes = name, metadata, chunk_bytes
-        self._compression = '' if compression == 'none' else compression
-        self._compress = _compressor(compression, level)
+        self._compression = compression
+        self._level = level
         self._schemas: dict[str, records.Schema] = {}
-        #: By topic, with the type and its hash.
-        self._channels: dict[str, tuple[records.Channel, str, str]] = {}
+        self._channels: dict[str, records.Channel] = {}
         self._counts: Counter[int] = Counter()
         self._chunks: list[records.ChunkIndex] = []
         self._metadata_index: list[records.MetadataIndex] = []
@@ -94,28 +92,29 @@ class McapOutput:
         if metadata:
             self._put_metadata(METADATA_NAME, metadata)
 
-    def channel(self, topic: str, kind: str, definition: Definition) -> int:
+    def channel(self, topic: str, kind: str, definition: tuple[str, str, str]) -> int:
         """Give the number of a topic's channel, made where it is new."""
-        if topic in self._channels:
-            known, known_kind, _ = self._channels[topic]
-            if known_kind != kind:
+        encoding, text, type_hash = definition
+        schema, known = self._schemas.get(kind), self._channels.get(topic)
+        if known is not None:
+            if schema is None or known.schema_id != schema.id:
                 raise RecordingError(f'already written with another type than {kind}')
             return known.id
-        if kind not in self._schemas:
-            number, text = len(self._schemas) + 1, definition.text.encode()
-            self._schemas[kind] = records.Schema(number, text, definition.encoding, kind)
-            self._put_record(self._schemas[kind])
+        if schema is None:
+            schema = records.Schema(len(self._schemas) + 1, text.encode(), encoding, kind)
+            self._schemas[kind] = schema
+            self._put_record(schema)
         channel = records.Channel(
             id=len(self._channels) + 1,
             topic=topic,
             message_encoding='cdr',
-            schema_id=self._schemas[kind].id,
+            schema_id=schema.id,
             metadata={
                 'offered_qos_profiles': dump_yaml([_offered_qos(kind)]).strip(),
-                'topic_type_hash': definition.type_hash,
+                'topic_type_hash': type_hash,
             },
         )
-        self._channels[topic] = channel, kind, definition.type_hash
+        self._channels[topic] = channel
         self._counts[channel.id] = 0
         self._put_record(channel)
         return channel.id
@@ -139,11 +138,7 @@ class McapOutput:
         for messages in self._tail:
             if len(messages):
                 self._put_chunk(messages)
-        topics = (
-            (topic, kind, type_hash, self._counts[channel.id])
-            for topic, (channel, kind, type_hash) in self._channels.items()
-        )
-        found = _information(self._name, *self._times(), topics, self._metadata)
+        found = self._information()
         self._put_metadata('rosbag2', {'serialized_metadata': dump_yaml(found).strip()})
         self._put_record(records.DataEnd(data_section_crc=0))
         self._put_summary()
@@ -154,6 +149,41 @@ class McapOutput:
     def close(self) -> None:
         """Close the file as it is."""
         self._stream.close()
+
+    def _information(self) -> dict[str, Any]:
+        """Build metadata.yaml as Jazzy has it."""
+        start_ns, end_ns = self._times()
+        kinds = {one.id: kind for kind, one in self._schemas.items()}
+        counted: list[dict[str, Any]] = [
+            {
+                'topic_metadata': {
+                    'name': one.topic,
+                    'type': kinds[one.schema_id],
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': [_offered_qos(kinds[one.schema_id])],
+                    'type_description_hash': one.metadata['topic_type_hash'],
+                },
+                'message_count': self._counts[one.id],
+            }
+            for one in self._channels.values()
+        ]
+        times = {
+            'duration': {'nanoseconds': end_ns - start_ns},
+            'starting_time': {'nanoseconds_since_epoch': start_ns},
+            'message_count': self._counts.total(),
+        }
+        return {
+            'version': 9,
+            'storage_identifier': 'mcap',
+            **times,
+            'topics_with_message_count': counted,
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [self._name],
+            'files': [{'path': self._name, **times}],
+            'custom_data': dict(self._metadata) or None,
+            'ros_distro': 'jazzy',
+        }
 
     def _times(self) -> tuple[int, int]:
         """Give the log times of the first and the last message."""
@@ -188,12 +218,14 @@ class McapOutput:
         heads['f0'], heads['f1'] = MESSAGE, size + (MESSAGE_HEAD_BYTES - PREFIX.size)
         heads['f2'], heads['f4'], heads['f5'] = channel, log_ns, log_ns
         scatter(data, at, heads.view(np.dtype((np.void, MESSAGE_HEAD_BYTES))))
-        packed, checksum = self._compress(data.data), zlib.crc32(data.data)
+        packed = _COMPRESSORS[self._compression](data.data, self._level)
+        name = '' if self._compression == 'none' else self._compression
         start, end = int(np.min(log_ns)), int(np.max(log_ns))
-        name = self._compression.encode()
-        begin, n_bytes = self._at, len(data)
+        begin, n_bytes, checksum = self._at, len(data), zlib.crc32(data.data)
         head = (Opcode.CHUNK, 40 + len(name) + len(packed), start, end, n_bytes, checksum)
-        self._put(struct.pack(f'<BQQQQII{len(name)}sQ', *head, len(name), name, len(packed)))
+        self._put(
+            struct.pack(f'<BQQQQII{len(name)}sQ', *head, len(name), name.encode(), len(packed))
+        )
         self._put(packed)
         chunk_length = self._at - begin
         offsets: dict[int, int] = {}
@@ -209,7 +241,7 @@ class McapOutput:
             records.ChunkIndex(
                 chunk_length=chunk_length,
                 chunk_start_offset=begin,
-                compression=self._compression,
+                compression=name,
                 compressed_size=len(packed),
                 message_end_time=end,
                 message_index_length=self._at - begin - chunk_length,
@@ -232,19 +264,11 @@ class McapOutput:
             metadata_count=len(self._metadata_index),
             schema_count=len(self._schemas),
         )
-        declared = *self._schemas.values(), *(one for one, *_ in self._channels.values())
-        body = self._put_record(*declared, statistics, *self._chunks, *self._metadata_index)
+        declared = *self._schemas.values(), *self._channels.values(), statistics
+        body = self._put_record(*declared, *self._chunks, *self._metadata_index)
         footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 20, begin, 0)
         self._put_record(records.Footer(begin, 0, zlib.crc32(footer_head, zlib.crc32(body))))
         self._put(MAGIC)
-
-
-def _compressor(compression: Compression, level: int | None) -> Callable[[Any], Any]:
-    if compression == 'zstd':
-        return zstandard.ZstdCompressor(level=_ZSTD_LEVEL if level is None else level).compress
-    if compression == 'lz4':
-        return lambda data: lz4.frame.compress(data, compression_level=level or 0)
-    return lambda data: data
 
 
 def _offered_qos(kind: str) -> dict[str, Any]:
@@ -260,46 +284,6 @@ def _offered_qos(kind: str) -> dict[str, Any]:
         'liveliness': 'automatic',
         'liveliness_lease_duration': _INFINITE,
         'avoid_ros_namespace_conventions': False,
-    }
-
-
-def _information(
-    name: str,
-    start_ns: int,
-    end_ns: int,
-    topics: Iterable[tuple[str, str, str, int]],
-    custom: Mapping[str, str],
-) -> dict[str, Any]:
-    """Build metadata.yaml as Jazzy has it; topics are name, type, hash of the type and count."""
-    counted: list[dict[str, Any]] = [
-        {
-            'topic_metadata': {
-                'name': topic,
-                'type': kind,
-                'serialization_format': 'cdr',
-                'offered_qos_profiles': [_offered_qos(kind)],
-                'type_description_hash': type_hash,
-            },
-            'message_count': count,
-        }
-        for topic, kind, type_hash, count in topics
-    ]
-    times = {
-        'duration': {'nanoseconds': end_ns - start_ns},
-        'starting_time': {'nanoseconds_since_epoch': start_ns},
-        'message_count': sum(one['message_count'] for one in counted),
-    }
-    return {
-        'version': 9,
-        'storage_identifier': 'mcap',
-        **times,
-        'topics_with_message_count': counted,
-        'compression_format': '',
-        'compression_mode': '',
-        'relative_file_paths': [name],
-        'files': [{'path': name, **times}],
-        'custom_data': dict(custom) or None,
-        'ros_distro': 'jazzy',
     }
 
 
