@@ -121,7 +121,7 @@ def check_cdr(data: bytes) -> None:
     from rclpy.serialization import deserialize_message
     from sensor_msgs.msg import Imu
 
-    from thermo_comp.ros.conversions import SampleConverter, read_temperature
+    from thermo_comp.ros.relay import SampleConverter, read_temperature
 
     compensator = COMPENSATOR
     compensator.reset()

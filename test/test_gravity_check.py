@@ -54,8 +54,3 @@ def test_time_that_jumps_starts_a_new_window(rng):
     watch(rng, seconds=10, monitor=monitor)
     result = watch(rng, seconds=10, monitor=monitor)
     assert result.n_windows == 19
-
-
-def test_gravity_must_be_positive():
-    with pytest.raises(ValueError, match='`gravity` must be positive'):
-        GravityCheck(0.0)

@@ -336,11 +336,8 @@ def _readings(name: str, value: Temperature, stamps: Ints, is_date: bool) -> tup
 
 
 def said_anew(stamp_ns: Ints, celsius: Floats) -> Ints:
-    """
-    Find which rows of a temperature column are readings: finite, and a change or ten seconds old.
-
-    What is filled up to the rate of other columns would look like a thermometer that stands still.
-    """
+    """Find which rows of a temperature column are readings: finite, and new or ten seconds old."""
+    # What is filled up to the rate of other columns would look like one that stands still.
     kept: list[int] = []
     last_ns, last = 0, math.nan
     for row, (now_ns, value) in enumerate(zip(stamp_ns.tolist(), celsius.tolist(), strict=True)):

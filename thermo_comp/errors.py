@@ -49,6 +49,4 @@ class OutputError(ThermoCompError):
 
 
 class FitError(ThermoCompError):
-    """
-    Data that cannot carry the fit asked of it; the text says what is missing and what to record.
-    """
+    """Data that cannot carry the fit asked of it: what is missing, and what to record."""

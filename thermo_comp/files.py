@@ -29,10 +29,7 @@ _INDEX = 'metadata.yaml'
 
 @dataclass(frozen=True)
 class Kind:
-    """
-    What an output is, and how it is known: a file by a pattern in its first 4 KiB, or empty; a
-    folder by one in the name of each file, and by its index.
-    """
+    """What an output is: a file known by a pattern in its head, a folder by its files' names."""
 
     name: str
     mark: bytes
@@ -88,11 +85,7 @@ def shown_name(path: str | Path) -> str:
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """
-    Open a regular file for reading; OSError if it is none.
-
-    A directory, a FIFO or a device is refused before anything is read, so a reader never blocks.
-    """
+    """Open a regular file for reading; OSError, before a reader could block, if it is none."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -118,12 +111,7 @@ def read_bounded(path: str | Path, limit: int) -> bytes:
 def check_output(
     path: str | Path, kind: Kind, *, overwrite: bool = False, others: Iterable[str | Path] = ()
 ) -> None:
-    """
-    Refuse an output before any work is done for it: OutputError.
-
-    `others` is what the command reads, and what else it writes: never replaced, however it is
-    spelt.
-    """
+    """Refuse an output before any work is done for it, `others` being never replaced."""
     target = Path(os.path.realpath(path))
     for other in others:
         if _overlaps(target, Path(os.path.realpath(other))):
@@ -148,12 +136,7 @@ def check_output(
 
 
 class Draft:
-    """
-    An output in the making: it stands under a hidden name, `partial`, until it is whole.
-
-    That name has the suffix of the output, so that tools open it; folders above it are made.
-    OutputError if it may not or cannot be written.
-    """
+    """An output in the making: it stands under a hidden name, `partial`, until it is whole."""
 
     def __init__(self, path: str | Path, kind: Kind, *, overwrite: bool = False) -> None:
         check_output(path, kind, overwrite=overwrite)
@@ -213,11 +196,7 @@ class Draft:
 
 @contextmanager
 def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """
-    Give a place to write to; what the block leaves there becomes the output, if it succeeds.
-
-    OutputError as `Draft`, and for an `OSError` of the block.
-    """
+    """Give a place to write to; what the block leaves there becomes the output, if it succeeds."""
     draft = Draft(path, kind, overwrite=overwrite)
     try:
         with _told(path):

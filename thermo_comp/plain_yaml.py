@@ -35,10 +35,7 @@ _LOADER: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class PlainYamlError(ValueError):
-    """
-    A text that is not YAML of plain values: what is wrong, quoting nothing, in which line, and a
-    detail that may quote the text.
-    """
+    """A text that is not YAML of plain values; the detail may quote it, the problem does not."""
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
@@ -50,9 +47,7 @@ class PlainYamlError(ValueError):
 def load_plain_yaml(
     text: str | bytes, depth_limit: int = DEPTH_LIMIT, node_limit: int = NODE_LIMIT
 ) -> Any:
-    """
-    Read one YAML document of plain values, null of an empty text; PlainYamlError where it is none.
-    """
+    """Read one YAML document of plain values, null of an empty text, or raise PlainYamlError."""
     try:
         return _load(text, depth_limit, node_limit)
     except yaml.YAMLError as error:

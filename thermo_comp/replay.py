@@ -54,16 +54,13 @@ _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """
-    The account of a replay: what came in, what went out, and why some did not.
-
-    `switches` are the first flag and each that differs from the one before.
-    """
+    """The account of a replay: what came in, what went out, and why some did not."""
 
     info: RecordingInfo
     output: Path
     counters: Counters
     n_flags: int
+    #: The first flag, and each that differs from the one before.
     switches: list[tuple[int, bool]]
 
 
@@ -72,12 +69,7 @@ WriteBlock = Callable[[Block, CompensatedBlock, list[tuple[int, bool]]], None]
 
 
 def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None = None) -> None:
-    """
-    Refuse a calibration that is for another unit, or for another kind of input.
-
-    The serial, as the user knows it, wins over the recording's; an empty one accepts any. Raises
-    CalibrationError.
-    """
+    """Refuse a calibration that is for another unit (an empty serial is any) or kind of input."""
     expected = info.metadata.get('serial', '') if serial is None else serial
     if expected and expected != calibration.unit.serial:
         raise CalibrationError(

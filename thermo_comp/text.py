@@ -17,12 +17,7 @@ def counted(n: int, noun: str, ending: str = 's') -> str:
 
 
 def one_line(text: str) -> str:
-    """
-    Return a text as one line that a terminal shows and never obeys.
-
-    Line breaks, escape sequences, marks of direction and bytes that are no text stand there as
-    Python would write them in a literal; everything else stays as it is.
-    """
+    """Return a text as one line that a terminal shows and never obeys: the rest as literals."""
     if text.isprintable():
         return text
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

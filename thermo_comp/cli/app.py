@@ -3,6 +3,9 @@
 """
 Owns the one door of the command line: which commands there are and what an exit code means.
 
+0: done. 1: the data or the result is bad. 2: the command line is wrong. 70: a mistake of this
+program's; its traceback goes into a file. Whatever it is, it is one line on stderr.
+
 Heavy libraries are imported by the commands when they run, so that ``--help`` is quick.
 """
 
@@ -62,12 +65,7 @@ app.add_typer(_fleet)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """
-    Run one command and leave the process with its exit code.
-
-    0: done. 1: the data or the result is bad. 2: the command line is wrong. 70: a mistake of this
-    program's; its traceback goes into a file. Whatever it is, it is one line on stderr.
-    """
+    """Run one command and leave the process with its exit code."""
     hold_standard_streams()
     # Threads over small matrices wait for each other: 16 times as long where the cores are busy.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -112,11 +110,7 @@ def run(arguments: list[str]) -> int:
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """
-    Give a command's own arguments and ROS's, which stand behind ``--ros-args`` up to ``--``.
-
-    ``--counts-topic T`` and its like, the spelling of 0.1, become ``--topic counts=T``.
-    """
+    """Give a command's own arguments and ROS's, which stand from ``--ros-args`` up to ``--``."""
     own: list[str] = []
     ros: list[str] = []
     target, given = own, iter(arguments)

@@ -63,8 +63,7 @@ def info(
             ('sensor', 'Hz', 'min degC', 'max degC', 'max K/min', 'min K/min'),
             [(name, *picked(one, facts).values()) for name, one in thermometers.items()],
         )
-    for finding in survey.findings:
-        out.line(f'- {finding}')
+    out.points(survey.findings)
     if not survey.findings:
         out.line('fit for a fit, together with other positions')
     out.end(
@@ -127,8 +126,7 @@ def _calibration(out: Output, path: Path) -> None:
                 for n in provenance.residuals
             ],
         )
-    for note in provenance.notes:
-        out.line(f'- {note}')
+    out.points(provenance.notes)
     out.end(path=path, calibration=calibration)
 
 

@@ -227,8 +227,7 @@ def export(
         result = export_calibration(calibration, to, number=number, device_id=device_id, up=up)
     write_atomically(output, result.text.encode(), PARAMETERS, overwrite=force)
     out.line(f'{output}: parameters of {to} for unit {calibration.unit.serial}')
-    for note in result.notes:
-        out.line(f'- {note}')
+    out.points(result.notes)
     out.end(output=output, to=to, serial=calibration.unit.serial, notes=result.notes)
 
 
@@ -282,6 +281,5 @@ def import_(
     lower, upper = calibration.static.temperature_range_c
     source = calibration.provenance.model
     out.line(f'{output}: unit {serial}, {source}, {lower:g} .. {upper:g} degC')
-    for note in calibration.provenance.notes:
-        out.line(f'- {note}')
+    out.points(calibration.provenance.notes)
     out.end(output=output, calibration=calibration)

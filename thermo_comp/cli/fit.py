@@ -211,23 +211,19 @@ def fleet_fit(
     )
     out.told((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        for said in ('problem', 'left_out'):
-            if row[said]:
-                out.line(f'- {row["name"]}: {row[said]}')
-        if row['n_torn']:
-            out.line(f'- {row["name"]}: {row["reservations"]}')
-    for one in summary.outliers:
-        out.line(
-            f'- {one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
-            f'{one.z:+.1f} sd'
-        )
-    for drift in summary.drifts:
-        if drift.is_significant:
-            worst = drift.worst
-            out.line(
-                f'- {drift.serial}: {worst.constant} changed by {worst.change:+.4g} {worst.unit} '
-                f'(sd {worst.sd:.2g}) from {drift.earlier} to {drift.later}'
-            )
+        said = (row['problem'], row['left_out'], row['n_torn'] and row['reservations'])
+        out.points(f'{row["name"]}: {one}' for one in said if one)
+    out.points(
+        f'{one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
+        f'{one.z:+.1f} sd'
+        for one in summary.outliers
+    )
+    out.points(
+        f'{one.serial}: {one.worst.constant} changed by {one.worst.change:+.4g} {one.worst.unit} '
+        f'(sd {one.worst.sd:.2g}) from {one.earlier} to {one.later}'
+        for one in summary.drifts
+        if one.is_significant
+    )
     if result.prior is not None:
         out.line(f'{result.prior}: what the units that hold have in common')
     elif with_prior:
@@ -305,9 +301,7 @@ def _say(
             f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
             f'walk {walk} mdeg/s/sqrt(h)'
         )
-    for finding in result.findings:
-        if finding.level != 'good':
-            out.line(f'- {finding.message}')
+    out.points(one.message for one in result.findings if one.level != 'good')
     headline = counted(len(result.positions), 'position')
     if left_out.n:
         headline += f', {spoken(left_out.rms)} RMS of |f| - g on each by the others alone'

@@ -95,8 +95,7 @@ def evaluate(
             ],
             title='what drifted between the calibrations, in a soak at the reference temperature',
         )
-    for line in result.notes:
-        out.line(f'- {line}')
+    out.points(result.notes)
     out.line(str(judged))
     if judged.rate is not None:
         out.line(str(judged.rate))
@@ -177,8 +176,7 @@ def report(
         evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in opened)
     write_report(evidence, output, info=info, figures=figures, overwrite=force)
-    for finding in evidence.findings:
-        out.line(f'- {finding}')
+    out.points(evidence.findings)
     judgement = evidence.judgement
     out.line(f'{output}: {evidence.headline}')
     out.end(

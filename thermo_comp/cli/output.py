@@ -28,9 +28,7 @@ _NUMBER = re.compile(r'-|[-+]?\d+\.?\d*(e[-+]\d+)?')
 
 
 class Output:
-    """
-    Where one command prints: tables and sentences, one JSON object instead, or nothing but errors.
-    """
+    """Where one command prints: tables and sentences, or one JSON object, or only errors."""
 
     def __init__(self, as_json: bool = False, quiet: bool = False) -> None:
         self.as_json, self.quiet = as_json, quiet
@@ -47,9 +45,7 @@ class Output:
             _print(f'thermo_comp: {text}', sys.stderr)
 
     def told(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
-        """
-        Say of bags what was chosen in them, once for those that are alike, and what is missing.
-        """
+        """Say of bags what was chosen in them, once for alike ones, and what is missing."""
         alike: dict[str, list[object]] = {}
         for bag, chosen, missing in bags:
             if chosen:
@@ -62,14 +58,16 @@ class Output:
             self.note(f'{names[0]}{more}: {said}')
 
     def end(self, code: int = 0, /, **data: Any) -> None:
-        """
-        End a command: its result for machines, in ASCII, where it is asked for; an exit code that
-        tells, too, if a bag was torn.
-        """
+        """End a command: its result as JSON where asked for; an exit code, 1 of a torn bag."""
         if self.as_json:
             print(json.dumps(plain(data), indent=2, allow_nan=False))
         if code or self._is_torn:
             raise typer.Exit(code or 1)
+
+    def points(self, found: Iterable[object]) -> None:
+        """Print findings, one a line."""
+        for one in found:
+            self.line(f'- {one}')
 
     def table(
         self, columns: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
@@ -81,10 +79,7 @@ class Output:
 
     @contextmanager
     def live(self) -> Iterator[Callable[..., None] | None]:
-        """
-        Show a table with lines below it, anew with each call of what is yielded; None where stderr
-        is no terminal or nothing is to be shown.
-        """
+        """Yield what shows a table with lines below it anew, None where stderr is no terminal."""
         if self.quiet or not sys.stderr.isatty():
             yield None
             return
@@ -107,10 +102,7 @@ class Output:
 
     @contextmanager
     def progress(self, what: str, total: float | None = 1.0) -> Iterator[Callable[[float], None]]:
-        """
-        Show a progress bar on a terminal; yields what is to be called with the amount done so far,
-        of a total that is None where nobody knows it.
-        """
+        """Show a progress bar on a terminal; yields what is to be told how much is done so far."""
         if self.quiet or not sys.stderr.isatty():
             yield lambda _done: None
             return

@@ -145,9 +145,7 @@ def simulate(
 def _write(
     writer: 'BagWriter', runs: Iterator['SimulatedRun'], unit: 'UnitModel', is_imu: bool
 ) -> Iterator[dict[str, int]]:
-    """
-    Write a run block by block, from its first temperatures on, as a recorder would; count them.
-    """
+    """Write a run by blocks, from its first temperatures on, as a recorder would; count them."""
     import numpy as np
 
     from ..recording import ImuColumns, Topics

@@ -55,12 +55,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """
-    Correct a block with the bits that `Compensator.process` gives, and
-    the angular rate of its samples, shape (n, 3), with those of `correct_rate`.
-
-    Flags wait in `Compensator.take_flags`, counts in its `counters`.
-    """
+    """Correct a block, and its angular rate (n, 3), with the bits of the stream."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -119,11 +114,7 @@ def _push(compensator: Compensator, arrivals: _Arrivals, place: int) -> None:
 def _gather(
     compensator: Compensator, arrivals: _Arrivals, index: Ints, stamps: Stamps
 ) -> tuple[list[tuple[Segment, int]], Ints]:
-    """
-    Let readings take effect at the first sample that is not before them and that comes after them.
-
-    Returns the segments between, with the number of samples of each, and which samples those are.
-    """
+    """Cut into segments between readings, with their numbers of samples; and which those are."""
     thermal, counters = compensator.thermal, compensator.counters
     n_seen = counters.n_in - counters.n_out_of_order
     segments: list[tuple[Segment, int]] = []
@@ -187,10 +178,7 @@ def _corrected(
     samples: Floats,
     is_rate: bool = False,
 ) -> Floats:
-    """
-    Correct the samples (n, 3) of segments: specific force and row-major covariance, shape (12, n);
-    or angular rates: these and variances, shape (6, n).
-    """
+    """Give force and row-major covariance (12, n) of segments; or rates and variances (6, n)."""
     each = [segment for segment, _ in segments]
     start, end, slow = (np.array([one[part] for one in each]).T for part in (4, 5, 6))
     excess = np.array([one.noise_excess for one in each])

@@ -165,14 +165,11 @@ class Compensator:
         """Begin anew at a sample before which time has jumped back: a bag that loops."""
         # Readings of the old time that no sample reached belong to the time that is gone.
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
-        self._forget_samples()
-        self.counters.n_time_jumps += 1
-        self.last_ns = stamp_ns - 1
-
-    def _forget_samples(self) -> None:
         self.thermal.reset()
         self.stuck = StuckCheck(self.config.stuck_timeout_s)
         self.gravity = self._gravity_check()
+        self.counters.n_time_jumps += 1
+        self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
         """Take the regime flags that became due: (stamp of the leading sensor's reading, S)."""
@@ -194,12 +191,8 @@ class Compensator:
         self.event_ns = EVER_NS
 
     def swap(self, calibration: Calibration) -> None:
-        """
-        Take over another calibration between two samples.
-
-        The thermometers, the regime and the memory go on where the new calibration reads them in
-        the same way and remembers the same; otherwise they start anew.
-        """
+        """Take over another calibration between two samples."""
+        # Thermometers, regime and memory go on where the new one reads and remembers the same.
         self.thermal.swap(calibration, self.now_ns)
         self._use(calibration)
         self.event_ns = EVER_NS
@@ -217,13 +210,6 @@ class Compensator:
     def now_ns(self) -> int | None:
         """Stamp of the last sample; None before the first."""
         return self.last_ns if self.last_ns != EVER_NS else None
-
-    def reset(self) -> None:
-        """Forget temperatures, regime and queue; counters stay."""
-        self.thermal.queue.keep(lambda _: False)
-        self.thermal.flags.clear()
-        self._forget_samples()
-        self.last_ns = self.event_ns = EVER_NS
 
 
 def corrected(

@@ -46,17 +46,12 @@ def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float
 
 
 class GravityCheck:
-    """
-    Compare |f| with gravity over still windows; `is_refuted` tells whether the last of them all
-    missed it by more than the tolerance [m/s^2], 0 = anything. Raises ValueError if gravity is not
-    positive.
-    """
+    """Compares |f| with gravity, positive, over still windows; a tolerance of 0 is anything."""
 
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
-        if not 0.0 < gravity < math.inf:
-            raise ValueError(f'`gravity` must be positive, got {gravity}')
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
+        #: Whether the last windows all missed it by more than the tolerance.
         self.is_refuted = False
         self._n_alike = 0
         self._is_against = False

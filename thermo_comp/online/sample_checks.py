@@ -34,16 +34,13 @@ class StuckCheck:
     """Counts equal samples in a row; beyond the time-out [s], if any, they are not believed."""
 
     def __init__(self, timeout_s: float) -> None:
-        self.limit_ns = round(timeout_s * 1e9) if timeout_s > 0.0 else NEVER_NS
+        #: Whether anything is watched.
+        self.is_on = timeout_s > 0.0
+        self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
         #: The sample that the run began with and its stamp.
         self.run = (nan, nan, nan, 0)
         #: How often it has come again.
         self.n_same = 0
-
-    @property
-    def is_on(self) -> bool:
-        """Whether anything is watched."""
-        return self.limit_ns != NEVER_NS
 
     def again(self, stamp_ns: int) -> bool:
         """Count one more equal sample; say whether it is too many."""
@@ -78,17 +75,14 @@ class StuckCheck:
 
 
 class RateCheck:
-    """
-    Compares the rate of the samples with the calibrated one, at the start of each segment.
-
-    `is_too_fast`: more samples have come than conversions can make; `ratio`: samples per
-    calibrated cycle over the last second or so.
-    """
+    """Compares the rate of the samples with the calibrated one, at the start of each segment."""
 
     def __init__(self, cycle_s: float) -> None:
         self._cycle_s = cycle_s
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
+        #: Whether more samples have come than conversions can make.
         self.is_too_fast = False
+        #: Samples per calibrated cycle over the last second or so.
         self.ratio = 1.0
         self._level = 0.0
         self._last: tuple[int, int] | None = None

@@ -14,7 +14,9 @@ first segment that begins in each span of ten seconds of the stamps, and held.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from math import sqrt
 from typing import Final, NamedTuple
 
 from ..thermal.memory import BOARD_INPUT
@@ -105,7 +107,7 @@ class ThermalSide:
         return replace(self.config, transition_time_s=gentle_s), self.calibration.board_lag_s
 
     def swap(self, calibration: Calibration, now_ns: int | None) -> None:
-        """Take over another calibration; see `Compensator.swap`."""
+        """Take over another calibration, as `Compensator.swap`."""
         old = self.tracker
         detector = self.calibration.detector
         self._use(calibration, self.config)
@@ -205,10 +207,7 @@ class ThermalSide:
             self.counters.n_stale += n_samples
 
     def segment(self, stamp_ns: int, n_seen: int) -> Segment:
-        """
-        Open the segment of a sample, `n_seen` samples after the first one: it is counted from the
-        last reading. A new one begins with a look at the rate.
-        """
+        """Open the segment of a sample, `n_seen` after the first; a new one looks at the rate."""
         start_ns = stamp_ns - (stamp_ns - (self.tracker.updated_ns or 0)) % SEGMENT_NS
         key = (self._n_applied, start_ns)
         is_new = key != self._segment_key
@@ -229,6 +228,12 @@ class ThermalSide:
         """What the rate adds to a sample's noise, relative to the calibrated cycle's."""
         excess = self.rate.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
+
+    def bias_sd(self, correction: Correction, variances: Sequence[float]) -> tuple[float, ...]:
+        """Give what is uncertain of each axis' bias: the whole variance less a sample's noise."""
+        excess = 1.0 + self.noise_excess
+        pairs = zip(variances, correction.noise, strict=False)
+        return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[float]:
         """Give the slow part of the variance of a segment, evaluated at its end or held."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, sqrt
+from math import inf
 
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
@@ -47,14 +47,14 @@ class CompensatorStatus:
     gravity: GravityResidual | None = None
     #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
     is_refuted: bool = False
-    #: What is uncertain of the bias of each axis' angular rate [rad/s]; None where none is known.
-    rate_bias_sd: tuple[float, ...] | None = None
+    #: What is uncertain of the bias of each axis' angular rate [rad/s]; empty where none is known.
+    rate_bias_sd: tuple[float, ...] = ()
 
 
 def take_snapshot(compensator: Compensator) -> CompensatorStatus:
     """Say how a compensator stands at the stamp of its last sample."""
     thermal = compensator.thermal
-    tracker = thermal.tracker
+    tracker, rate = thermal.tracker, thermal.rate_correction
     stamp_ns = compensator.now_ns
     if stamp_ns is None:
         stamp_ns = tracker.updated_ns
@@ -85,14 +85,5 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         tracker.lead.is_reversed,
         compensator.gravity.result,
         compensator.gravity.is_refuted,
-        _rate_bias_sd(compensator),
+        thermal.bias_sd(rate, compensator.rate_line[12::3]) if rate else (),
     )
-
-
-def _rate_bias_sd(compensator: Compensator) -> tuple[float, ...] | None:
-    thermal, line = compensator.thermal, compensator.rate_line
-    if thermal.rate_correction is None or not line:
-        return None
-    noises = [(1.0 + thermal.noise_excess) * one for one in thermal.rate_correction.noise]
-    pairs = zip(line[12::3], noises, strict=True)
-    return tuple(sqrt(max(0.0, whole - noise)) for whole, noise in pairs)

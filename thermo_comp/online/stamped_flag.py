@@ -13,11 +13,7 @@ _ENCAPSULATION = b'\0\1\0\0'
 
 
 def stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
-    """
-    Serialize a DiagnosticArray of one status: header stamp = that of the reading which decided.
-
-    Its message is `dynamic` or `static`, its level always OK, its hardware_id the unit's serial.
-    """
+    """Serialize a DiagnosticArray of one status, stamped as the reading which decided."""
     status = b''
     for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
         # The level is one byte, and a length stands at a multiple of four.

@@ -67,14 +67,10 @@ class Counters:
     n_time_jumps: int = 0
 
     @property
-    def n_dropped(self) -> int:
-        """Samples that came in and did not go out."""
-        return sum(_dropped(self))
-
-    @property
     def n_in(self) -> int:
         """Samples that came in."""
-        return self.n_out + self.n_dropped
+        n_dropped: int = sum(_dropped(self))
+        return self.n_out + n_dropped
 
 
 @dataclass(frozen=True, slots=True)

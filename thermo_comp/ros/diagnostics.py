@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -20,6 +20,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from ..online.compensator import Compensator
+from ..online.segments import RATE_TOLERANCE
 from ..online.snapshot import CompensatorStatus, take_snapshot
 from ..text import one_line
 from ..thermal.plausibility import Fault
@@ -30,8 +31,6 @@ from .waitloop import WaitLoop, type_name
 
 #: After so long without samples [s] readings take effect without them.
 IDLE_S = 5.0
-#: A sample rate further from the calibrated one than this is worth a warning.
-RATE_TOLERANCE = 0.1
 #: Readings stamped this much ahead of the samples wait too long to be of one clock with them [s].
 AHEAD_S = 5.0
 #: Samples that are late by so many cycles, and by so long [s], do not come any more.
@@ -179,23 +178,18 @@ class Reporter:
                 'gravity windows': str(gravity.n_windows),
                 'standing': str(gravity.is_still),
             }
-        for axis, density in zip('xyz', calibration.noise_density_m_s2_sqrt_hz, strict=True):
-            values[f'noise density {axis} [m/s^2/sqrt(Hz)]'] = f'{density:.3e}'
+        densities, gyroscope = calibration.noise_density_m_s2_sqrt_hz, calibration.gyroscope
+        values |= _of_axes('noise density {} [m/s^2/sqrt(Hz)]', densities)
         last, thermal = self._relay.converter.last_result, self._compensator.thermal
         if last is not None:
             variances = last[3], last[6], last[8]
-            for axis, variance, noise in zip(
-                'xyz', variances, thermal.correction.noise, strict=True
-            ):
-                bias_sd = math.sqrt(max(0.0, variance - (1.0 + thermal.noise_excess) * noise))
-                values[f'sd {axis} [m/s^2]'] = f'{math.sqrt(variance):.3e}'
-                values[f'bias sd {axis} [m/s^2]'] = f'{bias_sd:.3e}'
-        if calibration.gyroscope:
-            densities = calibration.gyroscope.noise_density_rad_s_sqrt_hz
-            for axis, density in zip('xyz', densities, strict=True):
-                values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'] = f'{density:.3e}'
-        for axis, bias_sd in zip('xyz', status.rate_bias_sd or (), strict=False):
-            values[f'bias sd of rate {axis} [rad/s]'] = f'{bias_sd:.3e}'
+            bias_sd = thermal.bias_sd(thermal.correction, variances)
+            values |= _of_axes('sd {} [m/s^2]', map(math.sqrt, variances))
+            values |= _of_axes('bias sd {} [m/s^2]', bias_sd)
+        if gyroscope:
+            densities = gyroscope.noise_density_rad_s_sqrt_hz
+            values |= _of_axes('noise density of rate {} [rad/s/sqrt(Hz)]', densities)
+        values |= _of_axes('bias sd of rate {} [rad/s]', status.rate_bias_sd)
         return {
             **values,
             'sample rate [Hz]': 'unknown' if rate is None else f'{rate:.2f}',
@@ -217,6 +211,10 @@ class Reporter:
             'calibration sha256': loaded.sha256,
             'calibration date': calibration.provenance.created,
         }
+
+
+def _of_axes(key: str, values: Iterable[float]) -> dict[str, str]:
+    return {key.format(axis): f'{value:.3e}' for axis, value in zip('xyz', values, strict=False)}
 
 
 def _mismatch(node: Node, subscription: Subscription) -> str:

@@ -30,11 +30,12 @@ from rclpy.service import Service
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
 from ..text import LONGEST_SERIAL, one_line
-from .conversions import LONGEST_FRAME
 from .waitloop import WaitLoop
 
 #: More requests than this that wait, or parameters in one of them, are refused.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
+#: The longest name of a frame that may be set, in bytes.
+LONGEST_FRAME = 255
 #: Of a reason, which may repeat what came in.
 _LONGEST_REASON = 1000
 
@@ -217,13 +218,10 @@ def _checked(name: str, value: Any) -> Any:
 
 
 class ParameterRequests:
-    """
-    What answers a node's parameter services.
+    """What answers a node's parameter services."""
 
-    `prepare` does what takes time about a change, beside the samples, `apply` sets what comes of
-    it, between two of them. Exceptions are refusals.
-    """
-
+    # `prepare` does what takes time about a change, beside the samples, `apply` sets what comes
+    # of it, between two of them. Exceptions are refusals.
     def __init__(
         self,
         node: Node,
@@ -313,11 +311,7 @@ def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> Non
 
 
 def read_parameter(message: ParameterMessage) -> Parameter:
-    """
-    Read a parameter off the network, whole numbers as floats where this node wants floats.
-
-    ParameterError if it has no name, or a value of no type.
-    """
+    """Read a parameter off the network, whole numbers as floats where this node wants floats."""
     if not message.name:
         # rclpy takes it for declared.
         raise ParameterError('a parameter without a name')

@@ -133,11 +133,7 @@ class Player:
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], None] = lambda _: None
     ) -> PlayReport:
-        """
-        Send the whole bag; ThermoCompError if a reliable subscriber stops.
-
-        `throttle` gets the number of samples sent after each window and may block.
-        """
+        """Send the bag; `throttle` is told the samples sent after each window, and may block."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {one.topic_name: role for role, one in self._publishers.items()}

@@ -24,22 +24,17 @@ PROFILE = Path(__file__).with_name('fastdds_profile.xml')
 
 
 def use_profile() -> None:
-    """
-    Make the node's profile that of this process, before its first context, but for a user's own.
-
-    It saves a quarter of the CPU time with reliable subscribers (docs/benchmarks.md).
-    """
+    """Make the node's profile that of this process, before its first context, if none is set."""
+    # It saves a quarter of the CPU time with reliable subscribers (docs/benchmarks.md).
     if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
         os.environ[VARIABLE] = str(PROFILE)
 
 
 class SignalWatch:
-    """
-    Turn the first signal into a call; the second ends the process at once.
+    """Turn the first signal into a call, entered in the main thread; the second ends at once."""
 
-    To be entered in the main thread. The call comes from another one, so that it also comes while
-    the main thread waits in the middleware, where the interpreter runs no handlers.
-    """
+    # The call comes from another thread, so that it also comes while the main one waits in the
+    # middleware, where the interpreter runs no handlers.
 
     def __init__(self) -> None:
         self._is_over = False

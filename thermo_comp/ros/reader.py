@@ -38,12 +38,7 @@ class LoadedCalibration:
 
 
 def read(name: str, directory: str = '') -> LoadedCalibration:
-    """
-    Read a calibration of whichever unit, from under a directory if one is given.
-
-    The CalibrationError names the path as given and the rule, and quotes nothing of a file that is
-    no calibration.
-    """
+    """Read a unit's calibration; CalibrationError, which quotes nothing of what is none."""
     if not name:
         raise CalibrationError(
             'parameter `calibration_file` is not set; start with '

@@ -8,25 +8,35 @@ of arrival. So it does not matter how the wake-ups fell.
 
 An input has one source. A message does not tell whose it is, so while there are two nothing of
 that input is used, nor the first messages after it, which may still be of the one that left.
+
+A sample is read and an Imu is written at fixed places of their plain form, little-endian CDR:
+4 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with
+its final NUL, the string, and, at the next multiple of 8 counted from behind the encapsulation,
+float64 values. A message of any other form is brought into this one by rclpy first.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from operator import itemgetter
+from struct import Struct
+from struct import error as StructError  # noqa: N812
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
 from ..online.compensator import Compensator
 from ..online.stamped_flag import STAMPED_TOPIC, stamped_flag
-from .conversions import SampleConverter, Traffic, read_temperature
 from .parameters import NodeConfig
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
@@ -41,8 +51,109 @@ FLAG_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: sample that Fast DDS has to repeat can be 3 s late.
 IDLE_NS = 1_000_000_000
 
+#: Compensates one sample: stamp and three components in, force and covariance out, None = drop.
+Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
+#: Corrects the angular rate that came with that sample: rate and variances out.
+CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
+
+#: An Imu with the longest name of a frame is shorter; what is longer is not even read.
+_LONGEST_MESSAGE = 1024
+
+_ENCAPSULATION = b'\0\1\0\0'
+_HEADER = Struct('<4siI4x')
+# An Imu is orientation 4 + 9, angular velocity 3 + 9, linear acceleration 3 + 9 float64 values;
+# all but the last twelve are passed on.
+_PASSED = 8 * 25
+_NO_GYRO = Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
+#: Where the rate stands in what is passed on, and its form with the first of its covariance.
+_RATE_AT = 8 * 13
+_RATE_IN, _RATE_OUT = Struct('<4d'), Struct('<12d')
+_CELSIUS = Struct('<d')
+
 # A temperature that has arrived: received [ns]; of which thermometer, stamp [ns], degC.
 _Reading = tuple[int, tuple[str, int, float]]
+
+
+@dataclass(slots=True)
+class Traffic:
+    """What the node itself counts, beside the compensator's counters."""
+
+    n_lost: int = 0  # samples that the driver sent and the node did not get
+    n_unpublished: int = 0  # output messages that the middleware did not accept
+    n_malformed: int = 0  # messages that could not be read
+    n_flags: int = 0  # regime flags published, one for each reading that decides
+    n_fallback: int = 0  # samples that rclpy had to bring into the plain form
+    n_contested: int = 0  # messages not used because their input had more than one publisher
+
+
+class SampleConverter:
+    """Turns samples into Imu, both serialized; an empty `frame_id` keeps the input's."""
+
+    def __init__(
+        self, message_type: Any, frame_id: str = '', traffic: Traffic | None = None
+    ) -> None:
+        self._message_type, self._frame_id = message_type, frame_id
+        self.traffic = traffic or Traffic()
+        # Of the last kind of message: its frame, what unpacks it, where what it passes on begins;
+        # of the Imu: its frame and what packs it.
+        self._name, self._passed, self._frame = b'', 0, b''
+        self._unpack: Callable[[bytes], tuple[Any, ...]] = Struct('').unpack
+        self._pack: Callable[..., bytes] = Struct('').pack
+        #: What `process` last gave, for reports.
+        self.last_result: tuple[float, ...] | None = None
+
+    def convert(
+        self, data: bytes, process: Process, correct_rate: CorrectRate | None = None
+    ) -> bytes | None:
+        """Compensate one sample; None if it is not readable or `process` dropped it."""
+        try:
+            encapsulation, sec, nanosec, name, x, y, z = self._unpack(data)
+            is_known = name == self._name and encapsulation == _ENCAPSULATION
+        except (StructError, ValueError):
+            is_known = False
+        if not is_known:
+            data = self._learn(data)
+            if not data:
+                self.traffic.n_malformed += 1
+                return None
+            _, sec, nanosec, _, x, y, z = self._unpack(data)
+        result = process(sec * 1_000_000_000 + nanosec, x, y, z)
+        if result is None:
+            return None
+        self.last_result = result
+        block = _NO_GYRO
+        if self._passed:
+            block = data[self._passed : self._passed + _PASSED]
+            if correct_rate is not None:
+                x, y, z, claimed = _RATE_IN.unpack_from(block, _RATE_AT)
+                if claimed != -1.0:
+                    x, y, z, xx, yy, zz = correct_rate(sec * 1_000_000_000 + nanosec, x, y, z)
+                    rate = x, y, z, xx, 0.0, 0.0, 0.0, yy, 0.0, 0.0, 0.0, zz
+                    block = block[:_RATE_AT] + _RATE_OUT.pack(*rate)
+        fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
+        return self._pack(
+            _ENCAPSULATION, sec, nanosec, self._frame, block,
+            fx, fy, fz, c00, c01, c02, c01, c11, c12, c02, c12, c22,
+        )  # fmt: skip
+
+    def _learn(self, data: bytes) -> bytes:
+        """Note where a message of a new kind has its values; return its plain form, or nothing."""
+        is_imu = self._message_type is Imu
+        skip, rest = (_PASSED, 72) if is_imu else (0, 0)
+        size = skip + 24 + rest
+        given, (data, start) = data, _plain(data, size, self._message_type)
+        if not start:
+            return b''
+        self.traffic.n_fallback += data is not given
+        self._passed = start if is_imu else 0
+        end = 16 + int.from_bytes(data[12:16], 'little')
+        # Behind the name there is anything.
+        self._name, gap = data[12:end], start - end + skip
+        self._unpack = Struct(f'<4siI{len(self._name)}s{gap}x3d{rest}x').unpack
+        frame = self._frame_id.encode() + b'\0' if self._frame_id else self._name[4:]
+        self._frame = len(frame).to_bytes(4, 'little') + frame + bytes(-(12 + len(frame)) % 8)
+        self._pack = Struct(f'<4siI{len(self._frame)}s{_PASSED}s12d').pack
+        return data
 
 
 class Relay:
@@ -177,3 +288,40 @@ class Relay:
         if not self._node.context.ok():
             raise ExternalShutdownException
         self.traffic.n_unpublished += 1
+
+
+def read_temperature(data: bytes) -> tuple[int, float] | None:
+    """Read the stamp [ns] and the temperature of a serialized Temperature; None if it is none."""
+    # A node that sleeps between samples pays for each line of code it has not touched for long:
+    # rclpy's deserialization costs it as much as several samples.
+    data, start = _plain(data, 16, Temperature)
+    if not start:
+        return None
+    _, sec, nanosec = _HEADER.unpack_from(data)
+    return sec * 1_000_000_000 + nanosec, _CELSIUS.unpack_from(data, start)[0]
+
+
+def _values_at(data: bytes, size: int) -> int:
+    """Find where the values of a stamped message begin, so many bytes; 0 in another form."""
+    if not 16 < len(data) <= _LONGEST_MESSAGE or data[:4] != _ENCAPSULATION:
+        return 0
+    length = int.from_bytes(data[12:16], 'little')
+    start = 16 + length + -(12 + length) % 8
+    name = data[16 : 16 + length]
+    if not length or len(data) != start + size or name.find(0) != length - 1:
+        return 0
+    with suppress(UnicodeDecodeError):
+        name.decode()
+        return start
+    return 0
+
+
+def _plain(data: bytes, size: int, message_type: Any) -> tuple[bytes, int]:
+    """Give a message, in another form as rclpy writes it, and where its values begin or 0."""
+    start = _values_at(data, size)
+    if not start and len(data) <= _LONGEST_MESSAGE:
+        # RuntimeError is rclpy's own, ValueError that of a name that is not UTF-8.
+        with suppress(RuntimeError, ValueError):
+            data = serialize_message(deserialize_message(data, message_type))
+            start = _values_at(data, size)
+    return data, start

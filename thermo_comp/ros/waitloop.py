@@ -30,12 +30,9 @@ from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
-from rclpy.publisher import Publisher
+from rclpy.node import Node, Publisher, Service, Subscription
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
-from rclpy.service import Service
-from rclpy.subscription import Subscription
 
 from ..errors import ThermoCompError
 from ..text import one_line
@@ -97,13 +94,10 @@ class RawSubscription:
 
 
 class WaitLoop:
-    """
-    A loop over a node of no executor: raw subscriptions are for the caller, the rest is served.
+    """A loop over a node of no executor: raw subscriptions are for the caller, the rest served."""
 
-    Messages of a best-effort subscription gather until `rest_s` after each wake-up [s], where they
-    come often enough for it: four within three such times, so that a rest is not for one alone.
-    """
-
+    # Messages of a best-effort subscription gather until `rest_s` after each wake-up [s], where
+    # they come often enough for it: four within three such times, so that none rests alone.
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
         self._node = node
         self._rest_ns = int(rest_s * 1e9)
@@ -160,11 +154,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def run(self, on_data: Callable[[], None]) -> None:
-        """
-        Serve until the end; `on_data` is called when woken and drains all subscriptions.
-
-        No exception of a callback ends it: it is logged and counted, and samples go on.
-        """
+        """Serve until the end; `on_data` is called when woken and drains all subscriptions."""
         try:
             while not self._is_stopping:
                 self._guarded(partial(self._serve, on_data), (RCLError, ExternalShutdownException))
@@ -233,9 +223,7 @@ class WaitLoop:
         if header is None:
             return False
 
-        def answer(response: Any) -> None:
-            service.send_response(response, header)
-
+        answer = partial(service.send_response, header=header)
         if service in self.handlers:
             self.handlers[service](request, answer)
         else:
@@ -298,10 +286,9 @@ def _opened(create: Callable[..., Any], message_type: Any, topic: str, qos: QoSP
 
 
 def _take_message(subscription: Subscription) -> bool:
-    taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-    if taken is not None:
+    if taken := subscription.handle.take_message(subscription.msg_type, subscription.raw):
         subscription.callback(taken[0])
-    return taken is not None
+    return bool(taken)
 
 
 @contextmanager
