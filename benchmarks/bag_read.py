@@ -27,7 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from thermo_comp.recording import BagWriter, open_recording, read_recording
+from thermo_comp.recording.reader import open_recording, read_recording
+from thermo_comp.recording.writer import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 RATE_HZ = 400

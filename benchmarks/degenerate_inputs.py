@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from thermo_comp.recording import BagWriter
+from thermo_comp.recording.writer import BagWriter
 
 SECOND, YEAR = 10**9, 366 * 86400 * 10**9
 START_NS = 1_767_225_600 * SECOND

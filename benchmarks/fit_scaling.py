@@ -31,7 +31,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
     """Simulate the chamber program once per position, straight into bags."""
-    from thermo_comp.recording import BagWriter
+    from thermo_comp.recording.writer import BagWriter
 
     unit = unit_preset('thermostatted', 1)
     paths = []

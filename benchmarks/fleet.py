@@ -35,7 +35,7 @@ from thermo_comp.fleet.run import fit_fleet
 from thermo_comp.fleet.table import Row
 from thermo_comp.fleet.units import FoundUnit, Storage, find_units
 from thermo_comp.fleet.work import FleetOptions, connected, run
-from thermo_comp.recording import BagWriter
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import simulate

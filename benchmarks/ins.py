@@ -33,7 +33,7 @@ import matplotlib as mpl
 import numpy as np
 
 import thermo_comp as tc
-from thermo_comp.recording import inspect_recording
+from thermo_comp.recording.reader import inspect_recording
 from thermo_comp.typing import Floats
 from thermo_comp.unit.correction import Correction
 

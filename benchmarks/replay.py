@@ -30,7 +30,8 @@ import numpy as np
 
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording import BagWriter, open_recording
+from thermo_comp.recording.reader import open_recording
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import BLOCK_MESSAGES
 from thermo_comp.replay import replay as replay_bag
 from thermo_comp.unit.calibration import Calibration

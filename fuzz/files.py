@@ -18,7 +18,7 @@ from pyarrow import parquet
 from thermo_comp.convert.columns import ColumnMap, table_log
 from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import open_recording
+from thermo_comp.recording.reader import open_recording
 from thermo_comp.unit.schema import build
 
 #: One for all inputs of a process.

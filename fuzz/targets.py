@@ -22,7 +22,7 @@ import zstandard
 
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording import open_recording
+from thermo_comp.recording.reader import open_recording
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.functions import Polynomial

@@ -11,7 +11,7 @@ import numpy as np
 
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet.work import FleetOptions
-from thermo_comp.recording import BagWriter
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset as preset
 from thermo_comp.simulation.run import simulate

@@ -14,7 +14,7 @@ import numpy as np
 from builders import ArrayBlock
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
-from thermo_comp.recording import BagWriter
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.evidence import Evidence, evidence_of_fit
 from thermo_comp.report.page import render_report
 from thermo_comp.simulation.campaign import parse_cyclogram, positions

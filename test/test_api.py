@@ -14,7 +14,8 @@ from readme_helpers import FENCES
 from test_layers import loaded_after
 
 import thermo_comp as tc
-from thermo_comp.recording import Topics, read_recording
+from thermo_comp.recording.reader import read_recording
+from thermo_comp.recording.topics import Topics
 from thermo_comp.replay import replay
 
 UNIQUE = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])

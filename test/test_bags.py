@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from conftest import Cli
 
-from thermo_comp.recording import read_recording
+from thermo_comp.recording.reader import read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / 'bags' / 'README.md').read_text()

@@ -21,7 +21,8 @@ from conftest import Cli, parsed
 
 from thermo_comp.cli import output
 from thermo_comp.cli.app import app, split_arguments
-from thermo_comp.recording import BagWriter, inspect_recording, read_recording
+from thermo_comp.recording.reader import inspect_recording, read_recording
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import save_calibration
 
 ROOT = Path(__file__).resolve().parent.parent

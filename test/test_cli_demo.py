@@ -13,7 +13,7 @@ import pytest
 from conftest import Cli
 from readme_helpers import ROOT, is_alike, shown
 
-from thermo_comp.recording import inspect_recording
+from thermo_comp.recording.reader import inspect_recording
 
 pytestmark = pytest.mark.usefixtures('equal_fits_once')
 

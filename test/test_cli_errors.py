@@ -17,7 +17,8 @@ import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration
 from conftest import ROOT, Cli, parsed
 
-from thermo_comp.recording import BagWriter, Topics
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.calibration_file import save_calibration
 

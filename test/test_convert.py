@@ -16,7 +16,7 @@ from conftest import Cli
 from thermo_comp.convert.columns import ColumnMap, load_column_map, table_log
 from thermo_comp.convert.log import Readings, thin, write_log
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import read_recording
+from thermo_comp.recording.reader import read_recording
 from thermo_comp.replay import replay
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import save_calibration

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from thermo_comp.convert.bag import bag_log, find_topics
 from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import read_recording
+from thermo_comp.recording.reader import read_recording
 
 G = 9.80665
 N = 400

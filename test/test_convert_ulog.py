@@ -17,7 +17,7 @@ import pytest
 from thermo_comp.convert.autopilot import read_autopilot
 from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import read_recording
+from thermo_comp.recording.reader import read_recording
 
 pytest.importorskip('pyulog', reason='pyulog is not installed: the extra `px4`')
 

@@ -20,7 +20,8 @@ import pytest
 from builders import calibration
 from conftest import ROOT, Cli
 
-from thermo_comp.recording import BagWriter, read_recording
+from thermo_comp.recording.reader import read_recording
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
 FIT = [*sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))]

@@ -26,7 +26,7 @@ from thermo_comp.fleet.run import Results, fit_fleet
 from thermo_comp.fleet.table import COLUMNS, Row, read_parquet
 from thermo_comp.fleet.units import Storage, find_units
 from thermo_comp.fleet.work import FleetOptions, connected, outcome_of
-from thermo_comp.recording import Topics
+from thermo_comp.recording.topics import Topics
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.unit.calibration_file import load_calibration
 

@@ -16,7 +16,7 @@ sys.path.insert(0, str(ROOT / 'fuzz'))
 
 import targets
 
-from thermo_comp.recording import open_recording
+from thermo_comp.recording.reader import open_recording
 from thermo_comp.unit.calibration_file import parse_calibration
 
 TARGETS = targets.targets()

@@ -21,8 +21,7 @@ from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.snapshot import take_snapshot
-from thermo_comp.recording import Block, ImuColumns
-from thermo_comp.recording.columns import Readings
+from thermo_comp.recording.columns import Block, ImuColumns, Readings
 from thermo_comp.simulation.campaign import plan
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import arrays

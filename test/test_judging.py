@@ -21,7 +21,9 @@ from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.judging.windows import Windows, csv_of
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording import BagWriter, Topics, open_recording
+from thermo_comp.recording.reader import open_recording
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration import Calibration, Provenance, ResidualSummary, Source
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
 

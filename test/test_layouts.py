@@ -19,7 +19,8 @@ from builders import GRAVITY, SECOND_NS, calibration
 from conftest import ROOT
 from rosbags.typesys import Stores, get_typestore
 
-from thermo_comp.recording import BagWriter, inspect_recording
+from thermo_comp.recording.reader import inspect_recording
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import replay
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 

@@ -18,7 +18,10 @@ from rosbags.highlevel import AnyReader
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.online.stamped_flag import STAMPED_TOPIC
-from thermo_comp.recording import BagWriter, Block, ImuColumns, Topics, read_recording
+from thermo_comp.recording.columns import Block, ImuColumns
+from thermo_comp.recording.reader import read_recording
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, replay
 from thermo_comp.ros.round_trip import round_trip
 from thermo_comp.unit.calibration import Calibration, Unit

@@ -14,7 +14,9 @@ from position_helpers import GRAVITY, MG, START_NS, Rest
 from thermo_comp.errors import FitError, RecordingError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
-from thermo_comp.recording import BagWriter, Part, Topics, open_recording, read_recording
+from thermo_comp.recording.reader import open_recording, read_recording
+from thermo_comp.recording.topics import Part, Topics
+from thermo_comp.recording.writer import BagWriter
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 

@@ -26,7 +26,7 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.judging.evaluation import evaluate
-from thermo_comp.recording import Part, Topics
+from thermo_comp.recording.topics import Part, Topics
 
 MG = GRAVITY * 1e-3
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')

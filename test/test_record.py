@@ -18,8 +18,10 @@ import pytest
 from conftest import ROOT, Cli
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import BagWriter, Topics, open_recording
 from thermo_comp.recording.growing import growing_blocks, numbered_bags
+from thermo_comp.recording.reader import open_recording
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import simulate_blocks

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import BagWriter, Block, open_recording
 from thermo_comp.recording.clock import LONGEST_PAUSE_NS
+from thermo_comp.recording.columns import Block
+from thermo_comp.recording.reader import open_recording
+from thermo_comp.recording.writer import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 YEAR_NS = 365 * 86400 * 10**9

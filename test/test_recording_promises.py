@@ -27,7 +27,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import inspect_recording, open_recording, read_recording
+from thermo_comp.recording.reader import inspect_recording, open_recording, read_recording
 
 
 def whole(folder: Path, storage: str = 'mcap', compression: str = '') -> Path:

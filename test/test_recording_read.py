@@ -35,14 +35,10 @@ from recording_helpers import (
 )
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import (
-    BagWriter,
-    Recording,
-    Topics,
-    inspect_recording,
-    open_recording,
-    read_recording,
-)
+from thermo_comp.recording.columns import Recording
+from thermo_comp.recording.reader import inspect_recording, open_recording, read_recording
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 
 ALL_TOPICS = (ACCEL, BOARD, CASE, OTHER)
 WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}

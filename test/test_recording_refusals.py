@@ -26,7 +26,9 @@ from recording_helpers import (
 from test_recording_damage import read, whole_file
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording import BagWriter, Topics, inspect_recording, open_recording
+from thermo_comp.recording.reader import inspect_recording, open_recording
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 
 
 def short_message(data: bytes) -> bytes:

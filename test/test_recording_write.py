@@ -27,7 +27,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as Reader2
 
 from thermo_comp.errors import OutputError, RecordingError
-from thermo_comp.recording import BagWriter, ImuColumns, open_recording, read_recording
+from thermo_comp.recording.columns import ImuColumns
+from thermo_comp.recording.reader import open_recording, read_recording
+from thermo_comp.recording.writer import BagWriter
 
 STEP_NS = 2_500_000
 REQUIRED: tuple[()] = ()
@@ -340,7 +342,7 @@ def test_a_killed_writer_leaves_the_old_output_and_a_readable_rest(
     small(path, 1.0)
     script = (
         'import os, signal, sys, numpy as np\n'
-        'from thermo_comp.recording import BagWriter\n'
+        'from thermo_comp.recording.writer import BagWriter\n'
         'bag = BagWriter(sys.argv[1], overwrite=True)\n'
         'stamps = np.arange(90_000) * 2_500_000\n'
         "bag.write_counts('accel/counts', stamps, np.zeros((90_000, 3)))\n"

@@ -21,14 +21,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording import (
-    BagWriter,
-    Block,
-    ImuColumns,
-    Topics,
-    open_recording,
-    read_recording,
-)
+from thermo_comp.recording.columns import Block, ImuColumns
+from thermo_comp.recording.reader import open_recording, read_recording
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, ReplayResult, replay, switches
 from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
 

@@ -13,7 +13,8 @@ from conftest import ROOT
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.plain_yaml import PlainYamlError, load_plain_yaml
-from thermo_comp.recording import BagWriter, inspect_recording
+from thermo_comp.recording.reader import inspect_recording
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 

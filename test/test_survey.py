@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.recording import BagWriter, Topics
 from thermo_comp.recording.overview import Survey, survey_recording
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000

@@ -34,7 +34,7 @@ from thermo_comp.errors import (
 )
 from thermo_comp.fitting import FitOptions, FitSource
 from thermo_comp.fitting.fit import check_serial
-from thermo_comp.recording import BagWriter
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.text import LONGEST_SERIAL, one_line, valid_serial
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration

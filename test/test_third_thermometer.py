@@ -19,7 +19,9 @@ import pytest
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.judging.evaluation import evaluate
-from thermo_comp.recording import BagWriter, Topics, read_recording
+from thermo_comp.recording.reader import read_recording
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import replay
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.drift import PartEffect

@@ -28,7 +28,8 @@ from .typing import Bools, Floats, Ints
 from .unit.calibration import Calibration
 
 if TYPE_CHECKING:
-    from .recording import Block, Topics
+    from .recording.columns import Block
+    from .recording.topics import Topics
 
 #: A temperature: one value for each sample, or (time_s, value) of readings of their own.
 Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
@@ -162,7 +163,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
     ----------
     path : str or Path
         A rosbag2 folder, ``*.mcap``, ``*.db3`` or a ROS 1 ``*.bag``.
-    topics : recording.Topics or None, optional
+    topics : recording.topics.Topics or None, optional
         Names of the topics, where they are not the usual ones.
 
     Returns
@@ -176,7 +177,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
         If the bag cannot be read, or holds no samples.
 
     """
-    from .recording import read_recording
+    from .recording.reader import read_recording
 
     recording = read_recording(path, topics, require=['accel'])
     block = recording.columns

@@ -29,19 +29,10 @@ from .online.batch import CompensatedBlock, process_block
 from .online.compensator import Compensator
 from .online.stamped_flag import STAMPED_TOPIC, STAMPED_TYPE, stamped_flag
 from .online.status import CompensatorConfig, Counters
-from .recording import (
-    BagWriter,
-    Block,
-    ImuColumns,
-    Input,
-    Messages,
-    RecordingInfo,
-    RecordingReader,
-    Role,
-    Topics,
-    open_recording,
-)
-from .recording.writer import TABLES, WriteRows, table_writer
+from .recording.columns import Block, ImuColumns, Input, Messages, RecordingInfo, Role
+from .recording.reader import RecordingReader, open_recording
+from .recording.topics import Topics
+from .recording.writer import TABLES, BagWriter, WriteRows, table_writer
 from .typing import Ints
 from .unit.calibration import Calibration
 

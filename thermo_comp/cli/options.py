@@ -133,7 +133,7 @@ def _topics(
     ),
     end: float | None = option('Read to there.', None, '--to', metavar='S'),
 ) -> Any:
-    from ..recording import Part, Topics
+    from ..recording.topics import Part, Topics
 
     with usage_of('--from, --to: '):
         part = Part(begin, end)

@@ -58,8 +58,8 @@ def record(
       thermo_comp record held_out.mcap --positions 1 --soak 1h -o bags/unit44
     """
     from ..fitting.acquisition import Acquisition
-    from ..recording import open_recording
     from ..recording.growing import PositionBags, growing_blocks, numbered_bags
+    from ..recording.reader import open_recording
     from ..ros.process import SignalWatch
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)

@@ -24,7 +24,7 @@ from .options import option
 from .output import Cell, Output, micro_g, picked
 
 if TYPE_CHECKING:
-    from ..recording import BagWriter
+    from ..recording.writer import BagWriter
     from ..simulation.run import SimulatedRun
     from ..simulation.unit import UnitModel
     from ..unit.calibration import Calibration
@@ -83,7 +83,7 @@ def simulate(
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
     """
     from .. import __version__
-    from ..recording import BagWriter
+    from ..recording.writer import BagWriter
     from ..simulation import campaign, presets, run
 
     with options.usage_of():
@@ -148,7 +148,8 @@ def _write(
     """Write a run by blocks, from its first temperatures on, as a recorder would; count them."""
     import numpy as np
 
-    from ..recording import ImuColumns, Topics
+    from ..recording.columns import ImuColumns
+    from ..recording.topics import Topics
 
     topics = Topics()
     start_ns: int | None = None
@@ -194,7 +195,7 @@ def demo(
     from ..arrays import fit
     from ..judging.evaluation import evaluate
     from ..judging.verdicts import SECTIONS
-    from ..recording import inspect_recording
+    from ..recording.reader import inspect_recording
     from ..report.evidence import evidence_of_bags
     from ..report.page import write_report
     from ..ros.round_trip import round_trip
@@ -282,7 +283,8 @@ def _equals_offline(recorded: Path, bag: Path, calibration: 'Calibration') -> bo
     """Compare the node's recorded output with the offline run, bit for bit."""
     import numpy as np
 
-    from ..recording import Topics, read_recording
+    from ..recording.reader import read_recording
+    from ..recording.topics import Topics
     from ..replay import replay
 
     def columns(path: Path) -> tuple[Any, ...]:

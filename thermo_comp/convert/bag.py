@@ -16,8 +16,8 @@ from typing import Literal
 import numpy as np
 
 from ..errors import RecordingError
-from ..recording import Topics, inspect_recording, read_recording
-from ..recording.topics import IMU, TEMPERATURE, Present, said_choice
+from ..recording.reader import inspect_recording, read_recording
+from ..recording.topics import IMU, TEMPERATURE, Present, Topics, said_choice
 from .log import ForeignLog, Readings
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'

@@ -23,8 +23,10 @@ from ..arrays import said_anew
 from ..errors import RecordingError
 from ..files import shown_name
 from ..fitting.sources import digest
-from ..recording import STAMP_END_NS, BagWriter, ImuColumns, Topics
+from ..recording.columns import ImuColumns
 from ..recording.stillness import CellAccumulator
+from ..recording.topics import Topics
+from ..recording.writer import STAMP_END_NS, BagWriter
 from ..text import valid_serial
 from ..typing import Bools, Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..recording import Block
-from ..recording.columns import Readings
+from ..recording.columns import Block, Readings
 from ..recording.overview import ThermometerSurvey, survey_thermometer, thermal_findings
 from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints

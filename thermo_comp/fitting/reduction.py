@@ -19,7 +19,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..recording import RecordingInfo, stillness
+from ..recording import stillness
+from ..recording.columns import RecordingInfo
 from ..recording.stillness import CellAccumulator, Cells
 from ..typing import Floats, Ints
 from .coverage import best_rests

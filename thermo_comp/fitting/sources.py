@@ -15,7 +15,9 @@ from pathlib import Path
 
 from ..errors import FitError
 from ..files import shown_name
-from ..recording import Block, Input, RecordingInfo, RecordingReader, Role, Topics, open_recording
+from ..recording.columns import Block, Input, RecordingInfo, Role
+from ..recording.reader import RecordingReader, open_recording
+from ..recording.topics import Topics
 from ..typing import Floats
 
 _SAMPLES: tuple[Role, ...] = ('accel',)

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import RecordingError, ThermoCompError
-from ..recording import open_recording
+from ..recording.reader import open_recording
 from ..text import one_line
 
 # What a file system may say of a file that changes with its content, the surest first.

@@ -21,7 +21,8 @@ from .. import __version__
 from ..errors import FitError, RecordingError, ThermoCompError
 from ..fitting import FitOptions, ReducedBag, fit_bags, reduce_bag
 from ..fitting.sources import digest, recording_source
-from ..recording import Input, Topics
+from ..recording.columns import Input
+from ..recording.topics import Topics
 from ..text import one_line
 from ..unit.calibration_file import dump_calibration
 from .table import FAILED, REFUSED, Cell, fitted_cells, row_of

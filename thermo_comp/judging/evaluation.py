@@ -15,8 +15,9 @@ from ..errors import RecordingError
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import digest, recording_source
-from ..recording import Input, Role, Topics
+from ..recording.columns import Input, Role
 from ..recording.stillness import STILL_SD
+from ..recording.topics import Topics
 from ..replay import check_unit, input_for, needed_roles
 from ..unit.calibration import Calibration
 from ..unit.gravity import STANDARD_GRAVITY

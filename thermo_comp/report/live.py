@@ -22,7 +22,7 @@ from typing import Any
 from ..errors import ThermoCompError
 from ..fitting import ReducedBag
 from ..judging.evaluation import open_bags
-from ..recording import RecordingInfo
+from ..recording.columns import RecordingInfo
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence, evidence_of_bags
 from .figures import ReportFigure, drawn_figures, figures_of

@@ -28,11 +28,11 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
 from ..online.stamped_flag import STAMPED_TOPIC
-from ..recording import BagWriter, Input, Role, Topics
-from ..recording.columns import Messages, Topic
+from ..recording.columns import Input, Messages, Role, Topic
 from ..recording.growing import News
-from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, is_thermometer
+from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics, is_thermometer
 from ..recording.wire import decode_blocks
+from ..recording.writer import BagWriter
 from ..typing import Ints
 from .waitloop import RawSubscription, WaitLoop, own_node, type_name
 

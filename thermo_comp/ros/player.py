@@ -33,7 +33,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from ..errors import ThermoCompError
-from ..recording import Block, Input, RecordingInfo, RecordingReader, Role, Topics, open_recording
+from ..recording.columns import Block, Input, RecordingInfo, Role
+from ..recording.reader import RecordingReader, open_recording
+from ..recording.topics import Topics
 from .relay import INPUTS
 from .waitloop import own_node
 

@@ -25,7 +25,7 @@ from rclpy.node import Node
 
 from ..errors import ThermoCompError
 from ..online.stamped_flag import STAMPED_TOPIC
-from ..recording import ROLES
+from ..recording.columns import ROLES
 from ..unit.calibration_file import load_calibration
 from .listener import OUTPUTS, Recorder
 from .node import NODE_NAME
