@@ -83,6 +83,16 @@ def test_arrays_have_the_bits_of_the_compensator(arrays: dict[str, np.ndarray]) 
         np.testing.assert_array_equal(out.covariance[k][UNIQUE], row[3:])
 
 
+def test_no_reading_is_lost_however_many(rng: np.random.Generator) -> None:
+    # All of them once waited together, and what waits is bounded.
+    time_s = np.arange(5000) * 0.1
+    readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
+    counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (5000, 3)).round()
+    counters = rich_calibration().correct(time_s, counts, **readings).counters
+    assert (counters.n_board, counters.n_case) == (5000, 5000)
+    assert (counters.n_board_rejected, counters.n_case_rejected) == (0, 0)
+
+
 def test_readings_beside_the_samples_are_those_at_times_of_their_own(
     arrays: dict[str, np.ndarray],
 ) -> None:

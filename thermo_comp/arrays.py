@@ -261,7 +261,7 @@ def _block(
     readings: Mapping[str, Temperature],
     start_ns: int,
 ) -> Block:
-    """Check arrays of a caller's; a reading waits for its sample."""
+    """Check arrays of a caller's; a reading comes just before its sample."""
     stamps = _stamps('time_s', time_s)
     samples = _numbers('counts', counts)
     if samples.shape != (len(stamps), 3):
@@ -272,7 +272,7 @@ def _block(
     found = {}
     for name, value in readings.items():
         own, celsius = _readings(name, value, stamps, _is_date(time_s))
-        found[name] = (own + start_ns, celsius, np.zeros(len(own), dtype=np.int64))
+        found[name] = (own + start_ns, celsius, np.searchsorted(stamps, own))
     # What is read of a block here; a whole one would need the libraries for bags.
     block = SimpleNamespace(accel_stamp_ns=stamps + start_ns, accel=samples, temperatures=found)
     return cast('Block', block)
