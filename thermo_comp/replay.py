@@ -191,9 +191,8 @@ def _messages_of(
                 writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
             # Their log time becomes their stamp, as that of the outputs is.
             for role, messages in block.raw.items():
-                name, is_accel = reader.topics[role], role == 'accel'
-                own = block.accel_stamp_ns if is_accel else block.temperatures[role].stamp_ns
-                copy(name, reader.info.topics[name][0], messages, own)
+                name = reader.topics[role]
+                copy(name, reader.info.topics[name][0], messages, block.stamp_ns[role])
             if len(block):
                 copy_others(block.log_ns['accel'][-1])
             writer.flush()

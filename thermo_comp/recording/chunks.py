@@ -273,11 +273,6 @@ def inflate(
     return np.frombuffer(b''.join(pieces), np.uint8)
 
 
-def inflate_message(packed: bytes) -> bytes:
-    """Decompress one message that rosbag2 has compressed by itself."""
-    return inflate('zstd', packed, _FREE_GROWTH_BYTES).tobytes()
-
-
 def inflate_ros1_chunk(packed: bytes) -> bytes:
     """Decompress a chunk of a ROS 1 bag, which begins as its compression does."""
     compression = {b'BZh': 'bz2', b'\x04\x22\x4d': 'lz4'}.get(packed[:3], '')

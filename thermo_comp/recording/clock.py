@@ -59,9 +59,6 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
                 'no recording of a thermal test',
                 path,
             )
-        if not moved.any():
-            yield block
-            continue
         offsets = np.empty_like(moved)
         offsets[order] = moved
         parts = np.split(offsets, np.cumsum([len(one.after) for one in thermometers]))

@@ -261,6 +261,12 @@ class Block:
         """Count the messages of all roles."""
         return sum(map(len, self.log_ns.values()))
 
+    @property
+    def stamp_ns(self) -> dict[Role, Ints]:
+        """The stamps of each role."""
+        stamps = {name: one.stamp_ns for name, one in self.temperatures.items()}
+        return {'accel': self.accel_stamp_ns, **stamps}
+
     def take(self, rows: Mapping[Role, Bools]) -> Block:
         """Choose some messages of each role."""
         own = rows['accel']

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -20,8 +21,7 @@ import numpy as np
 
 from ..errors import OutputError, RecordingError
 from ..files import MCAP, check_output
-from ..typing import Ints
-from .columns import Block, Input, Messages, RecordingInfo, Role
+from .columns import Block, Input, RecordingInfo, Role
 from .reader import open_recording
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics
 from .writer import BagWriter
@@ -56,7 +56,7 @@ def growing_blocks(
     """
     if not path.exists():
         raise RecordingError('no such file or directory', path)
-    n_seen: dict[Role, int] = {}
+    n_seen: Counter[Role] = Counter()
     size = 0
     while True:
         began = time.monotonic()
@@ -70,13 +70,14 @@ def growing_blocks(
             is_whole = False
         else:
             with reader:
-                n_read: dict[Role, int] = {}
+                n_read: Counter[Role] = Counter()
                 for block in reader.blocks(raw=True):
-                    is_new = {}
-                    for role, log_ns in block.log_ns.items():
-                        numbers = n_read.get(role, 0) + np.arange(len(log_ns))
-                        is_new[role] = numbers >= n_seen.get(role, 0)
-                        n_read[role] = n_read.get(role, 0) + len(log_ns)
+                    n_new = {role: len(log_ns) for role, log_ns in block.log_ns.items()}
+                    is_new = {
+                        role: n_read[role] + np.arange(n) >= n_seen[role]
+                        for role, n in n_new.items()
+                    }
+                    n_read.update(n_new)
                     yield News(block.take(is_new), reader.info)
                 n_seen = n_read
                 is_whole = reader.info.truncated is None and bool(n_seen)
@@ -95,10 +96,6 @@ def numbered_bags(folder: Path) -> list[Path]:
     return sorted(found, key=lambda one: int(one.stem))
 
 
-#: Name and type of a topic, the stamps of its messages and these.
-_Piece = tuple[str, str, Ints, Messages]
-
-
 class PositionBags:
     """Writes the bags; the next number is taken when its first message is written."""
 
@@ -107,7 +104,7 @@ class PositionBags:
         self._number = max((int(one.stem) for one in numbered_bags(folder)), default=0)
         check_output(self._path(self._number + 1), MCAP)
         self._writer: BagWriter | None = None
-        self._held: list[_Piece] = []
+        self._held: list[Block] = []
         #: Bags that were begun.
         self.written: list[Path] = []
 
@@ -116,28 +113,31 @@ class PositionBags:
 
     def add(self, news: News) -> None:
         """Take the serialized messages."""
-        block = news.block
         if news.info is not None and self._serial is None:
             self._serial = news.info.metadata.get('serial')
-        accel = (_USUAL.counts, VECTOR3_STAMPED) if block.imu is None else (_USUAL.imu, IMU)
-        for role, one in block.raw.items():
-            if role == 'accel':
-                self._held.append((*accel, block.accel_stamp_ns, one))
-            else:
-                stamp_ns = block.temperatures[role].stamp_ns
-                self._held.append((f'temperature/{role}', TEMPERATURE, stamp_ns, one))
+        self._held.append(news.block)
 
     def release(self, stamp_ns: int) -> None:
         """Write what is older than a stamp."""
-        early: list[_Piece] = []
-        late: list[_Piece] = []
-        for topic, kind, stamps, one in self._held:
-            is_late = np.maximum.accumulate(stamps >= stamp_ns)
-            for rows, part in ((~is_late, early), (is_late, late)):
-                if rows.any():
-                    part.append((topic, kind, stamps[rows], one.take(rows).packed()))
-        self._held = late
-        if early and self._writer is None:
+        held, self._held = self._held, []
+        try:
+            for block in held:
+                is_late = {
+                    role: np.maximum.accumulate(own >= stamp_ns)
+                    for role, own in block.stamp_ns.items()
+                }
+                self._write(block.take({role: ~own for role, own in is_late.items()}))
+                if any(own.any() for own in is_late.values()):
+                    self._held.append(block.take(is_late))
+            if self._writer is not None:
+                self._writer.flush()
+        except OutputError:
+            # It is said once, and not tried again.
+            self._writer, self._held = None, []
+            raise
+
+    def _write(self, block: Block) -> None:
+        if self._writer is None and block.n_messages:
             self._number += 1
             path = self._path(self._number)
             metadata = {} if self._serial is None else {'serial': self._serial}
@@ -145,15 +145,11 @@ class PositionBags:
                 path, metadata=metadata, chunk_bytes=_CHUNK_BYTES, is_precious=True
             )
             self.written.append(path)
-        if self._writer is not None:
-            try:
-                for topic, kind, _, one in early:
-                    self._writer.write_raw(topic, kind, one.log_ns, one)
-                self._writer.flush()
-            except OutputError:
-                # It is said once, and not tried again.
-                self._writer, self._held = None, []
-                raise
+        accel = (_USUAL.counts, VECTOR3_STAMPED) if block.imu is None else (_USUAL.imu, IMU)
+        for role, one in block.raw.items():
+            topic, kind = accel if role == 'accel' else (f'temperature/{role}', TEMPERATURE)
+            if self._writer is not None and len(one):
+                self._writer.write_raw(topic, kind, one.log_ns, one)
 
     def cut(self, stamp_ns: int) -> None:
         """End the bag before a stamp."""

@@ -24,7 +24,7 @@ from typing import Any
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
-from .chunks import expand, inflate_message, inflate_ros1_chunk, translated
+from .chunks import MAX_CHUNK_BYTES, expand, inflate, inflate_ros1_chunk, translated
 from .clock import without_jumps
 from .columns import (
     ROLES,
@@ -48,10 +48,10 @@ from .wire import decode_blocks
 
 _N_LOADERS = 2
 _MAX_BYTES = 1 << 24
+_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 #: What is decoded at once of a foreign file.
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
-_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 
 
 class RecordingReader(ExitStack):
@@ -137,8 +137,14 @@ class RecordingReader(ExitStack):
         return self._cut(self._blocks(raw, n_messages))
 
     def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
+        roles = {topic: role for role, topic in self.topics.items()}
+
+        def decoded(topics: Mapping[int, Topic], messages: Messages) -> list[Block]:
+            feeds = {number: (roles[topic.name], topic) for number, topic in topics.items()}
+            return decode_blocks(messages, feeds, self.topics, keep_raw=raw)
+
         n_read = dict.fromkeys(self.topics, 0)
-        for block in gathered(self._decoded(raw), n_messages):
+        for block in gathered(self._read(roles, {'cdr', 'ros1'}, decoded), n_messages):
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
             if block.n_messages:
@@ -148,16 +154,6 @@ class RecordingReader(ExitStack):
             if loss and loss not in (self.info.truncated or ''):
                 told = '; '.join(filter(None, (self.info.truncated, loss)))
                 self.info = replace(self.info, truncated=told)
-
-    def _decoded(self, raw: bool) -> Iterator[Block]:
-        """Decode the topic of each role, in reading order."""
-        roles = {topic: role for role, topic in self.topics.items()}
-
-        def decoded(topics: Mapping[int, Topic], messages: Messages) -> list[Block]:
-            feeds = {number: (roles[topic.name], topic) for number, topic in topics.items()}
-            return decode_blocks(messages, feeds, self.topics, keep_raw=raw)
-
-        return self._read(roles, {'cdr', 'ros1'}, decoded)
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
         """Read topics, by the bag's own names, as they are, about in order of log time."""
@@ -199,10 +195,10 @@ class RecordingReader(ExitStack):
             if len(block):
                 last_ns = int(block.accel_stamp_ns[-1])
                 first_ns = int(block.accel_stamp_ns[0]) if first_ns is None else first_ns
-            stamps = {name: one.stamp_ns for name, one in block.temperatures.items()}
-            stamps['accel'] = block.accel_stamp_ns
             begin, end = self._part.limits_ns(first_ns)
-            left = block.take({k: (own >= begin) & (own < end) for k, own in stamps.items()})
+            left = block.take(
+                {role: (own >= begin) & (own < end) for role, own in block.stamp_ns.items()}
+            )
             if len(left) and not n_kept:
                 self.since_s = (int(left.accel_stamp_ns[0]) - (first_ns or 0)) * 1e-9
             n_kept += len(left)
@@ -371,7 +367,9 @@ class ForeignFile(BagFile):
         batch: list[tuple[bytes, int, int]] = []
         n_bytes = 0
         for one, log_ns, packed in self._reader.messages(connections=chosen):
-            data = inflate_message(packed) if self._is_packed else packed
+            data = packed
+            if self._is_packed:
+                data = inflate('zstd', packed, MAX_CHUNK_BYTES).tobytes()
             batch.append((data, known[one.topic, one.msgtype], log_ns))
             n_bytes += len(data)
             is_long = n_bytes >= _BATCH_BYTES or log_ns - batch[0][2] > _BATCH_NS

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,14 +38,6 @@ _IMU_ACCELERATION = slice(25, 28)
 HEAD_BYTES = 16
 _MAX_PADDING = 7
 _NS = 1_000_000_000
-
-
-class Stamped(NamedTuple):
-    """Decoded messages of one topic, shape (n,) and `numbers` (n, k)."""
-
-    stamp_ns: Ints
-    numbers: Floats
-    frame: NDArray[Any]
 
 
 def decode_blocks(
@@ -107,11 +99,15 @@ def decode_blocks(
     ]
 
 
-def decode_stamped(messages: Messages, kind: str) -> Stamped:
-    """Decode messages that are a header and float64 numbers; `kind` is a key of `N_NUMBERS`."""
+def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
+    """
+    Decode messages that are a header and float64 numbers; `kind` is a key of `N_NUMBERS`.
+
+    Gives stamps, numbers, shape (n, k), and frames.
+    """
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
     if not n:
-        return Stamped(size, np.empty((0, n_numbers)), np.empty(0, 'S1'))
+        return size, np.empty((0, n_numbers)), np.empty(0, 'S1')
     if int(np.min(size)) < HEAD_BYTES + 8 * n_numbers:
         raise _misfit(kind)
     width = int(size[0]) if (size == size[0]).all() else HEAD_BYTES
@@ -119,12 +115,11 @@ def decode_stamped(messages: Messages, kind: str) -> Stamped:
     # Usually they are alike: of one length, in one byte order, with one length of the frame.
     for key in (size, number_at(rows, 0, 'u2'), number_at(rows, 12, 'u4')):
         if (key != key[0]).any():
-            found = Stamped(np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object))
+            found = np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object)
             order = np.argsort(key, kind='stable')
             for own in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
-                for column, part in zip(
-                    found, decode_stamped(messages.take(own), kind), strict=True
-                ):
+                parts = decode_stamped(messages.take(own), kind)
+                for column, part in zip(found, parts, strict=True):
                     column[own] = part
             return found
     representation = int(number_at(rows, 0, '>u2')[0])
@@ -147,7 +142,7 @@ def decode_stamped(messages: Messages, kind: str) -> Stamped:
         (n, n_numbers), f'{endian}f8', rows.data, offset=at, strides=(length, 8)
     )
     frame = number_at(rows, HEAD_BYTES, f'S{frame_size}') if frame_size else np.zeros(n, 'S1')
-    return Stamped(stamp_ns, values.astype(np.float64, 'C'), frame)
+    return stamp_ns, values.astype(np.float64, 'C'), frame
 
 
 def encode_stamped(
