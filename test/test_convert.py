@@ -15,7 +15,7 @@ from conftest import Cli
 
 from thermo_comp.convert.columns import ColumnMap, load_column_map, table_log
 from thermo_comp.convert.log import Readings, thin, write_log
-from thermo_comp.errors import RecordingError
+from thermo_comp.errors import RecordingError, ThermoCompError
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.replay import replay
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
@@ -345,16 +345,16 @@ class TestColumnMap:
 
     def test_files_that_are_no_maps(self, tmp_path: Path) -> None:
         path = tmp_path / 'map.yaml'
-        with pytest.raises(RecordingError, match='No such file'):
+        with pytest.raises(ThermoCompError, match=r'map\.yaml: .*No such file'):
             load_column_map(path)
         path.write_text('- a\n- b\n')
-        with pytest.raises(RecordingError, match='a column map is a mapping'):
+        with pytest.raises(ThermoCompError, match='a column map is a mapping'):
             load_column_map(path)
         path.write_text('a: [1\n')
-        with pytest.raises(RecordingError, match='not valid YAML'):
+        with pytest.raises(ThermoCompError, match=r'map\.yaml: not valid YAML'):
             load_column_map(path)
         path.write_bytes(b'\xff\xfe\x00a')
-        with pytest.raises(RecordingError, match='UTF-8'):
+        with pytest.raises(ThermoCompError, match='UTF-8'):
             load_column_map(path)
 
 

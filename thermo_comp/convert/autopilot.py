@@ -52,7 +52,6 @@ _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}
 _TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_combined', *_BAROMETERS)
-_INFORMATION = {'px4_hardware': 'ver_hw', 'px4_software': 'ver_sw_release', 'px4_uuid': 'sys_uuid'}
 #: `accelerometer_timestamp_relative` of a message without an accelerometer.
 _NOT_THERE = 2**31 - 1
 _HEADER_BYTES = 3
@@ -107,8 +106,7 @@ def _ulog(path: Path) -> _Held:
         for topic, name in _BAROMETERS.items()
         for number, columns in by_topic[topic].items()
     }
-    info = log.msg_info_dict
-    metadata = {key: str(info[name]) for key, name in _INFORMATION.items() if name in info}
+    metadata = {}
     if log.dropouts:
         lost_ms = sum(int(dropout.duration) for dropout in log.dropouts)
         metadata['px4_dropouts'] = f'{len(log.dropouts)}, {lost_ms} ms in all'

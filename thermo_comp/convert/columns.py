@@ -18,8 +18,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..errors import RecordingError
-from ..files import read_bounded
-from ..plain_yaml import load_plain_yaml
+from ..plain_yaml import read_plain_yaml
 from ..recording.topics import is_thermometer
 from ..typing import Floats
 from ..unit.schema import Bounds, Positive, SchemaError, build
@@ -35,8 +34,6 @@ _STEPS_S = (5e-5, 0.5)
 #: No gyroscope is turned by hand faster than this [rad/s].
 _FASTEST_RAD_S = 20.0
 _GIVE_MAP = 'give a column map: --columns MAP'
-#: A map takes some kB.
-_SIZE_LIMIT = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -125,19 +122,14 @@ class ColumnMap:
 
 
 def load_column_map(path: str | Path) -> ColumnMap:
-    """Read a column map; RecordingError, with the key, if it cannot be read or is none."""
+    """Read a column map; RecordingError, with the key, if it is none."""
+    data = read_plain_yaml(path)
     try:
-        data = load_plain_yaml(read_bounded(path, _SIZE_LIMIT).decode())
         if not isinstance(data, dict):
             raise SchemaError('', 'a column map is a mapping of keys (see config/columns)')
         return build(ColumnMap, data)
     except SchemaError as failure:
         raise RecordingError(failure.message, path, failure.key or None) from failure
-    except UnicodeDecodeError as failure:
-        raise RecordingError('a column map is YAML text in UTF-8', path=path) from failure
-    except (OSError, ValueError) as failure:
-        reason = getattr(failure, 'strerror', None) or str(failure)
-        raise RecordingError(reason, path=path) from failure
 
 
 def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:

@@ -10,7 +10,7 @@ notes of an export, with the error that its loss leaves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -18,16 +18,8 @@ from numpy.polynomial import polynomial
 from ..errors import CalibrationError
 from ..text import one_line
 from ..typing import Floats
-from ..unit.calibration import (
-    FORMAT_VERSION,
-    Axes,
-    AxisReference,
-    AxisSet,
-    Calibration,
-    Provenance,
-    RegimeSet,
-    Unit,
-)
+from ..unit import calibration as unit
+from ..unit.calibration import Calibration
 from ..unit.functions import Polynomial
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
 from ..unit.gyroscope import MILLIDEGREE, Gyroscope, RateCurve, RateSet
@@ -42,14 +34,6 @@ _RATE_NOISE = 1e-4
 _NEAR_ONE = 2.0
 
 
-@dataclass(frozen=True)
-class ForeignFile:
-    """A file for another tool, and what it cannot hold, one line each with what that costs."""
-
-    text: str
-    notes: tuple[str, ...]
-
-
 def export_calibration(
     calibration: Calibration,
     to: str,
@@ -57,9 +41,10 @@ def export_calibration(
     number: int | None = None,
     device_id: int = 0,
     up: tuple[float, float, float] | None = None,
-) -> ForeignFile:
+) -> Content:
     """
-    Write a calibration's static set as the file of one of `TOOLS`.
+    Write a calibration's static set as the file of one of `TOOLS`: its `text`, and in the `notes`
+    what it cannot hold.
 
     `number`: which set or IMU, where the file numbers them; `device_id`: by which PX4 matches it.
     At the attitude `up`, a unit vector, the drift of the scale is folded into the offset.
@@ -71,7 +56,7 @@ def export_calibration(
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
     # Whatever a note holds, it ends with its line; imu_tk's reader knows no comments.
     head = [] if to == 'imu_tk' else [f'# {one_line(said)}\n' for said in (title, *content.notes)]
-    return ForeignFile(''.join(head) + text, tuple(content.notes))
+    return replace(content, text=''.join(head) + text)
 
 
 def _content(
@@ -203,8 +188,8 @@ def import_calibration(
         # Of words with an offset, such as 32768, on either side of it.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
     one = Polynomial((1.0,))
-    sets = [AxisSet(curve, one) for curve in _curves(content.bias)]
-    regime = RegimeSet(content.range_c, (-60.0, 60.0), *sets)
+    sets = [unit.AxisSet(curve, one) for curve in _curves(content.bias)]
+    regime = unit.RegimeSet(content.range_c, (-60.0, 60.0), *sets)
     gyroscope = None
     if content.rate_bias is not None:
         rates = RateSet(*map(RateCurve, _curves(content.rate_bias)))
@@ -212,16 +197,18 @@ def import_calibration(
         gyroscope = Gyroscope((x, y, z), rates, rates, (_RATE_NOISE,) * 3)
     levels = zip(K.tolist(), content.bias[:, 0].tolist(), strict=True)
     return Calibration(
-        format_version=FORMAT_VERSION,
-        unit=Unit(serial, 'm/s^2' if is_si else 'counts', full_scale, cycle_time_s),
+        format_version=unit.FORMAT_VERSION,
+        unit=unit.Unit(serial, 'm/s^2' if is_si else 'counts', full_scale, cycle_time_s),
         reference_temperature_c=content.reference_c,
         gravity_m_s2=gravity,
-        axes=Axes(*(AxisReference(scale, bias) for scale, bias in levels)),
+        axes=unit.Axes(*(unit.AxisReference(scale, bias) for scale, bias in levels)),
         static=regime,
         dynamic=regime,
         noise_density_m_s2_sqrt_hz=(noise_density,) * 3,
         misalignment=((1.0, 0.0, 0.0), (yx, 1.0, 0.0), (zx, zy, 1.0)),
-        provenance=Provenance(model=content.source, notes=(*content.notes, *turned(rotation))),
+        provenance=unit.Provenance(
+            model=content.source, notes=(*content.notes, *turned(rotation))
+        ),
         gyroscope=gyroscope,
     )
 

@@ -64,6 +64,7 @@ class Content:
     # White [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second, on the way out.
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate_bias: Floats | None = None  # as `bias`, of the angular rate [rad/s]
+    text: str = ''  # the file, once it is written
 
 
 def _write_px4(content: Content, number: int | None, device_id: int) -> str:
