@@ -79,8 +79,10 @@ def claimed(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
 
-OWN_LAGS = unit_preset('own-lags', 1)
-PAPER = unit_preset('paper', 1)
+# A reading every four seconds: within them a ramp of 1.5 K/min moves the board by 0.1 K.
+OWN_LAGS, PAPER, PLAIN = (
+    unit_preset(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
+)
 
 
 @pytest.fixture(scope='module')
@@ -198,8 +200,7 @@ def test_the_compensator_does_what_the_fit_promised(response: FitResult) -> None
 
 
 def test_six_faces_leave_misalignment_at_its_prior() -> None:
-    plain = unit_preset('plain', 1)
-    result = fitted(plain, FACES, 2, groups=('curve', 'set'))
+    result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'))
     _, _, M = constants(result.calibration)
     _, scale_sd, M_sd = claimed(result.calibration)
     # Not told by six faces: 0 within 1 mrad.
@@ -209,12 +210,11 @@ def test_six_faces_leave_misalignment_at_its_prior() -> None:
     assert (finding.level, '6 distinct positions' in finding.message) == ('advice', True)
     # Bias and scale are told, but for what M of a mrad does to the faces: half its square.
     assert scale_sd.max() < 2e-5
-    assert np.abs(pulls(result, plain)).max() < 4.0
+    assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
 
 def test_one_position_tells_the_bias_along_gravity_over_temperature() -> None:
-    plain = unit_preset('plain', 1)
-    result = fitted(plain, np.array([[0.0, 0.0, 1.0]]), 3)
+    result = fitted(PLAIN, np.array([[0.0, 0.0, 1.0]]), 3)
     _, scale_sd, M_sd = claimed(result.calibration)
     # One equation for two unknowns per axis: the scale stays at its prior, 5 %.
     assert scale_sd.max() == pytest.approx(0.05, rel=0.3)
@@ -226,16 +226,15 @@ def test_one_position_tells_the_bias_along_gravity_over_temperature() -> None:
 
 
 def test_no_temperature_gives_nine_parameters() -> None:
-    plain = unit_preset('plain', 1)
-    records = records_of(replace(plain, drift=()), positions(12, 1), 4)
+    records = records_of(replace(PLAIN, drift=()), positions(12, 1), 4)
     result = fit(sources_of(records, False), FitOptions(gravity=STANDARD_GRAVITY))
     assert result.calibration.response == ()
     assert any(one.name == 'temperature' for one in result.findings)
-    assert np.abs(pulls(result, replace(plain, drift=()))).max() < 4.0
+    assert np.abs(pulls(result, replace(PLAIN, drift=()))).max() < 4.0
 
 
 def test_bags_with_and_without_temperature_contradict_themselves() -> None:
-    records = records_of(unit_preset('plain', 1), FACES, 5)
+    records = records_of(PLAIN, FACES, 5)
     sources = sources_of(records[:3]) + sources_of(records[3:], False)
     with pytest.raises(FitError, match='bag3: no board temperature, which the other bags have'):
         fit(sources, FitOptions(gravity=STANDARD_GRAVITY))

@@ -57,10 +57,11 @@ def weight(record: SimulatedRun, closes: Closes) -> Floats:
     ],
 )
 def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str, Any]) -> None:
-    unit = unit_preset('plain', 1)
+    # A reading every four seconds: the case changes by 0.1 K meanwhile.
+    unit = unit_preset('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
     plan = [Position(f'bag{k}', PROGRAM, up) for k, up in enumerate(FACES)]
-    for record in arrays(unit, plan, 11, rate_hz=4.0):
+    for record in arrays(unit, plan, 11, rate_hz=2.0):
         step = np.outer(weight(record, closes), STEP * unit.scale_factor)
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))

@@ -65,8 +65,8 @@ def rms(values):
 
 @pytest.fixture(scope='module')
 def unit():
-    # Its parts take minutes; a reading every other second is enough, and half the work.
-    return unit_preset('mems', 2).with_thermometers(rate_hz=0.5)
+    # Its parts take minutes; a reading every four seconds is enough, and a quarter of the work.
+    return unit_preset('mems', 2).with_thermometers(rate_hz=0.25)
 
 
 @pytest.fixture(scope='module')

@@ -24,17 +24,19 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = unit_preset('products', 1)
+#: The groups that this kind has: the bank is a third of the whole, and a fit takes half as long.
+OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
 def source(record: SimulatedRun) -> FitSource:
     block = ArrayBlock(
         record.accel_stamp_ns + 10**18,
         record.counts.astype(np.float64),
-        # Every fourth reading of a second: a ramp of 1 K/min is as well seen, four times sooner.
-        record.board_stamp_ns[::4] + 10**18,
-        record.board[::4],
-        record.case_stamp_ns[::4] + 10**18,
-        record.case[::4],
+        # Every eighth reading of a second: a ramp of 1 K/min is as well seen, eight times sooner.
+        record.board_stamp_ns[::8] + 10**18,
+        record.board[::8],
+        record.case_stamp_ns[::8] + 10**18,
+        record.case[::8],
     )
     return FitSource(record.name, lambda: [block])
 
@@ -53,7 +55,7 @@ test_of.__test__ = False
 @cache
 def fitted(number: int) -> FitResult:
     """Fit a sibling on nine of its twelve positions, which tell all that there is to tell."""
-    options = FitOptions(STANDARD_GRAVITY, serial=f'unit-{number}')
+    options = replace(OPTIONS, serial=f'unit-{number}')
     return fit([source(record) for record in test_of(number, 0, 9)], options)
 
 
@@ -98,7 +100,7 @@ def test_siblings_make_one_position_worth_more():
     # WHY: a unit with one position in the chamber shows nothing of its scale over temperature.
     # WHAT: with its siblings' prior it is better than alone, on positions it has not seen.
     few = [source(record) for record in test_of(9, 0, 1)]
-    options = FitOptions(STANDARD_GRAVITY, serial='unit-9')
+    options = replace(OPTIONS, serial='unit-9')
     alone = fit(few, options).calibration
     helped = fit(few, replace(options, prior=population(siblings()))).calibration
     truth = KIND.sibling(9, 0.15)
@@ -118,9 +120,7 @@ def fitted_curve(number: int):
 def test_new_rests_make_an_old_calibration_better():
     old = fitted(9).calibration
     later = [source(record) for record in test_of(9, 9, 12)]
-    options = FitOptions(
-        STANDARD_GRAVITY, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5
-    )
+    options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
     # Three positions measure three combinations of the six levels that have aged by 10 ug (bias)
     # and 20 ug (scale): on average half of the variance that the ageing brought must be gone.
@@ -149,7 +149,7 @@ def test_prior_without_claim_is_refused():
     prior = replace(fitted(1).calibration, posterior=None)
     few = [source(record) for record in test_of(9, 0, 6)]
     with pytest.raises(FitError, match='no covariance'):
-        fit(few, FitOptions(STANDARD_GRAVITY, serial='unit-9', prior=prior))
+        fit(few, replace(OPTIONS, serial='unit-9', prior=prior))
 
 
 def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
