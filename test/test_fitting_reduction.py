@@ -12,7 +12,7 @@ import pytest
 from builders import ArrayBlock
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import FitSource, normal_gravity, resolve_gravity
+from thermo_comp.fitting import FitOptions, FitSource, normal_gravity
 from thermo_comp.fitting.reduction import Readings, ReducedBag, reduce_source
 from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
 from thermo_comp.recording.stillness import CellAccumulator, still_intervals
@@ -222,13 +222,10 @@ def test_impossible_places_are_refused(latitude: float, height: float) -> None:
         normal_gravity(latitude, height)
 
 
-def test_gravity_is_never_guessed() -> None:
-    assert resolve_gravity(9.81, None, None) == 9.81
-    assert resolve_gravity(None, 50.0, 100.0) == normal_gravity(50.0, 100.0)
-    with pytest.raises(FitError, match='local gravity is needed'):
-        resolve_gravity(None, 50.0, None)
+@pytest.mark.parametrize('gravity', [98.1, -1.0, np.nan])
+def test_gravity_is_that_of_the_earth(gravity: float) -> None:
     with pytest.raises(FitError, match='not found on Earth'):
-        resolve_gravity(98.1, None, None)
+        FitOptions(gravity=gravity)
 
 
 def course(quantum: float, noise: float, rng: np.random.Generator) -> Readings:

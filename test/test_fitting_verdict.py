@@ -180,7 +180,6 @@ def test_scale_factors_far_from_one_are_said() -> None:
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
-        ({'gravity': -1.0}, '`gravity` must be positive, got -1.0'),
         ({'full_scale': -5.0}, '`full_scale` must be positive, got -5.0'),
         ({'min_rest_s': 0.0}, '`min_rest_s` must be positive, got 0.0'),
         ({'input': 'g'}, '`input` must be of counts, m/s'),

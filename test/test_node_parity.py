@@ -17,7 +17,7 @@ from builders import rich_calibration
 from rosbags.highlevel import AnyReader
 
 from thermo_comp.errors import ThermoCompError
-from thermo_comp.online.stamped_flag import STAMPED_TOPIC
+from thermo_comp.online.status import STAMPED_TOPIC
 from thermo_comp.recording.columns import Block, ImuColumns
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics

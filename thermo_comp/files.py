@@ -208,12 +208,10 @@ def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterato
         raise
 
 
-def write_atomically(
-    path: str | Path, content: bytes, kind: Kind, *, overwrite: bool = True
-) -> None:
+def write_atomically(path: str | Path, data: bytes, kind: Kind, *, overwrite: bool = True) -> None:
     """Write a file so that its readers see the old content or the new one, never a part."""
     with drafted(path, kind, overwrite=overwrite) as partial:
-        partial.write_bytes(content)
+        partial.write_bytes(data)
 
 
 def _sync(path: Path) -> None:

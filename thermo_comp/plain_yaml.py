@@ -44,12 +44,10 @@ class PlainYamlError(ValueError):
         super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 
-def load_plain_yaml(
-    text: str | bytes, depth_limit: int = DEPTH_LIMIT, node_limit: int = NODE_LIMIT
-) -> Any:
+def load_plain_yaml(text: str | bytes, node_limit: int = NODE_LIMIT) -> Any:
     """Read one YAML document of plain values, null of an empty text, or raise PlainYamlError."""
     try:
-        return _load(text, depth_limit, node_limit)
+        return _load(text, node_limit)
     except yaml.YAMLError as error:
         mark = getattr(error, 'problem_mark', None)
         problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
@@ -76,7 +74,7 @@ def is_plain_text(text: str) -> bool:
     return not (text in _WORDS or _INTEGER.fullmatch(text) or _FLOAT.fullmatch(text))
 
 
-def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
+def _load(text: str | bytes, node_limit: int) -> Any:
     def bounded() -> Iterator[Any]:
         for n, event in enumerate(yaml.parse(text, Loader=_LOADER)):
             if n > node_limit:
@@ -91,8 +89,8 @@ def _load(text: str | bytes, depth_limit: int, node_limit: int) -> Any:
             raise PlainYamlError('YAML tags are not accepted', line)
         if isinstance(event, yaml.ScalarEvent):
             return _scalar(event.value, line) if event.implicit[0] else event.value
-        if depth == depth_limit:
-            raise PlainYamlError(f'nested deeper than {depth_limit}', line)
+        if depth == DEPTH_LIMIT:
+            raise PlainYamlError(f'nested deeper than {DEPTH_LIMIT}', line)
         inner = takewhile(lambda one: not isinstance(one, yaml.CollectionEndEvent), events)
         if isinstance(event, yaml.SequenceStartEvent):
             return [value(one, depth + 1) for one in inner]

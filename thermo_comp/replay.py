@@ -27,8 +27,7 @@ from .errors import CalibrationError, OutputError
 from .files import shown_name
 from .online.batch import CompensatedBlock, process_block
 from .online.compensator import Compensator
-from .online.stamped_flag import STAMPED_TOPIC, STAMPED_TYPE, stamped_flag
-from .online.status import CompensatorConfig, Counters
+from .online.status import STAMPED_TOPIC, STAMPED_TYPE, CompensatorConfig, Counters, stamped_flag
 from .recording.columns import Block, ImuColumns, Input, Messages, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
 from .recording.topics import Topics
@@ -171,9 +170,7 @@ def _messages_of(
                 copy(topic.name, topic.type, messages, messages.log_ns)
                 one = next(following, None)
 
-        def write(
-            block: Block, corrected: CompensatedBlock, flags: list[tuple[int, bool]]
-        ) -> None:
+        def write(block: Block, corrected: CompensatedBlock, new: list[tuple[int, bool]]) -> None:
             if len(corrected.stamp_ns):
                 writer.write_imu(
                     OUTPUT_TOPIC,
@@ -183,11 +180,11 @@ def _messages_of(
                     frame_id or block.frame_id,
                     imu=_imu_of(block, corrected),
                 )
-            if flags:
-                stamps, values = zip(*flags, strict=True)
+            if new:
+                stamps, values = zip(*new, strict=True)
                 times = np.array(stamps, dtype=np.int64)
                 writer.write_bool(REGIME_TOPIC, times, np.array(values))
-                stamped = [stamped_flag(*flag, serial) for flag in flags]
+                stamped = [stamped_flag(*flag, serial) for flag in new]
                 writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
             # Their log time becomes their stamp, as that of the outputs is.
             for role, messages in block.raw.items():

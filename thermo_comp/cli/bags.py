@@ -241,9 +241,7 @@ def play(
     from ..ros.player import play as run
 
     with out.progress('playing') as done:
-        report = run(
-            bag, rate=rate, wait_s=wait, **reading, ros_args=context.obj or (), progress=done
-        )
+        report = run(bag, rate=rate, wait_s=wait, **reading, ros_args=context.obj, progress=done)
     for name in report.unheard:
         out.note(f'nobody listened to {name}')
     for name in report.lossy:

@@ -243,9 +243,7 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name for name in map(str.strip, text.split(',')) if name)
 
 
-def _say(
-    out: Output, result: 'FitResult', output: Path, report: Path | None, verbose: bool
-) -> None:
+def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verbose: bool) -> None:
     from ..unit.gravity import spoken
 
     calibration = result.calibration
@@ -306,8 +304,8 @@ def _say(
     if left_out.n:
         headline += f', {spoken(left_out.rms)} RMS of |f| - g on each by the others alone'
     out.line(f'{output}: unit {calibration.unit.serial}, {model}, {headline}')
-    if report is not None:
-        out.line(f'{report}: certificate')
+    if page is not None:
+        out.line(f'{page}: certificate')
     out.end(
         output=output,
         serial=calibration.unit.serial,

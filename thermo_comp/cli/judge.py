@@ -49,9 +49,7 @@ def evaluate(
     if csv is not None:
         check_output(csv, CSV, overwrite=force, others=[*bags, *calibration])
     is_named = len({path.stem for path in calibration}) == len(calibration)
-    models = [
-        (path.stem if is_named else str(path), load_calibration(path)) for path in calibration
-    ]
+    models = [(one.stem if is_named else str(one), load_calibration(one)) for one in calibration]
     with out.progress('evaluating') as done:
         result = run(bags, models, **judging, **reading, progress=done)
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)

@@ -209,17 +209,11 @@ def fitting(
     ),
     allow: list[str] | None = option('Refusal to override, as its message names it.'),
 ) -> dict[str, Any]:
-    """Give keywords of FitOptions; FitError where gravity is none that is found on Earth."""
+    """Give keywords of FitOptions."""
     given = locals()
-    from ..fitting import resolve_gravity
-
     if gravity is None:
         raise usage('give --gravity, or --latitude and --height')
-    return given | {
-        'gravity': resolve_gravity(gravity, None, None),
-        'still_sd': acceleration(still_sd, '--still-sd'),
-        'allow': tuple(allow or ()),
-    }
+    return given | {'still_sd': acceleration(still_sd, '--still-sd'), 'allow': tuple(allow or ())}
 
 
 def acceleration(text: str | None, name: str) -> float | None:

@@ -69,12 +69,10 @@ class Output:
         for one in found:
             self.line(f'- {one}')
 
-    def table(
-        self, columns: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
-    ) -> None:
+    def table(self, head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = '') -> None:
         """Print a table of aligned columns, numbers flush right; None is a dash."""
         if not (self.as_json or self.quiet):
-            for line in aligned(columns, rows, title):
+            for line in aligned(head, rows, title):
                 _print(line, sys.stdout)
 
     @contextmanager
@@ -165,15 +163,13 @@ def millidegrees(value: float) -> str | None:
     return f'{1e3 * math.degrees(value):.3g}' if math.isfinite(value) else None
 
 
-def aligned(
-    columns: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
-) -> Iterator[str]:
+def aligned(head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = '') -> Iterator[str]:
     """Yield the lines of a table, two blanks between columns."""
     cells = [[text(cell) for cell in row] for row in rows]
     if title:
         yield title
-    right = [all(_NUMBER.fullmatch(row[i]) for row in cells) for i in range(len(columns))]
-    lines = [list(columns), *cells]
+    right = [all(_NUMBER.fullmatch(row[i]) for row in cells) for i in range(len(head))]
+    lines = [list(head), *cells]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for row in lines:
         yield '  '.join(

@@ -90,7 +90,7 @@ def record(
             options.require_ros()
             from ..ros.listener import LiveTopics
 
-            live = stack.enter_context(LiveTopics(**reading, ros_args=context.obj or ()))
+            live = stack.enter_context(LiveTopics(**reading, ros_args=context.obj))
             news, problems = live.blocks(over.wait), lambda: live.problems
             out.line('listening; Ctrl-C ends it with whole bags')
             sys.stdout.flush()  # whoever reads this through a pipe waits for it

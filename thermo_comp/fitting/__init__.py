@@ -6,7 +6,7 @@ Owns the fit: bags of a thermal test -> still positions -> regression -> calibra
 
 from .evidence import ResidualRow
 from .fit import FitResult, fit, fit_bags, reduce_bag
-from .options import FitOptions, normal_gravity, resolve_gravity
+from .options import FitOptions, normal_gravity
 from .reduction import ReducedBag
 from .sources import FitSource
 
@@ -20,5 +20,4 @@ __all__ = [
     'fit_bags',
     'normal_gravity',
     'reduce_bag',
-    'resolve_gravity',
 ]

@@ -68,7 +68,7 @@ class FitOptions:
     """
     Options of a fit; ValueError if one is outside its range.
 
-    gravity: local gravity; see `resolve_gravity`
+    gravity: local gravity; FitError if it is none of the Earth's
     model: the whole bank, thinned by evidence; or the paper: a linear static and a quadratic
         dynamic set, without a response
     static_curve, dynamic_curve: one of `CURVES`; None takes the model's own
@@ -107,7 +107,12 @@ class FitOptions:
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ('gravity', 'min_rest_s', 'still_sd', 'full_scale'):
+        low, high = PLAUSIBLE_GRAVITY
+        if not low <= self.gravity <= high:
+            raise FitError(
+                f'local gravity {self.gravity:g} m/s^2 is not found on Earth ({low}..{high} m/s^2)'
+            )
+        for name in ('min_rest_s', 'still_sd', 'full_scale'):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {value}')
@@ -177,22 +182,3 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     relative = height_m / _SEMI_MAJOR_AXIS
     slope = 2.0 * (1.0 + _FLATTENING + _M_RATIO - 2.0 * _FLATTENING * sine2)
     return at_ellipsoid * (1.0 - slope * relative + 3.0 * relative**2)
-
-
-def resolve_gravity(
-    gravity: float | None, latitude_deg: float | None, height_m: float | None
-) -> float:
-    """Take local gravity from what the user gave; FitError if that is none of the Earth's."""
-    if gravity is None:
-        if latitude_deg is None or height_m is None:
-            raise FitError(
-                'local gravity is needed (a wrong value shifts all scale factors and leaves no '
-                'trace): give `--gravity` in m/s^2, or `--latitude` and `--height`'
-            )
-        gravity = normal_gravity(latitude_deg, height_m)
-    low, high = PLAUSIBLE_GRAVITY
-    if not low <= gravity <= high:
-        raise FitError(
-            f'local gravity {gravity:g} m/s^2 is not found on Earth ({low}..{high} m/s^2)'
-        )
-    return gravity

@@ -130,6 +130,5 @@ class GravityCheck:
         """The residual so far; None before the first still window."""
         if not self._n_windows:
             return None
-        return GravityResidual(
-            self._residual, math.sqrt(self._variance), self._n_windows, self._is_still
-        )
+        sd = math.sqrt(self._variance)
+        return GravityResidual(self._residual, sd, self._n_windows, self._is_still)

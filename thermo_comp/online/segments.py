@@ -75,8 +75,6 @@ class ThermalSide:
 
     def _use(self, calibration: Calibration, config: CompensatorConfig) -> None:
         self.config = config
-        #: Age of the board temperature beyond which nothing is published.
-        self._timeout_ns = int(config.temperature_timeout_s * 1e9)
         self.calibration = calibration
         self._needs_temperature = calibration.needs_temperature
         self.correction = Correction(calibration)
@@ -124,7 +122,6 @@ class ThermalSide:
     def reconfigure(self, config: CompensatorConfig, now_ns: int | None) -> None:
         """Take over other settings."""
         self.config = config
-        self._timeout_ns = int(config.temperature_timeout_s * 1e9)
         self._forget_segment()
         self.tracker.reconfigure(*self._tracker_config(), now_ns)
 
@@ -197,7 +194,8 @@ class ThermalSide:
         if not self._needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
-        return EVER_NS if board_ns is None else board_ns + self._timeout_ns
+        timeout_ns = int(self.config.temperature_timeout_s * 1e9)
+        return EVER_NS if board_ns is None else board_ns + timeout_ns
 
     def count_unmeasured(self, n_samples: int) -> None:
         """Count samples that came without a board temperature, or too long after it."""

@@ -1,13 +1,19 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what surrounds the compensator's arithmetic: its settings, its counters."""
+"""Owns what surrounds the compensator's arithmetic: settings, counters, the flag in bytes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from operator import attrgetter
+from struct import pack
 
 from ..thermal.settings import ThermalConfig, refuse_outside
+
+STAMPED_TOPIC = 'regime/stamped'
+STAMPED_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
+
+_ENCAPSULATION = b'\0\1\0\0'
 
 
 @dataclass(frozen=True)
@@ -90,3 +96,17 @@ class GravityResidual:
     def sigmas(self) -> float:
         """Size of the residual in its own standard deviations."""
         return abs(self.residual) / self.residual_sd
+
+
+def stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
+    """Serialize a DiagnosticArray of one status, stamped as the reading which decided."""
+    status = b''
+    for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
+        # The level is one byte, and a length stands at a multiple of four.
+        status += bytes(-(1 + len(status)) % 4) + pack('<I', len(text.encode()) + 1)
+        status += text.encode() + b'\0'
+    status += bytes(-(1 + len(status)) % 4) + pack('<I', 0)  # no key and value
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    # An empty frame_id with its NUL, padding, one status, its level.
+    head = pack('<iII4xIb', sec, nanosec, 1, 1, 0)
+    return _ENCAPSULATION + head + status

@@ -69,8 +69,9 @@ Finding = tuple[int, str]
 class Reporter:
     """Publishes the diagnostics of a node; logs when their level changes."""
 
-    def __init__(self, node: Node, loop: WaitLoop, relay: Relay, compensator: Compensator) -> None:
-        self._node, self._loop, self._relay, self._compensator = node, loop, relay, compensator
+    def __init__(self, loop: WaitLoop, relay: Relay, compensator: Compensator) -> None:
+        self._loop, self._node = loop, loop.node
+        self._relay, self._compensator = relay, compensator
         self._publisher = loop.publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         self._level = DiagnosticStatus.STALE
         self._n_publishers = 0

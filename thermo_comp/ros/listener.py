@@ -27,7 +27,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
-from ..online.stamped_flag import STAMPED_TOPIC
+from ..online.status import STAMPED_TOPIC
 from ..recording.columns import Input, Messages, Role, Topic
 from ..recording.growing import News
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics, is_thermometer
@@ -37,20 +37,15 @@ from ..typing import Ints
 from .waitloop import RawSubscription, WaitLoop, own_node, type_name
 
 #: The node's outputs.
-OUTPUTS: Mapping[str, Any] = {
-    'imu/data_raw': Imu,
-    'regime/dynamic': Bool,
-    STAMPED_TOPIC: DiagnosticArray,
-}
+OUTPUTS = {'imu/data_raw': Imu, 'regime/dynamic': Bool, STAMPED_TOPIC: DiagnosticArray}
 #: Time between two looks at what is published, and between two blocks [s].
 LOOK_S, BLOCK_S = 0.5, 1.0
 #: Time between two looks at what is waited for [s].
 WAIT_S = 0.02
 
-_RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-_AS_OFFERED = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.BEST_AVAILABLE
-)
+_ALL = HistoryPolicy.KEEP_ALL
+_RELIABLE = QoSProfile(history=_ALL, reliability=ReliabilityPolicy.RELIABLE)
+_AS_OFFERED = QoSProfile(history=_ALL, reliability=ReliabilityPolicy.BEST_AVAILABLE)
 _CLASSES = {type_name(kind): kind for kind in (Vector3Stamped, Imu, Temperature)}
 _STAMP = Struct('<iI')
 

@@ -78,12 +78,10 @@ class CompensationNode:
         self._compensator = Compensator(self._loaded.calibration, config.compensator_config())
         self._check(self._loaded, config)
         self._loop = WaitLoop(self.node, REST_S)
-        self._relay = Relay(self.node, self._loop, self._compensator, config)
-        self._reporter = Reporter(self.node, self._loop, self._relay, self._compensator)
+        self._relay = Relay(self._loop, self._compensator, config)
+        self._reporter = Reporter(self._loop, self._relay, self._compensator)
         self._reader = Reader()
-        self._requests = parameters.ParameterRequests(
-            self.node, self._loop, self._prepare, self._set
-        )
+        self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
         self._report_every(config.diagnostics_period)
         topics = [self.node.resolve_topic_name(topic) for _, topic in INPUTS.values()]
         # The input that is not open may be opened later, with these.
@@ -117,11 +115,9 @@ class CompensationNode:
             return None
         return self._reader.read(names[-1], self._config.calibration_directory)
 
-    def _set(
-        self, changes: list[Parameter], loaded: LoadedCalibration | None
-    ) -> SetParametersResult:
+    def _set(self, changes: list[Parameter], new: LoadedCalibration | None) -> SetParametersResult:
         """Check a change as a whole, set and apply it, between two samples."""
-        loaded = loaded or self._loaded
+        loaded = new or self._loaded
         before, samples, result = self._config, self._relay.samples, SetParametersResult()
         config = parameters.updated(before, changes)
         self._check(loaded, config)
@@ -136,9 +132,9 @@ class CompensationNode:
         if not result.successful:
             return result
         self._config = config
-        if loaded is not self._loaded:
-            self._loaded = loaded
-            self._compensator.swap(loaded.calibration)
+        if new:
+            self._loaded = new
+            self._compensator.swap(new.calibration)
             self._say_calibration()
         if config.compensator_config() != before.compensator_config():
             self._compensator.reconfigure(config.compensator_config())
@@ -166,10 +162,8 @@ class CompensationNode:
             raise CalibrationError(message, loaded.path, key)
 
     def _say_calibration(self) -> None:
-        loaded = self._loaded
-        self._log.info(
-            f'unit {loaded.calibration.unit.serial}: {loaded.path} ({loaded.sha256[:12]})'
-        )
+        loaded, serial = self._loaded, self._loaded.calibration.unit.serial
+        self._log.info(f'unit {serial}: {loaded.path} ({loaded.sha256[:12]})')
 
 
 def main(args: list[str] | None = None) -> int:

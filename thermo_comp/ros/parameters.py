@@ -224,15 +224,14 @@ class ParameterRequests:
     # of it, between two of them. Exceptions are refusals.
     def __init__(
         self,
-        node: Node,
         loop: WaitLoop,
         prepare: Callable[[list[Parameter]], Any],
         apply: Callable[[list[Parameter], Any], SetParametersResult],
     ) -> None:
-        self._node, self._loop, self._prepare, self._apply = node, loop, prepare, apply
+        self._loop, self._prepare, self._apply = loop, prepare, apply
         self._n_waiting = 0
         self._beside = ThreadPoolExecutor(1, 'parameters')
-        for service in node.services:
+        for service in loop.node.services:
             if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
                 loop.handlers[service] = partial(self._take, service.srv_type)
             elif service.srv_type.__module__.startswith('rcl_interfaces.'):
@@ -295,7 +294,7 @@ class ParameterRequests:
 
     def _is_in_force(self, change: Parameter) -> bool:
         """Tell whether it leaves a fixed parameter as it is, as `param load` of a dump does."""
-        node = self._node
+        node = self._loop.node
         return bool(
             node.has_parameter(change.name)
             and node.describe_parameter(change.name).read_only

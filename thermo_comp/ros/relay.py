@@ -29,14 +29,13 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
 from ..online.compensator import Compensator
-from ..online.stamped_flag import STAMPED_TOPIC, stamped_flag
+from ..online.status import STAMPED_TOPIC, stamped_flag
 from .parameters import NodeConfig
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
@@ -89,10 +88,8 @@ class Traffic:
 class SampleConverter:
     """Turns samples into Imu, both serialized; an empty `frame_id` keeps the input's."""
 
-    def __init__(
-        self, message_type: Any, frame_id: str = '', traffic: Traffic | None = None
-    ) -> None:
-        self._message_type, self._frame_id = message_type, frame_id
+    def __init__(self, kind: Any, frame_id: str = '', traffic: Traffic | None = None) -> None:
+        self._kind, self._frame_id = kind, frame_id
         self.traffic = traffic or Traffic()
         # Of the last kind of message: its frame, what unpacks it, where what it passes on begins;
         # of the Imu: its frame and what packs it.
@@ -138,10 +135,10 @@ class SampleConverter:
 
     def _learn(self, data: bytes) -> bytes:
         """Note where a message of a new kind has its values; return its plain form, or nothing."""
-        is_imu = self._message_type is Imu
+        is_imu = self._kind is Imu
         skip, rest = (_PASSED, 72) if is_imu else (0, 0)
         size = skip + 24 + rest
-        given, (data, start) = data, _plain(data, size, self._message_type)
+        given, (data, start) = data, _plain(data, size, self._kind)
         if not start:
             return b''
         self.traffic.n_fallback += data is not given
@@ -159,10 +156,8 @@ class SampleConverter:
 class Relay:
     """What stands between the inputs of a node and its outputs."""
 
-    def __init__(
-        self, node: Node, loop: WaitLoop, compensator: Compensator, config: NodeConfig
-    ) -> None:
-        self._node, self._loop, self._compensator = node, loop, compensator
+    def __init__(self, loop: WaitLoop, compensator: Compensator, config: NodeConfig) -> None:
+        self._loop, self._compensator = loop, compensator
         self.traffic = Traffic()
         self.samples = self.open_samples(config)
         self.configure(config, self.samples)
@@ -177,7 +172,6 @@ class Relay:
         self._stamped = loop.publisher(DiagnosticArray, STAMPED_TOPIC, FLAG_QOS)
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
-        self._contested: set[RawSubscription] = set()
 
     @property
     def inputs(self) -> dict[str, RawSubscription]:
@@ -210,15 +204,12 @@ class Relay:
 
     def _is_of_one(self, subscription: RawSubscription, n: int) -> bool:
         """Tell whether messages are of an input's only publisher; count them if not."""
-        was_contested = subscription in self._contested
-        if subscription.count_publishers() > 1:
-            self._contested.add(subscription)
-        elif was_contested:
-            self._contested.remove(subscription)
-        else:
-            return True
-        self.traffic.n_contested += n
-        return False
+        was_contested = subscription.is_contested
+        subscription.is_contested = subscription.count_publishers() > 1
+        if was_contested or subscription.is_contested:
+            self.traffic.n_contested += n
+            return False
+        return True
 
     def advance_without_samples(self, silence_ns: int) -> None:
         """Let readings take effect without samples, so that the flag stays alive."""
@@ -285,7 +276,7 @@ class Relay:
 
     def _count_unpublished(self) -> None:
         """Go on after a message that the middleware did not take, but not after the shutdown."""
-        if not self._node.context.ok():
+        if not self._loop.node.context.ok():
             raise ExternalShutdownException
         self.traffic.n_unpublished += 1
 

@@ -24,7 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from ..errors import ThermoCompError
-from ..online.stamped_flag import STAMPED_TOPIC
+from ..online.status import STAMPED_TOPIC
 from ..recording.columns import ROLES
 from ..unit.calibration_file import load_calibration
 from .listener import OUTPUTS, Recorder

@@ -62,6 +62,8 @@ class RawSubscription:
     def __init__(self, subscription: Subscription, is_hot: bool) -> None:
         self.subscription = subscription
         self.is_hot = is_hot
+        #: Whether it had more than one publisher when that was asked last.
+        self.is_contested = False
         self._take = partial(subscription.handle.take_message, subscription.msg_type, True)
         #: How many publishers the middleware has found; cheap, to be asked while the loop runs.
         self.count_publishers: Callable[[], int] = subscription.handle.get_publisher_count
@@ -99,7 +101,7 @@ class WaitLoop:
     # Messages of a best-effort subscription gather until `rest_s` after each wake-up [s], where
     # they come often enough for it: four within three such times, so that none rests alone.
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
-        self._node = node
+        self.node = node
         self._rest_ns = int(rest_s * 1e9)
         self._guard = GuardCondition(None, None, context=node.context)
         self._raw: list[RawSubscription] = []
@@ -119,7 +121,7 @@ class WaitLoop:
     ) -> RawSubscription:
         """Subscribe in serialized form; the first hot one wakes the loop, others wait a little."""
         # Its callback is never called: that is for an executor to do.
-        create = partial(self._node.create_subscription, callback=lambda _: None, raw=True)
+        create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)
         subscription = _opened(create, message_type, topic, qos)
         self._raw.append(RawSubscription(subscription, is_hot))
         self._is_stale = True
@@ -127,13 +129,13 @@ class WaitLoop:
 
     def publisher(self, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
         """Open a publisher."""
-        return _opened(self._node.create_publisher, message_type, topic, qos)
+        return _opened(self.node.create_publisher, message_type, topic, qos)
 
     def unsubscribe(self, raw: RawSubscription) -> None:
         """Destroy a subscription of this loop."""
         self._raw.remove(raw)
         self._is_stale = True
-        self._node.destroy_subscription(raw.subscription)
+        self.node.destroy_subscription(raw.subscription)
 
     def call_soon(self, callback: Callable[[], None]) -> None:
         """Call back in the loop's thread, one callback a wake-up; callable from any thread."""
@@ -159,7 +161,7 @@ class WaitLoop:
             while not self._is_stopping:
                 self._guarded(partial(self._serve, on_data), (RCLError, ExternalShutdownException))
         except (RCLError, ExternalShutdownException):
-            if self._node.context.ok():
+            if self.node.context.ok():
                 raise
 
     def close(self) -> None:
@@ -168,7 +170,7 @@ class WaitLoop:
 
     def _serve(self, on_data: Callable[[], None]) -> None:
         """Wait and serve until the entities change or the loop is to stop."""
-        node, self._is_stale = self._node, False
+        node, self._is_stale = self.node, False
         raw = [one.subscription for one in self._raw]
         others = {one: partial(_take_message, one) for one in node.subscriptions if one not in raw}
         others |= {one: partial(self._take_request, one) for one in node.services}
@@ -241,7 +243,7 @@ class WaitLoop:
         except fatal:
             raise
         except Exception as error:
-            if not self._node.context.ok():
+            if not self.node.context.ok():
                 raise ExternalShutdownException from error
             self.n_failures += 1
             now = time.monotonic_ns()
@@ -249,7 +251,7 @@ class WaitLoop:
                 self._logged_ns = now
                 lines = ''.join(traceback.format_exception(error)).splitlines()
                 text = '\n'.join(['a callback failed, samples go on:', *map(one_line, lines)])
-                self._node.get_logger().error(text)
+                self.node.get_logger().error(text)
             return None
 
 
@@ -275,12 +277,10 @@ class _WaitSet:
 
 def _opened(create: Callable[..., Any], message_type: Any, topic: str, qos: QoSProfile) -> Any:
     """Open a topic with the overrides of its QoS; ThermoCompError where name or QoS are wrong."""
-    overridable = QoSOverridingOptions.with_default_policies()
+    overrides = QoSOverridingOptions.with_default_policies()
     try:
         # rclpy writes the overrides into the profile.
-        return create(
-            message_type, topic, qos_profile=copy(qos), qos_overriding_options=overridable
-        )
+        return create(message_type, topic, qos_profile=copy(qos), qos_overriding_options=overrides)
     except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
         raise ThermoCompError(f'a topic cannot be opened: {error}') from error
 
