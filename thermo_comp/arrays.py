@@ -233,7 +233,7 @@ def fit(
     RecordingError
         If a bag cannot be read.
     FitError
-        If the data cannot carry a fit.
+        If the data cannot carry a fit, or gravity is none of the Earth's.
 
     """
     from .fitting import FitOptions, FitSource
