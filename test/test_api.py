@@ -240,7 +240,7 @@ def test_arrays_that_cannot_be_fitted_are_refused() -> None:
     columns = tc.Columns(np.arange(5.0), np.zeros((4, 3)), {})
     with pytest.raises(ValueError, match=r'must have the shape \(5, 3\), .* got \(4, 3\)'):
         tc.fit(columns, gravity=9.8)
-    with pytest.raises(tc.ThermoCompError, match='gravity 0 m/s.2 is not found on Earth'):
+    with pytest.raises(tc.ThermoCompError, match=r'gravity 0 m/s\^2 is not found on Earth'):
         tc.fit([], gravity=0.0)
     with pytest.raises(tc.ThermoCompError, match='no bag was given'):
         tc.fit([], gravity=9.8)
