@@ -13,9 +13,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from struct import Struct
 from typing import Any
 
@@ -57,7 +56,7 @@ class _Listener:
         self._name, self._ros_args = name, ros_args
         self._heard: dict[str, RawSubscription] = {}
         #: What came: whence, messages, when each was received [ns].
-        self._waiting: SimpleQueue[tuple[str, list[bytes], list[int]]] = SimpleQueue()
+        self._came: list[tuple[str, list[bytes], list[int]]] = []
 
     def __enter__(self) -> Any:
         """Open the subscriptions and start the thread."""
@@ -88,11 +87,11 @@ class _Listener:
         for name, subscription in self._heard.items():
             messages, received_ns = subscription.drain()
             if messages:
-                self._waiting.put((name, messages, received_ns))
+                self._came.append((name, messages, received_ns))
 
 
 class Recorder(_Listener):
-    """Records topics into a bag that any rosbag2 tool opens, whenever its caller looks."""
+    """Records topics into a bag that any rosbag2 tool opens; it is written at the end."""
 
     def __init__(
         self,
@@ -104,20 +103,22 @@ class Recorder(_Listener):
     ) -> None:
         super().__init__('thermo_comp_recorder', ros_args)
         self._writer, self._topics = BagWriter(path, overwrite=overwrite), topics
-        self._counts = dict.fromkeys(topics, 0)
-        self._newest: dict[str, bytes] = {}
-        self._newest_ns: int | None = None
-        # What is not written yet: topic, messages, their log times if they have stamps.
-        self._held: list[tuple[str, list[bytes], Ints | None]] = []
 
     def __exit__(self, *raised: object) -> None:
-        """Stop; finish the bag, or drop it after an error."""
+        """Stop; write the bag, or drop it after an error."""
         super().__exit__()
         if raised[0] is not None:
             self._writer.abort()
             return
-        with self._writer:
-            _ = self.counts
+        with self._writer as writer:
+            times = [_stamps(data) for name, data, _ in self._came if self._topics[name] is Imu]
+            newest_ns = times[0][:1] if times else np.zeros(1, np.int64)
+            following = iter(times)
+            for name, messages, _ in self._came:
+                is_stamped = self._topics[name] is Imu
+                log_ns = next(following) if is_stamped else newest_ns.repeat(len(messages))
+                newest_ns = log_ns[-1:]
+                writer.write_raw(name, type_name(self._topics[name]), log_ns, messages)
 
     def _open(self) -> None:
         for name, kind in self._topics.items():
@@ -125,10 +126,11 @@ class Recorder(_Listener):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages recorded so far, with what waits, by the relative topic name."""
-        for _ in range(self._waiting.qsize()):
-            self._record(*self._waiting.get())
-        return self._counts
+        """Messages that have come so far, by the relative topic name."""
+        counts = dict.fromkeys(self._topics, 0)
+        for name, messages, _ in self._came:
+            counts[name] += len(messages)
+        return counts
 
     @property
     def has_publishers(self) -> bool:
@@ -136,37 +138,25 @@ class Recorder(_Listener):
         return all(one.count_publishers() for one in self._heard.values())
 
     def newest(self, name: str) -> Any:
-        """Return the newest message of a topic, be it recorded or not; None before any."""
-        data = self._newest.get(name)
+        """Return the newest message of a topic; None before any."""
+        came = (messages[-1] for own, messages, _ in reversed(self._came) if own == name)
+        data = next(came, None)
         return None if data is None else deserialize_message(data, self._topics[name])
 
-    def wait_until(self, is_done: Callable[[Mapping[str, int]], bool], timeout_s: float) -> bool:
-        """Record until it is as wanted, by the counts; False after the time-out [s]."""
+    def wait_until(self, is_done: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait until it is as wanted; False after the time-out [s]."""
         deadline = time.monotonic() + timeout_s
-        while not is_done(self.counts):
-            left_s = deadline - time.monotonic()
-            if left_s <= 0.0:
+        while not is_done():
+            if time.monotonic() > deadline:
                 return False
-            with suppress(Empty):
-                self._record(*self._waiting.get(timeout=min(left_s, WAIT_S)))
+            time.sleep(WAIT_S)
         return True
 
-    def _record(self, name: str, messages: list[bytes], _received_ns: list[int]) -> None:
-        """Write messages; those without a stamp once there is one."""
-        self._newest[name] = messages[-1]
-        log_ns: Ints | None = None
-        if self._topics[name] is Imu:
-            stamps = np.array([_STAMP.unpack_from(data, 4) for data in messages])
-            log_ns = stamps[:, 0] * 10**9 + stamps[:, 1]
-            self._newest_ns = int(log_ns[-1])
-        self._held.append((name, messages, log_ns))
-        if self._newest_ns is None:
-            return
-        for one, waiting, times in self._held:
-            log_ns = np.full(len(waiting), self._newest_ns) if times is None else times
-            self._writer.write_raw(one, type_name(self._topics[one]), log_ns, waiting)
-            self._counts[one] += len(waiting)
-        self._held.clear()
+
+def _stamps(messages: list[bytes]) -> Ints:
+    stamps = np.array([_STAMP.unpack_from(data, 4) for data in messages])
+    log_ns: Ints = stamps[:, 0] * 10**9 + stamps[:, 1]
+    return log_ns
 
 
 class LiveTopics(_Listener):
@@ -195,7 +185,9 @@ class LiveTopics(_Listener):
             is_over = wait(BLOCK_S)
             if is_over:
                 self._stack.close()
-            waiting = [self._waiting.get() for _ in range(self._waiting.qsize())]
+            waiting = self._came[:]
+            # The thread may have put more behind them.
+            del self._came[: len(waiting)]
             if waiting:
                 feeds = dict(enumerate(self._feeds.items()))
                 numbers = {role: number for number, (role, _) in feeds.items()}

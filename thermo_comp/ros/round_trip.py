@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -129,7 +129,7 @@ def round_trip(
             newest = recorder.newest('diagnostics')
             return {one.key: one.value for one in newest.status[0].values} if newest else {}
 
-        def is_connected(_: object) -> bool:
+        def is_connected() -> bool:
             # The node learns of the recorder's subscriptions in the order in which they were made:
             # once it is heard on the last one it sends on all of them.
             return not node.is_alive or (recorder.has_publishers and bool(account()))
@@ -140,19 +140,19 @@ def round_trip(
         def throttle(n_sent: int) -> None:
             """Wait for the node, which tells how far it is ten times a second."""
             recorder.wait_until(
-                lambda _: n_sent - int(account()['samples in']) <= IN_FLIGHT, ANSWER_S
+                lambda: n_sent - int(account()['samples in']) <= IN_FLIGHT, ANSWER_S
             )
 
         with opened_player(bag, rate, ros_args=ros_args) as player:
             awaited = ['accel', *thermometers]
             recorder.wait_until(
-                lambda _: not player.unheard(awaited) and _answers(player.node), PATIENCE_S
+                lambda: not player.unheard(awaited) and _answers(player.node), PATIENCE_S
             )
             played = player.run(progress, throttle)
 
-        def is_complete(counts: Mapping[str, int]) -> bool:
+        def is_complete() -> bool:
             """Tell whether the node has taken all, and the recorder all that it published."""
-            said = account()
+            said, counts = account(), recorder.counts
             expected = [said[key] for key in ('samples in', 'samples out', 'flags', 'flags')]
             found = [max(played.n_messages.values()), *(counts[topic] for topic in OUTPUTS)]
             return not node.is_alive or expected == [str(count) for count in found]
