@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.clock import LONGEST_PAUSE_NS
-from thermo_comp.recording.columns import Block
+from thermo_comp.recording.columns import LONGEST_PAUSE_NS, Block
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.writer import BagWriter
 

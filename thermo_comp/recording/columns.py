@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a stretch of a bag becomes: messages by the thousand, then a block of columns; and the
-words that describe a bag.
+Owns what a stretch of a bag becomes: messages by the thousand, then a block of columns, on one
+clock; and the words that describe a bag.
 
 A column is a numpy array with one row per message. All times are integer nanoseconds: the
 ``stamp`` is the message's own header stamp, the ``log`` is when the recorder got it.
@@ -11,13 +11,14 @@ A column is a numpy array with one row per message. All times are integer nanose
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RecordingError
 from ..typing import Bools, Bytes, Floats, Ints
 
 Input = Literal['auto', 'counts', 'imu']
@@ -29,6 +30,12 @@ ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 #: A block is given out once it has so many messages, where nobody wants another number; a chunk
 #: of usual size has more.
 BLOCK_MESSAGES = 1 << 13
+
+#: What a longer jump of the stamps becomes [ns].
+LONGEST_PAUSE_NS = 3600 * 10**9
+#: More jumps are no clock; and so many days need a message every so many seconds.
+_MOST_JUMPS = 100
+_SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 Done = TypeVar('Done')
 #: What is done with messages while their bytes are at hand.
@@ -187,17 +194,6 @@ class RecordingInfo:
         return sum(count for _, count in self.topics.values())
 
 
-def count_topics(channels: Iterable[Topic]) -> dict[str, tuple[str, int]]:
-    """Make `RecordingInfo.topics` of what each channel carries."""
-    found: dict[str, list[Topic]] = {}
-    for one in channels:
-        found.setdefault(one.name, []).append(one)
-    return {
-        name: (' | '.join(dict.fromkeys(o.type for o in own)), sum(o.n_messages for o in own))
-        for name, own in found.items()
-    }
-
-
 class ImuColumns(NamedTuple):
     """
     What a sensor_msgs/Imu carries beside its stamp and its linear acceleration.
@@ -339,3 +335,54 @@ def joined(blocks: Sequence[Block]) -> Block:
         {role: np.concatenate([b.log_ns[role] for b in blocks]) for role in blocks[0].log_ns},
         {role: join_messages(own) for role, own in raws.items()},
     )
+
+
+def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
+    """
+    Move stamps behind a jump, all by the same; RecordingError for stamps that are no clock.
+
+    A clock that is set while it runs leaves a hole of years, and whatever walks a grid of time
+    would walk it. After an hour without a reading nothing is known of a unit's thermal state, so
+    a longer jump, either way, becomes an hour.
+    """
+    last_ns: int | None = None
+    offset = 0
+    n_jumps = n_messages = span_ns = 0
+    for block in blocks:
+        thermometers = block.temperatures.values()
+        # Reading order; a reading stands before the sample that it counts for.
+        places = [*(one.after for one in thermometers), np.arange(len(block))]
+        stamps = np.concatenate([*(one.stamp_ns for one in thermometers), block.accel_stamp_ns])
+        if not len(stamps):
+            yield block
+            continue
+        order = np.argsort(np.concatenate(places), kind='stable')
+        read: Ints = stamps[order]
+        steps = np.diff(read, prepend=read[0] if last_ns is None else last_ns)
+        is_jump = np.abs(steps) > LONGEST_PAUSE_NS
+        moved = offset + np.cumsum(np.where(is_jump, LONGEST_PAUSE_NS - steps, 0))
+        last_ns, offset = int(read[-1]), int(moved[-1])
+        n_jumps += int(np.count_nonzero(is_jump))
+        n_messages += len(read)
+        span_ns += int(np.sum(np.where(is_jump, LONGEST_PAUSE_NS, np.maximum(steps, 0))))
+        if n_jumps > _MOST_JUMPS:
+            raise RecordingError(
+                f'its stamps jump by more than an hour more than {_MOST_JUMPS} times', path
+            )
+        if span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
+            raise RecordingError(
+                f'{n_messages} messages stamped over {span_ns * 1e-9 / 86400:.0f} days: '
+                'no recording of a thermal test',
+                path,
+            )
+        offsets = np.empty_like(moved)
+        offsets[order] = moved
+        parts = np.split(offsets, np.cumsum([len(one.after) for one in thermometers]))
+        yield replace(
+            block,
+            accel_stamp_ns=block.accel_stamp_ns + parts[-1],
+            temperatures={
+                name: one._replace(stamp_ns=one.stamp_ns + by)
+                for (name, one), by in zip(block.temperatures.items(), parts, strict=False)
+            },
+        )

@@ -25,7 +25,6 @@ from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
 from .chunks import MAX_CHUNK_BYTES, expand, inflate, inflate_ros1_chunk, translated
-from .clock import without_jumps
 from .columns import (
     ROLES,
     BagFile,
@@ -38,9 +37,9 @@ from .columns import (
     Role,
     Topic,
     Work,
-    count_topics,
     gathered,
     joined,
+    without_jumps,
 )
 from .mcap_file import McapFile
 from .topics import Topics, select_topics, shown
@@ -119,9 +118,15 @@ class RecordingReader(ExitStack):
                 notes.append(front + one.truncated)
         # Ended before the files that its threads read.
         self.callback(pool.shutdown, wait=True, cancel_futures=True)
-        topics = count_topics(topic for one in self._files for topic in one.topics.values())
-        for topic, n_promised in found.counts.items():
-            notes.append(_loss(topic, topics.get(topic, ('', 0))[1], n_promised))
+        channels: dict[str, list[Topic]] = {}
+        for topic in (topic for one in self._files for topic in one.topics.values()):
+            channels.setdefault(topic.name, []).append(topic)
+        topics = {
+            name: (' | '.join(dict.fromkeys(o.type for o in own)), sum(o.n_messages for o in own))
+            for name, own in channels.items()
+        }
+        for wanted, n_promised in found.counts.items():
+            notes.append(_loss(wanted, topics.get(wanted, ('', 0))[1], n_promised))
         return RecordingInfo(
             path,
             self._files[0].storage,
