@@ -134,9 +134,10 @@ class TestGrowing:
         for news in growing_blocks(growing, Topics(), 'auto', wait):
             n_looks += news is None
             if news is not None:
-                assert news.info is not None
-                assert news.info.metadata['serial'] == 'lab-7'
-                for role, messages in news.block.raw.items():
+                block, info = news
+                assert info is not None
+                assert info.metadata['serial'] == 'lab-7'
+                for role, messages in block.raw.items():
                     found.setdefault(role, []).extend(messages)
         assert n_looks == 10
         sent = contents([session])

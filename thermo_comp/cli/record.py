@@ -97,11 +97,12 @@ def record(
         show = stack.enter_context(out.live())
         for new in news:
             if new is not None:
-                if new.info is not None and new.info.chosen != chosen:
-                    chosen = new.info.chosen
-                    out.told([(new.info.path, chosen, None)])
-                bags.add(new)
-                for begin_ns in test.add(new.block):
+                block, info = new
+                if info is not None and info.chosen != chosen:
+                    chosen = info.chosen
+                    out.told([(info.path, chosen, None)])
+                bags.add(block, info)
+                for begin_ns in test.add(block):
                     bags.cut(begin_ns)
                 bags.release(test.settled_ns)
                 continue

@@ -15,7 +15,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -36,11 +35,8 @@ _NEVER_NS = 2**63 - 1
 _SHARE = 0.2
 
 
-class News(NamedTuple):
-    """What has come: a block with its serialized messages, and from which bag."""
-
-    block: Block
-    info: RecordingInfo | None = None
+#: What has come: a block with its serialized messages, and from which bag.
+News = tuple[Block, RecordingInfo | None]
 
 
 def growing_blocks(
@@ -78,7 +74,7 @@ def growing_blocks(
                         for role, n in n_new.items()
                     }
                     n_read.update(n_new)
-                    yield News(block.take(is_new), reader.info)
+                    yield block.take(is_new), reader.info
                 n_seen = n_read
                 is_whole = reader.info.truncated is None and bool(n_seen)
         yield None
@@ -111,11 +107,11 @@ class PositionBags:
     def _path(self, number: int) -> Path:
         return self._folder / f'{number:02d}.mcap'
 
-    def add(self, news: News) -> None:
-        """Take the serialized messages."""
-        if news.info is not None and self._serial is None:
-            self._serial = news.info.metadata.get('serial')
-        self._held.append(news.block)
+    def add(self, block: Block, info: RecordingInfo | None) -> None:
+        """Take the serialized messages, and from where they come."""
+        if info is not None and self._serial is None:
+            self._serial = info.metadata.get('serial')
+        self._held.append(block)
 
     def release(self, stamp_ns: int) -> None:
         """Write what is older than a stamp."""

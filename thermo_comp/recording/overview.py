@@ -101,7 +101,6 @@ def survey_recording(
         cells = CellAccumulator(_CELL_S, None)
         # A thermal test has few readings beside its samples.
         readings: dict[str, list[Readings]] = {}
-        first_ns = last_ns = 0
         n = n_gaps = n_backwards = first_ns = last_ns = 0
         longest_gap = step_ns = 0.0
         for block in reader.blocks():

@@ -196,7 +196,8 @@ class LiveTopics(_Listener):
                     [numbers[role] for role, messages, _ in waiting for _ in messages],
                     [one for _, _, received_ns in waiting for one in received_ns],
                 ).in_order()
-                yield from map(News, decode_blocks(messages, feeds, numbers, keep_raw=True))
+                for block in decode_blocks(messages, feeds, numbers, keep_raw=True):
+                    yield block, None
             yield None
 
     def _look(self) -> None:
