@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -83,3 +84,67 @@ def test_a_bag_at_the_rails_says_so(rng):
     rest.accel[:] = -40000.0
     with pytest.raises(FitError, match='100 % of its samples are at the full scale, see --full'):
         fit([rest.source()], replace(COUNTS, allow=('saturation',)))
+
+
+def without_a_clock(rest: Rest) -> None:
+    rest.board_time = rest.board_time + 18000.0
+
+
+def two_minutes_are_lost(rest: Rest) -> None:
+    rest.board_time = rest.board_time + 120.0
+
+
+def in_thousandths(rest: Rest) -> None:
+    rest.warm, rest.fall = 35000.0, 20000.0
+
+
+def in_kelvin(rest: Rest) -> None:
+    rest.warm += 273.15
+
+
+def dead(rest: Rest) -> None:
+    rest.accel = rest.level + 0.1 * (rest.accel - rest.level)
+    rest.accel[:, 1] = 0.0
+
+
+def frozen(rest: Rest) -> None:
+    rest.accel[:] = rest.level
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'said'),
+    [
+        (without_a_clock, r'^bag0: no temperature of the board .* share a clock\?$'),
+        (in_thousandths, r'^bag0: 1200 readings of board are beyond 1000 degC$'),
+        (dead, 'an axis is exactly zero at rest'),
+    ],
+)
+def test_what_gives_no_numbers_is_a_sentence(rng, spoil, said):
+    # WHY: each of these once ended in a traceback, or its readings fell silently.
+    with pytest.raises(FitError, match=said):
+        fit(spoilt(rng, spoil), FORCE)
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'name', 'said'),
+    [
+        (
+            two_minutes_are_lost,
+            'unmeasured',
+            '^2[0-9] % of the time at rest lies before the first',
+        ),
+        (in_kelvin, 'reference', 'far from the reference of 20: .* are these no degC'),
+        (frozen, 'stuck', '^no sample at rest differs from the one before'),
+    ],
+)
+def test_what_is_likely_a_mistake_is_said(rng, spoil, name, said):
+    findings = {one.name: one.message for one in fit(spoilt(rng, spoil), FORCE).findings}
+    assert re.search(said, findings[name])
+
+
+def spoilt(rng, spoil):
+    """Spoil seven positions alike."""
+    rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
+    for rest in rests:
+        spoil(rest)
+    return [rest.source(name=f'bag{number}') for number, rest in enumerate(rests)]

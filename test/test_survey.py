@@ -73,6 +73,13 @@ def test_span(tmp_path: Path, low: float, high: float, message: str) -> None:
     assert any(message in f for f in survey(tmp_path / 'bag', up_and_down(low, high)).findings)
 
 
+def test_thousandths_of_a_degree_are_no_degrees(tmp_path: Path) -> None:
+    findings = survey(tmp_path / 'bag', up_and_down(5000.0, 35000.0)).findings
+    assert [f for f in findings if 'no degC' in f] == [
+        f'{name} reads 5000 .. 3.5e+04: that is no degC' for name in ('board', 'case')
+    ]
+
+
 def test_one_direction_only(tmp_path: Path) -> None:
     heating = np.interp(np.arange(3600.0), [0, 600, 3000, 3600], [5.0, 5.0, 35.0, 35.0])
     findings = survey(tmp_path / 'bag', heating).findings

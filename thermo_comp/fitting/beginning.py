@@ -73,8 +73,8 @@ def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibra
     means = position_means(windows.data)
     gravity = options.gravity
     norms = np.linalg.norm(means, axis=1)
-    if not norms.all():
-        raise FitError('the samples at rest are exactly zero: is it the right topic?')
+    if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
+        raise FitError('an axis is exactly zero at rest: is it dead, is it the right topic?')
     if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
         return constant_calibration(means, gravity, with_misalignment=False)
     scale = float(np.median(norms)) / gravity

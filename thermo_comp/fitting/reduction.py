@@ -12,6 +12,7 @@ because a charge-balancing converter makes means better than the scatter of its 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +20,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ..errors import FitError
 from ..recording import stillness
 from ..recording.columns import RecordingInfo
 from ..recording.stillness import CellAccumulator, Cells
+from ..thermal.thermometer import COLDEST, HOTTEST
 from ..typing import Floats, Ints
 from .coverage import best_rests
 from .sources import FitSource, angular_velocity
@@ -36,8 +39,6 @@ _LEAST_FILLED = 0.9
 # What is tried, the strictest first: lengths of the shortest rest [s], ratios of variances.
 _MIN_RESTS_S = (3.0, 2.0, 1.0)
 _RATIOS = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
-# Nothing that is read outside these is a temperature of a part [degC].
-_COLDEST, _HOTTEST = -273.15, 1e4
 
 
 class Readings(NamedTuple):
@@ -138,6 +139,7 @@ def reduce_source(
     cells = CellAccumulator(min(cell_s, window_s), full_scale, window_s)
     readings: dict[str, list[Readings]] = {}
     n_samples = 0
+    n_impossible: Counter[str] = Counter()
     has_rate = True
     for block in source.blocks():
         rate = angular_velocity(block)
@@ -146,10 +148,14 @@ def reduce_source(
         cells.add(block.accel_stamp_ns, block.accel, rate)
         for name, (reading_ns, celsius, _) in block.temperatures.items():
             own = readings.setdefault(name, [NO_READINGS])
+            n_impossible[name] += int(np.count_nonzero(np.abs(celsius) > HOTTEST))
             new = _thinned(reading_ns, celsius, own[-1].stamp_ns[-1:])
             if len(new.stamp_ns):
                 own.append(new)
         n_samples += len(block.accel_stamp_ns)
+    for name, n in n_impossible.items():
+        if n > sum(len(one.value) for one in readings[name]):
+            raise FitError(f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC')
     found, reader = cells.finish(), source.reader()
     ranges = _rests(found, min_rest_s, still_sd)
     per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
@@ -254,7 +260,7 @@ def _thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     """Keep possible readings, in rising order after the last one; average very fast ones."""
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
-    use = (value > _COLDEST) & (value < _HOTTEST)
+    use = (value >= COLDEST) & (value <= HOTTEST)
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import FitError
 from ..thermal.memory import MemorySpec, memory_on_grid, start_covariance
 from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Layout
@@ -159,6 +160,11 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             parts.append(merged)
             numbers.append((np.full(n, len(rests)), np.full(n, bag)))
             rests.append((reduced, interval))
+        if not rests or rests[-1][0] is not reduced:
+            raise FitError(
+                f'{reduced.source.name}: no temperature of the board is stamped before the end of '
+                'its last rest: do the thermometers and the accelerometer share a clock?'
+            )
     time, count, mean, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
     k, m = len(columns), len(groups) + len(columns)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
+from ..thermal.thermometer import COLDEST, HOTTEST
 from .columns import Readings, RecordingInfo
 from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
@@ -83,6 +84,9 @@ def thermal_findings(thermometers: Mapping[str, ThermometerSurvey]) -> list[str]
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
                 found.append(f'no {name} ramp: the dynamic set would not know {name}')
+    for name, one in thermometers.items():
+        if one.lowest < COLDEST or one.highest > HOTTEST:
+            found.append(f'{name} reads {one.lowest:.4g} .. {one.highest:.4g}: that is no degC')
     if 'case' not in thermometers:
         found.append(
             'no case temperature: the regime will follow the slower board sensor; name yours '
