@@ -150,12 +150,12 @@ def test_counts_at_another_rate_are_of_another_scale(rng):
         20_000, 2000.0, lambda k: tuple(float(value + k % 2) for value in twentieth), 5 * SECOND_NS
     )
     stamps, _ = run(compensator, fast)
-    assert compensator.thermal.is_too_fast
+    assert compensator.thermal.rate.is_too_fast
     # Noticed at the first event after the surplus has passed 50 samples: within 1 s.
     assert len(stamps) <= 2000
     assert compensator.counters.n_too_fast == 20_000 - len(stamps)
     after, _ = run(compensator, recording(500, 100.0, lambda _: at_rest(rng), 16 * SECOND_NS))
-    assert not compensator.thermal.is_too_fast
+    assert not compensator.thermal.rate.is_too_fast
     # The surplus is forgiven within a second or two.
     assert after[-1] == 16 * SECOND_NS + 4_990_000_000
     assert len(after) > 250

@@ -24,7 +24,7 @@ from ros_helpers import DEEP, TIMEOUT, Peer
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from thermo_comp.ros.waitloop import OTHERS_PERIOD_NS, RCLError, WaitLoop, undeclared_overrides
+from thermo_comp.ros.waitloop import OTHERS_PERIOD_NS, RCLError, WaitLoop, overrides
 
 RELIABLE = QoSProfile(depth=2000)
 BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -101,9 +101,9 @@ def test_rclpy_still_has_what_is_used_beyond_its_documented_api() -> None:
     assert issubclass(RCLError, Exception)
 
 
-def test_overrides_that_no_parameter_takes_are_named(node: Node) -> None:
+def test_what_the_user_set_is_known_by_name(node: Node) -> None:
     node.declare_parameter('known', 1)
-    assert undeclared_overrides(node) == ['mispelt']
+    assert overrides(node) == {'mispelt': 1, 'known': 2}
 
 
 def test_messages_come_serialized_in_order_with_their_time(node: Node, peer: Peer) -> None:

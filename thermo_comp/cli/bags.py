@@ -83,7 +83,7 @@ def _calibration(out: Output, path: Path) -> None:
     from ..unit.calibration_file import load_calibration
 
     calibration = load_calibration(path)
-    unit, provenance, axes = calibration.unit, calibration.provenance, calibration.axes
+    unit, provenance = calibration.unit, calibration.provenance
     out.line(f'{path}: unit {unit.serial}, {unit.input} up to {unit.full_scale:g}')
     out.line(
         f'  fitted {provenance.created or "at an unknown time"} by thermo_comp '
@@ -97,13 +97,8 @@ def _calibration(out: Output, path: Path) -> None:
     out.table(
         ('axis', 'scale factor', 'bias', 'bias ug'),
         [
-            (
-                name,
-                f'{one.scale_factor:.8g}',
-                f'{one.bias:.6g}',
-                micro_g(one.bias / one.scale_factor),
-            )
-            for name, one in zip('xyz', (axes.x, axes.y, axes.z), strict=True)
+            (k, f'{a.scale_factor:.8g}', f'{a.bias:.6g}', micro_g(a.bias / a.scale_factor))
+            for k, a in zip('xyz', calibration.axes, strict=True)
         ],
     )
     out.table(

@@ -111,7 +111,7 @@ class Compensator:
         return corrected_rate(self.rate_line, (stamp_ns - self._segment[0]) * 1e-9, x, y, z)
 
     def _count_bad(self, x: float, y: float, z: float) -> None:
-        if self.is_refusing and self.thermal.is_too_fast:
+        if self.is_refusing and self.thermal.rate.is_too_fast:
             self.counters.n_too_fast += 1
         elif self.is_refusing:
             self.counters.n_refuted += 1

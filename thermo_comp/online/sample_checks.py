@@ -26,6 +26,8 @@ LARGEST_RATE: Final = 1.5
 #: ... with so many of them, or so many seconds' worth, at once (a driver that empties a buffer).
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
+#: Samples this much faster than calibrated, relative, still have the calibrated noise.
+RATE_TOLERANCE: Final = 0.1
 #: A rate is measured over so many seconds.
 _WINDOW_S: Final = 1.0
 
@@ -77,8 +79,8 @@ class StuckCheck:
 class RateCheck:
     """Compares the rate of the samples with the calibrated one, at the start of each segment."""
 
-    def __init__(self, cycle_s: float) -> None:
-        self._cycle_s = cycle_s
+    def __init__(self, cycle_s: float, counts_cycles: bool = True) -> None:
+        self._cycle_s, self._counts_cycles = cycle_s, counts_cycles
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
         #: Whether more samples have come than conversions can make.
         self.is_too_fast = False
@@ -87,6 +89,12 @@ class RateCheck:
         self._level = 0.0
         self._last: tuple[int, int] | None = None
         self._window = (0, 0)
+
+    @property
+    def noise_excess(self) -> float:
+        """What the rate adds to a sample's noise, relative to the calibrated cycle's."""
+        excess = self.ratio - 1.0
+        return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
         """Take the count of samples, of different stamps, before a stamp."""
@@ -103,7 +111,7 @@ class RateCheck:
         else:
             # Twice the allowance at most, so that a long excess is soon forgiven.
             self._level = min(level, 2.0 * self._allowance)
-            self.is_too_fast = self._level > self._allowance
+            self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
         if dt >= _WINDOW_S:
             self.ratio = n * self._cycle_s / dt

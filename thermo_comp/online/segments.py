@@ -36,8 +36,6 @@ from .status import CompensatorConfig, Counters
 SEGMENT_NS: Final = 1_000_000_000
 #: How long what changes slowly is held.
 SLOW_NS: Final = 10_000_000_000
-#: Samples this much faster than calibrated, relative, still have the calibrated noise.
-RATE_TOLERANCE: Final = 0.1
 #: Earlier than any stamp.
 EVER_NS: Final = -NEVER_NS
 #: A unit that no thermometer watches is taken to be at the reference, within this sd [K].
@@ -86,8 +84,11 @@ class ThermalSide:
             self.rate_correction = Correction(triad, self.correction.memory)
             self._uncertainty.append(SlowUncertainty(triad, self.rate_correction))
         self.inputs = (BOARD_INPUT, *calibration.sensors)
-        self.rate = RateCheck(calibration.unit.cycle_time_s)
-        self._counts_cycles = calibration.unit.input == 'counts'
+        self._forget_rate()
+
+    def _forget_rate(self) -> None:
+        unit = self.calibration.unit
+        self.rate = RateCheck(unit.cycle_time_s, unit.input == 'counts')
         self._forget_segment()
 
     def _forget_segment(self) -> None:
@@ -128,8 +129,7 @@ class ThermalSide:
     def reset(self) -> None:
         """Forget temperatures, regime and rate; what waits, and counters, stay."""
         self.tracker = self._new_tracker()
-        self.rate = RateCheck(self.calibration.unit.cycle_time_s)
-        self._forget_segment()
+        self._forget_rate()
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """Queue a reading, if the calibration knows its thermometer."""
@@ -213,23 +213,12 @@ class ThermalSide:
             self._segment_key = key
             self.rate.update(n_seen, stamp_ns)
         start, end = self.sample(start_ns), self.sample(start_ns + SEGMENT_NS)
-        slow = self._slow_at(start_ns, end)
-        return Segment(start_ns, is_new, self.is_too_fast, self.noise_excess, start, end, slow)
-
-    @property
-    def is_too_fast(self) -> bool:
-        """Whether samples come too fast to be conversions of the calibrated cycle."""
-        return self.rate.is_too_fast and self._counts_cycles
-
-    @property
-    def noise_excess(self) -> float:
-        """What the rate adds to a sample's noise, relative to the calibrated cycle's."""
-        excess = self.rate.ratio - 1.0
-        return excess if excess > RATE_TOLERANCE else 0.0
+        slow, rate = self._slow_at(start_ns, end), self.rate
+        return Segment(start_ns, is_new, rate.is_too_fast, rate.noise_excess, start, end, slow)
 
     def bias_sd(self, correction: Correction, variances: Sequence[float]) -> tuple[float, ...]:
         """Give what is uncertain of each axis' bias: the whole variance less a sample's noise."""
-        excess = 1.0 + self.noise_excess
+        excess = 1.0 + self.rate.noise_excess
         pairs = zip(variances, correction.noise, strict=False)
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 

@@ -65,10 +65,8 @@ def take_snapshot(compensator: Compensator) -> CompensatorStatus:
         return CompensatorStatus(stamp_ns, faults, ahead_s)
     board_age = inf if board_ns is None else (stamp_ns - board_ns) * 1e-9
     # Half the time-out at the latest, so that a warning always comes before the error.
-    stale_after = compensator.config.temperature_timeout_s / 2.0
-    usual = STALE_INTERVALS * tracker.board.interval_s
-    if usual < stale_after:
-        stale_after = max(usual, SHORTEST_STALE_S)
+    latest = compensator.config.temperature_timeout_s / 2.0
+    stale_after = min(latest, max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S))
     state = thermal.sample(stamp_ns)
     is_dynamic = tracker.detector.regime == Regime.DYNAMIC
     return CompensatorStatus(

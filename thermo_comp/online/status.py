@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from operator import attrgetter
 from struct import pack
 
@@ -39,25 +39,10 @@ class CompensatorConfig(ThermalConfig):
         )
 
 
-#: The counters of samples that came in and did not go out.
-DROPPED = (
-    'n_not_finite',
-    'n_saturated',
-    'n_out_of_order',
-    'n_no_temperature',
-    'n_stale',
-    'n_stuck',
-    'n_too_fast',
-    'n_refuted',
-)
-_dropped = attrgetter(*DROPPED)
-
-
 @dataclass(slots=True)
-class Counters:
-    """What came in and why some of it did not go out."""
+class Dropped:
+    """Why samples that came in did not go out."""
 
-    n_out: int = 0
     n_not_finite: int = 0
     n_saturated: int = 0
     n_out_of_order: int = 0
@@ -66,6 +51,17 @@ class Counters:
     n_stuck: int = 0
     n_too_fast: int = 0
     n_refuted: int = 0
+
+
+DROPPED = tuple(one.name for one in fields(Dropped))
+_dropped = attrgetter(*DROPPED)
+
+
+@dataclass(slots=True)
+class Counters(Dropped):
+    """What came in and why some of it did not go out."""
+
+    n_out: int = 0
     n_board: int = 0
     n_board_rejected: int = 0
     n_case: int = 0

@@ -16,12 +16,8 @@ from contextlib import suppress
 
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.context import Context
-from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 
 from ..errors import CalibrationError, ThermoCompError
 from ..online.compensator import Compensator
@@ -31,7 +27,7 @@ from .diagnostics import Reporter
 from .process import SignalWatch, use_profile
 from .reader import LoadedCalibration, Reader, read
 from .relay import INPUTS, Relay
-from .waitloop import WaitLoop, undeclared_overrides
+from .waitloop import WaitLoop, overrides
 
 NODE_NAME = 'thermo_comp'
 
@@ -55,13 +51,13 @@ parameters:
 NOT_GIVEN = 'not_given.'
 
 #: What files, values, the environment and the middleware do: RuntimeError is its own, too.
-_NOT_OURS = (ThermoCompError, OSError, RuntimeError, ParameterException)
+_NOT_OURS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
 class CompensationNode:
     """The node around a `Compensator`; ThermoCompError if it cannot start."""
 
-    def __init__(self, context: Context | None = None) -> None:
+    def __init__(self, context: rclpy.context.Context | None = None) -> None:
         self.node = rclpy.create_node(NODE_NAME, context=context)
         try:
             self._build()
@@ -86,8 +82,8 @@ class CompensationNode:
         topics = [self.node.resolve_topic_name(topic) for _, topic in INPUTS.values()]
         # The input that is not open may be opened later, with these.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
-        for name in undeclared_overrides(self.node):
-            if not name.startswith(known):
+        for name in overrides(self.node):
+            if not (self.node.has_parameter(name) or name.startswith(known)):
                 self._log.warning(f'there is no parameter `{one_line(name)}`, it has no effect')
 
     def run(self) -> None:
@@ -171,7 +167,7 @@ def main(args: list[str] | None = None) -> int:
     args = sys.argv if args is None else args
     hold_standard_streams()
     try:
-        extra = remove_ros_args(args)[1:]
+        extra = rclpy.utilities.remove_ros_args(args)[1:]
     except RuntimeError as error:
         return _fail(error, 2)
     if extra:
@@ -188,7 +184,7 @@ def main(args: list[str] | None = None) -> int:
     with SignalWatch() as signals:
         try:
             use_profile()
-            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            rclpy.init(args=args, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
             node = CompensationNode()
             try:
                 signals.on_signal(node.stop)

@@ -30,7 +30,7 @@ from rclpy.service import Service
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
 from ..text import LONGEST_SERIAL, one_line
-from .waitloop import WaitLoop
+from .waitloop import WaitLoop, overrides
 
 #: More requests than this that wait, or parameters in one of them, are refused.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
@@ -134,13 +134,10 @@ class ParameterError(ThermoCompError):
 
 def declare(node: Node) -> NodeConfig:
     """Declare every parameter with the user's value; ParameterError where it does not fit."""
-    values: dict[str, Any] = {}
+    values, given = {}, overrides(node)
     for name, entry in _TABLE.items():
-        # Looked at before it is declared for good: an integer override of a float is welcome.
-        probe = ParameterDescriptor(dynamic_typing=True)
-        override = node.declare_parameter(name, entry.default, probe).value
-        node.undeclare_parameter(name)
-        values[name] = _checked(name, override)
+        # Not by rclpy, to whom a whole number is no float.
+        values[name] = _checked(name, given.get(name, entry.default))
         node.declare_parameter(name, values[name], descriptor(name), ignore_override=True)
     return NodeConfig(**values)
 

@@ -17,13 +17,12 @@ float64 values. A message of any other form is brought into this one by rclpy fi
 
 from __future__ import annotations
 
+import struct
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from operator import itemgetter
-from struct import Struct
-from struct import error as StructError  # noqa: N812
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -59,15 +58,15 @@ CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 _LONGEST_MESSAGE = 1024
 
 _ENCAPSULATION = b'\0\1\0\0'
-_HEADER = Struct('<4siI4x')
+_HEADER = struct.Struct('<4siI4x')
 # An Imu is orientation 4 + 9, angular velocity 3 + 9, linear acceleration 3 + 9 float64 values;
 # all but the last twelve are passed on.
 _PASSED = 8 * 25
-_NO_GYRO = Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
+_NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
 #: Where the rate stands in what is passed on, and its form with the first of its covariance.
 _RATE_AT = 8 * 13
-_RATE_IN, _RATE_OUT = Struct('<4d'), Struct('<12d')
-_CELSIUS = Struct('<d')
+_RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
+_CELSIUS = struct.Struct('<d')
 
 # A temperature that has arrived: received [ns]; of which thermometer, stamp [ns], degC.
 _Reading = tuple[int, tuple[str, int, float]]
@@ -94,8 +93,8 @@ class SampleConverter:
         # Of the last kind of message: its frame, what unpacks it, where what it passes on begins;
         # of the Imu: its frame and what packs it.
         self._name, self._passed, self._frame = b'', 0, b''
-        self._unpack: Callable[[bytes], tuple[Any, ...]] = Struct('').unpack
-        self._pack: Callable[..., bytes] = Struct('').pack
+        self._unpack: Callable[[bytes], tuple[Any, ...]] = struct.Struct('').unpack
+        self._pack: Callable[..., bytes] = struct.Struct('').pack
         #: What `process` last gave, for reports.
         self.last_result: tuple[float, ...] | None = None
 
@@ -106,7 +105,7 @@ class SampleConverter:
         try:
             encapsulation, sec, nanosec, name, x, y, z = self._unpack(data)
             is_known = name == self._name and encapsulation == _ENCAPSULATION
-        except (StructError, ValueError):
+        except (struct.error, ValueError):
             is_known = False
         if not is_known:
             data = self._learn(data)
@@ -146,10 +145,10 @@ class SampleConverter:
         end = 16 + int.from_bytes(data[12:16], 'little')
         # Behind the name there is anything.
         self._name, gap = data[12:end], start - end + skip
-        self._unpack = Struct(f'<4siI{len(self._name)}s{gap}x3d{rest}x').unpack
+        self._unpack = struct.Struct(f'<4siI{len(self._name)}s{gap}x3d{rest}x').unpack
         frame = self._frame_id.encode() + b'\0' if self._frame_id else self._name[4:]
         self._frame = len(frame).to_bytes(4, 'little') + frame + bytes(-(12 + len(frame)) % 8)
-        self._pack = Struct(f'<4siI{len(self._frame)}s{_PASSED}s12d').pack
+        self._pack = struct.Struct(f'<4siI{len(self._frame)}s{_PASSED}s12d').pack
         return data
 
 

@@ -137,11 +137,9 @@ def round_trip(
         if not recorder.wait_until(is_connected, PATIENCE_S) or not node.is_alive:
             raise ThermoCompError(' '.join(node.said.split()) or 'the node was not found')
 
-        def throttle(n_sent: int) -> None:
+        def throttle(n: int) -> None:
             """Wait for the node, which tells how far it is ten times a second."""
-            recorder.wait_until(
-                lambda: n_sent - int(account()['samples in']) <= IN_FLIGHT, ANSWER_S
-            )
+            recorder.wait_until(lambda: n - int(account()['samples in']) <= IN_FLIGHT, ANSWER_S)
 
         with opened_player(bag, rate, ros_args=ros_args) as player:
             awaited = ['accel', *thermometers]

@@ -25,7 +25,6 @@ from functools import partial
 from typing import Any
 
 import rclpy
-from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
@@ -258,7 +257,7 @@ class WaitLoop:
 class _WaitSet:
     """A wait set, filled anew for each wait."""
 
-    def __init__(self, context: Context, entities: Sequence[Any]) -> None:
+    def __init__(self, context: rclpy.context.Context, entities: Sequence[Any]) -> None:
         types = [type(one) for one in entities]
         counts = types.count(Subscription), types.count(GuardCondition), 0, 0, types.count(Service)
         self._set = rclpy_implementation.WaitSet(*counts, 0, context.handle)
@@ -277,10 +276,10 @@ class _WaitSet:
 
 def _opened(create: Callable[..., Any], message_type: Any, topic: str, qos: QoSProfile) -> Any:
     """Open a topic with the overrides of its QoS; ThermoCompError where name or QoS are wrong."""
-    overrides = QoSOverridingOptions.with_default_policies()
+    policies = QoSOverridingOptions.with_default_policies()
     try:
         # rclpy writes the overrides into the profile.
-        return create(message_type, topic, qos_profile=copy(qos), qos_overriding_options=overrides)
+        return create(message_type, topic, qos_profile=copy(qos), qos_overriding_options=policies)
     except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
         raise ThermoCompError(f'a topic cannot be opened: {error}') from error
 
@@ -294,7 +293,7 @@ def _take_message(subscription: Subscription) -> bool:
 @contextmanager
 def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
     """Open a node in a context of its own."""
-    context = Context()
+    context = rclpy.context.Context()
     rclpy.init(args=['--ros-args', *ros_args], context=context)
     try:
         node = rclpy.create_node(name, context=context)
@@ -312,7 +311,6 @@ def type_name(message_type: Any) -> str:
     return f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'
 
 
-def undeclared_overrides(node: Node) -> list[str]:
-    """Name the parameters that the user gave and the node does not have: misspelt, most likely."""
-    overrides = node._parameter_overrides  # noqa: SLF001
-    return sorted(name for name in overrides if not node.has_parameter(name))
+def overrides(node: Node) -> dict[str, Any]:
+    """Give the parameters that the user set at the start, known to the node or not, by name."""
+    return {name: one.value for name, one in node._parameter_overrides.items()}  # noqa: SLF001
