@@ -39,12 +39,10 @@ _GIVE_MAP = 'give a column map: --columns MAP'
 @dataclass(frozen=True)
 class Accel:
     """
-    The accelerometer's three columns.
+    The accelerometer's three columns, which become `output`: ``counts`` or ``imu`` (m/s^2).
 
-    `output` is what becomes of them: ``counts`` (geometry_msgs/Vector3Stamped) or ``imu``
-    (sensor_msgs/Imu, m/s^2). `clip` are the readings, in the table's unit, at and beyond which
-    the sensor saturates; `offset` is what it reads without a force, as 32768 in offset binary,
-    which is taken away.
+    `clip` are the readings, in the table's unit, at and beyond which the sensor saturates;
+    `offset` is what it reads without a force, as 32768 in offset binary, which is taken away.
     """
 
     columns: Triple

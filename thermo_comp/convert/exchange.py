@@ -162,7 +162,6 @@ def import_calibration(
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, told by what it holds, with the same set in both regimes.
-
     `number` chooses a set or IMU; None takes the only one there is. `full_scale` is in m/s^2.
     """
     read = (tool.read(text, number) for tool in TOOLS.values())

@@ -114,10 +114,9 @@ def read_text(
 
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
-    Find the delimiter of a text table, the one that splits most lines alike, and its width.
-
-    One of comma, semicolon, tab, bar, or a blank for any run of white space. The lines are taken
-    from the end of the head, where the preamble of a logger is over; the last one may be cut.
+    Find the delimiter of a text table, the one that splits most lines alike (a blank stands for any
+    white space), and its width. The lines are taken from the end of the head, where the preamble
+    of a logger is over; the last one may be cut.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = (lines[:-1] if len(lines) > 2 else lines)[-50:]
@@ -150,10 +149,9 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
 
 def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str], _Rows]:
     """
-    Skip what stands before a table; return its headings, if it has any, and its rows.
-
-    Its rows are as wide as most, but for a blank last cell. The first of numbers, or a run of such
-    rows right before it, begins the table: then the first of these has the headings.
+    Skip what stands before a table; return its headings, if it has any, and its rows. These are as
+    wide as most, but for a blank last cell. The first of numbers, or a run of such rows right
+    before it, begins the table: then the first of these has the headings.
     """
     first = list(islice(rows, _PREAMBLE_ROWS))
     is_row = [_n_cells(row) == width for _, row in first]

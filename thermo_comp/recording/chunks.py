@@ -4,7 +4,6 @@
 Owns the stretches of a file that hold messages: unpacked within limits, and the messages found.
 
 What a chunk or a frame claims about its size is only ever an upper limit of what is taken for it.
-
 The message index behind a chunk is never trusted. What it points at must be message records that
 tile the chunk without gap or overlap; where they do not, because other records stand between them
 or there is no index, the records are walked one by one. Layout: https://mcap.dev/spec.
@@ -94,9 +93,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 class Span:
     """
     A stretch of a file: a chunk, one whose end is missing, or messages outside any chunk.
-
-    `position` and `length` [bytes] are its records', without the message indexes behind it; `size`
-    is its content's; start and end are log times.
+    `position` and `length` [bytes] leave out the message indexes behind it, `size` is its content.
     """
 
     position: int
@@ -202,7 +199,6 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
 def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
     Go from record to record as far as they are whole, and say what is wrong with the next.
-
     Before zeros the last message is left out: its own end may be zeros, too.
     """
     view = data.data

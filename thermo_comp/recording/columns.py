@@ -150,10 +150,8 @@ def join_messages(pieces: Sequence[Messages]) -> Messages:
 
 class BagFile:
     """
-    What is known of one open file of a bag; `path` is what errors call it.
-
-    `topics` are by the number of their channel, `definitions` encoding and text by message type,
-    start and end log times; `truncated` says what is missing.
+    What is known of one open file of a bag, which errors call by its `path`: topics by the number
+    of their channel, encoding and text of message types, log times, and what is missing.
     """
 
     storage = 'mcap'
@@ -174,8 +172,8 @@ class RecordingInfo:
     What a bag holds, known before its messages are read.
 
     `topics` have message type, two joined by `` | ``, and number of messages. Start and end are
-    the first and last log time, or 0; `truncated` says what is missing, `metadata` what its writer
-    left in it, `input` which accelerometer topic is read, `chosen` what was taken by its type.
+    log times, or 0; `truncated` says what is missing, `metadata` what its writer left in it,
+    `input` which accelerometer topic is read, `chosen` what was taken by its type.
     """
 
     path: Path
@@ -196,10 +194,8 @@ class RecordingInfo:
 
 class ImuColumns(NamedTuple):
     """
-    What a sensor_msgs/Imu carries beside its stamp and its linear acceleration.
-
-    The orientation is a quaternion x, y, z, w, shape (n, 4); the rates [rad/s] have shape (n, 3),
-    each covariance (n, 9).
+    What a sensor_msgs/Imu carries beside its stamp and its linear acceleration: a quaternion
+    x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3), and covariances, shape (n, 9).
     """
 
     orientation: Floats

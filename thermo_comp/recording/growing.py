@@ -46,8 +46,7 @@ def growing_blocks(
     wait: Callable[[float], bool],
 ) -> Iterator[News | None]:
     """
-    Give what is new in a bag, and None at the end of each look, until the bag is whole.
-
+    Give what is new in a bag, and None at the end of each look, until the bag is whole;
     `wait` waits so long [s] and tells whether to end.
     """
     if not path.exists():

@@ -51,10 +51,8 @@ class ThermometerSurvey:
 @dataclass(frozen=True)
 class Survey:
     """
-    What a recording holds, as far as a fit is concerned.
-
-    The rate is by the usual interval, NaN where there is none. Still intervals last at least 3 s.
-    The findings say what stands between it and a fit, each with the next step.
+    What a recording holds, as far as a fit is concerned. The rate is by the usual interval, still
+    intervals last at least 3 s; findings say what stands between it and a fit, and the next step.
     """
 
     info: RecordingInfo

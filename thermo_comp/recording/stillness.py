@@ -49,8 +49,7 @@ class Cells:
 
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Dropped are samples that are not finite or whose stamp does not rise. `quantum` is their step,
-    0 when they have none; `middle` that of words of 16 bits without a sign, where they can be
-    nothing else, or 0. The rates are the gyroscope's [rad/s], zeros where there is none.
+    0 without one; `middle` that of words of 16 bits without a sign, or 0; rates are in rad/s.
     """
 
     start_ns: int
@@ -76,10 +75,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces samples to cells of `cell_s`, or of 30 samples if that is longer, while they stream by.
-
-    `full_scale` is where a sample is saturated. A whole number of cells fills `window_s`, or one
-    of `STRETCHES` of them.
+    Reduces samples to cells of `cell_s`, or of 30 samples if that is longer, while they stream by;
+    a whole number of cells fills `window_s`, or one of `STRETCHES` of them.
     """
 
     def __init__(
@@ -220,7 +217,6 @@ def still_intervals(
 ) -> list[tuple[int, int]]:
     """
     Find the runs of cells in which nothing moved: half-open ranges of cell numbers, in order.
-
     `still_sd` is the largest scatter at rest [parts of g], `ratio` of a variance to the quiet one.
     """
     full = _is_full(cells)

@@ -143,10 +143,9 @@ def select_topics(
     require: Collection[Role],
 ) -> tuple[dict[Role, str], Literal['counts', 'imu'] | None, str | None]:
     """
-    Find the topics that feed the roles, as far as they have messages.
-
-    Gives these, what the accelerometer's is, and what was taken for want of the usual name.
-    RecordingError for a topic that is ambiguous, of another type, or required and not there.
+    Find the topics that feed the roles, as far as they have messages, what the accelerometer's is,
+    and what was taken for want of the usual name. RecordingError for a topic that is ambiguous, of
+    another type, or required and not there.
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages')

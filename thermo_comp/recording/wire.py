@@ -48,10 +48,9 @@ def decode_blocks(
     keep_raw: bool = False,
 ) -> list[Block]:
     """
-    Decode messages, in their order; a block ends where the frame changes.
-
-    `feeds` are role and topic of each channel, `roles` those of the whole bag. Raises
-    RecordingError, without a path, for a message whose bytes do not fit its type.
+    Decode messages, in their order; a block ends where the frame changes. `feeds` are role and
+    topic of each channel, `roles` those of the whole bag. RecordingError, without a path, for a
+    message whose bytes do not fit its type.
     """
     roles = tuple(dict.fromkeys((*ROLES, *roles)))
     topics = dict(feeds.values())
@@ -101,9 +100,8 @@ def decode_blocks(
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
     """
-    Decode messages that are a header and float64 numbers; `kind` is a key of `N_NUMBERS`.
-
-    Gives stamps, numbers, shape (n, k), and frames.
+    Decode messages that are a header and the float64 numbers of `kind`, a key of `N_NUMBERS`, to
+    stamps, numbers, shape (n, k), and frames.
     """
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
     if not n:
@@ -150,7 +148,6 @@ def encode_stamped(
 ) -> Bytes:
     """
     Serialize (CDR, little-endian) a header and float64 numbers, as rows of bytes, shape (n, size).
-
     Each piece is the first column of some of the numbers and their values, shape (n, width), or
     (width,) for the same in each message; the others are 0.
     """

@@ -108,9 +108,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         log_ns: ArrayLike | None = None,
     ) -> None:
         """
-        Write sensor_msgs/Imu: m/s^2, shape (n, 3), with the covariance (n, 9) or (9,).
-
-        Without `imu` neither orientation nor rate is claimed: -1 begins their covariances.
+        Write sensor_msgs/Imu: m/s^2, shape (n, 3), with the covariance (n, 9) or (9,). Without
+        `imu` neither orientation nor rate is claimed: -1 begins their covariances.
         """
         columns: list[_Column] = [
             (25, 'linear_acceleration', linear_acceleration, 3),
@@ -272,8 +271,8 @@ def table_writer(
     """
     Write a table, by its suffix one of `TABLES`; it takes its name when the block ends well.
 
-    Yields what takes columns by name, shape (n,) each, the same ones every time. A CSV file has no
-    place for the metadata. OutputError if it may not or cannot be written, or pyarrow is missing.
+    Yields what takes columns by name, shape (n,) each, the same ones every time; CSV has no place
+    for the metadata. OutputError if it may not or cannot be written, or pyarrow is missing.
     """
     kind = TABLES[Path(path).suffix]
     with drafted(path, kind, overwrite=overwrite) as partial, partial.open('wb') as file:
