@@ -114,7 +114,7 @@ def read_text(
 
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
-    Find the delimiter of a text table, the one that splits most lines alike (a blank stands for any
+    Find the delimiter of a text table, the one that splits most lines alike (a blank is any run of
     white space), and its width. The lines are taken from the end of the head, where the preamble
     of a logger is over; the last one may be cut.
     """

@@ -180,9 +180,8 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
         columns.append(np.frombuffer(index, '<i8', length // 8, begin)[1::2])
         begin += length
     at = np.sort(np.concatenate(columns), kind='stable') if columns else np.empty(0, np.int64)
-    if begin != len(index) or not len(at):
-        return None
-    if at[0] < 0 or at[-1] > len(data) - MESSAGE_HEAD_BYTES:
+    is_inside = len(at) > 0 and at[0] >= 0 and at[-1] <= len(data) - MESSAGE_HEAD_BYTES
+    if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
     # Unsigned on purpose: a length that is too small wraps around to one that is too large.

@@ -263,19 +263,16 @@ class Block:
         """Choose some messages of each role."""
         own = rows['accel']
         n_before = np.concatenate(([0], np.cumsum(own)))
+        temperatures = {}
+        for name, one in self.temperatures.items():
+            kept = Readings(*(column[rows[name]] for column in one))
+            temperatures[name] = kept._replace(after=n_before[kept.after])
         return Block(
             self.accel_stamp_ns[own],
             self.accel[own],
             self.frame_id,
             self.imu and self.imu.take(own),
-            {
-                name: Readings(
-                    one.stamp_ns[rows[name]],
-                    one.celsius[rows[name]],
-                    n_before[one.after[rows[name]]],
-                )
-                for name, one in self.temperatures.items()
-            },
+            temperatures,
             {role: log_ns[rows[role]] for role, log_ns in self.log_ns.items()},
             {role: one.take(rows[role]).packed() for role, one in self.raw.items()},
         )
@@ -314,14 +311,11 @@ def joined(blocks: Sequence[Block]) -> Block:
     begins = np.cumsum([0, *map(len, blocks)])
     temperatures = {}
     for name in blocks[0].temperatures:
-        stamps, celsius, afters = zip(*(block.temperatures[name] for block in blocks), strict=True)
-        moved = [after + begin for after, begin in zip(afters, begins, strict=False)]
-        temperatures[name] = Readings(*map(np.concatenate, (stamps, celsius, moved)))
+        own = zip((block.temperatures[name] for block in blocks), begins, strict=False)
+        moved = [one._replace(after=one.after + begin) for one, begin in own]
+        temperatures[name] = Readings(*map(np.concatenate, zip(*moved, strict=True)))
     imus = [block.imu for block in blocks if block.imu is not None]
-    raws: dict[Role, list[Messages]] = {}
-    for block in blocks:
-        for role, own in block.raw.items():
-            raws.setdefault(role, []).append(own)
+    raws = {role: [b.raw[role] for b in blocks if role in b.raw] for b in blocks for role in b.raw}
     return Block(
         np.concatenate([block.accel_stamp_ns for block in blocks]),
         np.concatenate([block.accel for block in blocks]),

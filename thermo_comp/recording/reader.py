@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import inf
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -194,22 +195,22 @@ class RecordingReader(ExitStack):
         if self._part.is_whole:
             yield from blocks
             return
-        first_ns: int | None = None
+        first_ns: float = inf
         last_ns = n_kept = 0
         for block in blocks:
             if len(block):
                 last_ns = int(block.accel_stamp_ns[-1])
-                first_ns = int(block.accel_stamp_ns[0]) if first_ns is None else first_ns
+                first_ns = int(block.accel_stamp_ns[0]) if first_ns == inf else first_ns
             begin, end = self._part.limits_ns(first_ns)
             left = block.take(
                 {role: (own >= begin) & (own < end) for role, own in block.stamp_ns.items()}
             )
             if len(left) and not n_kept:
-                self.since_s = (int(left.accel_stamp_ns[0]) - (first_ns or 0)) * 1e-9
+                self.since_s = (int(left.accel_stamp_ns[0]) - first_ns) * 1e-9
             n_kept += len(left)
             if left.n_messages:
                 yield left
-        if not n_kept and first_ns is not None:
+        if not n_kept and first_ns < inf:
             raise RecordingError(
                 f'no sample is in {self._part}: they are stamped from {first_ns * 1e-9:.3f} '
                 f'to {last_ns * 1e-9:.3f}, which is {(last_ns - first_ns) * 1e-9:.1f} s',

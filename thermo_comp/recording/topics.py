@@ -63,11 +63,9 @@ class Part:
         """Whether the times are stamps."""
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
-    def limits_ns(self, first_ns: int | None) -> tuple[float, float]:
-        """Give begin and end as stamps; `first_ns` is the bag's first sample, if it has come."""
+    def limits_ns(self, first_ns: float) -> tuple[float, float]:
+        """Give begin and end as stamps; `first_ns` is the first sample's, inf until it comes."""
         origin = 0 if self.is_stamped else first_ns
-        if origin is None:  # nothing is known of it but whether it may begin before
-            return (-inf, inf) if self.begin is None else (inf, inf)
         begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
         return begin, inf if self.end is None else origin + round(self.end * 1e9)
 
