@@ -265,8 +265,8 @@ class Block:
         n_before = np.concatenate(([0], np.cumsum(own)))
         temperatures = {}
         for name, one in self.temperatures.items():
-            kept = Readings(*(column[rows[name]] for column in one))
-            temperatures[name] = kept._replace(after=n_before[kept.after])
+            which, after = rows[name], n_before[one.after[rows[name]]]
+            temperatures[name] = Readings(one.stamp_ns[which], one.celsius[which], after)
         return Block(
             self.accel_stamp_ns[own],
             self.accel[own],
