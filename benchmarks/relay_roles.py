@@ -130,7 +130,6 @@ def _sink(arguments: argparse.Namespace) -> None:
                 latencies.append(received - sec * 1_000_000_000 - nanosec)
         if messages and latencies:
             last = time.monotonic()
-    loop.close()
     if not latencies:
         sys.exit('nothing came out of the relay')
     percentiles = np.percentile(latencies, (50, 99, 99.9)) * 1e-6

@@ -116,7 +116,6 @@ class Soak:
         """Leave the middleware."""
         self._loop.stop()
         self._thread.join(TIMEOUT_S)
-        self._loop.close()
         self._executor.shutdown()
         self._operator.destroy_node()
         self.node.destroy_node()

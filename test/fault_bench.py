@@ -131,7 +131,6 @@ class Bench:
     def close(self) -> None:
         self._loop.stop()
         self._thread.join(TIMEOUT_S)
-        self._loop.close()
         self._operator.close()
         self.node.destroy_node()
 

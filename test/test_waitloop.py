@@ -77,7 +77,6 @@ class Running:
         self.loop.stop()
         self.thread.join(TIMEOUT)
         assert not self.thread.is_alive()
-        self.loop.close()
 
 
 def test_rclpy_still_has_what_is_used_beyond_its_documented_api() -> None:
@@ -130,7 +129,6 @@ def test_one_drain_takes_what_waits_and_leaves_nothing(node: Node, peer: Peer) -
     taken: list[bytes] = []
     peer.poll(lambda: taken.extend(raw.drain()[0]) or len(taken) == 100, '100 messages')
     assert raw.drain() == ([], [])
-    loop.close()
 
 
 def test_what_a_full_queue_loses_is_counted(node: Node, peer: Peer) -> None:
@@ -151,7 +149,6 @@ def test_what_a_full_queue_loses_is_counted(node: Node, peer: Peer) -> None:
 
     peer.poll(is_last_taken, 'the last message')
     assert raw.n_lost == 51 - len(taken)
-    loop.close()
 
 
 def test_raw_publisher_sends_the_bytes(node: Node, peer: Peer) -> None:
@@ -294,7 +291,6 @@ def test_quality_of_service_is_open_to_overrides(node: Node) -> None:
     assert depth.value == 7
     reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')
     assert ReliabilityPolicy[reliability.value.upper()] is ReliabilityPolicy.RELIABLE
-    loop.close()
 
 
 @pytest.mark.parametrize(
@@ -342,6 +338,5 @@ def test_only_best_effort_messages_that_crowd_gather(
     loop.stop()
     thread.join(TIMEOUT)
     assert not thread.is_alive()
-    loop.close()
     assert bool(rests) == is_resting
     assert all(0.0 < rest <= rest_s for rest in rests)

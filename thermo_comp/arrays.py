@@ -14,8 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +23,10 @@ from .files import shown_name
 from .online.batch import process_block
 from .online.compensator import Compensator
 from .online.status import CompensatorConfig, Counters
+from .recording.columns import Block, Readings
+from .recording.topics import Topics
 from .typing import Bools, Floats, Ints
 from .unit.calibration import Calibration
-
-if TYPE_CHECKING:
-    from .recording.columns import Block
-    from .recording.topics import Topics
 
 #: A temperature: one value for each sample, or (time_s, value) of readings of their own.
 Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
@@ -272,10 +269,8 @@ def _block(
     found = {}
     for name, value in readings.items():
         own, celsius = _readings(name, value, stamps, _is_date(time_s))
-        found[name] = (own + start_ns, celsius, np.searchsorted(stamps, own))
-    # What is read of a block here; a whole one would need the libraries for bags.
-    block = SimpleNamespace(accel_stamp_ns=stamps + start_ns, accel=samples, temperatures=found)
-    return cast('Block', block)
+        found[name] = Readings(own + start_ns, celsius, np.searchsorted(stamps, own))
+    return Block(stamps + start_ns, samples, '', None, found, {})
 
 
 def _is_date(value: object) -> bool:

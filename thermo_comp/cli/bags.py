@@ -12,6 +12,7 @@ from typing import Any
 import typer
 
 from ..files import bag_kind, check_output
+from ..online.status import DROPPED, CompensatorConfig
 from ..text import counted
 from . import options
 from .options import argument, option
@@ -137,9 +138,9 @@ def replay(
     ),
     serial: str | None = options.SERIAL,
     frame_id: str = option("Frame of the output; empty keeps the input's.", ''),
-    transition_time: float | None = option(_AS_THE_NODE, min=0.0),
-    temperature_timeout: float | None = option(_AS_THE_NODE),
-    case_timeout: float | None = option(_AS_THE_NODE),
+    transition_time: float = option(_AS_THE_NODE, CompensatorConfig.transition_time_s, min=0.0),
+    temperature_timeout: float = option(_AS_THE_NODE, CompensatorConfig.temperature_timeout_s),
+    case_timeout: float = option(_AS_THE_NODE, CompensatorConfig.case_timeout_s),
     reading: dict[str, Any] = options.reading,
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -155,18 +156,12 @@ def replay(
     Example:
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
     """
-    from ..online.status import DROPPED, CompensatorConfig
     from ..recording.writer import TABLES
     from ..replay import replay as run
     from ..unit.calibration_file import load_calibration
 
-    given = {
-        'transition_time_s': transition_time,
-        'temperature_timeout_s': temperature_timeout,
-        'case_timeout_s': case_timeout,
-    }
     with options.usage_of():
-        config = CompensatorConfig(**{k: v for k, v in given.items() if v is not None})
+        config = CompensatorConfig(transition_time, temperature_timeout, case_timeout)
     kind = TABLES.get(output.suffix) or bag_kind(output, ', *.csv, *.parquet')
     if output.suffix in TABLES and (keep_inputs or all_topics):
         raise options.usage('--keep-inputs and --all-topics are for bags')

@@ -10,18 +10,16 @@ is gathered, evaluated for all segments together and applied to all samples by t
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
+from ..recording.columns import Block
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.correction import Correction
 from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
-
-if TYPE_CHECKING:
-    from ..recording.columns import Block
 
 #: Readings yet to come, the next one last: samples before it, thermometer, stamp, degC.
 _Arrivals: TypeAlias = list[tuple[int, str, int, float]]

@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from struct import pack
+from typing import NamedTuple
 
 from ..thermal.settings import ThermalConfig, refuse_outside
 
@@ -75,17 +76,12 @@ class Counters(Dropped):
         return self.n_out + n_dropped
 
 
-@dataclass(frozen=True, slots=True)
-class GravityResidual:
-    """What the still windows say."""
+class GravityResidual(NamedTuple):
+    """|f| - g over still windows [m/s^2], its sd, their number, and whether the last was still."""
 
-    #: |f| - g [m/s^2], averaged over the recent still windows.
     residual: float
-    #: Its standard deviation [m/s^2]: what calibration and noise leave uncertain.
     residual_sd: float
-    #: Still windows that went into it.
     n_windows: int
-    #: Whether the last window was still.
     is_still: bool
 
     @property

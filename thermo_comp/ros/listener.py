@@ -63,7 +63,6 @@ class _Listener:
         with ExitStack() as stack:
             self._node = stack.enter_context(own_node(self._name, self._ros_args))
             self._loop = WaitLoop(self._node)
-            stack.callback(self._loop.close)
             self._open()
             thread = threading.Thread(target=self._run, name=self._name)
             thread.start()

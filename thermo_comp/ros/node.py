@@ -98,7 +98,6 @@ class CompensationNode:
         """Destroy the node."""
         self._requests.close()
         self._reader.close()
-        self._loop.close()
         self.node.destroy_node()
 
     def _report_every(self, period_s: float) -> None:

@@ -119,10 +119,9 @@ class NodeConfig:
     def compensator_config(self) -> CompensatorConfig:
         """Return the part that the compensator takes."""
         # There the names say the units.
-        names = {one.name: one.name.removesuffix('_m_s2') for one in fields(CompensatorConfig)}
-        return CompensatorConfig(
-            **{name: getattr(self, own.removesuffix('_s')) for name, own in names.items()}
-        )
+        names = [one.name for one in fields(CompensatorConfig)]
+        own = (getattr(self, one.removesuffix('_m_s2').removesuffix('_s')) for one in names)
+        return CompensatorConfig(**dict(zip(names, own, strict=True)))
 
 
 _TABLE: Mapping[str, Field[Any]] = {entry.name: entry for entry in fields(NodeConfig)}

@@ -102,7 +102,7 @@ class WaitLoop:
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
         self.node = node
         self._rest_ns = int(rest_s * 1e9)
-        self._guard = GuardCondition(None, None, context=node.context)
+        self._guard = node.create_guard_condition(lambda: None)
         self._raw: list[RawSubscription] = []
         #: What takes the requests of services in place of callbacks that have to answer at once.
         self.handlers: dict[Service, Serve] = {}
@@ -162,10 +162,6 @@ class WaitLoop:
         except (RCLError, ExternalShutdownException):
             if self.node.context.ok():
                 raise
-
-    def close(self) -> None:
-        """Release the guard condition; the node itself stays."""
-        self._guard.destroy()
 
     def _serve(self, on_data: Callable[[], None]) -> None:
         """Wait and serve until the entities change or the loop is to stop."""
