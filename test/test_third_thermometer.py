@@ -79,7 +79,7 @@ def fitted(bags: list[Path]) -> Calibration:
 def runs() -> list[SimulatedRun]:
     unit = unit_with_a_lid()
     return [
-        simulate(unit, PROGRAM, up, rate_hz=2.0, temperature_rate_hz=0.25, seed=number)
+        simulate(unit, PROGRAM, up, rate_hz=2.0, temperature_rate_hz=0.5, seed=number)
         for number, up in enumerate(positions(7, 1))
     ]
 
