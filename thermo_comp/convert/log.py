@@ -274,7 +274,7 @@ def _write(
             if log.input == 'counts':
                 writer.write_counts(topics.counts, stamp_ns, values, log.frame_id, newest[rows])
             else:
-                imu = None if log.gyro is None else ImuColumns.of_rate(log.gyro[rows])
+                imu = ImuColumns.of_rate(None if log.gyro is None else log.gyro[rows])
                 writer.write_imu(
                     topics.imu, stamp_ns, values, np.zeros(9), log.frame_id, imu, newest[rows]
                 )

@@ -195,7 +195,8 @@ class RecordingInfo:
 class ImuColumns(NamedTuple):
     """
     What a sensor_msgs/Imu carries beside its stamp and its linear acceleration: a quaternion
-    x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3), and covariances, shape (n, 9).
+    x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3), and covariances, shape (n, 9). What is
+    written may be one row, the same for all.
     """
 
     orientation: Floats
@@ -205,12 +206,12 @@ class ImuColumns(NamedTuple):
     linear_acceleration_covariance: Floats
 
     @classmethod
-    def of_rate(cls, rate: Floats) -> ImuColumns:
-        """Give what is no orientation (REP 145), and rates; their covariances are not known."""
-        no_orientation = [0.0, 0.0, 0.0, 1.0], [-1.0] + 8 * [0.0]
-        level, none, unknown = (
-            np.broadcast_to(row, (len(rate), len(row))) for row in (*no_orientation, np.zeros(9))
-        )
+    def of_rate(cls, rate: Floats | None) -> ImuColumns:
+        """Give rates, if any, of unknown covariance, and what is no orientation (REP 145)."""
+        none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
+        level = np.array([0.0, 0.0, 0.0, 1.0])
+        if rate is None:
+            return cls(level, none, np.zeros(3), none, unknown)
         return cls(level, none, rate, unknown, unknown)
 
     def take(self, rows: Ints | Bools) -> ImuColumns:

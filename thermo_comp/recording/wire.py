@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
+from struct import pack
 from typing import Any
 
 import numpy as np
@@ -151,30 +152,23 @@ def encode_stamped(
     Each piece is the first column of some of the numbers and their values, shape (n, width), or
     (width,) for the same in each message; the others are 0.
     """
-    characters = frame_id.encode() + b'\0'
-    body = 4 + (12 + len(characters) + 7) // 8 * 8
-    fields: Any = {
-        'names': ['order', 'sec', 'nanosec', 'length', 'frame', 'numbers'],
-        'formats': ['u1', '<i4', '<u4', '<u4', f'V{len(characters)}', ('<f8', (n_numbers,))],
-        'offsets': [1, 4, 8, 12, HEAD_BYTES, body],
-        'itemsize': body + 8 * n_numbers,
-    }
-    pattern: NDArray[Any] = np.zeros(1, np.dtype(fields))
-    pattern['order'], pattern['length'] = 1, len(characters)
-    pattern['frame'] = np.void(characters)
+    text = frame_id.encode() + b'\0'
+    head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text
+    body = 4 + (len(head) + 3) // 8 * 8
+    row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
     # What all have in common is written once, and copied with the rest.
     for column, values in pieces:
         if values.ndim == 1:
-            pattern['numbers'][:, column : column + len(values)] = values
-    row = pattern.view(np.uint8)
+            row[body:].view('<f8')[column : column + len(values)] = values
     data = np.empty((len(stamp_ns), len(row)), np.uint8)
     data[:] = row
-    rows = data.view(pattern.dtype)[:, 0]
-    rows['sec'] = seconds = stamp_ns // _NS
-    rows['nanosec'] = stamp_ns - seconds * _NS
+    seconds = stamp_ns // _NS
+    data[:, 4:8].view('<i4')[:, 0] = seconds
+    data[:, 8:12].view('<u4')[:, 0] = stamp_ns - seconds * _NS
+    numbers = data[:, body:].view('<f8')
     for column, values in pieces:
         if values.ndim > 1:
-            rows['numbers'][:, column : column + values.shape[1]] = values
+            numbers[:, column : column + values.shape[1]] = values
     return data
 
 

@@ -115,13 +115,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
             (25, 'linear_acceleration', linear_acceleration, 3),
             (28, 'linear_acceleration_covariance', linear_acceleration_covariance, 9),
         ]
-        if imu is None:
-            nothing = np.zeros(25)
-            nothing[3], nothing[[4, 16]] = 1.0, -1.0
-            columns.append((0, '', nothing, 25))
-        else:
-            places = zip((0, 4, 13, 16), imu._fields, imu, (4, 9, 3, 9), strict=False)
-            columns += [(at, f'imu.{name}', one, width) for at, name, one, width in places]
+        imu = imu or ImuColumns.of_rate(None)
+        places = zip((0, 4, 13, 16), imu._fields, imu, (4, 9, 3, 9), strict=False)
+        columns += [(at, f'imu.{name}', one, width) for at, name, one, width in places]
         self._write_stamped(topic, IMU, stamp_ns, log_ns, frame_id, columns)
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
