@@ -3,20 +3,17 @@
 """
 Owns the logs of autopilots, behind the extras ``px4`` and ``ardupilot``: one IMU, one barometer.
 
-The thermometer inside the IMU sits with the converter and lags: it becomes the board temperature.
-The barometer beside it hardly heats itself and follows the surroundings: it becomes the case
-temperature, and the board's where the IMU has none. A simulator's log is refused: it has no noise,
-so nothing can be weighed by it.
+The thermometer inside the IMU lags: it becomes the board temperature. The barometer beside it
+follows the surroundings: it becomes the case temperature, and the board's where the IMU has none.
+A simulator's log is refused: it has no noise, so nothing can be weighed by it.
 
-PX4's ULog (``.ulg``): ``sensor_accel`` holds what the driver read, before PX4's own thermal
-correction and calibration, with the temperature of the same chip. PX4 logs it at 1 Hz unless the
-logger's profile asks for more (``SDLOG_PROFILE``: thermal calibration). Where it is missing,
-``sensor_combined`` stands in: after PX4's calibration, and without a temperature.
+PX4's ULog (``.ulg``): ``sensor_accel`` holds what the driver read, before PX4's own corrections,
+with the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` asks for more. Where it is
+missing, ``sensor_combined`` stands in: after PX4's calibration, and without a temperature.
 
 ArduPilot's DataFlash (``.BIN``): one message type per IMU in old logs (``IMU``, ``IMU2``), one
-with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. The
-readings are those after ArduPilot's own correction, so a log made with ``INS_TCALn_ENABLE = 1`` is
-refused: its thermal drift is already taken out.
+with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. A log made
+with ``INS_TCALn_ENABLE = 1`` is refused: its thermal drift is already taken out.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
 https://ardupilot.org/copter/docs/logmessages.html

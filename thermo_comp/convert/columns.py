@@ -6,7 +6,6 @@ Owns tables with a column map: which column is what, in which unit, and how it b
 A map is a small YAML file beside the log; config/columns/ has examples. A table of numbers alone,
 ``[t] ax ay az [wx wy wz]`` as for imu_tk, has its map guessed: times rise; what rests reads
 gravity in its unit; and a gyroscope that counts in degrees is faster than any hand in radians.
-What was taken for what is said, and a column map says it otherwise.
 """
 
 from __future__ import annotations

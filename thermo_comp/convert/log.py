@@ -3,8 +3,7 @@
 """
 Owns the way from any foreign log to a bag: checks, thinning, and the account of every row.
 
-A reader of a format makes a `ForeignLog`; `write_log` does the rest, the same for all formats. At
-rest the specific force is gravity, whatever the attitude: a log whose map says otherwise is
+At rest the specific force is gravity, whatever the attitude: a log whose map says otherwise is
 refused, because a factor of 9.8 that nobody sees ends in a calibration.
 """
 

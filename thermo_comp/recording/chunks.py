@@ -4,9 +4,9 @@
 Owns the stretches of a file that hold messages: unpacked within limits, and the messages found.
 
 What a chunk or a frame claims about its size is only ever an upper limit of what is taken for it.
-The message index behind a chunk is never trusted. What it points at must be message records that
-tile the chunk without gap or overlap; where they do not, because other records stand between them
-or there is no index, the records are walked one by one. Layout: https://mcap.dev/spec.
+Its message index is never trusted: what it points at must be message records that tile the chunk
+without gap or overlap; where they do not, the records are walked one by one.
+https://mcap.dev/spec
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 """
 Owns messages while they come: what is new in somebody else's bag, and numbered bags of ours.
 
-Each look reads a growing bag from its beginning, so looks are as far apart as they take long.
-What comes becomes a folder of bags, `01.mcap`, `02.mcap`, ... under the node's own names. Where
-one ends is known a little late, so the newest messages are held back.
+Each look reads a growing bag from its beginning, so looks are as far apart as they take long. What
+comes becomes a folder of bags, `01.mcap`, ... under the node's own names; where one ends is known
+a little late, so the newest messages are held back.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: A look may take this part of the time.
 _SHARE = 0.2
-
 
 #: What has come: a block with its serialized messages, and from which bag.
 News = tuple[Block, RecordingInfo | None]
@@ -96,15 +95,12 @@ class PositionBags:
 
     def __init__(self, folder: Path, serial: str | None) -> None:
         self._folder, self._serial = folder, serial
-        self._number = max((int(one.stem) for one in numbered_bags(folder)), default=0)
-        check_output(self._path(self._number + 1), MCAP)
+        self._number = max((int(one.stem) for one in numbered_bags(folder)), default=0) + 1
+        check_output(folder / f'{self._number:02d}.mcap', MCAP)
         self._writer: BagWriter | None = None
         self._held: list[Block] = []
         #: Bags that were begun.
         self.written: list[Path] = []
-
-    def _path(self, number: int) -> Path:
-        return self._folder / f'{number:02d}.mcap'
 
     def add(self, block: Block, info: RecordingInfo | None) -> None:
         """Take the serialized messages, and from where they come."""
@@ -133,13 +129,13 @@ class PositionBags:
 
     def _write(self, block: Block) -> None:
         if self._writer is None and block.n_messages:
-            self._number += 1
-            path = self._path(self._number)
+            path = self._folder / f'{self._number:02d}.mcap'
             metadata = {} if self._serial is None else {'serial': self._serial}
             self._writer = BagWriter(
                 path, metadata=metadata, chunk_bytes=_CHUNK_BYTES, is_precious=True
             )
             self.written.append(path)
+            self._number += 1
         accel = (_USUAL.counts, VECTOR3_STAMPED) if block.imu is None else (_USUAL.imu, IMU)
         for role, one in block.raw.items():
             topic, kind = accel if role == 'accel' else (f'temperature/{role}', TEMPERATURE)

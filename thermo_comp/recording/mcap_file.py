@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fast path: one MCAP file, mapped, and its messages chunk by chunk in bounded memory.
+Owns the fast path: one MCAP file, and its messages chunk by chunk in bounded memory.
 
 An ordinary file says in its summary which stretches hold its messages. One without a usable
 summary, or cut off anywhere, is gone through record by record, and its messages are counted.
-Whatever is no message is read by the `mcap` library. Reading order is log time and, for equal
-ones, the place in the file; it needs the time spans of the chunks to be true, which is checked.
+Whatever is no message is read by the `mcap` library.
 """
 
 from __future__ import annotations

@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the MCAP file being written: chunks with their message indexes, the summary at the end, and
-what rosbag2 says of it (metadata.yaml of version 9).
-
-The bulk (message records, message indexes) is numpy bytes; the few other records go through the
-`mcap` library's record classes.
+what rosbag2 says of it (metadata.yaml of version 9). Messages and their indexes are numpy bytes;
+the few other records go through the `mcap` library's classes.
 """
 
 from __future__ import annotations

@@ -3,9 +3,8 @@
 """
 Owns the door to recordings: open a bag of any storage, say what it holds, read it as columns.
 
-Reading order
-    The order of a ROS player: log time, and for equal log times the place in the file. The split
-    files of one bag follow each other as its metadata.yaml lists them.
+Reading order is that of a ROS player: log time, and for equal log times the place in the file. The
+split files of one bag follow each other as its metadata.yaml lists them.
 """
 
 from __future__ import annotations
