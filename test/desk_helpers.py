@@ -106,7 +106,9 @@ class Desk:
             write_unit(path, 42, 3)
         elif name == 'fleet':
             pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
-            shutil.copytree(self._make('bags/unit42'), path / 'unit42')
+            from fleet_helpers import write_unit
+
+            write_unit(path / 'unit42', 42, 1)
         elif name == 'log.csv':
             rng = np.random.default_rng(3)
             rows = [
