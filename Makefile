@@ -26,6 +26,8 @@ unexport AMENT_PREFIX_PATH
 unexport COLCON_PREFIX_PATH
 unexport LD_LIBRARY_PATH
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# What is compiled is kept: without it each of the tests' many processes compiles it anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test lint nightly fuzz bench docs clean help
 .DEFAULT_GOAL := help
