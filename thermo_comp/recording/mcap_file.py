@@ -95,7 +95,7 @@ class McapFile(BagFile):
         if all(one.end_ns <= other.start_ns for one, other in pairwise(self.spans)):
             yield from self._ahead(self.spans, lambda span: work(self._load(span, channels)))
             return
-        order = sorted(range(len(self.spans)), key=lambda row: (self.spans[row].start_ns, row))
+        order = sorted(range(len(self.spans)), key=lambda row: self.spans[row].start_ns)
         spans = [self.spans[row] for row in order]
         following = [*(span.start_ns for span in spans[1:]), None]
         loaded = self._ahead(spans, lambda span: self._load(span, channels))

@@ -42,11 +42,6 @@ class ThermometerSurvey:
     steepest_cooling_k_min: float
     quantum: float
 
-    @property
-    def span(self) -> float:
-        """Highest minus lowest."""
-        return self.highest - self.lowest
-
 
 @dataclass(frozen=True)
 class Survey:
@@ -76,9 +71,9 @@ def thermal_findings(thermometers: Mapping[str, ThermometerSurvey]) -> list[str]
         )
     else:
         heating, cooling = board.steepest_heating_k_min, -board.steepest_cooling_k_min
-        if board.span < ADVISED_SPAN_K:
-            advised = f'{ADVISED_SPAN_K:g} are advised'
-            found.append(f'board temperature spans {board.span:.1f} K: {advised}')
+        span = board.highest - board.lowest
+        if span < ADVISED_SPAN_K:
+            found.append(f'board temperature spans {span:.1f} K: {ADVISED_SPAN_K:g} are advised')
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
                 found.append(f'no {name} ramp: the dynamic set would not know {name}')
@@ -130,8 +125,8 @@ def survey_recording(
         info = reader.info
     reduced = cells.finish()
     still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
-    found = {name: survey_thermometer(own) for name, own in readings.items()}
-    thermometers = {name: one for name, one in found.items() if one is not None}
+    found = ((name, survey_thermometer(own)) for name, own in readings.items())
+    thermometers = {name: one for name, one in found if one is not None}
     findings = [
         (info.truncated, f'cut off: {info.truncated}'),
         (not n, _NO_SAMPLES),

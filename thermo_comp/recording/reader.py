@@ -42,7 +42,7 @@ from .columns import (
     without_jumps,
 )
 from .mcap_file import McapFile
-from .topics import Topics, select_topics, shown
+from .topics import WHOLE, Topics, select_topics, shown
 from .wire import decode_blocks
 
 _N_LOADERS = 2
@@ -191,7 +191,7 @@ class RecordingReader(ExitStack):
 
     def _cut(self, blocks: Iterator[Block]) -> Iterator[Block]:
         """Leave out what is outside the part; RecordingError where no sample is left."""
-        if self._part.is_whole:
+        if self._part == WHOLE:
             yield from blocks
             return
         first_ns: float = inf

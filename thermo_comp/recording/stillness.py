@@ -99,14 +99,13 @@ class CellAccumulator:
         use = (np.abs(samples) < _LARGEST).all(axis=1)
         before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
+        self._n_dropped += int((~use).sum())
         if self._full_scale is not None:
             if self._full_scale == _WORD - 1.0 and not self._middle:
                 self._look_for_sign(samples[use])
             saturated = use & (np.abs(samples - self._middle) >= self._full_scale).any(axis=1)
             self._n_saturated += int(saturated.sum())
-            self._n_dropped -= int(saturated.sum())
             use &= ~saturated
-        self._n_dropped += int((~use).sum())
         stamp_ns, samples = stamp_ns[use], samples[use]
         if not len(stamp_ns):
             return

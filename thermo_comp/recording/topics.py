@@ -54,11 +54,6 @@ class Part:
             raise ValueError(f'the part of a bag must end after {limits[0]:g}, got {limits[1]:g}')
 
     @property
-    def is_whole(self) -> bool:
-        """Whether nothing is left out."""
-        return self.begin is None and self.end is None
-
-    @property
     def is_stamped(self) -> bool:
         """Whether the times are stamps."""
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
@@ -72,7 +67,7 @@ class Part:
     def __str__(self) -> str:
         """Write it behind a bag's name."""
         begin, end = ('' if limit is None else f'{limit:.12g}' for limit in (self.begin, self.end))
-        return '' if self.is_whole else f'[{begin}:{end}]'
+        return '' if self == WHOLE else f'[{begin}:{end}]'
 
 
 #: All of a bag.
@@ -173,10 +168,10 @@ def _further(
     both = {}
     for own, wanted in topics.further.items():
         name = _match(present, wanted, f'temperature/{own}')
-        if name is None and is_read:
-            raise _missing(present, {f'temperature/{own}': wanted})
         if name is not None:
             both[own] = _of_type(present, name, TEMPERATURE)
+        elif is_read:
+            raise _missing(present, {f'temperature/{own}': wanted})
     beside = found.get('board') or found.get('case') or ''
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'
